@@ -135,6 +135,8 @@ def estimate_motion(
     from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
 
     given.check_type("correspondences", correspondences, Correspondences)
+    if motion_model is not None:
+        arguments.name_or_path("motion_model", motion_model)
     arguments.check_rows(rig, shutter)
     given.check_whole("seed", seed, 0)
     options = RobustOptions()
@@ -177,6 +179,7 @@ def pose_errors(
     if not isinstance(found, RobustEstimate | MotionEstimate):
         raise ValueError(f"found: must be what estimate_motion returned or a MotionEstimate, got {type(found)}")
     arguments.check_motion(rig, motion)
+    given.check_one_of("reference_point", reference_point, ("body", "left", None))
     estimate = found if isinstance(found, MotionEstimate) else found.estimate
     point = "body" if isinstance(found, MotionEstimate) else found.reference_point
     errors = scoring.pose_errors(
@@ -207,7 +210,10 @@ def match(images: Series[Image], *, features: str | Path = "sift-refined") -> Co
     from rsbench.pipeline.frame_matches import find_matches
     from rsbench.vision.feature_matcher import load_features
 
-    return find_matches(arguments.four_images(images), CorrectionOptions(features=load_features(features)))
+    return find_matches(
+        arguments.four_images(images),
+        CorrectionOptions(features=load_features(arguments.name_or_path("features", features))),
+    )
 
 
 def stereo_depth(
@@ -224,8 +230,11 @@ def stereo_depth(
     from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 
     given.check_one_of("side", side, SIDES)
+    given.check_type("rig", rig, StereoRig)
     left, right = arguments.check_image("left", left, rig), arguments.check_image("right", right, rig)
-    disparity = find_disparities(load_matcher(matcher), left, right, rig)[SIDES.index(side)]
+    disparity = find_disparities(load_matcher(arguments.name_or_path("matcher", matcher)), left, right, rig)[
+        SIDES.index(side)
+    ]
     return np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)
 
 
@@ -237,7 +246,7 @@ def read_dataset(folder: AnyPath) -> list[Sequence]:
     """
     from rsbench.dataset import sequence
 
-    return sequence.read_dataset(Path(folder))
+    return sequence.read_dataset(arguments.path("folder", folder))
 
 
 def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, workers: int = 1) -> list[Sequence]:
@@ -256,10 +265,11 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
     from rsbench.dataset.generation import generate_dataset
 
     given.check_whole("workers", workers, 1)
-    dataset = load_dataset_card(card)
+    place = arguments.path("out", out)
+    dataset = load_dataset_card(arguments.name_or_path("card", card))
     if sequences is not None:
-        dataset = dataset.only(list(arguments.names(sequences)))
-    generate_dataset(dataset, Path(out), workers=workers)
+        dataset = dataset.only(list(arguments.names("sequences", sequences)))
+    generate_dataset(dataset, place, workers=workers)
     return read_dataset(out)
 
 
@@ -279,7 +289,8 @@ def verify(
     """
     from rsbench.verification import verify_dataset
 
-    return verify_dataset(Path(folder), stride, rerender=rerender, scenes=[Path(path) for path in scenes])
+    cards = [arguments.path("scenes", each) for each in arguments.items("scenes", scenes)]
+    return verify_dataset(arguments.path("folder", folder), stride, rerender=rerender, scenes=cards)
 
 
 def evaluate(
@@ -320,17 +331,18 @@ def evaluate(
     from rsbench.benchmark.images.score import TABLES
 
     options = EvaluationOptions(
-        solvers=arguments.names(solvers),
-        correction_solver=correct_with,
-        features=features,
-        matcher=matcher,
-        corrector=corrector,
-        metrics=arguments.names(metrics),
-        only=arguments.names(only),
+        solvers=arguments.names("solvers", solvers),
+        correction_solver=str(arguments.name_or_path("correct_with", correct_with)),
+        features=str(arguments.name_or_path("features", features)),
+        matcher=str(arguments.name_or_path("matcher", matcher)),
+        corrector=str(arguments.name_or_path("corrector", corrector)),
+        metrics=arguments.names("metrics", metrics),
+        only=arguments.names("only", only),
         force=force,
         rehash=rehash,
         seeds=seeds,
         seed=seed,
     )
-    open_evaluation(Path(folder), Path(out), options).run("rsbench.evaluate", lambda word: None)
-    return {table: read_scores(Path(out), table) for table in TABLES}
+    data, place = arguments.path("folder", folder), arguments.path("out", out)
+    open_evaluation(data, place, options).run("rsbench.evaluate", lambda word: None)
+    return {table: read_scores(place, table) for table in TABLES}

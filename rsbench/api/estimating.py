@@ -61,9 +61,9 @@ def estimate_trajectory(
     if shutter is not None:
         arguments.check_rows(rig, shutter)
     samples = arguments.gyro_samples(gyro)
-    windows = [each for each in sequence if isinstance(each, Correspondences)]
+    windows = [each for each in arguments.items("sequence", sequence) if isinstance(each, Correspondences)]
     if len(windows) != len(sequence):
-        windows = matches_of(sequence, rig, features)
+        windows = matches_of(sequence, rig, str(arguments.name_or_path("features", features)))
     return trajectory_of(windows, rig, shutter, seed, samples)
 
 

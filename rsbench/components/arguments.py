@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
+_LONGEST_PATH = 4096
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
 
 
@@ -107,7 +110,7 @@ def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) ->
     Raises:
         ValueError: not four, not uint8 or uint16, not alike, or not of the size of the rig's cameras.
     """
-    if len(images) != 4:
+    if len(items("images", images)) != 4:
         raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
     views: dict[View, NDArray[Any]] = {}
     for (side, frame), image in zip(((s, f) for f in FRAMES for s in SIDES), images, strict=True):
@@ -125,6 +128,8 @@ def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArra
     if not isinstance(image, np.ndarray) or image.dtype not in _IMAGE_TYPES:
         kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"{name}: must be an array of uint8 or uint16, got {kind}")
+    if image.size == 0:
+        raise ValueError(f"{name}: must have pixels, got shape {image.shape}")
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise ValueError(f"{name}: must have shape (H, W) or (H, W, 3), got {image.shape}")
     if rig is not None and image.shape[:2] != (rig.camera.height, rig.camera.width):
@@ -133,6 +138,30 @@ def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArra
     return image
 
 
-def names(given: str | Iterable[str]) -> tuple[str, ...]:
-    """One name or many."""
-    return (given,) if isinstance(given, str) else tuple(given)
+def items(name: str, value: Any) -> Sequence[Any]:
+    """What has a length and can be indexed; raises ValueError on anything else, a text included."""
+    listed = isinstance(value, Sequence) and not isinstance(value, str)
+    if not listed and not (isinstance(value, np.ndarray) and value.ndim > 0):
+        raise ValueError(f"{name}: must be a list, got {given.shown(value)}")
+    return value
+
+
+def path(name: str, value: Any) -> Path:
+    """A path; raises ValueError on what is none, or is longer than a system takes."""
+    return Path(name_or_path(name, value))
+
+
+def name_or_path(name: str, value: Any) -> str | Path:
+    """The name of a component or the path of its card; raises ValueError on what is neither."""
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or "\0" in text or not 0 < len(text) <= _LONGEST_PATH:
+        raise ValueError(f"{name} = {given.shown(value)}: must be a name or a path")
+    return value if isinstance(value, str | Path) else text
+
+
+def names(name: str, value: Any) -> tuple[str, ...]:
+    """One name or many; raises ValueError on anything else."""
+    found = (value,) if isinstance(value, str) else value
+    if not isinstance(found, Iterable) or isinstance(found, Mapping):
+        raise ValueError(f"{name}: must be names, got {given.shown(value)}")
+    return tuple(str(name_or_path(name, each)) for each in found)

@@ -179,12 +179,20 @@ def check_values(data: Mapping[str, Any], where: str) -> None:
                 raise RsbenchError(f"{where}: {field} = {value}: numbers must be finite")
 
 
+_LISTED, _COMPARED = 10, 100
+"""Names that a message lists at most, and characters of a wrong one that they are compared with."""
+
+
 def choices(value: str, names: Iterable[str]) -> str:
-    """End of a message about an unknown name: the nearest name, then the names that exist."""
-    known = sorted(names)
+    """End of a message about an unknown name: the nearest name, then those that exist, or the nearest of many."""
+    known, value = sorted(names), value[:_COMPARED]
     near = difflib.get_close_matches(value, known, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return f"{hint}; there are: {', '.join(known) or 'none'}"
+    listed = (
+        known if len(known) <= _LISTED else sorted(difflib.get_close_matches(value, known, n=_LISTED, cutoff=0.0))
+    )
+    more = f" and {len(known) - len(listed)} more" if len(known) > len(listed) else ""
+    return f"{hint}; there are: {', '.join(listed) or 'none'}{more}"
 
 
 def shipped_folder(in_checkout: str, in_wheel: str) -> Path:

@@ -44,6 +44,7 @@ class PinholeCamera:
             given.check_positive(f"camera {name}", getattr(self, name), given.LARGEST_PX, "pixels")
         for name in ("cx", "cy"):
             given.check_number(f"camera {name}", getattr(self, name), -given.LARGEST_PX, given.LARGEST_PX)
+        given.keep_plain(self)
         if self.lens is not None:
             given.check_type("camera lens", self.lens, Lens)
             self._check_lens(self.lens)

@@ -66,6 +66,7 @@ class Lens:
         given.check_one_of("lens model", self.model, get_args(LensModel))
         for field in fields(self)[1:]:
             given.check_number(f"lens {field.name}", getattr(self, field.name))
+        given.keep_plain(self)
         for name in _UNUSED[self.model]:
             if getattr(self, name) != 0.0:
                 raise ValueError(f"lens {name} = {getattr(self, name)}: {self.model} has no such coefficient")

@@ -45,6 +45,7 @@ class StereoRig:
         given.check_type("camera", self.camera, PinholeCamera)
         given.check_positive("baseline", self.baseline, given.LARGEST_M, "metres")
         given.check_one_of("origin", self.origin, ("middle", "left", "right"))
+        given.keep_plain(self)
 
     def offset(self, side: Side) -> FloatArray:
         """``x_in_cam = x_in_body + offset`` (3,): the camera stands at minus the offset."""

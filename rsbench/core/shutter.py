@@ -99,6 +99,7 @@ class RollingShutter:
             given.check_whole("shutter width", self.width, 1, given.LARGEST_SIZE)
         if self.width is None and not {self.scan, self.scan_of("right")} <= {"top", "bottom"}:
             raise ValueError("shutter width must be given where columns are read")
+        given.keep_plain(self)
 
     @property
     def plain(self) -> bool:

@@ -37,6 +37,10 @@ def options_of(
 ) -> CorrectionOptions:
     """Options with these components, by name or card; RsbenchError where there is none of a name."""
     entry = entry_of(solver)
+    for name, value in (("matcher", matcher), ("features", features), ("corrector", corrector)):
+        arguments.name_or_path(name, value)
+    if motion_model is not None:
+        arguments.name_or_path("motion_model", motion_model)
     return CorrectionOptions(
         features=load_features(features),
         solver=entry,
@@ -60,6 +64,7 @@ def of_rig(
 
     ``close``: narrow holes too.
     """
+    given.check_type("rig", rig, StereoRig)
     arguments.check_times(readout_ratio, options.target_row, rig)
     views, known = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
     with Isolation() as isolation:
@@ -81,9 +86,9 @@ def of_one_camera(
 ) -> list[Fused]:
     """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
     known = StereoRig(camera=camera, baseline=1.0) if isinstance(camera, PinholeCamera) else None
-    for number, image in enumerate(images):
+    for number, image in enumerate(arguments.items("images", images)):
         arguments.check_image(f"frame {number}", image, known)
-    if images:
+    if len(images) > 0:
         given.check_number("target_row", target_row, 0.0, images[0].shape[0] - 1.0)
     given.check_whole("seed", seed, 0)
     samples = arguments.gyro_samples(gyro)

@@ -13,7 +13,7 @@ from rsbench.components.identity import source_version
 from rsbench.components.motion_models import motion_model
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.given import check_whole
+from rsbench.core.given import check_whole, keep_plain
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -85,6 +85,7 @@ class RefinedSolver(Solver):
         if self.one_camera and not self.use_pairs:
             raise ValueError("one_camera: uses pairs, so use_pairs cannot be off")
         check_whole("iterations", self.iterations, 1, 10_000)
+        keep_plain(self)
 
     @property
     def inner_keys(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.given import LARGEST_M, LARGEST_PX, check_number, check_one_of, check_whole, shown
+from rsbench.core.given import LARGEST_M, LARGEST_PX, check_number, check_one_of, check_whole, keep_plain, shown
 from rsbench.core.lens import inverse_2x2
 from rsbench.core.motion import Motion
 from rsbench.core.projection import (
@@ -101,12 +101,14 @@ class SimulationOptions:
         check_one_of("shape", self.shape, get_args(SceneShape))
         check_one_of("outlier_images", self.outlier_images, get_args(OutlierImages))
         depth = self.depth
-        if np.shape(depth) != (2,):
+        if not isinstance(depth, tuple | list | np.ndarray) or len(depth) != 2:
             raise ValueError(f"depth = {shown(depth)}: must be two distances in metres, the nearer first")
         for distance in depth:
             check_number("depth", distance, 0.0, LARGEST_M)
         if not 0.0 < depth[0] <= depth[1]:
             raise ValueError(f"depth = {depth}: must be two positive distances in metres, the nearer first")
+        object.__setattr__(self, "depth", (float(depth[0]), float(depth[1])))
+        keep_plain(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -286,7 +288,16 @@ def _exact(
         places.append(points[seen])
         total += int(np.count_nonzero(seen))
     if total < count:
-        raise ValueError(f"the motion leaves only {total} of {count} points in view; use a slower one")
+        wide = camera.fx * rig.baseline / options.depth[1]
+        if len(sides) > 1 and wide >= camera.width:
+            raise ValueError(
+                f"depth = {options.depth}: cameras {rig.baseline:g} m apart see no point together that is nearer "
+                f"than {options.depth[1] * wide / camera.width:.3g} m; use larger depths"
+            )
+        raise ValueError(
+            f"the motion leaves only {total} of {count} points in view, {options.depth[0]:g} to "
+            f"{options.depth[1]:g} m away; use a slower one or larger depths"
+        )
     return np.concatenate(found)[:count], np.concatenate(places)[:count]
 
 

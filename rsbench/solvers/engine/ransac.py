@@ -69,6 +69,7 @@ class RansacOptions:
             given.check_number(name, getattr(self, name), 0.0, 1.0)
         for name in ("min_iterations", "max_iterations", "lo_steps", "final_steps"):
             given.check_whole(name, getattr(self, name), 0, _MOST_STEPS)
+        given.keep_plain(self)
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")
         if not 0.0 < self.chance < 1.0:

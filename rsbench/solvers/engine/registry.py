@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rsbench.components import plugins
+from rsbench.components.arguments import name_or_path as name_or_path_of
 from rsbench.components.plugins import Entry, Kind
+from rsbench.core import given
 from rsbench.core.errors import RsbenchError
 from rsbench.solvers.engine.base import Solver, SolverSpec
 
@@ -68,7 +70,7 @@ def load_solver(name_or_path: str | Path) -> Solver:
     Raises:
         RsbenchError: no such solver, two of that name, or its card or class is wrong.
     """
-    return load_solver_entry(name_or_path).solver
+    return load_solver_entry(name_or_path_of("name_or_path", name_or_path)).solver
 
 
 def load_solver_entries(names_or_paths: Sequence[str]) -> list[SolverEntry]:
@@ -105,5 +107,7 @@ def entry_of(solver: str | Path | Solver) -> SolverEntry:
     if isinstance(solver, str | Path):
         return load_solver_entry(solver)
     if not isinstance(solver, Solver):
-        raise ValueError(f"solver: must be a name, the path of a card or an rsbench.Solver, got {solver!r}")
+        raise ValueError(
+            f"solver: must be a name, the path of a card or an rsbench.Solver, got {given.shown(solver)}"
+        )
     return wrap_solver(solver)

@@ -16,6 +16,7 @@ from rsbench.benchmark.studies.correction_summary import (
     SCORES,
     by_law,
     by_scene,
+    by_sequence,
     loss_to_true_motion,
     masks,
     summarise,
