@@ -83,7 +83,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda clone: (clone / "check.py").write_text("print('fine')"),
         "'check.py': only submissions/METHOD",
     ),
-    "link": (link, "must be a plain file, and stay"),
+    "link": (link, "must be a plain file; no link, submodule or executable"),
     "name": (another_name, "its header names 'mine'; folder and method must agree"),
     "ours": (answers("rs-stereo-refined"), "is the name of a method of rsbench"),
 }
@@ -109,7 +109,7 @@ def test_one_is_scored_published_and_there_when_the_board_is_opened_again(keeper
     hand_in(tmp_path, "shouting", answers("MINE"))
     run("git", "fetch", "-q", "origin", "shouting", cwd=keeper)
     ran = run(sys.executable, "check.py", "main", "FETCH_HEAD", cwd=keeper)
-    assert ran.returncode != 0 and "differs from submissions/mine in case alone" in ran.stderr
+    assert ran.returncode != 0 and "reads like submissions/mine, which is there" in ran.stderr
     tables = []
     for later in (False, True):  # from what the repository holds alone, as after a year
         if later:  # a newer rsbench has a method of an entry's name, and no doubt that the keeper spoke of
