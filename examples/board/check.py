@@ -2,11 +2,11 @@
 
 What is judged is the tree that merging HEAD into BASE gives, against that of BASE. They may differ in one folder,
 submissions/METHOD, and in nothing else. It holds predictions.jsonl, whose header names METHOD, the pictures/ or
-matches/ that its track asks for, and owner.pub, a public key of SSH (ed25519), where its author wants to change the
-entry later. A change of an entry of BASE needs a signature of the key that BASE has, update.sig, or the keeper, who
-sets BOARD_UPDATE to the hash of HEAD. ``check.py BASE HEAD --message`` prints what is to be signed; other options
-go to ``rsbench leaderboard submit``. All of HEAD is read as data from git objects: nothing of it is checked out or
-run, and no link is followed.
+matches/ that its track asks for, and owner.pub, a public SSH key (ed25519), where its author wants to change the
+entry later. A change of an entry of BASE needs update.sig, a signature by the owner.pub of BASE, or the keeper's
+leave: BOARD_UPDATE is the hash of HEAD. ``check.py BASE HEAD --message`` prints what is to be signed; other options
+go to ``rsbench leaderboard submit``. HEAD is read as data from git objects: none of it is checked out or run, and
+no link is followed.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def digest(entry: dict[str, bytes]) -> str:
 
 
 def message(method: str, old: dict[str, bytes], new: dict[str, bytes]) -> bytes:
-    """What an owner signs. The old entry counts with its signature, so that no state, and no message, comes again."""
+    """What an owner signs. The old entry counts with its signature, so that no message comes a second time."""
     unsigned = {name: data for name, data in new.items() if name != SIGNATURE}
     return f"rsbench board: update of {method}\nfrom {digest(old)}\nto {digest(unsigned)}\n".encode()
 
@@ -198,7 +198,9 @@ def main() -> None:
     keeper = os.environ.get("BOARD_UPDATE") == head
     vouched = git("cat-file", "blob", before["accepted.txt"].sha).decode() if "accepted.txt" in before else ""
     if not keeper and any(line.partition(": ")[0] == method for line in vouched.splitlines()):
-        refuse(f"submissions/{method}: accepted.txt vouches for what it is now; only the keeper may allow a change")
+        refuse(
+            f"submissions/{method}: accepted.txt vouches for what it is now; only the keeper may allow a change"
+        )
     with tempfile.TemporaryDirectory() as folder:
         check_right(method, old, new, Path(folder), keeper=keeper)
         score(method, new, Path(folder), options)

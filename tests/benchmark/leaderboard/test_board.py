@@ -140,7 +140,7 @@ def test_entries_stand_alone_and_copies_tie(tmp_path: Path) -> None:
     (alone,) = entries_of(board, "points-1", SPLIT.name)
     for name, lines in (("copy", _noisy(0.02)), ("better", _noisy(0.001)), ("worse", _noisy(0.3))):
         add(board, write(tmp_path / "a.jsonl", named(lines, name)), SPLIT, {})
-    add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {})
+    add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {"command": ORACLES})
     entries = entries_of(board, "points-1", SPLIT.name)
     pd.testing.assert_frame_equal({e.header.method: e for e in entries}["a"].scores, alone.scores)
     found = {line.scored.header.method: line for line in standings(entries)}

@@ -102,7 +102,7 @@ def test_motions_without_matches_have_none(split: Split, tmp_path: Path) -> None
 
 def test_matches_are_kept_with_the_entry(split: Split, tmp_path: Path) -> None:
     path = _handed_in(tmp_path / "in", split, {"left": _tracks()[:, [0, 1, 4, 5]]})
-    add(tmp_path / "board", path, split, {})
+    add(tmp_path / "board", path, split, {"command": ORACLES})
     assert merge(tmp_path / "board", tmp_path / "other") == [f"pose-own-1/{split.name}/truth"]
     assert rescore(tmp_path / "other", split) == {}
     (entry,) = entries_of(tmp_path / "other", "pose-own-1", split.name)
