@@ -304,11 +304,19 @@ def test_one_is_scored_published_and_there_when_the_board_is_opened_again(keeper
     assert tables[0] == tables[1]
 
 
-def test_the_workflow_runs_the_scripts_of_the_board_and_gives_pull_requests_no_rights() -> None:
+def test_the_workflow_runs_nothing_of_a_request() -> None:
+    """Of pull_request the file would be the request's; here file and scripts are those of main, with no rights."""
     flow = yaml.safe_load((BOARD / ".github" / "workflows" / "board.yml").read_text("utf-8"))
-    steps = flow["jobs"]["check"]["steps"]
-    assert flow["permissions"] == {"contents": "read"} and "permissions" not in flow["jobs"]["check"]
-    assert "pull_request_target" not in flow[True]
-    assert "base.sha" in steps[0]["with"]["ref"] and steps[0]["with"]["persist-credentials"] is False
+    job = flow["jobs"]["check"]
+    assert set(flow[True]) == {"push", "pull_request_target"} and flow[True]["pull_request_target"][
+        "branches"
+    ] == ["main"]
+    assert flow["permissions"] == {} and job["permissions"] == {"contents": "read"}
+    first = job["steps"][0]["with"]
+    assert first["ref"] == "refs/heads/main" and first["persist-credentials"] is False
+    assert sum("checkout" in str(step) for step in job["steps"]) == 1
+    ran = "".join(step.get("run", "") for step in job["steps"])
+    assert "${{" not in ran and 'check.py main "$HEAD"' in ran and "secrets" not in str(flow)
+    assert "action == 'labeled'" in job["env"]["BOARD_UPDATE"]
     for word in ("check.py", "publish.py"):
         assert (BOARD / word).is_file() and word in str(flow["jobs"])

@@ -14,7 +14,7 @@ from commands import run_here
 from leaderboards import truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import entries_of, rescore
+from rsbench.benchmark.leaderboard.board import ORACLES, entries_of, rescore
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.own_matches import match_scores
