@@ -4,9 +4,9 @@ What is judged is the tree that merging HEAD into BASE gives, against that of BA
 submissions/METHOD, and in nothing else. It holds predictions.jsonl, whose header names METHOD, the pictures/ or
 matches/ that its track asks for, and owner.pub, a public SSH key (ed25519), where its author wants to change the
 entry later. A change of an entry of BASE needs update.sig, a signature by the owner.pub of BASE, or the keeper's
-leave: BOARD_UPDATE is the hash of HEAD. ``check.py BASE HEAD --message`` prints what is to be signed; other options
-go to ``rsbench leaderboard submit``. HEAD is read as data from git objects: none of it is checked out or run, and
-no link is followed.
+leave: BOARD_UPDATE is the hash of HEAD. ``check.py BASE HEAD --message`` prints what is to be signed; other
+options go to ``rsbench leaderboard submit``. HEAD is read as data from git objects: none of it is checked out or
+run, and no link is followed.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ def shown(name: str) -> str:
 
 
 def safe(text: str) -> str:
-    """Lines for the log, with whatever is not printable ASCII escaped."""
-    return "".join(c if c == "\n" or " " <= c <= "~" else ascii(c)[1:-1] for c in text)
+    """Lines for the log, with whatever is not printable escaped."""
+    return "".join(c if c == "\n" or c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def git(*words: str, why: str = "git failed") -> bytes:
     environment = {**os.environ, "GIT_NO_REPLACE_OBJECTS": "1", "LC_ALL": "C"}
     ran = subprocess.run(["git", *words], check=False, capture_output=True, env=environment)
     if ran.returncode != 0:
-        said = next(iter(ran.stderr.decode("utf-8", "backslashreplace").splitlines()), "")
-        refuse(f"{why} (git {words[0]}: {shown(said)})")
+        said = ran.stderr.decode("utf-8", "backslashreplace").strip()
+        refuse(f"{why} (git {words[0]}: {shown(said)})" if said else why)
     return ran.stdout
 
 
@@ -71,8 +71,10 @@ def merged(base: str, head: str) -> str:
     found = re.search(rb"(\d+)\.(\d+)", git("version"))
     if found is None or (int(found[1]), int(found[2])) < (2, 38):
         refuse("git is older than 2.38 and cannot tell what a merge gives; install a newer one")
-    words = ("merge-tree", "--write-tree", "--no-messages", base, head)
-    return git(*words, why="the request does not merge; merge the board's branch into it").decode().strip()
+    fault = "the request does not merge; merge the board's branch into it"
+    if git("merge-base", base, head, why=fault).decode().strip() == base:
+        return head  # as it stands, so that nothing is mended that a fast-forward would leave
+    return git("merge-tree", "--write-tree", "--no-messages", base, head, why=fault).decode().strip()
 
 
 def files_of(tree: str) -> dict[str, Blob]:
@@ -180,6 +182,8 @@ def score(method: str, entry: dict[str, bytes], folder: Path, options: list[str]
 
 
 def main() -> None:
+    if len(sys.argv) < 3:
+        refuse("two commits are missing; run python check.py BASE HEAD")
     base, head, options = commit(sys.argv[1]), commit(sys.argv[2]), sys.argv[3:]
     before, after = files_of(base), files_of(merged(base, head))
     method = one_method(before, after)
@@ -196,8 +200,10 @@ def main() -> None:
     if KEY in new and not KEY_LINE.fullmatch(new[KEY]):
         refuse(f"submissions/{method}/{KEY}: must be one line, ssh-ed25519 and a key (ssh-keygen -t ed25519)")
     keeper = os.environ.get("BOARD_UPDATE") == head
-    vouched = git("cat-file", "blob", before["accepted.txt"].sha).decode() if "accepted.txt" in before else ""
-    if not keeper and any(line.partition(": ")[0] == method for line in vouched.splitlines()):
+    vouched = git("cat-file", "blob", before["accepted.txt"].sha) if "accepted.txt" in before else b""
+    if not keeper and any(
+        line.partition(": ")[0] == method for line in vouched.decode("utf-8", "replace").splitlines()
+    ):
         refuse(
             f"submissions/{method}: accepted.txt vouches for what it is now; only the keeper may allow a change"
         )
