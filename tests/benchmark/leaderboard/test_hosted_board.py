@@ -200,6 +200,13 @@ def test_a_history_of_two_merge_bases_deletes_nothing(keeper: Path, tmp_path: Pa
             assert len(git("merge-base", "--all", "main", made).split()) == 2
         ran = run(sys.executable, "check.py", "main", made, cwd=keeper)
         assert_refused(ran, "'accepted.txt': only submissions/METHOD")
+    # A tree with one name twice, which a merge would mend and a fast-forward keep.
+    raw = subprocess.run(["git", "cat-file", "tree", "main"], cwd=keeper, capture_output=True, check=True).stdout
+    twice = tmp_path / "tree"
+    twice.write_bytes(raw + b"40000 submissions\0" + bytes.fromhex(git("rev-parse", f"{tree}:submissions")))
+    tree = git("hash-object", "-t", "tree", "--literally", "-w", twice)
+    ran = run(sys.executable, "check.py", "main", head("main"), cwd=keeper)
+    assert_refused(ran, "stands twice in its folder")
     assert_refused(run(sys.executable, "check.py", "main", head(), cwd=keeper), "does not merge")  # unrelated
     assert_refused(run(sys.executable, "check.py", "main", "no", cwd=keeper), "'no': is no commit")
 
