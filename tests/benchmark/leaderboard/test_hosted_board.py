@@ -187,7 +187,8 @@ def test_a_history_of_two_merge_bases_deletes_nothing(keeper: Path, tmp_path: Pa
     git("checkout", "-q", "-b", "theirs", root)
     answers("mine")(keeper)
     git("add", "-A")
-    git("commit", "-qm", "The first request")
+    # The newer of two merge bases is the one that git takes for ``BASE...HEAD``.
+    run("git", "commit", "-qm", "The first request", cwd=keeper, GIT_COMMITTER_DATE="2090-01-01T00:00:00Z")
     first = git("rev-parse", "HEAD")
     answers("mine", 0.06)(keeper)
     git("add", "-A")
