@@ -21,6 +21,7 @@ from browser import CHROMIUM, Browser, started
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
+from rsbench.benchmark.leaderboard.board import ORACLES
 from rsbench.benchmark.leaderboard.splits import Split, dataset_split
 from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.core.camera import PinholeCamera
@@ -61,7 +62,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
             lines = [{**line, "metric": True, "covariance": spread} for line in lines]
         head = {**truth[0], **(HOSTILE if name == "weak" else {})}
         add(folder / "board", write(folder / "x.jsonl", named([head, *lines], name, uses)), SPLIT, {})
-    add(folder / "board", write(folder / "x.jsonl", truth), SPLIT, {})
+    add(folder / "board", write(folder / "x.jsonl", truth), SPLIT, {"command": ORACLES})
     build_site(folder / "board", folder / "out")
     return folder / "out"
 
@@ -310,7 +311,12 @@ def rendered_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutter = RollingShutter(height=72, readout_ratio=0.8)
     write_analytic_dataset(folder / "data", rig, shutter, motion, twins=(36,))
     splits = {track: dataset_split(TRACKS[track], folder / "data") for track in ("pose", "depth", "correction")}
-    add(folder / "board", write(folder / "x.jsonl", truth_lines(splits["pose"])), splits["pose"], {})
+    add(
+        folder / "board",
+        write(folder / "x.jsonl", truth_lines(splits["pose"])),
+        splits["pose"],
+        {"command": ORACLES},
+    )
     for track in ("depth", "correction"):
         path = splits[track].track.write_truth(splits[track], folder / track)
         lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]

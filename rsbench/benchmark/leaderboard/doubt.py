@@ -8,6 +8,7 @@ with a small error shows neither sign: a keeper who wants to be sure runs the me
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -36,16 +37,28 @@ _BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
 """Names that were used, beside those of cards."""
 
 
+def outline(name: str) -> str:
+    """A name as it reads at a glance: without case, with one separator, 0 as o, and 1 and i as l."""
+    return re.sub("[._-]+", "-", name.lower()).strip("-").translate(str.maketrans("01i", "oll"))
+
+
 def refuse_reserved(header: Header, where: str) -> None:
-    """Raises RsbenchError where a name, but of an oracle, is that of a method of rsbench, which alone has it."""
-    method = header.method
-    if ORACLE in header.uses:
-        return
-    kinds = ("solvers", "matchers", "correctors")
-    if method.lower() in {*_ORACLES, *_BUILT_IN, *METHODS, *(name for kind in kinds for name in list_cards(kind))}:
+    """What comes from outside takes neither the name of a method of rsbench nor the truth.
+
+    Raises:
+        RsbenchError: the name reads like one of rsbench's own, or ``uses`` names the truth.
+    """
+    method, kinds = header.method, ("solvers", "matchers", "correctors")
+    own = {*_ORACLES, *_BUILT_IN, *METHODS, *(name for kind in kinds for name in list_cards(kind))}
+    if outline(method) in {outline(name) for name in own}:
         raise RsbenchError(
             f"{where}: method = {method!r}: is the name of a method of rsbench; choose another, such as "
             f"'{method}-mine'"
+        )
+    if ORACLE in header.uses:
+        raise RsbenchError(
+            f"{where}: uses = {ORACLE!r}: only oracles of rsbench know the truth (rsbench leaderboard oracles); "
+            "name the data that the method works on"
         )
 
 

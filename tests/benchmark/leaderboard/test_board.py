@@ -18,7 +18,7 @@ from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import entries_of, rescore, splits_of
+from rsbench.benchmark.leaderboard.board import ORACLES, entries_of, rescore, splits_of
 from rsbench.benchmark.leaderboard.exporting import write_inputs
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.merging import merge
@@ -140,7 +140,7 @@ def test_entries_stand_alone_and_copies_tie(tmp_path: Path) -> None:
     (alone,) = entries_of(board, "points-1", SPLIT.name)
     for name, lines in (("copy", _noisy(0.02)), ("better", _noisy(0.001)), ("worse", _noisy(0.3))):
         add(board, write(tmp_path / "a.jsonl", named(lines, name)), SPLIT, {})
-    add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {})
+    add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {"command": ORACLES})
     entries = entries_of(board, "points-1", SPLIT.name)
     pd.testing.assert_frame_equal({e.header.method: e for e in entries}["a"].scores, alone.scores)
     found = {line.scored.header.method: line for line in standings(entries)}
@@ -197,8 +197,8 @@ def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypat
     assert load_arrays(tmp_path / "in" / "problems.npz")["rig"].shape == (2, 7)
     head, *answers = truth_lines(split)
     off = [{**head, "method": "off", "uses": ["left"]}, *({**a, "readout_ratio": 0.77} for a in answers)]
-    for lines in ([head, *answers], off):
-        assert run_here("leaderboard", "submit", write(tmp_path / "x.jsonl", lines), *where).returncode == 0
+    assert run_here("leaderboard", "oracles", "readout", *where).returncode == 0
+    assert run_here("leaderboard", "submit", write(tmp_path / "x.jsonl", off), *where).returncode == 0
     assert run_here("leaderboard", "run", "readout", *where, "--entry", "rs-stereo-refined").returncode == 0
     refused = run_here("leaderboard", "run", "readout", *where, "--entry", "gs-8pt")
     assert_refused(refused, "gs-8pt", "finds no readout ratio")
@@ -351,8 +351,7 @@ def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypa
     assert ran.returncode == 0, ran.stderr
     split = dataset_split(TRACKS["pose"], smoke_dataset)
     assert {truth.scene for truth in split.truths} == {"castle", "room"}
-    write(tmp_path / "truth.jsonl", truth_lines(split))
-    assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where).returncode == 0
+    assert run_here("leaderboard", "oracles", "pose", *where).returncode == 0
     found = {each.header.method: each.scores for each in entries_of(tmp_path / "board", "pose-1", split.name)}
     assert list(found) == ["gs-8pt", "rs-stereo-refined", "truth"]
     assert found["truth"]["error_deg"].max() < 1e-5
@@ -361,12 +360,15 @@ def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypa
     shown = run_here("leaderboard", "show", "--board", tmp_path / "board", "--csv").stdout
     assert [line.partition(",")[0] for line in shown.splitlines()[1:]] == ["gs-8pt", "rs-stereo-refined", "truth"]
     # What people handed in is not replaced by a run; what a run made is.
-    (tmp_path / "truth.jsonl").write_text(json.dumps({**truth_lines(split)[0], "method": "gs-8pt"}), "utf-8")
-    assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where).returncode == 2
-    assert run_here("leaderboard", "submit", tmp_path / "truth.jsonl", *where, "--replace").returncode == 0
+    card, mine = tmp_path / "mine.toml", tmp_path / "mine.jsonl"
+    card.write_bytes((ROOT / "solvers" / "gs-8pt.toml").read_bytes())
+    assert run_here("leaderboard", "run", "pose", *where, "--entry", card).returncode == 0
+    write(mine, named(truth_lines(split)[:1], "mine"))
+    assert run_here("leaderboard", "submit", mine, *where).returncode == 2
+    assert run_here("leaderboard", "submit", mine, *where, "--replace").returncode == 0
     assert run_here("leaderboard", "run", "pose", *where, "--entry", "rs-stereo-refined").returncode == 0
-    refused = run_here("leaderboard", "run", "pose", *where, "--entry", "gs-8pt")
-    assert_refused(refused, "gs-8pt", "with other predictions")
+    refused = run_here("leaderboard", "run", "pose", *where, "--entry", card)
+    assert_refused(refused, "mine", "with other predictions")
 
 
 # Documents

@@ -11,7 +11,7 @@ from commands import assert_refused, run_here
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import RUN, accept, entries_of, rescore
+from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, entries_of, rescore
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
 from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings, table
@@ -65,11 +65,22 @@ def test_the_truth_under_another_name_is_in_doubt(tmp_path: Path) -> None:
     assert numbers["rank"].isna().all() and numbers["handed_in"].all() and numbers["doubt"].notna().all()
 
 
+@pytest.mark.parametrize("uses", ["left", "truth"])
 @pytest.mark.parametrize(
-    "name", ["rs-stereo-refined", "RS-Stereo-Refined", "sgm", "fusion", "cramer-rao", "truth"]
+    "name",
+    [
+        "rs-stereo-refined",
+        "RS-Stereo-Refined",
+        "rs_stereo.ref1ned",
+        "gs-8pt",
+        "sgm",
+        "fusion",
+        "cramer-rao",
+        "truth",
+    ],
 )
-def test_names_of_rsbench_are_its_own(tmp_path: Path, name: str) -> None:
-    lines = handed(truth_lines(SMALL), name, "left")
+def test_names_of_rsbench_are_its_own(tmp_path: Path, name: str, uses: str) -> None:
+    lines = handed(truth_lines(SMALL), name, uses)
     with pytest.raises(RsbenchError, match=f"method = '{name}': is the name of a method of rsbench"):
         add(
             tmp_path / "board",
@@ -78,6 +89,13 @@ def test_names_of_rsbench_are_its_own(tmp_path: Path, name: str) -> None:
             {"command": "rsbench leaderboard submit"},
         )
     assert not add(tmp_path / "own", write(tmp_path / "a.jsonl", lines), SMALL, {"command": RUN}).handed_in
+
+
+def test_the_truth_is_used_by_no_stranger(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.jsonl", handed(truth_lines(SMALL), "mine", "left", "truth"))
+    with pytest.raises(RsbenchError, match="uses = 'truth': only oracles of rsbench know the truth"):
+        add(tmp_path / "board", file, SMALL, {"command": "rsbench leaderboard submit"})
+    assert not add(tmp_path / "board", file, SMALL, {"command": ORACLES}).handed_in
 
 
 def _erring(lines: list[Line], name: str, size: float, share: float = 1.0) -> list[Line]:

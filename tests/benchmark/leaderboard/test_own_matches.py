@@ -14,7 +14,7 @@ from commands import run_here
 from leaderboards import truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import entries_of, rescore
+from rsbench.benchmark.leaderboard.board import ORACLES, entries_of, rescore
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.own_matches import match_scores
@@ -102,7 +102,7 @@ def test_motions_without_matches_have_none(split: Split, tmp_path: Path) -> None
 
 def test_matches_are_kept_with_the_entry(split: Split, tmp_path: Path) -> None:
     path = _handed_in(tmp_path / "in", split, {"left": _tracks()[:, [0, 1, 4, 5]]})
-    add(tmp_path / "board", path, split, {})
+    add(tmp_path / "board", path, split, {"command": ORACLES})
     assert merge(tmp_path / "board", tmp_path / "other") == [f"pose-own-1/{split.name}/truth"]
     assert rescore(tmp_path / "other", split) == {}
     (entry,) = entries_of(tmp_path / "other", "pose-own-1", split.name)

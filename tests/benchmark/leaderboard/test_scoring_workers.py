@@ -71,11 +71,11 @@ def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], 
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        add(tmp_path / "cut", path, split, {}, workers=workers, step=stop)
+        add(tmp_path / "cut", path, split, {"command": ORACLES}, workers=workers, step=stop)
     (kept,) = (tmp_path / "cut" / ".rsbench" / "scoring").glob("*/*")
     (row,) = decode(kept.read_bytes(), {})
     kept.write_bytes(encode([{**row, "scene": "marble"}]))  # seen only if it is taken
-    add(tmp_path / "cut", path, split, {}, workers=workers)
+    add(tmp_path / "cut", path, split, {"command": ORACLES}, workers=workers)
     table = pd.read_csv(next((tmp_path / "cut").rglob("scores.csv")))
     assert kept.name == scored[0] and list(table["scene"]).count("marble") == 1
     assert not (tmp_path / "cut" / ".rsbench" / "scoring").exists()
@@ -99,7 +99,7 @@ def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Spl
     paths = list(split.track.oracles(split, tmp_path / "oracles"))
     write_depth(pictures_of(paths[0])[0], np.full((80, 96), -1.0, dtype=np.float32))
     with pytest.raises(RsbenchError, match=r"left_1\.exr: 7680 pixels are negative"):
-        add_all(tmp_path / "board", paths, split, {})
+        add_all(tmp_path / "board", paths, split, {"command": ORACLES})
     (entry,) = entries_of(tmp_path / "board", split.track.id, split.name)
     assert entry.header.method == "constant"
 
