@@ -286,10 +286,14 @@ def test_a_lost_connection_ends_the_run_with_a_line(
     async def hang_up(comm: Any, **_: Any) -> None:
         comm.abort()
 
+    async def keep_workers(**_: Any) -> None:
+        """In place of their restart, which takes up to 30 s and is not what this is about."""
+
     def act() -> None:
         wait_until(mark.exists)
         local.sync(lose_all)
 
+    monkeypatch.setattr(scheduler, "restart_workers", keep_workers)
     if when == "fetching":
         monkeypatch.setitem(scheduler.handlers, "gather", hang_up)
     actor = threading.Thread(target=act, daemon=True)
