@@ -22,6 +22,7 @@ from rsbench.jobs.workers import Cluster, WorkerProcesses
 
 Job = TypeVar("Job")
 _CONNECT_S = 30
+_DISMISS_S = 5
 _WATCH_S = 0.5
 
 
@@ -48,22 +49,24 @@ def run_on_cluster(
                 futures[client.submit(_do, key, shared, job, limit, pure=False)] = job
             for future in as_completed(list(futures)):
                 job = futures.pop(future)
-                try:
+                try:  # it waits again where a worker dies with the result: the scheduler repeats the task then
                     outcome = future.result()
                 except KilledWorker as error:
                     reason = f"workers of the cluster died: {error.last_worker.address}"
                     outcome = Outcome(value=None, reason=reason, output="", ended=True)
-                except CancelledError as error:
+                except (CancelledError, OSError) as error:
+                    if future.status == "error":  # raised by the job, not by fetching its result
+                        raise
                     raise RsbenchError(
-                        f"--scheduler {cluster.address}: the connection is lost; what is done is kept, and the "
-                        "same command goes on there"
+                        f"--scheduler {cluster.address}: the connection is lost or the scheduler has restarted; "
+                        "what is done is kept, and the same command goes on there"
                     ) from error
                 future.release()
                 yield job, outcome
         finally:
-            with contextlib.suppress(Exception):  # who is gone has no children
+            with contextlib.suppress(Exception):  # a worker that is gone has no children; one may be frozen
                 client.cancel(list(futures), force=True)
-                client.run(_dismiss, key)
+                client.sync(client.run, _dismiss, key, callback_timeout=_DISMISS_S)
 
 
 @contextlib.contextmanager
@@ -94,10 +97,9 @@ def _connected(cluster: Cluster) -> Iterator[Any]:
 
 @dataclass
 class _Hired:
-    """A child process, the set of workers that it belongs to, and what stops it."""
+    """A child process and the set of workers that it belongs to."""
 
     processes: WorkerProcesses
-    cancel: threading.Event
     worker: IsolatedWorker
 
 
@@ -108,8 +110,11 @@ class _ClusterWorkers:
     lock: threading.Lock = field(default_factory=threading.Lock)
     idle: dict[str, list[_Hired]] = field(default_factory=dict)
 
-    def take(self, key: str, content: bytes) -> _Hired:
-        """An idle child of a set of workers, or a new one; those of other sets, whose runs are over, end."""
+    def take(self, key: str, content: bytes, cancel: threading.Event) -> _Hired:
+        """An idle child of a set of workers, or a new one, for one job, which ``cancel`` stops.
+
+        Children of other sets, whose runs are over, end.
+        """
         with self.lock:
             others = [hired for name in list(self.idle) if name != key for hired in self.idle.pop(name)]
             own = self.idle.get(key, [])
@@ -117,9 +122,10 @@ class _ClusterWorkers:
         for hired in others:
             hired.worker.close()
         if found is not None:
+            found.worker.cancel = cancel
             return found
-        processes, cancel = ForkingPickler.loads(content), threading.Event()
-        return _Hired(processes, cancel, processes.hire(cancel))
+        processes = ForkingPickler.loads(content)
+        return _Hired(processes, processes.hire(cancel))
 
     def give_back(self, key: str, hired: _Hired) -> None:
         with self.lock:
@@ -141,15 +147,22 @@ def _dismiss(key: str) -> None:
 
 
 def _do(key: str, processes: bytes, job: object, limit_s: float) -> Outcome:
-    """One job in a child of this worker of the cluster."""
-    hired = _CREWS.take(key, processes)
-    with _watched(hired.cancel):
+    """One job in a child of this worker of the cluster.
+
+    Raises:
+        distributed.Reschedule: the job was stopped. If the scheduler wants it after all, it repeats the task.
+    """
+    from distributed import Reschedule
+
+    cancel = threading.Event()  # of this job alone: the watch may set it when the child already does the next one
+    hired = _CREWS.take(key, processes, cancel)
+    with _watched(cancel):
         try:
             outcome = hired.processes.done_by(hired.worker, job, limit_s)
         except BaseException as error:
             hired.worker.close()
-            if isinstance(error, Cancelled):  # nobody waits for it
-                return Outcome(value=None, reason="cancelled", output="")
+            if isinstance(error, Cancelled):
+                raise Reschedule from error
             raise
     _CREWS.give_back(key, hired)
     return outcome

@@ -35,6 +35,8 @@ START_LIMIT_S = 300.0
 """Loading a module, and compiling what it needs, once."""
 NO_ANSWER = "gave no valid answer"
 _POLL_S = 0.1
+_LAST_ANSWER_S = 10.0
+"""Time to read the answer of a process that has ended; only a process that left its group makes a call wait so."""
 _KEPT_BYTES = 8192
 _LONGEST_REASON = 300
 _POSIX = os.name == "posix"
@@ -101,7 +103,8 @@ class IsolatedWorker:
         self._classes = {cls.__name__: cls for cls in classes}
         self._start_limit_s = start_limit_s
         self._environment = {**os.environ, **(environment or {})}
-        self._cancel = cancel or threading.Event()
+        self.cancel = cancel or threading.Event()
+        """See the argument; another event may take its place between calls."""
         self._child: _Child | None = None
         self._one_call = threading.Lock()
 
@@ -114,6 +117,8 @@ class IsolatedWorker:
         """
         with self._one_call:  # the answers to two would be mixed up
             try:
+                if self._child is not None and self._child.ended:
+                    self.close()  # it died after its last answer, which is no fault of this call
                 if self._child is None:
                     self._child = _Child(self._environment)
                     started = self._exchange(self._start, self._start_limit_s)
@@ -140,7 +145,7 @@ class IsolatedWorker:
     def _exchange(self, message: object, limit_s: float) -> Outcome:
         assert self._child is not None
         child = self._child
-        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s, self._cancel, self._memory_mb)
+        data, reason = child.exchange(bytes(ForkingPickler.dumps(message)), limit_s, self.cancel, self._memory_mb)
         value = None
         if data is not None:
             value, reason = self._read(data)
@@ -204,6 +209,10 @@ class _Child:
             reader.start()
 
     @property
+    def ended(self) -> bool:
+        return self._process.poll() is not None
+
+    @property
     def output(self) -> str:
         return self._printed.decode("utf-8", errors="replace")
 
@@ -220,9 +229,10 @@ class _Child:
             if memory_mb is not None and self._used_mb() > memory_mb:
                 self.overdue = True
                 return None, f"used more than {memory_mb:g} MB of memory"
-            ended = self._process.poll() is not None  # its own children may keep the pipe open
-            try:
-                answer = self._answers.get(timeout=0.0 if ended else min(left, _POLL_S))
+            if ended := self.ended:
+                self._kill_group()  # its own children may keep the pipe open
+            try:  # what ended may have answered before: the reader comes to the end of the pipe, perhaps late
+                answer = self._answers.get(timeout=_LAST_ANSWER_S if ended else min(left, _POLL_S))
             except queue.Empty:
                 if ended:
                     return None, self._ending()
@@ -242,9 +252,7 @@ class _Child:
 
     def kill(self) -> None:
         """End the process and its group, and wait for that."""
-        if _POSIX:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
+        self._kill_group()
         self._process.kill()
         self._process.wait()
         if self._lifeline is not None:
@@ -258,6 +266,11 @@ class _Child:
         with contextlib.suppress(OSError, ValueError):
             if self._process.stdin is not None:
                 self._process.stdin.close()
+
+    def _kill_group(self) -> None:
+        if _POSIX:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
 
     def _ending(self) -> str:
         """How the process has ended; it is given a moment to do so."""

@@ -5,13 +5,17 @@ from __future__ import annotations
 import functools
 import math
 import os
+import signal
 import time
+from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import EntryFailure
+from rsbench.jobs.isolation import EntryFailure, IsolatedWorker
+from rsbench.jobs.plain_data import receive
 from rsbench.jobs.process_jobs import LostJobsError, finished_jobs, run_jobs
 
 ASK = "__import__('os').getpid()"
@@ -46,6 +50,46 @@ def test_a_job_that_was_killed_once_is_done(tmp_path: Path) -> None:
         functools.partial, [f"test -e {mark} || {{ touch {mark}; kill -9 $PPID; }}"], 1, {}, os.system
     )
     assert outcome.success and outcome.value == 0
+
+
+def kill_and_await(pid: int) -> None:
+    """Kill a process; its end stays to be seen by its parent."""
+    os.kill(pid, signal.SIGKILL)
+    with suppress(ChildProcessError):  # the parent has seen it already
+        os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
+@pytest.mark.skipif(not hasattr(os, "waitid"), reason="needs os.waitid")
+def test_an_answer_counts_although_its_process_dies_before_it_is_read(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The thread that reads the answer gets no processor for a while, in which the process is killed.
+
+    The job has a limit, so that it is tried once.
+    """
+    note = tmp_path / "pids"
+
+    def receive_late(stream: BinaryIO) -> bytes | None:
+        answer = receive(stream)
+        if answer is not None and note.exists():  # the answer to the job, not that the process has started
+            kill_and_await(int(note.read_text()))
+            time.sleep(0.5)  # longer than the other thread takes to see that the process has ended
+        return answer
+
+    monkeypatch.setattr("rsbench.jobs.isolation.receive", receive_late)
+    job = f"echo $PPID >> {note}"
+    ((_, outcome),) = run_jobs(functools.partial, [job], 1, {}, os.system, seconds_of=lambda job: 60.0)
+    assert outcome.success and outcome.value == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "waitid"), reason="needs os.waitid")
+def test_a_process_that_died_between_two_jobs_costs_the_second_nothing() -> None:
+    """Jobs with a limit are tried once."""
+    with IsolatedWorker(functools.partial, eval) as worker:
+        pid = worker.call(ASK, limit_s=60.0).value
+        kill_and_await(pid)
+        outcome = worker.call(ASK, limit_s=60.0)
+    assert outcome.success and outcome.value != pid
 
 
 def test_jobs_that_are_lost_are_named_when_the_others_are_done() -> None:
