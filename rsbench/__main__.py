@@ -26,11 +26,23 @@ def main() -> None:
     try:
         run()
     except SystemExit as end:
-        if end.code not in [128 + number for number in heard]:
+        if end.code not in [128 + number for number in heard] and not _waits_for_components():
             raise
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
-        os._exit(int(end.code))  # all is closed but Python, which takes a second for its modules
+            sys.stderr.flush()
+        os._exit(int(end.code or 0))  # all is closed but Python, which takes a second for its modules
+
+
+def _waits_for_components() -> bool:
+    """Whether Python's end would wait for threads of a component; what is to be done at the end is done then."""
+    import atexit
+
+    imports = sys.modules.get("rsbench.components.imports")
+    if imports is None or not imports.abandoned_threads():
+        return False
+    atexit._run_exitfuncs()
+    return True
 
 
 def _keep_memory_together() -> None:

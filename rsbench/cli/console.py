@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from rsbench.core.errors import printable
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -36,7 +38,7 @@ def say(note: str) -> None:
     import typer
 
     if not _quiet:
-        typer.echo(note)
+        typer.echo(printable(note))
 
 
 @contextmanager
@@ -65,6 +67,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
         task = progress.add_task(label, total=total, word="")
 
         def advance(word: str) -> None:
+            word = printable(word)
             done = progress.tasks[0].completed + 1  # may become more than was expected
             progress.update(task, completed=done, total=max(total, done), word=word)
 
@@ -93,7 +96,7 @@ def late_progress(label: str) -> Iterator[Callable[[str], None]]:
     start = time.monotonic()
 
     def advance(word: str) -> None:
-        progress.update(task, advance=1, word=word)
+        progress.update(task, advance=1, word=printable(word))
         if not _quiet and progress.console.is_terminal and time.monotonic() - start > 2.0:
             progress.start()
 
@@ -129,7 +132,7 @@ def print_rows(
 
     if _quiet:
         return
-    console, texts, right = Console(), [[str(value) for value in row] for row in rows], set(right)
+    console, texts, right = Console(), [[printable(str(value)) for value in row] for row in rows], set(right)
     cells = [[column, *(row[k] for row in texts)] for k, column in enumerate(columns)]
     words = [max((cell_len(word) for cell in each for word in cell.split()), default=0) for each in cells]
     lines = [max(cell_len(line) for cell in each for line in cell.split("\n")) for each in cells]

@@ -32,7 +32,7 @@ from rsbench.cli import (
 )
 from rsbench.cli import list_cards as cards
 from rsbench.cli.signals import stoppable
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, printable
 from rsbench.core.version import __version__
 
 app = typer.Typer(
@@ -76,7 +76,7 @@ def _root(
 def _told(message: Warning | str, category: type[Warning], *where: object, **more: object) -> None:
     """A warning for users in a line; those for who writes programs are not theirs."""
     if issubclass(category, FutureWarning):
-        typer.echo(f"rsbench: note: {message}", err=True)
+        typer.echo(f"rsbench: note: {printable(str(message))}", err=True)
 
 
 for module in (
@@ -142,5 +142,5 @@ def _fail(message: str, code: int = 2) -> None:
     words = " ".join(message.split())
     if len(words) > _LONGEST:
         words = f"{words[: _LONGEST // 2]} ... {words[-_LONGEST // 2 :]}"
-    sys.stderr.write(f"rsbench: error: {words}\n")
+    sys.stderr.write(f"rsbench: error: {printable(words)}\n")
     sys.exit(code)

@@ -34,13 +34,19 @@ _COMMAND = (
 _expendable = False
 _beside_cards: dict[str, tuple[Path, str]] = {}
 """Modules that were imported from beside a card: file, and its hash when it was imported."""
+_threads: list[threading.Thread] = []
+"""Those that others' code started."""
 _folders: list[str] = []
 """Folders of cards on ``sys.path``, the last used first."""
 
 
 @contextlib.contextmanager
 def blaming(where: str, what: str) -> Iterator[None]:
-    """What others' code raises becomes one line with its name; what it prints stays out of answers on stdout."""
+    """What others' code raises becomes one line with its name; what it prints stays out of answers on stdout.
+
+    Threads that it starts do not keep the command from ending, see ``abandoned_threads``.
+    """
+    before = set(threading.enumerate())
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
@@ -49,6 +55,8 @@ def blaming(where: str, what: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         text = str(error).partition("\n")[0] if isinstance(error, RsbenchError) else in_words(error)
         raise RsbenchError(f"{where}: {what}: {text}") from error
+    finally:
+        _threads.extend(each for each in threading.enumerate() if each not in before and not each.daemon)
 
 
 def in_words(error: BaseException) -> str:
@@ -67,6 +75,11 @@ def import_target(target: str, folder: Path | None, where: str) -> object:
             try_import(module)
             return getattr(importlib.import_module(module), name)
         return getattr(_import_beside(module, folder.resolve()), name)
+
+
+def abandoned_threads() -> bool:
+    """Whether threads run that others' code started, and for which Python would wait at its end."""
+    return any(thread.is_alive() for thread in _threads)
 
 
 def try_import(module: str, version: str = "") -> None:

@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 
 _WORD = 300
 """Characters of a word of a message, which may be a path, or a name that somebody gave."""
+
+
+def printable(text: str) -> str:
+    """A text as a terminal may show it: control characters, which could move its cursor, are escaped.
+
+    Line ends and tabs stay.
+    """
+    hidden = {c for c in set(text) - set("\n\t") if unicodedata.category(c).startswith("C")}
+    return text.translate({ord(c): c.encode("unicode_escape").decode() for c in hidden})
 
 
 class RsbenchError(Exception):

@@ -6,6 +6,7 @@ A file may name others, such as textures, in its own folder and below.
 from __future__ import annotations
 
 import io
+import logging
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from rsbench.components.imports import in_words
 from rsbench.core.errors import RsbenchError
 from rsbench.scenes.gltf import TextureTransform
-from rsbench.scenes.mesh_limits import check_mesh_file
+from rsbench.scenes.mesh_limits import TEXTURE, check_mesh_file
 from rsbench.scenes.mesh_placement import box_of, standing, surroundings
 from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
 from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, check_size
@@ -31,8 +32,9 @@ _Z_UP = {
 }
 _SHEET = 1024  # columns of the sheet that holds colours of faces
 _TRIANGLES = 1 << 22
-_TEXTURE, _TEXTURES = 1 << 24, 1 << 26
-"""Pixels of one, 4096 x 4096, and of all."""
+_TEXTURES = 1 << 26
+"""Pixels of all textures."""
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what it logs of a file is in our line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,7 +332,7 @@ def _roughness(source: Any, where: str) -> float | None:
 
 def _texture(image: Any, factor: FloatArray, where: str, others: list[Material]) -> NDArray[np.uint8]:
     """(h, w, 3) sRGB of an image times a linear factor; its size is checked before it is decoded."""
-    check_size(f"{where}: texture", image.size, most=_TEXTURE)
+    check_size(f"{where}: texture", image.size, most=TEXTURE)
     taken = sum(other.texture.size // 3 for other in others if other.texture is not None)
     pixels = taken + image.size[0] * image.size[1]
     check_amount(where, "pixels of all textures", pixels, _TEXTURES)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote_to_bytes
 
 from rsbench.core.errors import RsbenchError
 from rsbench.scenes.gltf import TextureTransform, check_extensions, texture_transforms
-from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, parse_json, read_bytes
+from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, check_image_size, parse_json, read_bytes
 
 PARTS = 1 << 12
 """Nodes, meshes, materials and so on, of each kind."""
@@ -17,6 +19,8 @@ VALUES = 1 << 26
 """Numbers in the arrays of a file, and in those of all its parts, which may share them."""
 _DEEPEST = 64
 _VISITS = 1 << 28
+TEXTURE = 1 << 24
+"""Pixels of a texture, 4096 x 4096."""
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
@@ -35,7 +39,7 @@ def check_mesh_file(path: Path) -> dict[str, TextureTransform]:
     try:
         match path.suffix.lower():
             case ".glb":
-                return _check_gltf(_json_chunk(data), where)
+                return _check_gltf(_json_chunk(data), where, _binary_chunk(data))
             case ".gltf":
                 return _check_gltf(data, where)
             case ".ply":
@@ -53,7 +57,12 @@ def _json_chunk(data: bytes) -> bytes:
     return data[20 : 20 + int.from_bytes(data[12:16], "little")]
 
 
-def _check_gltf(text: bytes, where: str) -> dict[str, TextureTransform]:
+def _binary_chunk(data: bytes) -> bytes:
+    start = 20 + int.from_bytes(data[12:16], "little")
+    return data[start + 8 : start + 8 + int.from_bytes(data[start : start + 4], "little")]
+
+
+def _check_gltf(text: bytes, where: str, binary: bytes = b"") -> dict[str, TextureTransform]:
     header = parse_json(text.decode("utf-8"), where)
     for name, items in header.items():
         if isinstance(items, list):
@@ -68,7 +77,36 @@ def _check_gltf(text: bytes, where: str) -> dict[str, TextureTransform]:
     check_extensions(header, where)
     if any(not {"bufferView", "sparse"} & set(header["accessors"][index]) for index in used):
         raise RsbenchError(f"{where}: has meshes without data: export it without compression")
+    for number in _coloured_images(header):
+        _check_image(header, number, binary, f"{where}: image {number}")
     return texture_transforms(header, where)
+
+
+def _coloured_images(header: dict[str, Any]) -> list[int]:
+    """Numbers of the images that colour a material, each once."""
+    textures = [
+        each.get("pbrMetallicRoughness", {}).get("baseColorTexture") for each in header.get("materials", [])
+    ]
+    sources = [header["textures"][each["index"]].get("source") for each in textures if each is not None]
+    return sorted({number for number in sources if number is not None})
+
+
+def _check_image(header: dict[str, Any], number: int, binary: bytes, where: str) -> None:
+    """Refuse an image inside the file that cannot be decoded, in whose place trimesh takes grey without a word.
+
+    Images in files of their own are read, and refused, as they are needed.
+    """
+    image = header["images"][number]
+    if str(image.get("uri", "")).startswith("data:"):
+        kind, _, text = image["uri"].partition(",")
+        data = base64.b64decode(text, validate=True) if kind.endswith(";base64") else unquote_to_bytes(text)
+    elif "bufferView" in image and binary:
+        view = header["bufferViews"][image["bufferView"]]
+        start = int(view.get("byteOffset", 0))
+        data = binary[start : start + int(view["byteLength"])]
+    else:
+        return
+    check_image_size(data, where, most=TEXTURE)
 
 
 def _check_graph(header: dict[str, Any], where: str) -> None:

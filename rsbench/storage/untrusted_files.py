@@ -229,8 +229,8 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
 # Images
 
 
-def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = None) -> None:
-    """Refuse an image by its header: of another size than ``size`` (width, height), or of more than ``PIXELS``.
+def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = None, most: int = PIXELS) -> None:
+    """Refuse an image by its header: of another size than ``size`` (width, height), or of more than ``most``.
 
     Raises:
         RsbenchError: that, or not a PNG, JPEG, TIFF, BMP, WebP or PNM file.
@@ -245,7 +245,7 @@ def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = 
         raise RsbenchError(f"{where}: cannot be decoded as an image") from error
     finally:
         Image.MAX_IMAGE_PIXELS = own
-    check_size(where, found, size)
+    check_size(where, found, size, most)
 
 
 def check_size(

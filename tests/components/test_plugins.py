@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -326,3 +328,27 @@ def test_what_is_ours_around_what_is_not_is_not_ours(tmp_path: Path, monkeypatch
     for inner, built_in in ((None, True), (stranger.component, False)):
         entry = Entry(name="x", path=None, description="", component=Polite(inner), options=NoOptions(), key="x")
         assert entry.built_in == built_in
+
+
+def test_a_package_that_starts_a_thread_keeps_no_command_from_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what it says of itself moves no cursor: its escapes are shown as text."""
+    module = "import threading, time\nfrom rsbench.solvers.engine.base import Solver\n"
+    module += "threading.Thread(target=time.sleep, args=(3600,)).start()\n"
+    module += "import atexit\natexit.register(print, 'the end')\n"
+    module += 'class Mine(Solver):\n    """\x1b[2J\x1b[31mRed\x07 words.\n\n    More."""\n'
+    (tmp_path / "waiting.py").write_text(module, "utf-8")
+    install(tmp_path, monkeypatch, "waiting", "[rsbench.solvers]\nwaiting = waiting:Mine\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    ran = subprocess.run(
+        [sys.executable, "-m", "rsbench", "list", "solvers"],
+        capture_output=True,
+        text=True,
+        timeout=300,  # an hour without the mend
+        env=environment,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "waiting" in ran.stdout and "rs-stereo-refined" in ran.stdout and "the end" in ran.stdout
+    assert "\x1b" not in ran.stdout + ran.stderr and "\x07" not in ran.stdout

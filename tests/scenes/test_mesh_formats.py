@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from collections.abc import Callable
@@ -47,6 +48,47 @@ def test_meshes_without_data_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(RsbenchError, match="has meshes without data"):
         load(tmp_path, _edited(tmp_path, strip))
+
+
+@pytest.mark.parametrize(
+    "uri", ["data:image/png;base64,AAAA", "data:image/png;base64,no base64!", "data:image/png;base64,", "data:,x"]
+)
+def test_an_image_inside_the_file_that_cannot_be_decoded_is_refused(tmp_path: Path, uri: str) -> None:
+    """Trimesh would take grey in its place without a word."""
+
+    def put(header: dict[str, Any]) -> None:
+        header["images"] = [{"uri": uri}]
+
+    with pytest.raises(RsbenchError, match=r"quad\.glb: (image 0: )?cannot be (decoded|read)"):
+        load(tmp_path, _edited(tmp_path, put))
+
+    def cut(header: dict[str, Any]) -> None:
+        header["bufferViews"][header["images"][0]["bufferView"]]["byteLength"] = 20
+
+    with pytest.raises(RsbenchError, match=r"quad\.glb: image 0: cannot be decoded"):
+        load(tmp_path, _edited(tmp_path, cut))
+
+
+def test_an_image_inside_the_file_colours_it(tmp_path: Path) -> None:
+    Image.new("RGB", (2, 2), (200, 10, 10)).save(tmp_path / "red.png")
+    uri = "data:image/png;base64," + base64.b64encode((tmp_path / "red.png").read_bytes()).decode()
+    mesh = load(tmp_path, _edited(tmp_path, lambda header: header.update(images=[{"uri": uri}]))).meshes[0]
+    assert np.all(np.asarray(mesh.material.texture)[..., 0] > np.asarray(mesh.material.texture)[..., 1])
+
+
+def test_a_texture_outside_the_folder_of_a_ply_is_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", (2, 2)).save(tmp_path / "outside.png")
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    header = "ply\nformat ascii 1.0\ncomment TextureFile ../outside.png\nelement vertex 3\n"
+    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (inner / "tri.ply").write_text(header + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
+    with pytest.raises(RsbenchError, match=r"refers to \.\./outside\.png, which is missing or lies outside"):
+        load(inner, 'file = "tri.ply"')
+    assert capfd.readouterr().err == ""
 
 
 def _transformed(**transform: object) -> Callable[[dict[str, Any]], None]:
