@@ -42,6 +42,16 @@ def named(lines: list[Line], method: str, uses: tuple[str, ...] = ("left",)) -> 
     return [{**lines[0], "method": method, "uses": uses}, *lines[1:]]
 
 
+def erring(lines: Iterable[Line], w: float, d: float, seed: int = 0) -> list[Line]:
+    """Answers with normal errors of these deviations of w and d: an exact one would be in doubt."""
+    random, answers = np.random.default_rng(seed), list[Line]()
+    for line in lines:
+        errors = random.standard_normal((2, 3)) * [[w], [d]]
+        wrong = {name: (np.array(line[name]) + error).tolist() for name, error in zip("wd", errors, strict=True)}
+        answers.append({**line, **wrong})
+    return answers
+
+
 _RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
 _SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
 _MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))

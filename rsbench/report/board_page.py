@@ -56,7 +56,7 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
     out.mkdir(parents=True, exist_ok=True)
     for each, album in zip(boards, albums(boards, out, data), strict=True):
         for suffix, text in (
-            ("csv", as_csv(each.lines)),
+            ("csv", as_csv(each.lines, each.secret)),
             ("md", as_markdown(each.lines)),
             ("tex", as_latex(each.lines)),
         ):

@@ -12,9 +12,9 @@ BRIEF = 2
 """Medians of the tables that show few numbers."""
 
 
-def as_csv(lines: Sequence[Standing]) -> str:
+def as_csv(lines: Sequence[Standing], secret: bool) -> str:
     """All numbers of a table, with all their digits; no cell begins as a formula does, since names do not."""
-    return table(lines).to_csv(index=False, lineterminator="\n")
+    return table(lines, worst=not secret).to_csv(index=False, lineterminator="\n")
 
 
 def as_markdown(lines: Sequence[Standing]) -> str:

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 from analytic_dataset import write_analytic_dataset
 from browser import CHROMIUM, Browser, started
-from leaderboards import Line, named, small_split, truth_lines, write
+from leaderboards import erring, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.board import ORACLES
@@ -48,17 +48,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three methods that err more and more, of which the second uses more than the others, and the truth."""
     folder = tmp_path_factory.mktemp("site")
     truth = truth_lines(SPLIT)
-    rng = np.random.default_rng(0)
-    for name, size, uses in (
-        ("best_one", 0.002, ("left",)),
-        ("middle", 0.02, ("left", "readout")),
-        ("weak", 0.06, ("left",)),
+    for name, size, shift, uses in (
+        ("best_one", 0.002, 0.01, ("left",)),
+        ("middle", 0.02, 0.02, ("left", "readout")),
+        ("weak", 0.06, 0.04, ("left",)),
     ):
-        lines: list[Line] = [
-            {**line, "w": (np.array(line["w"]) + size * rng.standard_normal(3)).tolist()} for line in truth[1:]
-        ]
+        lines = erring(truth[1:], size, shift)
         if name == "best_one":
-            spread = np.diag([size**2] * 3 + [1e-6] * 3).tolist()
+            spread = np.diag([size**2] * 3 + [shift**2] * 3).tolist()
             lines = [{**line, "metric": True, "covariance": spread} for line in lines]
         head = {**truth[0], **(HOSTILE if name == "weak" else {})}
         add(folder / "board", write(folder / "x.jsonl", named([head, *lines], name, uses)), SPLIT, {})

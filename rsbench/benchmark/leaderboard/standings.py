@@ -159,8 +159,8 @@ def _median(values: FloatArray) -> float:
     return float(np.median(there)) if there.size else float("nan")
 
 
-def table(lines: Sequence[Standing]) -> pd.DataFrame:
-    """The numbers of a table, as its CSV file holds them."""
+def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
+    """The numbers of a table, as its CSV file holds them; of a secret split without the ``worst`` problems."""
     rows = []
     for line in lines:
         header = line.scored.header
@@ -170,7 +170,7 @@ def table(lines: Sequence[Standing]) -> pd.DataFrame:
         row |= {"assumes": line.assumes or None} if line.parts else {}
         row |= _ends(line.means) | line.medians
         row |= _ends({f"{line.track.primary.key}_{name}": triple for name, triple in line.parts.items()})
-        for name, (problem, error) in line.worst.items():
+        for name, (problem, error) in line.worst.items() if worst else ():
             row |= {f"worst_{name}": error, f"worst_{name}_problem": problem}
         if "nees" in line.scored.scores:
             row |= _ends(named_numbers(line.calibration))

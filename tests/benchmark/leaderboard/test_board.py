@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import assert_refused, run_here
-from leaderboards import Line, named, small_split, truth_lines, write
+from leaderboards import Line, erring, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.adding import add
@@ -49,9 +49,7 @@ TRUTH = truth_lines(SPLIT)
 
 
 def _noisy(size: float, seed: int = 0) -> list[Line]:
-    rng = np.random.default_rng(seed)
-    answers = [{**line, "w": (np.array(line["w"]) + size * rng.standard_normal(3)).tolist()} for line in TRUTH[1:]]
-    return [TRUTH[0], *answers]
+    return [TRUTH[0], *erring(TRUTH[1:], size, 0.3 * size, seed)]
 
 
 def _scores(path: Path, lines: list[Line], split: Split = SPLIT) -> pd.DataFrame:
@@ -136,9 +134,9 @@ def test_stated_covariances_are_judged(tmp_path: Path) -> None:
 
 def test_entries_stand_alone_and_copies_tie(tmp_path: Path) -> None:
     board = tmp_path / "board"
-    add(board, write(tmp_path / "a.jsonl", named(_noisy(0.02), "a")), SPLIT, {})
+    add(board, write(tmp_path / "a.jsonl", named(_noisy(0.1), "a")), SPLIT, {})
     (alone,) = entries_of(board, "points-1", SPLIT.name)
-    for name, lines in (("copy", _noisy(0.02)), ("better", _noisy(0.001)), ("worse", _noisy(0.3))):
+    for name, lines in (("copy", _noisy(0.1)), ("better", _noisy(0.03)), ("worse", _noisy(0.6))):
         add(board, write(tmp_path / "a.jsonl", named(lines, name)), SPLIT, {})
     add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {"command": ORACLES})
     entries = entries_of(board, "points-1", SPLIT.name)
