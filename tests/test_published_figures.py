@@ -119,7 +119,7 @@ def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
     ranked = [each for each in page.split("\n\n") if " rank |" in each.partition("\n")[0]]
     shown = [each.splitlines() for each in ranked]
     boards = (
-        *("points-2--", "pose-2--", "readout-2--", "correction-2--"),
+        *("points-2--", "pose-2--", "readout-3--", "correction-3--"),
         *("points-1--", "pose-1--", "depth-1--", "correction-1--"),
         *("correction-mono-1--footage", "correction-mono-1--standard"),
     )

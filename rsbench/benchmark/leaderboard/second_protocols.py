@@ -259,10 +259,11 @@ def crps(error: float, sigma: float) -> float:
 def spread_of(ratios: Sequence[float]) -> float:
     """The mean CRPS of the distribution of all ``ratios`` for each of them: half of their mean distance.
 
-    No distribution that is stated for all of them alike has a lower mean.
+    No distribution that is stated for all of them alike has a lower mean. A single ratio has no spread: its value
+    is that of ratios even from 0 to 1.
     """
     known = np.array(ratios)
-    return 0.5 * float(np.mean(np.abs(known[:, None] - known)))
+    return 0.5 * float(np.mean(np.abs(known[:, None] - known))) or 1.0 / 6.0
 
 
 def best_constant(ratios: Sequence[float]) -> float:

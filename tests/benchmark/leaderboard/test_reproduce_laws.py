@@ -18,7 +18,7 @@ from rsbench.benchmark.leaderboard.track_list import TRACKS
 from rsbench.cli import generate, reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
 
-ENTRIES = {"pose-2": ["gs-p3p", "gs-8pt"], "readout-2": ["rs-stereo-refined"], "correction-2": ["rotation-only"]}
+ENTRIES = {"pose-2": ["gs-p3p", "gs-8pt"], "readout-3": ["rs-stereo-refined"], "correction-3": ["rotation-only"]}
 
 
 def _nothing_left(serve: Any, jobs: Any, *arguments: object) -> Any:
@@ -46,11 +46,11 @@ def test_one_command_makes_all_boards_and_goes_on(tmp_path: Path, monkeypatch: p
     stored = {path.name: {each.name for each in path.iterdir()} for path in (folder / "predictions").iterdir()}
     assert stored == {
         "pose-2": {"gs-p3p.jsonl.xz", "gs-8pt.jsonl.xz", "truth.jsonl.xz"},
-        "readout-2": {"rs-stereo-refined.jsonl.xz", "constant.jsonl.xz", "truth.jsonl.xz"},
+        "readout-3": {"rs-stereo-refined.jsonl.xz", "constant.jsonl.xz", "truth.jsonl.xz"},
     }
     made = json.loads((folder / "provenance.json").read_text("utf-8"))
     assert made["command"] == "rsbench reproduce laws"
-    assert f"correction-2/{splits['correction-2']}/uncorrected" in made["entries"]
+    assert f"correction-3/{splits['correction-3']}/uncorrected" in made["entries"]
     page = (folder / "site" / "index.html").read_text("utf-8")
     assert all(f"{protocol}--{split}" in page for protocol, split in splits.items())
     # What is stored of frames scores as it did; a second run answers nothing again.
@@ -75,5 +75,5 @@ def test_entries_of_laws_answer_what_is_asked() -> None:
         TRACKS[protocol].load(names)
         assert len(set(names)) == len(names)
     choosers = {protocol for protocol, names in entries.items() if running.CHOOSES in names}
-    assert choosers == {"points-2", "pose-2", "readout-2"} and entries["points-2"] == entries["pose-2"]
-    assert "gyro" not in entries["correction-2"]
+    assert choosers == {"points-2", "pose-2", "readout-3"} and entries["points-2"] == entries["pose-2"]
+    assert "gyro" not in entries["correction-3"]

@@ -180,7 +180,7 @@ def test_the_crps_is_its_integral(error: float, sigma: float) -> None:
 
 @settings(max_examples=200)
 @given(
-    st.lists(st.floats(0.0, 1.0), min_size=2, max_size=30),
+    st.lists(st.floats(0.0, 1.0), min_size=2, max_size=30, unique=True),
     st.floats(0.0, 1.0),
     st.just(0.0) | st.floats(1e-3, 1.0),
 )
