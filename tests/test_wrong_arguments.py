@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "a generator": lambda: (x for x in range(3)),
     "ragged rows": lambda: [[1], [2, 3]],
     "a long text": lambda: "a" * 100_000,
+    "a long path": lambda: "a/" * 50_000,
     "a zero byte": lambda: "a\0b",
     "NaN": lambda: float("nan"),
     "infinity": lambda: float("inf"),
@@ -57,7 +58,19 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Callable[
         "LinearMotion": (rsbench.LinearMotion, vectors),
         "TwistMotion": (rsbench.TwistMotion, vectors),
         "AcceleratedMotion": (rsbench.AcceleratedMotion, {**vectors, "acceleration": 0.1}),
-        "SplineMotion": (rsbench.SplineMotion, vectors),
+        "SplineMotion": (rsbench.SplineMotion, {**vectors, "preset": "handheld", "seed": 1, "interval": None}),
+        "MotionEstimate": (rsbench.MotionEstimate, {**vectors, "success": True, "metric": True}),
+        "SolverSpec": (
+            rsbench.SolverSpec,
+            {
+                "needs": {"left"},
+                "minimum": {"left": 5},
+                "metric": False,
+                "motion_model": "linear",
+                "shutter": "rolling",
+            }
+            | {"reference": "none", "reference_point": "body", "assumes": "nothing", "motion_parameters": {}},
+        ),
         "Correspondences": (rsbench.Correspondences, {"left": np.zeros((0, 4)), "tracks": np.zeros((0, 8))}),
         "project": (rsbench.project, {"points": [[0.0, 0.0, 5.0]], **moving, "side": "left", "frame": 0}),
         "simulate": (
@@ -89,6 +102,11 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Callable[
                 "target_row": 0.0,
             }
             | {"inpaint": None, "seed": 0, "gyro": None},
+        ),
+        "correct one camera": (
+            rsbench.correct,
+            {"images": [image] * 2, "camera": camera, "readout_ratio": 0.8, "target_row": 0.0, "inpaint": None}
+            | {"seed": 0, "gyro": None, "solver": "rs-stereo-refined", "corrector": "fusion"},
         ),
         "estimate_trajectory": (
             rsbench.estimate_trajectory,
@@ -124,12 +142,11 @@ def test_a_wrong_argument_is_one_short_line(wrong: str, calls: dict[str, Any]) -
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.int8, np.int64, np.longdouble])
-def test_numbers_of_numpy_are_stored_as_python_s(kind: type[np.generic]) -> None:
-    camera = rsbench.PinholeCamera(
-        width=np.int16(64), height=np.int32(48), fx=kind(100), fy=kind(100), cx=31.5, cy=23
-    )
+def test_numbers_of_numpy_are_stored_as_python_s(kind: Any) -> None:
+    int16, int32, uint8, float16 = (cast(Any, each) for each in (np.int16, np.int32, np.uint8, np.float16))
+    camera = rsbench.PinholeCamera(width=int16(64), height=int32(48), fx=kind(100), fy=kind(100), cx=31.5, cy=23)
     rig = rsbench.StereoRig(camera=camera, baseline=kind(2))
-    shutter = rsbench.RollingShutter(height=np.uint8(48), readout_ratio=np.float16(0.5))
+    shutter = rsbench.RollingShutter(height=uint8(48), readout_ratio=float16(0.5))
     numbers = (
         camera.width,
         camera.height,
@@ -142,8 +159,8 @@ def test_numbers_of_numpy_are_stored_as_python_s(kind: type[np.generic]) -> None
     assert {type(number) for number in numbers} <= {int, float}
     # In float16 the product fx * baseline is infinite from 256 x 256 on; in int8 100 * 2 is -56.
     assert float(rig.depth(2.0)) == 100.0
-    large = rsbench.PinholeCamera(**{**CAMERA, "fx": np.float16(60000.0)})
-    assert float(rsbench.StereoRig(camera=large, baseline=np.float16(500.0)).depth(1.0)) == 60_000.0 * 500.0
+    large = rsbench.PinholeCamera(**{**CAMERA, "fx": float16(60000.0)})
+    assert float(rsbench.StereoRig(camera=large, baseline=float16(500.0)).depth(1.0)) == 60_000.0 * 500.0
 
 
 def test_depths_that_no_point_can_have_are_the_fault_of_depth(calls: dict[str, Any]) -> None:

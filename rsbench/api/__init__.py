@@ -330,6 +330,8 @@ def evaluate(
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.benchmark.images.score import TABLES
 
+    given.check_whole("seeds", seeds, 1, 1_000_000)
+    given.check_whole("seed", seed, 0)
     options = EvaluationOptions(
         solvers=arguments.names("solvers", solvers),
         correction_solver=str(arguments.name_or_path("correct_with", correct_with)),

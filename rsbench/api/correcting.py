@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.core import given
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 
@@ -97,11 +98,12 @@ def correct(
     """
     from rsbench.pipeline import array_correction
 
+    given.check_one_of("inpaint", inpaint, (None, True, False))
     if (rig is None) == (camera is None):
         raise ValueError("rig: give a StereoRig, or camera = a PinholeCamera, degrees or 'unknown'; one of both")
     if rig is None:
         _check_own(solver, motion_model, matcher, features, corrector)
-        known = None if camera == "unknown" else camera
+        known = None if isinstance(camera, str) and camera == "unknown" else camera
         return array_correction.of_one_camera(images, known, readout_ratio, target_row, inpaint, seed, gyro)
     components = solver, motion_model, matcher, features, corrector
     options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
@@ -111,6 +113,8 @@ def correct(
 def _check_own(*components: object) -> None:
     """ValueError where a component is named that one camera does not have."""
     names = ("solver", "motion_model", "matcher", "features", "corrector")
-    for name, given, default in zip(names, components, _COMPONENTS, strict=True):
-        if given != default:
-            raise ValueError(f"{name} = {given!r}: is chosen for a stereo rig; leave it out with camera")
+    for name, value, default in zip(names, components, _COMPONENTS, strict=True):
+        if not isinstance(value, str | Path | None) or value != default:
+            raise ValueError(
+                f"{name} = {given.shown(value)}: is chosen for a stereo rig; leave it out with camera"
+            )

@@ -138,7 +138,7 @@ def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArra
     return image
 
 
-def items(name: str, value: Any) -> Sequence[Any]:
+def items(name: str, value: Any) -> Any:
     """What has a length and can be indexed; raises ValueError on anything else, a text included."""
     listed = isinstance(value, Sequence) and not isinstance(value, str)
     if not listed and not (isinstance(value, np.ndarray) and value.ndim > 0):
@@ -153,7 +153,7 @@ def path(name: str, value: Any) -> Path:
 
 def name_or_path(name: str, value: Any) -> str | Path:
     """The name of a component or the path of its card; raises ValueError on what is neither."""
-    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
     if not isinstance(text, str) or "\0" in text or not 0 < len(text) <= _LONGEST_PATH:
         raise ValueError(f"{name} = {given.shown(value)}: must be a name or a path")
     return value if isinstance(value, str | Path) else text

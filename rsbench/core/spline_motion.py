@@ -230,8 +230,7 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
         _only(parameters, "shake")
         return _interval(parameters), _twists(parameters["shake"], _interval(parameters), "shake")
     preset = parameters.get("preset", "handheld")
-    if preset not in PRESETS:
-        raise ValueError(f"preset = {preset!r}: must be one of {', '.join(PRESETS)}")
+    given.check_one_of("preset", preset, PRESETS)
     if "interval" in parameters:
         raise ValueError("interval goes with shake or poses, or spectrum; a preset has its own")
     interval, rotation_deg, translation = PRESETS[preset]
@@ -243,9 +242,8 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
 def _generator(purpose: str, parameters: Mapping[str, Any]) -> np.random.Generator:
     """What is drawn with the seed of the parameters."""
     seed = parameters.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"seed = {seed!r}: must be a whole number, not negative")
-    digest = hashlib.sha256(f"{purpose}/{seed}".encode()).digest()
+    given.check_whole("seed", seed, 0, 1 << 256)
+    digest = hashlib.sha256(f"{purpose}/{int(seed)}".encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:16], "little"))
 
 

@@ -343,7 +343,7 @@ class DatasetCard(Scanning):
 
 
 def load_dataset_card(
-    name_or_path: str, trajectory: Path | None = None, seeds: tuple[int, ...] = ()
+    name_or_path: str | Path, trajectory: Path | None = None, seeds: tuple[int, ...] = ()
 ) -> DatasetCard:
     """Dataset card by name or path, expanded.
 

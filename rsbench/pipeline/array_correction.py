@@ -91,5 +91,9 @@ def of_one_camera(
     if len(images) > 0:
         given.check_number("target_row", target_row, 0.0, images[0].shape[0] - 1.0)
     given.check_whole("seed", seed, 0)
+    if readout_ratio is not None:
+        given.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+    if camera is not None and not isinstance(camera, PinholeCamera):
+        given.check_number("camera", camera, 1.0, 179.0)
     samples = arguments.gyro_samples(gyro)
     return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=samples)

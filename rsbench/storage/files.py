@@ -38,7 +38,7 @@ POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
 
 def sha256(path: Path) -> str:
     with open_regular(path) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()  # pyrefly: ignore[bad-argument-type]
 
 
 def write_bytes(path: Path, data: bytes) -> None:

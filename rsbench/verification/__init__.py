@@ -58,7 +58,7 @@ def verify_dataset(
         LostJobsError: the process of a sequence ended each time it was tried.
         RsbenchError: no dataset.json, or one that is not a JSON object; no card of a scene where one was named.
     """
-    given.check_whole("stride", stride, 1)
+    given.check_whole("stride", stride, 1, given.LARGEST_SIZE)
     given.check_one_of("rerender", rerender, ("no", "auto", "all"))
     given.check_whole("workers", workers, 1)
     manifest = read_json(folder / manifest_checks.DATASET)

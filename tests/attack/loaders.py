@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
@@ -47,6 +48,8 @@ def loaders(inputs: Path, results: dict[str, Path], folder: Path) -> list[Loader
         *_datasets(inputs, folder),
         *_meshes(inputs, folder),
         *_problems(folder),
+        _answers(folder),
+        _arguments(folder),
     ]
     return [*found, *_results(inputs, results, folder)] if "evaluate" in results else found
 
@@ -226,6 +229,74 @@ def _problems(folder: Path) -> Iterator[Loader]:
         load=read,
         change=mutated_npz,
     )
+
+
+def _answers(folder: Path) -> Loader:
+    """Submitted answers; a direction that is read is 0 or has a length that can be scored."""
+    from rsbench.benchmark.leaderboard.answers import LEAST_D, Answer
+    from rsbench.components.cards import parse_card
+    from rsbench.storage.files import read_json
+
+    def read(path: Path) -> None:
+        answer = parse_card(Answer, read_json(path), str(path))
+        if answer.d is not None and any(answer.d) and not math.hypot(*answer.d) >= LEAST_D:
+            raise AssertionError(f"d = {answer.d} was read")
+
+    path = _place(folder, "answers") / "answer.json"
+    trees = tuple(
+        {"name": "a", "w": [0.0, 0.01, 0.0], "d": [length, 0.0, 0.0], "metric": True}
+        for length in (0.1, 5e-324, 1e-170, 1e200)
+    )
+    seeds = tuple(json.dumps(tree).encode() for tree in trees)
+    return Loader(name="answer", path=path, seeds=seeds, load=read, trees=trees)
+
+
+def _arguments(folder: Path) -> Loader:
+    """Arguments of a rig as scalars of NumPy; what is made holds Python's numbers, and its depths are finite."""
+    import rsbench
+    from rsbench.core.errors import RsbenchError
+    from rsbench.storage.files import read_json
+
+    kinds: dict[object, Any] = {
+        kind.__name__: kind for kind in (np.float16, np.float32, np.longdouble, np.int8, np.uint16, np.int64)
+    }
+    kinds |= {
+        "timedelta64": lambda value: np.timedelta64(int(value), "s"),
+        "bool": np.bool_,
+        "complex64": np.complex64,
+    }
+
+    def make(path: Path) -> None:
+        content = read_json(path)
+        kind = content.get("kind")
+
+        def scalar(name: str) -> Any:
+            value = content.get(name)
+            try:
+                return kinds[kind](value) if isinstance(kind, str) and kind in kinds else value
+            except (ValueError, TypeError, OverflowError):  # which that kind cannot hold
+                return value
+
+        try:
+            camera = rsbench.PinholeCamera(
+                width=content.get("width"), height=content.get("height"),
+                fx=scalar("focal"), fy=scalar("focal"), cx=scalar("centre"), cy=scalar("centre"),
+            )  # fmt: skip
+            rig = rsbench.StereoRig(camera=camera, baseline=scalar("baseline"))
+            shutter = rsbench.RollingShutter(height=scalar("height"), readout_ratio=scalar("ratio"))
+        except ValueError as error:
+            raise RsbenchError(f"{path}: {error}") from error
+        numbers = camera.fx, camera.cx, rig.baseline, shutter.readout_ratio
+        if {type(number) for number in numbers} != {float} or type(shutter.height) is not int:
+            raise AssertionError(f"stored as given: {rig}, {shutter}")
+        if not np.isfinite(rig.depth(1.0)):
+            raise AssertionError(f"depth of {rig} is {rig.depth(1.0)}")
+
+    path = _place(folder, "arguments") / "arguments.json"
+    rig = {"width": 100, "height": 90, "focal": 100, "centre": 50, "baseline": 100, "ratio": 1}
+    trees = tuple({"kind": kind, **rig, "focal": focal} for kind in kinds for focal in (100, 60000))
+    seeds = tuple(json.dumps(tree).encode() for tree in trees)
+    return Loader(name="arguments", path=path, seeds=seeds, load=make, trees=trees)
 
 
 def _results(inputs: Path, results: dict[str, Path], folder: Path) -> Iterator[Loader]:

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 Rng = np.random.Generator
 _NUMBERS = (
-    b"0 -1 1 2 3 255 65535 65536 2147483647 4294967295 99999999999999999999 1e308 -1e308 1e-320 nan inf".split()
-)
+    b"0 -1 1 2 3 255 65535 65536 2147483647 4294967295 99999999999999999999 "
+    b"1e308 -1e308 1e-320 5e-324 1e-170 1e200 nan inf"
+).split()
 _WORDS = (
     *_NUMBERS,
     b"-inf",
@@ -155,7 +156,7 @@ JUNK: st.SearchStrategy[Any] = st.recursive(
     st.none()
     | st.booleans()
     | st.integers()
-    | st.sampled_from((0, -1, 10**30, 2**63, 1e308, -0.0, 5e-324))
+    | st.sampled_from((0, -1, 10**30, 2**63, 1e308, -0.0, 5e-324, 1e-170, 1e200))
     | st.floats()
     | st.text(max_size=8)
     | st.sampled_from(("..", "/", "../../other", "a\nb", "\x00", "..:x", "os:system", "nan", "a" * 5000)),

@@ -259,7 +259,7 @@ def test_explicit_poses_fix_the_motion() -> None:
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"preset": "boat"}, "must be one of steady, handheld, drone, driving"),
+        ({"preset": "boat"}, "must be one of 'steady', 'handheld', 'drone', 'driving'"),
         ({"seed": -1}, "seed = -1: must be a whole number"),
         ({"interval": 0.5}, "interval goes with shake or poses"),
         ({"shake": np.zeros((7, 6))}, "interval = None: must be a number"),

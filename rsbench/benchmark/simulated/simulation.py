@@ -101,7 +101,7 @@ class SimulationOptions:
         check_one_of("shape", self.shape, get_args(SceneShape))
         check_one_of("outlier_images", self.outlier_images, get_args(OutlierImages))
         depth = self.depth
-        if not isinstance(depth, tuple | list | np.ndarray) or len(depth) != 2:
+        if not isinstance(depth, (tuple, list, np.ndarray)) or len(depth) != 2:
             raise ValueError(f"depth = {shown(depth)}: must be two distances in metres, the nearer first")
         for distance in depth:
             check_number("depth", distance, 0.0, LARGEST_M)

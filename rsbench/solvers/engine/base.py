@@ -20,7 +20,7 @@ import numpy as np
 from rsbench.components.motion_models import check_parameters
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.given import real_array
+from rsbench.core.given import real_array, shown
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -60,10 +60,13 @@ class MotionEstimate:
     """Those of the motion model's own parameters that the solver has found; the others are those of its spec."""
 
     def __post_init__(self) -> None:
+        for name in ("success", "metric", "direction_known"):
+            if not isinstance(getattr(self, name), bool | np.bool_):
+                raise ValueError(f"{name} = {shown(getattr(self, name))}: must be True or False")
         for name in ("w", "d"):
             value = real_array(f"{name} of a motion estimate", getattr(self, name))
             if value.shape != (3,) or (self.success and not np.all(np.isfinite(value))):
-                raise ValueError(f"{name} of a motion estimate must be 3 finite numbers, got {value}")
+                raise ValueError(f"{name} of a motion estimate must be 3 finite numbers, got {shown(value)}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
@@ -105,14 +108,20 @@ class SolverSpec:
     """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 
     def __post_init__(self) -> None:
+        needs = self.needs
+        if not isinstance(needs, Set | Sequence) or not all(isinstance(each, str) for each in needs):
+            raise ValueError(f"needs: must be a set of names, got {shown(self.needs)}")
+        for name in ("minimum", "motion_parameters"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ValueError(f"{name}: must be a table, got {shown(getattr(self, name))}")
         object.__setattr__(self, "needs", frozenset(self.needs))
         for name in ("minimum", "motion_parameters"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         sets = get_args(MatchSet)
         for name, given in (("needs", self.needs), ("minimum", self.minimum)):
             for value in given:
-                if value not in sets:
-                    raise ValueError(f"{name}: {value!r} is no set of matches; there are: {', '.join(sets)}")
+                if not isinstance(value, str) or value not in sets:
+                    raise ValueError(f"{name}: {shown(value)} is no set of matches; there are: {', '.join(sets)}")
         if not self.needs:
             raise ValueError(f"needs: must name at least one of {', '.join(sets)}")
         missing = self.needs - set(self.minimum)
@@ -129,13 +138,13 @@ class SolverSpec:
             ("reference_point", ("body", "left")),
             ("cameras", ("ideal", "lens", "any")),
         ):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} = {getattr(self, name)!r}: must be one of {', '.join(allowed)}")
+            if not isinstance(getattr(self, name), str) or getattr(self, name) not in allowed:
+                raise ValueError(f"{name} = {shown(getattr(self, name))}: must be one of {', '.join(allowed)}")
         if not isinstance(self.metric, bool):
-            raise ValueError(f"metric = {self.metric!r}: must be True or False")
+            raise ValueError(f"metric = {shown(self.metric)}: must be True or False")
         for name in ("motion_model", "reference", "assumes"):
             if not isinstance(getattr(self, name), str) or not getattr(self, name):
-                raise ValueError(f"{name} = {getattr(self, name)!r}: must be a text")
+                raise ValueError(f"{name} = {shown(getattr(self, name))}: must be a text")
         try:
             check_parameters(self.motion_model, self.motion_parameters)
         except RsbenchError as error:

@@ -6,8 +6,10 @@ import json
 import lzma
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -191,7 +193,7 @@ def test_nothing_that_is_stated_of_all_ratios_alike_beats_a_refusal(
     assert blind >= spread_of(ratios) - 1e-12  # a refusal scores 0: 1 - spread / spread
 
 
-def _read_out(split: Split, answers: dict[str, dict[str, object]], folder: Path) -> pd.DataFrame:
+def _read_out(split: Split, answers: Mapping[str, Mapping[str, Any]], folder: Path) -> pd.DataFrame:
     lines = [{"name": truth.name, **answers[truth.name]} for truth in split.truths]
     header = {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
     return mark(read_submission(write(folder / "a.jsonl", [header, *lines]), split), split)
