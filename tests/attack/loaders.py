@@ -279,7 +279,7 @@ def _arguments(folder: Path) -> Loader:
 
         try:
             camera = rsbench.PinholeCamera(
-                width=content.get("width"), height=content.get("height"),
+                width=content.get("width"), height=content.get("height"),  # pyrefly: ignore[bad-argument-type]
                 fx=scalar("focal"), fy=scalar("focal"), cx=scalar("centre"), cy=scalar("centre"),
             )  # fmt: skip
             rig = rsbench.StereoRig(camera=camera, baseline=scalar("baseline"))

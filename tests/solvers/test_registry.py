@@ -103,7 +103,7 @@ def test_a_wrong_card_is_refused_in_one_line(tmp_path: Path, text: str, parts: l
 def test_an_unknown_name_lists_what_exists() -> None:
     with pytest.raises(
         RsbenchError,
-        match=r"rs-stereo-linaer.*did you mean 'rs-stereo-linear'.*; there are: .*rs-stereo-iterated.* and \d+ more",
+        match=r"rs-stereo-linaer.*did you mean 'rs-stereo-linear'.*rs-stereo-iterated.* and \d+ more",
     ):
         load_solver("rs-stereo-linaer")
 

@@ -108,8 +108,7 @@ class SolverSpec:
     """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 
     def __post_init__(self) -> None:
-        needs = self.needs
-        if not isinstance(needs, Set | Sequence) or not all(isinstance(each, str) for each in needs):
+        if not hasattr(self.needs, "__iter__") or not all(isinstance(each, str) for each in self.needs):
             raise ValueError(f"needs: must be a set of names, got {shown(self.needs)}")
         for name in ("minimum", "motion_parameters"):
             if not isinstance(getattr(self, name), Mapping):
