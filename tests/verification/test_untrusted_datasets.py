@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,16 @@ def test_what_a_process_has_open_is_read(dataset: Path) -> None:
     assert answer.stdout == b"x" * 300_000
     os.mkfifo(dataset / "pipe")
     assert "it is a named pipe; give a regular file" in refusal(lambda: read_bytes(dataset / "pipe"))
+
+
+@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="needs /dev/shm")
+def test_a_folder_below_dev_holds_files_of_anybody() -> None:
+    """In memory, where datasets lie for speed, a pipe is refused as elsewhere."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        os.mkfifo(pipe := Path(folder) / "poses.csv")
+        assert refusal(lambda: read_bytes(pipe)) == (
+            f"{pipe}: cannot be read: it is a named pipe; give a regular file"
+        )
 
 
 @pytest.mark.slow
