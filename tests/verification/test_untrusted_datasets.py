@@ -183,6 +183,25 @@ def test_sequences_that_are_not_there_are_counted(dataset: Path) -> None:
     assert any("not the name of a folder in it: '../s0', '../s1'" in line for line in lines) and len(lines) < 10
 
 
+@pytest.mark.parametrize("what", ["empty", "pipe", "no JSON"])
+def test_a_sequence_that_cannot_be_read_is_one_fault(dataset: Path, what: str) -> None:
+    """Not one for each file that it might have had."""
+    names = [f"s{number}" for number in range(150)]
+    for name in names:
+        (dataset / name).mkdir()
+        if what == "pipe":
+            os.mkfifo(dataset / name / "sequence.json")
+        elif what == "no JSON":
+            (dataset / name / "sequence.json").write_text("{")
+    change(dataset / "dataset.json", "sequences", ["planes", *names])
+    reports = verify_dataset(dataset)
+    found = {report.name: report.faults for report in reports if report.name in names}
+    assert {len(faults) for faults in found.values()} == {1}
+    assert len(found) == (100 if what == "empty" else 150)
+    if what == "empty":
+        assert found["s99"][0].endswith("; 50 more sequences of dataset.json are missing likewise")
+
+
 def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
     path = dataset / "planes/rs/left_0.png"
     path.rename(dataset / "planes/kept.png")
