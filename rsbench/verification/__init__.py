@@ -28,6 +28,9 @@ __all__ = [
     "verify_sequence",
 ]
 
+MOST_FAULTS = 1000
+"""Of one sequence that are reported one by one: its manifests may list any number of files."""
+
 
 def verify_dataset(
     folder: Path,
@@ -137,4 +140,6 @@ def verify_sequence(
     for _ in range(steps):
         step(name)
     findings, agreements = tuple(dict.fromkeys(state.findings)), tuple(state.agreements.values())
+    if more := len(findings[MOST_FAULTS:]):
+        findings = *findings[:MOST_FAULTS], Finding(f"{name}/", f"{more} more faults of this sequence")
     return SequenceReport(name=name, findings=findings, agreements=agreements, notes=tuple(state.notes))

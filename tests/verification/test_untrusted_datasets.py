@@ -202,6 +202,15 @@ def test_a_sequence_that_cannot_be_read_is_one_fault(dataset: Path, what: str) -
         assert found["s99"][0].endswith("; 50 more sequences of dataset.json are missing likewise")
 
 
+def test_files_that_are_not_there_are_counted(dataset: Path) -> None:
+    """A manifest may list any number of them; two faults each, for sequence.json does not list them either."""
+    files = json.loads((dataset / "dataset.json").read_text())["files"]
+    more = {f"planes/{number}.png": {"sha256": "0" * 64, "size": 1} for number in range(2000)}
+    change(dataset / "dataset.json", "files", files | more)
+    faults = next(report.faults for report in verify_dataset(dataset) if report.name == "planes")
+    assert len(faults) == 1001 and faults[-1] == "planes/: 3000 more faults of this sequence"
+
+
 def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
     path = dataset / "planes/rs/left_0.png"
     path.rename(dataset / "planes/kept.png")
