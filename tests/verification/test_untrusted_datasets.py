@@ -211,6 +211,19 @@ def test_files_that_are_not_there_are_counted(dataset: Path) -> None:
     assert len(faults) == 1001 and faults[-1] == "planes/: 3000 more faults of this sequence"
 
 
+def test_faults_move_no_cursor(dataset: Path) -> None:
+    """Names of a stranger's manifest are shown as text."""
+    files = json.loads((dataset / "dataset.json").read_text())["files"]
+    strange = {"planes/\x1b[2J\x07.png": {"sha256": "0" * 64, "size": 1}, "x\x9b\r.png": {}}
+    change(dataset / "dataset.json", "files", files | strange)
+    ran = run_here("verify", dataset, "--rerender", "no")
+    assert r"planes/\x1b[2J\x07.png: missing" in ran.stderr and r"none of its sequences: x\x9b\r.png" in ran.stderr
+    assert not {"\x1b", "\x07", "\x9b", "\r"} & set(
+        "".join(each for each in ran.stderr.splitlines() if "fault" in each)
+    )
+    assert "\x07" not in ran.stderr and "\x9b" not in ran.stderr
+
+
 def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
     path = dataset / "planes/rs/left_0.png"
     path.rename(dataset / "planes/kept.png")
