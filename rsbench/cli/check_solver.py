@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -44,7 +45,7 @@ def check_solver(
     failed = sum(finding.verdict == "failed" for finding in findings)
     if json:
         content = {"solver": entry.name, "passed": not failed, "checks": [asdict(each) for each in findings]}
-        typer.echo(json_module.dumps(content))
+        echo(json_module.dumps(content))
     else:
         print_table(f"{entry.name} and the contract of solvers", pd.DataFrame([asdict(each) for each in findings]))
         say(f"{entry.name}: {failed} of {len(findings)} checks failed")

@@ -33,12 +33,17 @@ def is_quiet() -> bool:
     return _quiet
 
 
-def say(note: str) -> None:
-    """A line on stdout that is no result."""
+def echo(text: str, err: bool = False, nl: bool = True) -> None:
+    """Results on stdout, or faults and notes on stderr; control characters of what others wrote are escaped."""
     import typer
 
+    typer.echo(printable(text), err=err, nl=nl)
+
+
+def say(note: str) -> None:
+    """A line on stdout that is no result."""
     if not _quiet:
-        typer.echo(printable(note))
+        echo(note)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.component_kinds import named
+from rsbench.cli.console import echo
 from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row, with_found_camera
 from rsbench.cli.correct_one_camera import (
     CameraFile,
@@ -100,7 +101,7 @@ def _correct_given(given: Given, target: str, options: CorrectionOptions, close:
             else:
                 correct_sequence_given(given, target, options, close)
     except (NoMotionError, NotCorrectedError) as error:
-        typer.echo(f"rsbench: not corrected: {error}", err=True)
+        echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
 
 
@@ -191,15 +192,15 @@ def _correct_four(
 
 def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     motion = record["motion"]
-    typer.echo(first)
+    echo(first)
     say_calibration(record)
     if motion is not None:
-        typer.echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
+        echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
         if motion["model_choice"]:
-            typer.echo(f"motion model: {motion['model_choice']['text']}")
+            echo(f"motion model: {motion['model_choice']['text']}")
         if motion["note"]:
-            typer.echo(f"note: {motion['note']}")
-    typer.echo(f"report: {(out / 'report.html').resolve()}")
+            echo(f"note: {motion['note']}")
+    echo(f"report: {(out / 'report.html').resolve()}")
 
 
 def register(app: typer.Typer) -> None:

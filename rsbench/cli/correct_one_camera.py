@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rsbench.cli.console import echo
 from rsbench.cli.correct_said import listed
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None
     if abs(share - 1.0) > _SAME_RATE:
         ratio, other = card.readout_ratio, card.readout_ratio * share
         there = f"; the same readout is {other:.3g} of them" if other <= 1.0 else ", which no frame of it lasts"
-        typer.echo(
+        echo(
             f"rsbench: camera: readout ratio {ratio:.3g} is of {1.0 / card.frame_period_s:.4g} frames a second, "
             f"and the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
             err=True,
@@ -248,7 +249,7 @@ def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> 
                 advance("all pairs together")
             return found
     except NoMotionError as error:
-        typer.echo(f"rsbench: not corrected: {error}", err=True)
+        echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
 
 
@@ -348,19 +349,19 @@ def _say(record: dict[str, Any], out: Path) -> None:
     motions = ((each["number"], each.get("motion", {})) for each in record["frames"])
     told["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
-    typer.echo(f"readout ratio {_readout(record)}")
-    typer.echo(f"focal length {_focal(record)}")
+    echo(f"readout ratio {_readout(record)}")
+    echo(f"focal length {_focal(record)}")
     if "gyro_clock" in record:
-        typer.echo(f"gyroscope's clock: {_clock(record)}")
-    typer.echo(f"{corrected} of {len(record['frames'])} frames corrected")
+        echo(f"gyroscope's clock: {_clock(record)}")
+    echo(f"{corrected} of {len(record['frames'])} frames corrected")
     place = out if out.is_file() else out / "report.html"
-    typer.echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
+    echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
     if told["gyro"]:
-        typer.echo(f"rsbench: corrected without the gyroscope: {told['gyro']}", err=True)
+        echo(f"rsbench: corrected without the gyroscope: {told['gyro']}", err=True)
     if told["skipped"]:
-        typer.echo(f"rsbench: corrected with the frame after them: {told['skipped']}", err=True)
+        echo(f"rsbench: corrected with the frame after them: {told['skipped']}", err=True)
     if told["reason"]:
-        typer.echo(f"rsbench: not corrected: {told['reason']}", err=True)
+        echo(f"rsbench: not corrected: {told['reason']}", err=True)
         raise typer.Exit(1)
 
 

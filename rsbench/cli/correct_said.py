@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.capture.estimate import Capture
@@ -62,9 +62,9 @@ def readout_words(shutter: RollingShutter, capture: Capture | None) -> str:
 
 def say_calibration(record: dict[str, Any]) -> None:
     if record["camera_note"]:
-        typer.echo(record["camera_note"])
+        echo(record["camera_note"])
     if record["calibration_note"]:
-        typer.echo(f"errors of the calibration, taken from the matches: {record['calibration_note']}")
+        echo(f"errors of the calibration, taken from the matches: {record['calibration_note']}")
 
 
 def listed(frames: Iterable[tuple[int, str]]) -> str:

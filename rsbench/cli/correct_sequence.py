@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from rsbench.cli.console import echo
 from rsbench.cli.correct_input import sized, target_row, with_found_camera
 from rsbench.cli.correct_said import listed, readout_words, say_calibration, write_page_of
 
@@ -214,24 +215,24 @@ def _say(out: Path, first: str, record: dict[str, Any], given_gyro: bool) -> Non
     failed, skipped = (
         listed((frame["number"], frame[key]) for frame in frames if key in frame) for key in ("reason", "skipped")
     )
-    typer.echo(first)
+    echo(first)
     say_calibration(record)
     gyros = [(each["number"], each["motion"]["gyro"]) for each in frames if "gyro" in each.get("motion", {})]
     used = [found for _, found in gyros if not isinstance(found, str)]
     if used:
         off = max(abs(value - (i == j)) for i, row in enumerate(used[-1]["matrix"]) for j, value in enumerate(row))
-        typer.echo(f"gyroscope: clock {_late(used[-1]['shift'])}, axes and scales off by {off:.1%}: allowed for")
+        echo(f"gyroscope: clock {_late(used[-1]['shift'])}, axes and scales off by {off:.1%}: allowed for")
     elif given_gyro and record["readout_ratio"] == 0.0:
-        typer.echo("rsbench: corrected without the gyroscope: the shutter is global", err=True)
-    typer.echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
-    typer.echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
+        echo("rsbench: corrected without the gyroscope: the shutter is global", err=True)
+    echo(f"{sum('reason' not in frame for frame in frames)} of {len(frames)} times corrected")
+    echo(f"video: {out.resolve()}" if is_video(out) else f"report: {(out / 'report.html').resolve()}")
     if len(used) < len(gyros):
         unlike = listed((number, found) for number, found in gyros if isinstance(found, str))
-        typer.echo(f"rsbench: corrected without the gyroscope: {unlike}", err=True)
+        echo(f"rsbench: corrected without the gyroscope: {unlike}", err=True)
     if skipped:
-        typer.echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
+        echo(f"rsbench: corrected with the motion of the frames around: {skipped}", err=True)
     if failed:
-        typer.echo(f"rsbench: not corrected: {failed}", err=True)
+        echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
 
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from rsbench.cli.console import echo
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench digest data/paper --out paper.txt
@@ -46,12 +48,12 @@ def digest(
     if out is not None:
         write_bytes(out, text_of(found).encode())
     if known is None:
-        typer.echo(f"{out}: digests of {len(found)} sequences" if out else text_of(found), nl=out is not None)
+        echo(f"{out}: digests of {len(found)} sequences" if out else text_of(found), nl=out is not None)
         return
     faults = differences(found, known)
     for fault in faults:
-        typer.echo(f"fault: {fault}", err=True)
-    typer.echo(f"{folder}: {len(found)} sequences, {len(faults)} faults")
+        echo(f"fault: {fault}", err=True)
+    echo(f"{folder}: {len(found)} sequences, {len(faults)} faults")
     if faults:
         raise typer.Exit(1)
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from rsbench.cli.console import echo
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench docs                              [dim](what there is)[/dim]
@@ -27,7 +29,7 @@ def docs(
     if name is not None:
         if name not in documents:
             raise RsbenchError(f"document {name!r} does not exist{choices(name, documents)}")
-        typer.echo(documents[name])
+        echo(documents[name])
         return
     import pandas as pd
 
@@ -35,7 +37,7 @@ def docs(
 
     rows = [{"name": known, "about": _title(path)} for known, path in documents.items()]
     print_table("documents and examples", pd.DataFrame(rows))
-    typer.echo("rsbench docs NAME prints the path of one")
+    echo("rsbench docs NAME prints the path of one")
 
 
 def list_documents() -> dict[str, Path]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import typer
 
+from rsbench.cli.console import echo
+
 
 def doctor() -> None:
     """Try every rendering backend in a child process, list the versions that matter, and say what to do."""
@@ -16,7 +18,7 @@ def doctor() -> None:
     rows = [{"component": row.component, "status": row.status, "detail": row.detail} for row in report]
     print_table("rsbench doctor", pd.DataFrame(rows))
     for line in advice(report):
-        typer.echo(line)
+        echo(line)
     if any(row.status == "fail" and row.component != "libLLVM" for row in report):  # without it, others render
         raise typer.Exit(1)
 

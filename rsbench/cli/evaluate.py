@@ -9,6 +9,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at, shared_path
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -154,7 +155,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
             (out / "scores").mkdir(parents=True, exist_ok=True)
             write_table(out / "scores" / f"{name}.csv", table)
             print_table(name, table if name != "correction" else _means(table))
-    typer.echo(f"scores: {name_of(out / 'scores')}")
+    echo(f"scores: {name_of(out / 'scores')}")
 
 
 def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.DataFrame:
@@ -219,9 +220,9 @@ def evaluate_dataset(
         print_table(table.title, table.brief)
     if stale:
         why = "made from other data, components or options, or by a card that was not named"
-        typer.echo(f"not scored, {why}: {', '.join(stale)}", err=True)
+        echo(f"not scored, {why}: {', '.join(stale)}", err=True)
     page = write_report(folder, out)
-    typer.echo(f"report: {name_of(page)}")
+    echo(f"report: {name_of(page)}")
     return page
 
 

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from rsbench.cli.console import echo
+
 EPILOG = """[bold]Examples[/bold]
 
   rsbench export data/paper --to colmap --out out/colmap    [dim](global-shutter twins)[/dim]
@@ -78,7 +80,7 @@ def export(
         )
     for sentence in told:
         say(f"note: {sentence}")
-    typer.echo(f"{out}: {to}; README.txt says what it holds")
+    echo(f"{out}: {to}; README.txt says what it holds")
 
 
 def register(app: typer.Typer) -> None:

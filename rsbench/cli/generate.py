@@ -9,6 +9,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, shared_path
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.dataset.card import DatasetCard
@@ -147,9 +148,9 @@ def generate(
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
     _ask_for(backend, scheduler)
     if (started := start_backend()).message:
-        typer.echo(started.message, err=True)
+        echo(started.message, err=True)
     if estimate:
-        typer.echo(_estimated(dataset, full_frames))
+        echo(_estimated(dataset, full_frames))
         return
     steps = steps_of(dataset) * len(dataset.sequence)
     with progress_bar(f"rendering {dataset.name}", steps) as advance:
@@ -157,7 +158,7 @@ def generate(
             dataset, place, workers=processes, full_frames=full_frames, rehash=rehash, progress=advance
         )
     words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
-    typer.echo(f"{shown(str(place))}: {words}")
+    echo(f"{shown(str(place))}: {words}")
 
 
 def _ask_for(backend: str | None, scheduler: str | None) -> None:

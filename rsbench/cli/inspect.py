@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rsbench.cli.component_kinds import named
+from rsbench.cli.console import echo
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def inspect(
     for case in _cases(given or [], rig, left, right, options):
         if isinstance(case, RsbenchError):
             wrong = True
-            typer.echo(f"rsbench: error: {' '.join(str(case).split())}", err=True)
+            echo(f"rsbench: error: {' '.join(str(case).split())}", err=True)
             continue
         found = conclude(list(case.windows), max_sigma)
         told = told and found.told
@@ -175,7 +176,7 @@ def _with_found_camera(
 
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
     rig, words = with_found_camera(said, rig, spread_windows(left, right), chain)
-    typer.echo(words, err=True)
+    echo(words, err=True)
     return rig
 
 
@@ -265,7 +266,7 @@ def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
 def _print_json(answer: dict[str, Any]) -> None:
     import json
 
-    typer.echo(json.dumps(answer, allow_nan=False))
+    echo(json.dumps(answer, allow_nan=False))
 
 
 def _show(answers: list[dict[str, Any]]) -> None:
@@ -274,7 +275,7 @@ def _show(answers: list[dict[str, Any]]) -> None:
     rows = [_row(answer) for answer in answers]
     if is_quiet():
         for row in rows:
-            typer.echo("\t".join(row.values()))
+            echo("\t".join(row.values()))
     elif rows:
         print_rows("", list(rows[0]), [list(row.values()) for row in rows], right=("matches", "moved (px)"))
 

@@ -9,6 +9,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 from rsbench.cli.leaderboard_run import predict
 from rsbench.cli.leaderboard_tracks import (
     Data,
@@ -82,8 +83,8 @@ def export(
         if data is not None and split.track.gives_images:
             write_frames_of(split, data, out)
         write_inputs(split, _counted(split.track.problems(data, seed_file, len(split.truths)), advance), out)
-    typer.echo(f"{split.track.id}, split {split.name}, {len(split.truths)} problems: {out}")
-    typer.echo(f"fingerprint: {split.fingerprint}")
+    echo(f"{split.track.id}, split {split.name}, {len(split.truths)} problems: {out}")
+    echo(f"fingerprint: {split.fingerprint}")
 
 
 @board_app.command()
@@ -102,13 +103,13 @@ def template(
             raise RsbenchError(f"--out: the track {track!r} asks for pictures; name a new folder for the example")
         with tempfile.TemporaryDirectory() as folder:
             split.track.write_template(split, path := Path(folder) / "predictions.jsonl")
-            typer.echo(path.read_text("utf-8"), nl=False)
+            echo(path.read_text("utf-8"), nl=False)
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RsbenchError(f"--out {out}: is there already; choose a new folder")
     out.mkdir(parents=True, exist_ok=True)
     split.track.write_template(split, path := out / "predictions.jsonl")
-    typer.echo(str(path))
+    echo(str(path))
 
 
 @board_app.command()
@@ -118,10 +119,10 @@ def check(file: _File, data: Data = None, seed_file: Secret = None, secret: Hidd
 
     found = check_submission(file, split_of(_track_of(file), data, seed_file, secret))
     for fault in found.faults:
-        typer.echo(f"fault: {' '.join(fault.split())}", err=True)
+        echo(f"fault: {' '.join(fault.split())}", err=True)
     for note in found.notes:
-        typer.echo(f"note: {note}", err=True)
-    typer.echo(f"{file}: {len(found.faults)} faults, {len(found.notes)} notes")
+        echo(f"note: {note}", err=True)
+    echo(f"{file}: {len(found.faults)} faults, {len(found.notes)} notes")
     if found.faults or found.notes:
         raise typer.Exit(2 if found.faults else 1)
 
@@ -143,11 +144,11 @@ def submit(
 
     split = split_of(_track_of(file), data, seed_file, secret)
     for note in check_submission(file, split).notes:
-        typer.echo(f"note: {note}", err=True)
+        echo(f"note: {note}", err=True)
     scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace, workers=workers)
     _show(board, split.track.id, split.name, None, scored.header.method)
     if scored.doubt:
-        typer.echo(f"in doubt, and not ranked: {scored.doubt}")
+        echo(f"in doubt, and not ranked: {scored.doubt}")
 
 
 @board_app.command()
@@ -244,7 +245,7 @@ def build(
     """Write the board as a static site, with each table as CSV, Markdown and LaTeX."""
     from rsbench.report.board_page import build_site
 
-    typer.echo(f"page: {build_site(board, out, data or ())}")
+    echo(f"page: {build_site(board, out, data or ())}")
 
 
 @board_app.command()
@@ -255,7 +256,7 @@ def merge(
     from rsbench.benchmark.leaderboard.merging import merge
 
     for name in merge(other, board):
-        typer.echo(name)
+        echo(name)
 
 
 @board_app.command()
@@ -284,7 +285,7 @@ def rescore(
     with _scoring(split) as step:
         changed = rescore(board, split, workers, step)
     for method, columns in changed.items():
-        typer.echo(f"{method}: other scores: {', '.join(columns)}")
+        echo(f"{method}: other scores: {', '.join(columns)}")
     if changed:
         raise typer.Exit(1)
 
@@ -328,7 +329,7 @@ def _show(
     wanted = None if at_most is None else [name.strip() for name in at_most.split(",")]
     lines = standings(entries_of(board, protocol, split), wanted)
     if csv:
-        typer.echo(table(lines).to_csv(index=False, lineterminator="\n"), nl=False)
+        echo(table(lines).to_csv(index=False, lineterminator="\n"), nl=False)
         return
     lines = [line for line in lines if method in (None, line.scored.header.method)]
     for uses in dict.fromkeys(line.uses for line in lines):

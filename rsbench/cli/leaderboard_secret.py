@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 from rsbench.cli.leaderboard_tracks import Workers
 from rsbench.core.errors import RsbenchError
 
@@ -45,9 +46,9 @@ def publish(
     drawn = secret_card(card, text)
     with progress_bar(f"rendering {drawn.name}", steps_of(drawn) * len(drawn.sequence)) as advance:
         made = publishing.publish(of_frames, card, text, keep, out, workers=workers, progress=advance)
-    typer.echo(f"{made.protocol}, split {made.split}, {len(drawn.sequence)} sequences: {out}")
+    echo(f"{made.protocol}, split {made.split}, {len(drawn.sequence)} sequences: {out}")
     for name in ("commitment", "fingerprint", "truth"):
-        typer.echo(f"{name}: {getattr(made, name)}")
+        echo(f"{name}: {getattr(made, name)}")
 
 
 def score(
@@ -74,12 +75,12 @@ def score(
     track, text = track_of_id(announced.protocol), read_secret(seed_file)
     split = announced_split(announced, track, card or announced.card, text, keep)
     for note in check_submission(file, split).notes:
-        typer.echo(f"note: {note}", err=True)
+        echo(f"note: {note}", err=True)
     made = provenance("rsbench leaderboard score")
     scored = add(board, file, split, made, replace=replace, workers=workers)
-    typer.echo(f"entry: {scored.folder}")
+    echo(f"entry: {scored.folder}")
     if scored.doubt:
-        typer.echo(f"in doubt, and not ranked: {scored.doubt}")
+        echo(f"in doubt, and not ranked: {scored.doubt}")
 
 
 def accept(
@@ -94,4 +95,4 @@ def accept(
 
     if not reason.strip():
         raise RsbenchError("--reason '': must say why the entry is believed")
-    typer.echo(f"{method}: ranked all the same: {boards.accept(board, protocol, split, method, reason)}")
+    echo(f"{method}: ranked all the same: {boards.accept(board, protocol, split, method, reason)}")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.smoke import Job
@@ -138,7 +139,7 @@ def _frames(data: Path | None, tracks: Sequence[str], problems: int | None) -> I
     card = load_dataset_card(CARD)
     card = card.only([sequence.name for sequence in card.sequence[:problems]])
     if (backend := start_backend()).message:
-        typer.echo(backend.message, err=True)
+        echo(backend.message, err=True)
     with tempfile.TemporaryDirectory() as folder:
         with progress_bar(f"rendering {card.name}", steps_of(card) * len(card.sequence)) as advance:
             generate_dataset(card, Path(folder) / CARD, progress=advance)
@@ -155,7 +156,7 @@ def _store(stored: Path, found: dict[str, Any], frames: dict[str, str]) -> None:
         inputs = {} if track == "points" else {"frames": frames}
         write_table(stored / file_of(track), table)
         write_json(stored / record_of(track), provenance(_COMMAND, **inputs))
-        typer.echo(f"scores: {stored / file_of(track)}")
+        echo(f"scores: {stored / file_of(track)}")
 
 
 def _compare(stored: Path, found: dict[str, Any], known: dict[str, Any], frames: dict[str, str]) -> None:
@@ -165,13 +166,13 @@ def _compare(stored: Path, found: dict[str, Any], known: dict[str, Any], frames:
     for track, table in found.items():
         others = list[str]() if track == "points" else other_frames(stored, track, frames)
         if others:
-            typer.echo(f"note: {track}: other frames than those of the stored scores: {', '.join(others)}")
+            echo(f"note: {track}: other frames than those of the stored scores: {', '.join(others)}")
         lines += differences(track, table, known[track], others)
     for line in lines:
-        typer.echo(line)
+        echo(line)
     answers = sum(len(table) for table in found.values())
     entries = sum(table["method"].nunique() for table in found.values())
-    typer.echo(f"{answers} answers of {entries} entries of {len(found)} tracks, {len(lines)} differ from {stored}")
+    echo(f"{answers} answers of {entries} entries of {len(found)} tracks, {len(lines)} differ from {stored}")
     if lines:
         raise typer.Exit(1)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.component_kinds import complete_kind
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.components.plugins import Kind, Offer
@@ -39,7 +40,7 @@ def list_(
         raise RsbenchError(f"kind {kind!r} does not exist{choices(kind, kinds)}")
     rows = _kinds(kinds) if kind is None else entries(kind)
     if json:
-        typer.echo(json_module.dumps(rows))
+        echo(json_module.dumps(rows))
         return
     columns = ("kind", "names") if kind is None else ("name", "origin", "description")
     texts = [[row[column] for column in columns] for row in rows]

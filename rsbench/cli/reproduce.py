@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import say
+from rsbench.cli.console import echo, say
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -151,9 +151,9 @@ def _make(
             say(f"[{number + 1} of {len(targets)}] {each}: {_left(targets[number:], paces)}")
         _reproduce(each, out, data, workers, seeds or _SEEDS.get(each, 1), width)
         paces.append((time.monotonic() - start) / 60.0 / _MINUTES[each])
-        typer.echo(f"{each}: {paces[-1] * _MINUTES[each]:.1f} minutes")
+        echo(f"{each}: {paces[-1] * _MINUTES[each]:.1f} minutes")
     if len(targets) > 1:
-        typer.echo(f"{Target.everything}: {(time.monotonic() - begin) / 60.0:.1f} minutes")
+        echo(f"{Target.everything}: {(time.monotonic() - begin) / 60.0:.1f} minutes")
 
 
 def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
@@ -228,7 +228,7 @@ def _images(out: Path, data: Path, seeds: int) -> None:
     evaluation = data / "paper-evaluation"
     options = EvaluationOptions(solvers=tuple(every_solver()), seeds=seeds)
     evaluate_dataset(data / "paper", evaluation, options, "rsbench reproduce images")
-    typer.echo(f"published: {publish(evaluation, out / 'images')}")
+    echo(f"published: {publish(evaluation, out / 'images')}")
 
 
 def register(app: typer.Typer) -> None:

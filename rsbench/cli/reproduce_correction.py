@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +47,7 @@ def fig4(out: Path, data: Path) -> None:
         rows = [(name, load_panels(data / "fig4" / card / name)) for name in names]
         numbers |= {(card, name): panels.numbers for name, panels in rows}
         for path in draw_fig4(rows, folder / f"fig4-{card}"):
-            typer.echo(f"figure: {path}")
+            echo(f"figure: {path}")
     write_table(folder / "numbers.csv", numbers_table(numbers))
     records = [dataset_record(data / card) for card, _ in _FIG4]
     write_json(folder / "provenance.json", provenance("rsbench reproduce fig4", datasets=records))
@@ -76,7 +76,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     records = [dataset_record(data / card) for card in STRATA]
     write_json(folder / "provenance.json", provenance("rsbench reproduce correction", datasets=records))
     for path in write_study(folder):
-        typer.echo(f"written: {path}")
+        echo(f"written: {path}")
 
 
 def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
@@ -96,7 +96,7 @@ def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
     write_table(folder / "summary.csv", by_law(pd.read_csv(folder / "sequences.csv")))
     records = [dataset_record(data / LAWS_FRAMES)]
     write_json(folder / "provenance.json", provenance("rsbench reproduce laws-correction", datasets=records))
-    typer.echo(f"written: {write_laws(folder)}")
+    echo(f"written: {write_laws(folder)}")
 
 
 def _studied(
@@ -152,7 +152,7 @@ def sgm(out: Path, data: Path) -> None:
     records = [dataset_record(data / card) for card in dict.fromkeys(card for card, _ in _SGM)]
     write_json(folder / "provenance.json", provenance("rsbench reproduce sgm", datasets=records))
     for path in write_sgm_page(folder):
-        typer.echo(f"written: {path}")
+        echo(f"written: {path}")
 
 
 def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
@@ -196,7 +196,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     records = [dataset_record(place) for place in places.values()]
     write_json(folder / "provenance.json", provenance("rsbench reproduce real", datasets=records))
     for path in (_draw_real(places, folder), write_real_page(folder, asdict(card))):
-        typer.echo(f"written: {path}")
+        echo(f"written: {path}")
 
 
 def _draw_real(places: dict[str, Path], folder: Path) -> Path:

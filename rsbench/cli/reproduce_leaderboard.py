@@ -7,8 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-import typer
-
+from rsbench.cli.console import echo
 from rsbench.cli.reproduce_correction import LAWS_FRAMES
 
 BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
@@ -148,4 +147,4 @@ def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboar
         if isinstance(record, dict)
     }
     write_json(out / "provenance.json", {**provenance(command), "entries": brief})
-    typer.echo(f"page: {page}")
+    echo(f"page: {page}")

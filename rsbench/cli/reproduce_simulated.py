@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,7 +43,7 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
     seeds = {name: card.seed for name, card in cards.items()}
     write_json(folder / "provenance.json", provenance(command, sweeps=list(SWEEPS), seeds=seeds))
     for path in draw_fig3(folder):
-        typer.echo(f"figure: {path}")
+        echo(f"figure: {path}")
 
 
 def sweeps(out: Path, data: Path, workers: int | None) -> None:
@@ -62,7 +62,7 @@ def sweeps(out: Path, data: Path, workers: int | None) -> None:
         write_table(folder / f"{card.name}.csv", tables[card.name])
     write_bytes(folder / "README.md", sweeps_page(cards, tables).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=list(_OTHER_SWEEPS)))
-    typer.echo(f"tables: {folder}")
+    echo(f"tables: {folder}")
 
 
 def claims(out: Path, data: Path, workers: int | None) -> None:
@@ -90,7 +90,7 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     page = folder / "README.md"
     write_bytes(page, claims_page(verdicts, best).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=[*SWEEPS, "points", "degenerate"]))
-    typer.echo(f"claims: {page}")
+    echo(f"claims: {page}")
 
 
 def _claim_tables(
@@ -152,7 +152,7 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
     page = folder / "README.md"
     write_bytes(page, readings_page(holding_settings(judged)).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=list(SWEEPS)))
-    typer.echo(f"readings: {page}")
+    echo(f"readings: {page}")
 
 
 def image_claims(out: Path) -> None:
@@ -164,7 +164,7 @@ def image_claims(out: Path) -> None:
     text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"
     page.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(page, text.encode())
-    typer.echo(f"claims: {page}")
+    echo(f"claims: {page}")
 
 
 def _summary(card: SweepCard, folder: Path, workers: int | None, command: str) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.component_kinds import complete_any, complete_kind
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.components.plugins import Kind, Offer
@@ -39,7 +40,7 @@ def show(
 
     found = [_about(name, each) for each in _kinds_of(name, kind)]
     if json:
-        typer.echo(json_module.dumps(found[0] if len(found) == 1 else found, default=str))
+        echo(json_module.dumps(found[0] if len(found) == 1 else found, default=str))
         return
     for content in found:
         _print(content)

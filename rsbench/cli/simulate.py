@@ -10,6 +10,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -77,7 +78,7 @@ def simulate(
     with results_at(out, scheduler) as place:
         table = run_and_summarise(card, place, processes, command, time_limit_s=time_limit, force=force)
         show(card, table)
-        typer.echo(f"table: {name_of(place / 'summary.csv')}")
+        echo(f"table: {name_of(place / 'summary.csv')}")
 
 
 def run_and_summarise(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.component_kinds import named
+from rsbench.cli.console import echo
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def solve(
 def _print_example() -> None:
     from rsbench.pipeline.problem import EXAMPLE
 
-    typer.echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
+    echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
 
 
 def _tell(found: Iterator[dict[str, Any] | RsbenchError], json: bool) -> int:
@@ -98,11 +99,11 @@ def _tell(found: Iterator[dict[str, Any] | RsbenchError], json: bool) -> int:
     for answer in found:
         if isinstance(answer, RsbenchError):
             wrong += 1
-            typer.echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
+            echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
             continue
         failed += not answer["success"]
         if json:
-            typer.echo(json_module.dumps(answer, allow_nan=False))
+            echo(json_module.dumps(answer, allow_nan=False))
         else:
             answers.append(answer)
     _show(answers)
@@ -145,27 +146,27 @@ def _show(answers: list[dict[str, Any]]) -> None:
         _show_one(answers[0])
     elif is_quiet():
         for row in rows:
-            typer.echo("\t".join(row.values()))
+            echo("\t".join(row.values()))
     elif rows:
         print_rows("", list(rows[0]), [list(row.values()) for row in rows], right=("rotation", "inliers", "ms"))
 
 
 def _show_one(answer: dict[str, Any]) -> None:
     if not answer["success"]:
-        typer.echo(f"no estimate: {answer['reason']}", err=True)
+        echo(f"no estimate: {answer['reason']}", err=True)
         return
     whose = {"body": "the middle of the baseline", "left": "the left camera"}[answer["reference_point"]]
     unit = "m per frame" if answer["metric"] else "(direction only)"
-    typer.echo(f"w  {_vector(answer['w'])} rad per frame ({_degrees(answer['w']):.4f} deg)")
-    typer.echo(f"d  {_vector(answer['d'])} {unit}, of {whose}")
-    typer.echo(f"inliers: {answer['inliers']} of {answer['matches']} matches")
-    typer.echo(f"assumes: {answer['motion_model']} motion, {answer['shutter']} shutter; {answer['assumes']}")
+    echo(f"w  {_vector(answer['w'])} rad per frame ({_degrees(answer['w']):.4f} deg)")
+    echo(f"d  {_vector(answer['d'])} {unit}, of {whose}")
+    echo(f"inliers: {answer['inliers']} of {answer['matches']} matches")
+    echo(f"assumes: {answer['motion_model']} motion, {answer['shutter']} shutter; {answer['assumes']}")
     if "readout" in answer:
-        typer.echo(f"readout: {_readout(answer)}")
+        echo(f"readout: {_readout(answer)}")
     if answer.get("model_choice"):
-        typer.echo(f"motion model: {answer['model_choice']['text']}")
+        echo(f"motion model: {answer['model_choice']['text']}")
     if answer["reason"]:
-        typer.echo(f"note: {answer['reason']}")
+        echo(f"note: {answer['reason']}")
 
 
 def _readout(answer: dict[str, Any]) -> str:

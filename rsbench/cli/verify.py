@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -93,7 +94,7 @@ def _reference_faults(folder: Path) -> list[str]:
     same = sum(each.same for each in found)
     faults = [f"{each.name}: {each.fault}" for each in found if each.fault]
     alike = len(found) - same - len(faults)
-    typer.echo(f"reference copy: {same} of {len(found)} sequences have its bytes, {alike} are alike")
+    echo(f"reference copy: {same} of {len(found)} sequences have its bytes, {alike} are alike")
     return faults
 
 
@@ -136,8 +137,8 @@ def _verify_ours(
         say(note)
     faults = more + [f"{report.name}: {fault}" for report in reports for fault in report.faults]
     for fault in faults:
-        typer.echo(f"fault: {fault}", err=True)
-    typer.echo(f"{folder}: {sum(report.name != DATASET for report in reports)} sequences, {len(faults)} faults")
+        echo(f"fault: {fault}", err=True)
+    echo(f"{folder}: {sum(report.name != DATASET for report in reports)} sequences, {len(faults)} faults")
     if faults:
         raise typer.Exit(1)
 
@@ -176,8 +177,8 @@ def _verify_others(folder: Path, layout: str) -> None:
         columns = ["recording", "seen", "count", f"within {NEAR_PX:g} px (%)", "typical (px)"]
         print_rows("Features where cameras and poses say", columns, seen, right=columns[2:])
     for fault in faults:
-        typer.echo(f"fault: {fault}", err=True)
-    typer.echo(f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
+        echo(f"fault: {fault}", err=True)
+    echo(f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
     if faults:
         raise typer.Exit(1)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.component_kinds import complete
+from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.dataset.sequence import Sequence
@@ -64,7 +65,7 @@ def view(
     with late_progress("showing") as advance:
         for each in chosen:
             _show(_scene(each, points, features), save, advance)
-    typer.echo(f"{save}: {chosen[0].name}" if save is not None else "sent to the viewer")
+    echo(f"{save}: {chosen[0].name}" if save is not None else "sent to the viewer")
 
 
 def _has_screen() -> bool:

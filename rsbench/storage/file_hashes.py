@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import sha256
 from rsbench.storage.work_folder import HIDDEN
 
@@ -36,8 +37,13 @@ class FileHashes:
             root: the folder.
             store: where hashes are kept; need not exist.
             rehash: forget what is kept.
+
+        Raises:
+            RsbenchError: the store is there and is no regular file: a named pipe, a link, a folder.
         """
         self._root, self._store = root, store
+        if os.path.lexists(store) and not stat.S_ISREG(store.lstat().st_mode):
+            raise RsbenchError(f"{store}: is not a regular file; remove it")
         if rehash:
             store.unlink(missing_ok=True)
         self._known = _read(store)

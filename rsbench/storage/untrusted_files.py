@@ -36,6 +36,8 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
 """Names that become folders: of sequences, in cards and in what they were rendered to."""
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)
 """What Windows takes for a device, with any ending, and names whose last dot it drops."""
+_OPEN = re.compile(r"/dev/[^/]+|/dev/fd/\d+|/proc/[^/]+(/task/\d+)?/fd/\d+")
+"""Devices, and what a process has open; folders such as /dev/shm hold files of anybody."""
 _KINDS = "biufU"
 _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
@@ -96,7 +98,7 @@ def inside(folder: Path, relative: str) -> Path:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file, or what a process has open already (below /dev and /proc), for reading bytes.
+    """Open a regular file, or what a process has open already (``_OPEN``), for reading bytes.
 
     Raises:
         OSError: it cannot be opened, or is a named pipe, a socket or a device, on which a read may never end.
@@ -104,7 +106,7 @@ def open_regular(path: Path) -> BinaryIO:
     file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  the caller closes it
     mode = os.fstat(file.fileno()).st_mode
     if not stat.S_ISREG(mode):
-        if not os.path.abspath(path).startswith(("/dev/", "/proc/")):
+        if not _OPEN.fullmatch(os.path.abspath(path)):
             file.close()
             raise OSError(errno.EINVAL, f"it is {_kind_of(mode)}; give a regular file")
         os.set_blocking(file.fileno(), True)

@@ -145,6 +145,8 @@ def _take(out: Path, hidden: Path) -> int:
                 continue
             raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another folder") from error
         try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise RsbenchError(f"{hidden / LOCK}: is not a regular file; remove it")
             _claim(out, descriptor)
             if _is_at(hidden / LOCK, descriptor):
                 return descriptor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,9 @@ __all__ = [
     "verify_sequence",
 ]
 
+MOST_FAULTS = 1000
+"""Of one sequence that are reported one by one: its manifests may list any number of files."""
+
 
 def verify_dataset(
     folder: Path,
@@ -51,7 +53,7 @@ def verify_dataset(
 
     Returns:
         One report per sequence; before them one named dataset.json where that has faults of its own, and one for
-        each of the first ``MOST_MISSING`` sequences that have no folder.
+        each of the first ``MOST_MISSING`` sequences that have no folder or an empty one.
 
     Raises:
         ValueError: ``stride``, ``rerender`` or ``workers`` is none of the allowed.
@@ -68,9 +70,9 @@ def verify_dataset(
     run_stage(state, "dataset")
     reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
     options = stride, rerender, *_cards_and_files(scenes)
-    missing = dict(manifest_checks.missing_sequences(listing))
-    reports += [SequenceReport(name=name, findings=(finding,)) for name, finding in missing.items()]
-    names = [name for name in listing.names if os.path.isdir(folder / name)]
+    missing = manifest_checks.missing_sequences(listing)
+    reports += [SequenceReport(name=name, findings=(each,)) for name, each in missing.items() if each is not None]
+    names = [name for name in listing.names if name not in missing]
     if workers == 1 or len(names) < 2:
         check = _checker(folder, *options, step)
         return reports + [check(name) for name in names]
@@ -138,4 +140,6 @@ def verify_sequence(
     for _ in range(steps):
         step(name)
     findings, agreements = tuple(dict.fromkeys(state.findings)), tuple(state.agreements.values())
+    if more := len(findings[MOST_FAULTS:]):
+        findings = *findings[:MOST_FAULTS], Finding(f"{name}/", f"{more} more faults of this sequence")
     return SequenceReport(name=name, findings=findings, agreements=agreements, notes=tuple(state.notes))

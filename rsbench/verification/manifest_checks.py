@@ -7,6 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from reprlib import repr as shortened
 from typing import Any
@@ -16,7 +17,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.croissant import CROISSANT, croissant_of
-from rsbench.dataset.layout import RELATIVE_FILES, files_of
+from rsbench.dataset.layout import files_of
 from rsbench.dataset.manifest import DATASET, says
 from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, sequence_manifest
 from rsbench.renderers.options import RendererOptions
@@ -107,13 +108,28 @@ def _name_faults(names: object) -> Iterator[Finding]:
         yield Finding(DATASET, f"sequences: named twice: {_some(twice)}")
 
 
-def missing_sequences(listing: Listing) -> Iterator[tuple[str, Finding]]:
-    """Sequences without a folder, a finding each for the first of them, and the last one with how many more."""
-    missing = [name for name in listing.names if not os.path.isdir(listing.folder / name)]
-    for number, name in enumerate(missing[:MOST_MISSING], start=1):
-        more = len(missing) - MOST_MISSING if number == MOST_MISSING else 0
+def missing_sequences(listing: Listing) -> dict[str, Finding | None]:
+    """Sequences without a folder, or with an empty one, in the order of the list.
+
+    The first ``MOST_MISSING`` have a finding each; the last of these says how many more there are.
+    """
+    found: dict[str, Finding | None] = dict.fromkeys(name for name in listing.names if _is_empty(listing, name))
+    more = len(found) - MOST_MISSING
+    for number, name in enumerate(islice(found, MOST_MISSING), start=1):
         rest = f"; {more} more sequences of {DATASET} are missing likewise" if more > 0 else ""
-        yield name, Finding(f"{name}/", f"{MISSING}: no such folder in the dataset{rest}")
+        words = f"{MISSING}: no such folder in the dataset, or an empty one"
+        found[name] = Finding(f"{name}/", words + (rest if number == MOST_MISSING else ""))
+    return found
+
+
+def _is_empty(listing: Listing, name: str) -> bool:
+    try:
+        with os.scandir(f"{listing.folder}/{name}") as entries:
+            return next(entries, None) is None
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False  # the reader says why
 
 
 def _listing_faults(listing: Listing) -> Iterator[Finding]:
@@ -181,9 +197,9 @@ def file_faults(listing: Listing, name: str) -> Iterator[Finding]:
         entry = listed.get(relative)
         if relative not in own and relative != "sequence.json" and not fault:
             yield Finding(f"{below}sequence.json", f"files does not list {relative}")
-        if entry is None:
+        if entry is None and (own or not fault):
             yield Finding(below + relative, "not listed in dataset.json")
-        else:
+        elif entry is not None:
             yield from _content_faults(folder, below + relative, entry, own.get(relative))
 
 
@@ -192,7 +208,7 @@ def _own_files(folder: Path) -> tuple[dict[str, object], tuple[str, ...], Findin
     try:
         manifest = read_json(inside(folder, "sequence.json"))
     except RsbenchError as error:
-        return {}, RELATIVE_FILES, Finding.of(error)
+        return {}, (), Finding.of(error)
     files, needed = manifest.get("files"), files_of(manifest)
     if not isinstance(files, dict) or not files:
         return (

@@ -79,7 +79,8 @@ class State:
         """Some sequences of the dataset, the nearest in the list first."""
         names = self.listing.names
         place = names.index(self.name)
-        near = sorted(range(len(names)), key=lambda other: abs(other - place))[1 : _MOST_ELSEWHERE + 1]
+        around = range(max(place - _MOST_ELSEWHERE, 0), min(place + _MOST_ELSEWHERE + 1, len(names)))
+        near = sorted(around, key=lambda other: abs(other - place))[1 : _MOST_ELSEWHERE + 1]
         for other in near:
             with contextlib.suppress(RsbenchError):
                 yield read_sequence(self.listing.folder / names[other])

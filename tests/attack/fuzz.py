@@ -1,5 +1,7 @@
 """Mutated inputs through every loader: each is read, or refused in one line that names the file.
 
+First each loader meets what is no regular file in place of its own, and valid files that hold too much.
+
 Loaders run in forked children of limited memory; one that crashes or hangs is named by the number of its input.
 Input ``number`` of a loader is the same in every run with the same seed.
 """
@@ -12,10 +14,11 @@ import os
 import resource
 import select
 import signal
+import socket
 import time
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -32,13 +35,36 @@ MEMORY_MB = 2048
 BLOCK = 50
 """Inputs of one child; those of a block are all changed bytes or all broken trees."""
 
+_BESIDE = "a-pipe"
+
+
+def _bind(path: Path) -> None:
+    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as bound:  # a name of 108 bytes at most
+        bound.bind(path.name)
+
+
+def _link_to_pipe(path: Path) -> None:
+    os.mkfifo(path.with_name(_BESIDE))
+    path.symlink_to(_BESIDE)
+
+
+STRANGE: tuple[Callable[[Path], object], ...] = (
+    os.mkfifo,
+    _link_to_pipe,
+    _bind,
+    Path.mkdir,
+    lambda path: path.symlink_to("/dev/zero"),
+)
+"""What makes something else than a regular file."""
+
 
 def attack(loaders: list[Loader], count: int, seed: int, keep: Path) -> Tally:
     """``count`` inputs or a few more; those at fault are left in ``keep``."""
     tally = Tally()
     weights = [0.1 if loader.slow else 1.0 for loader in loaders]
     for loader, weight in zip(loaders, weights, strict=True):
-        share = math.ceil(count * weight / sum(weights))
+        share, special = math.ceil(count * weight / sum(weights)), len(STRANGE) + len(loader.huge)
+        _block(loader, -special, special, seed, keep, tally)
         for first in range(0, share, BLOCK):
             _block(loader, first, min(BLOCK, share - first), seed, keep, tally)
     return tally
@@ -107,7 +133,7 @@ def _serve(loader: Loader, first: int, size: int, done: int, seed: int, keep: Pa
                 continue
             os.write(writer, f"at {number}\n".encode())
             word, text = _outcome(loader, data)
-            if word not in ("read", "refused"):
+            if word not in ("read", "refused") and isinstance(data, bytes):
                 name = f"{loader.name.replace(' ', '-')}-{seed}-{first + number}{loader.path.suffix}"
                 (keep / name).write_bytes(data)
             os.write(writer, f"{word} {' '.join(text.split())}\n".encode())
@@ -122,12 +148,16 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _inputs(loader: Loader, first: int, size: int, seed: int) -> list[tuple[int, bytes]]:
-    """The inputs of a block, with their numbers in it."""
+def _inputs(
+    loader: Loader, first: int, size: int, seed: int
+) -> list[tuple[int, bytes | Callable[[Path], object]]]:
+    """The inputs of a block, with their numbers in it; those before the first one are not drawn."""
+    if first < 0:
+        return list(enumerate((*STRANGE, *loader.huge)))
     rng = np.random.default_rng([seed, zlib.crc32(loader.name.encode()), first])
     if loader.trees and (first // BLOCK) % 2 == 1:
         return list(enumerate(_broken_trees(loader, size, int(rng.integers(2**31)))))
-    out = []
+    out: list[tuple[int, bytes | Callable[[Path], object]]] = []
     for number in range(size):
         data = loader.seeds[int(rng.integers(len(loader.seeds)))]
         out.append((number, loader.change(data, loader.seeds, rng)))
@@ -154,11 +184,24 @@ def _broken_trees(loader: Loader, size: int, seed: int) -> list[bytes]:
     return found
 
 
-def _outcome(loader: Loader, data: bytes) -> tuple[str, str]:
+def _put(path: Path, data: bytes | Callable[[Path], object]) -> None:
+    """Write a file, or make something else, in place of what lies there."""
+    path.with_name(_BESIDE).unlink(missing_ok=True)
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    else:
+        path.unlink(missing_ok=True)
+    if isinstance(data, bytes):
+        path.write_bytes(data)
+    else:
+        data(path)
+
+
+def _outcome(loader: Loader, data: bytes | Callable[[Path], object]) -> tuple[str, str]:
     """How a loader takes an input: read, refused, or at fault."""
     from rsbench.core.errors import RsbenchError
 
-    loader.path.write_bytes(data)
+    _put(loader.path, data)
     start = time.monotonic()
     try:
         loader.load(loader.path)

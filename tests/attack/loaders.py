@@ -8,7 +8,7 @@ import math
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,18 @@ import numpy as np
 
 from attack.mutations import mutated, mutated_npz, mutated_png
 from attack.tiny import ROOT, to_toml
+
+VERIFIED = (
+    "dataset.json",
+    "one/sequence.json",
+    "one/poses/left_0.csv",
+    "one/rs/left_0.png",
+    "one/rs_depth/left_0.exr",
+)
+"""Files of a dataset that are changed before all of it is verified."""
+NAMES = 20_000
+MOST_FAULTS = 2500
+"""Of a dataset of two sequences."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +46,8 @@ class Loader:
     """The seeds as trees, where they are."""
     write: Callable[[Any], str] = json.dumps
     """Makes a file of a tree."""
+    huge: tuple[bytes, ...] = ()
+    """Valid text of its kind with more than anybody needs; each is tried once."""
     slow: bool = False
     """Whether it works for a tenth of a second or more, and gets a tenth of the inputs of others."""
 
@@ -118,9 +132,22 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
 
     data = folder / "data"
     shutil.copytree(inputs / "data", data)
-    yield _json(
+    huge = _many_names(json.loads((data / "dataset.json").read_bytes()))
+    manifest = _json(
         "dataset.json", data / "dataset.json", lambda path: _inside(read_dataset(path.parent), path.parent)
     )
+    yield replace(manifest, huge=huge)
+    for number, name in enumerate(VERIFIED):
+        path = folder / f"verified-{number}" / name
+        shutil.copytree(inputs / "data", folder / f"verified-{number}")
+        yield Loader(
+            name=f"verify {name}",
+            path=path,
+            seeds=(path.read_bytes(),),
+            load=partial(_verify, folder / f"verified-{number}"),
+            huge=huge if name == "dataset.json" else (),
+            slow=True,
+        )
     data = folder / "sequence"
     shutil.copytree(inputs / "data" / "one", data)
     yield _json("sequence.json", data / "sequence.json", lambda path: read_sequence(path.parent))
@@ -141,6 +168,29 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
         name="matches", path=files / "matches.npz", seeds=(matches,), load=load_matches, change=mutated_npz
     )
     yield Loader(name="arrays", path=files / "arrays.npz", seeds=(matches,), load=load_arrays, change=mutated_npz)
+
+
+def _verify(data: Path, path: Path) -> None:
+    """A fault for every file or so, and not for every name."""
+    from rsbench.verification import verify_dataset
+
+    faults = sum(len(report.faults) for report in verify_dataset(data))
+    if faults > MOST_FAULTS:
+        raise AssertionError(f"{faults} faults")
+
+
+def _many_names(manifest: dict[str, Any]) -> tuple[bytes, ...]:
+    """A dataset.json of very many names: of nothing, of folders elsewhere, of one folder, no names."""
+    name = manifest["sequences"][0]
+    lists: tuple[list[object], ...] = (
+        [*manifest["sequences"], *(f"s{number}" for number in range(NAMES))],
+        [f"../{number}" for number in range(NAMES)],
+        [name] * NAMES,
+        [[name]] * NAMES,
+    )
+    files = manifest["files"] | {f"{name}/{number}.png": "0" * 64 for number in range(NAMES)}
+    changes = [*({"sequences": each} for each in lists), {"files": files}]
+    return tuple(json.dumps(manifest | change).encode() for change in changes)
 
 
 def _sky(path: Path) -> bytes:

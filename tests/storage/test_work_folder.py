@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rsbench.core.errors import RsbenchError
+from rsbench.storage.file_hashes import FileHashes
 from rsbench.storage.work_folder import HIDDEN, WORK, files_below, listed, remove, unknown_files, work_folder
 
 HOLDS = """
@@ -134,6 +135,39 @@ def test_a_hidden_folder_of_somebody_else_is_left_alone(tmp_path: Path, kind: st
         pass
     found = out / HIDDEN if kind == "file" else out / HIDDEN / "diary"
     assert found.read_text() == "dear"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("kind", ["pipe", "link to a pipe", "link"])
+def test_hidden_files_are_regular(tmp_path: Path, kind: str) -> None:
+    """A folder of results may be a stranger's: no command waits for a pipe there or writes through a link."""
+    hidden, other = tmp_path / HIDDEN, tmp_path / "other"
+    hidden.mkdir()
+    for store in (hidden / "hashes.jsonl", hidden / "lock"):
+        pipe = store if kind == "pipe" else other
+        if kind == "link":
+            other.write_text("mine")
+        else:
+            os.mkfifo(pipe)
+            threading.Thread(
+                target=lambda place=pipe: place.open("wb").close(), daemon=True
+            ).start()  # or none ends
+        if kind != "pipe":
+            store.symlink_to(other)
+        with pytest.raises(RsbenchError) as caught:
+            if store.name == "lock":
+                with work_folder(tmp_path):
+                    pass
+            else:
+                FileHashes(tmp_path, store)
+        assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+        if kind == "pipe":
+            assert str(caught.value) == f"{store}: is not a regular file; remove it"
+        if kind == "link":
+            assert other.read_text() == "mine"
+        else:
+            os.close(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))  # the thread goes
+        other.unlink(missing_ok=True)
 
 
 def test_links_are_removed_and_not_followed(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,16 @@ def test_what_a_process_has_open_is_read(dataset: Path) -> None:
     assert "it is a named pipe; give a regular file" in refusal(lambda: read_bytes(dataset / "pipe"))
 
 
+@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="needs /dev/shm")
+def test_a_folder_below_dev_holds_files_of_anybody() -> None:
+    """In memory, where datasets lie for speed, a pipe is refused as elsewhere."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        os.mkfifo(pipe := Path(folder) / "poses.csv")
+        assert refusal(lambda: read_bytes(pipe)) == (
+            f"{pipe}: cannot be read: it is a named pipe; give a regular file"
+        )
+
+
 @pytest.mark.slow
 def test_sequences_that_are_not_there_are_counted(dataset: Path) -> None:
     """As many lines for 300 000 names as for 300, in a time that does not grow with their square."""
@@ -170,6 +181,47 @@ def test_sequences_that_are_not_there_are_counted(dataset: Path) -> None:
     change(dataset / "dataset.json", "sequences", ["planes", *(f"../{name}" for name in names)])
     lines = [line for report in verify_dataset(dataset) for line in report.faults]
     assert any("not the name of a folder in it: '../s0', '../s1'" in line for line in lines) and len(lines) < 10
+
+
+@pytest.mark.parametrize("what", ["empty", "pipe", "no JSON"])
+def test_a_sequence_that_cannot_be_read_is_one_fault(dataset: Path, what: str) -> None:
+    """Not one for each file that it might have had."""
+    names = [f"s{number}" for number in range(150)]
+    for name in names:
+        (dataset / name).mkdir()
+        if what == "pipe":
+            os.mkfifo(dataset / name / "sequence.json")
+        elif what == "no JSON":
+            (dataset / name / "sequence.json").write_text("{")
+    change(dataset / "dataset.json", "sequences", ["planes", *names])
+    reports = verify_dataset(dataset)
+    found = {report.name: report.faults for report in reports if report.name in names}
+    assert {len(faults) for faults in found.values()} == {1}
+    assert len(found) == (100 if what == "empty" else 150)
+    if what == "empty":
+        assert found["s99"][0].endswith("; 50 more sequences of dataset.json are missing likewise")
+
+
+def test_files_that_are_not_there_are_counted(dataset: Path) -> None:
+    """A manifest may list any number of them; two faults each, for sequence.json does not list them either."""
+    files = json.loads((dataset / "dataset.json").read_text())["files"]
+    more = {f"planes/{number}.png": {"sha256": "0" * 64, "size": 1} for number in range(2000)}
+    change(dataset / "dataset.json", "files", files | more)
+    faults = next(report.faults for report in verify_dataset(dataset) if report.name == "planes")
+    assert len(faults) == 1001 and faults[-1] == "planes/: 3000 more faults of this sequence"
+
+
+def test_faults_move_no_cursor(dataset: Path) -> None:
+    """Names of a stranger's manifest are shown as text."""
+    files = json.loads((dataset / "dataset.json").read_text())["files"]
+    strange = {"planes/\x1b[2J\x07.png": {"sha256": "0" * 64, "size": 1}, "x\x9b\r.png": {}}
+    change(dataset / "dataset.json", "files", files | strange)
+    ran = run_here("verify", dataset, "--rerender", "no")
+    assert r"planes/\x1b[2J\x07.png: missing" in ran.stderr and r"none of its sequences: x\x9b\r.png" in ran.stderr
+    assert not {"\x1b", "\x07", "\x9b", "\r"} & set(
+        "".join(each for each in ran.stderr.splitlines() if "fault" in each)
+    )
+    assert "\x07" not in ran.stderr and "\x9b" not in ran.stderr
 
 
 def test_links_within_a_dataset_are_followed(dataset: Path) -> None:
