@@ -52,8 +52,8 @@ def refuse_reserved(header: Header, where: str) -> None:
     own = {*_ORACLES, *_BUILT_IN, *METHODS, *(name for kind in kinds for name in list_cards(kind))}
     if outline(method) in {outline(name) for name in own}:
         raise RsbenchError(
-            f"{where}: method = {method!r}: is the name of a method of rsbench; choose another, such as "
-            f"'{method}-mine'"
+            f"{where}: method = {method!r}: is the name of a method of rsbench, or looks like it; choose another, "
+            f"such as '{method}-mine'"
         )
     if ORACLE in header.uses:
         raise RsbenchError(
