@@ -33,11 +33,11 @@ def is_quiet() -> bool:
     return _quiet
 
 
-def echo(text: str, err: bool = False, nl: bool = True) -> None:
+def echo(text: str | None, err: bool = False, nl: bool = True) -> None:
     """Results on stdout, or faults and notes on stderr; control characters of what others wrote are escaped."""
     import typer
 
-    typer.echo(printable(text), err=err, nl=nl)
+    typer.echo(printable(text or ""), err=err, nl=nl)
 
 
 def say(note: str) -> None:

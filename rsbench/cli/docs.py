@@ -29,7 +29,7 @@ def docs(
     if name is not None:
         if name not in documents:
             raise RsbenchError(f"document {name!r} does not exist{choices(name, documents)}")
-        echo(documents[name])
+        echo(str(documents[name]))
         return
     import pandas as pd
 

@@ -218,9 +218,6 @@ def test_faults_move_no_cursor(dataset: Path) -> None:
     change(dataset / "dataset.json", "files", files | strange)
     ran = run_here("verify", dataset, "--rerender", "no")
     assert r"planes/\x1b[2J\x07.png: missing" in ran.stderr and r"none of its sequences: x\x9b\r.png" in ran.stderr
-    assert not {"\x1b", "\x07", "\x9b", "\r"} & set(
-        "".join(each for each in ran.stderr.splitlines() if "fault" in each)
-    )
     assert "\x07" not in ran.stderr and "\x9b" not in ran.stderr
 
 
