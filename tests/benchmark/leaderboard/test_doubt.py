@@ -138,6 +138,16 @@ def test_every_error_is_judged_and_a_tenth_is_enough(tmp_path: Path) -> None:
     assert scored.doubt.startswith("e_R_deg is below 1e-05, exact but for rounding, in 0.")
 
 
+def test_the_truth_of_the_last_problems_is_in_doubt_too(tmp_path: Path) -> None:
+    """As attacked: bad motions in the first 50 of 250 problems, and errors of 1e-4 deg in all others."""
+    split = small_split(250)
+    lines = handed(truth_lines(split), "mine", "left", "right", "links", "readout")
+    bad, near = (_erring(_erring(lines, "w", size), "d", size) for size in (0.03, 2e-6))
+    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", [*bad[:51], *near[51:]]), split, {})
+    assert np.mean(scored.scores["e_R_deg"] < 1e-5) < 0.1 and scored.scores["auc_5"].mean() > 0.8
+    assert scored.doubt.startswith("e_R_deg is below the median at the Cramer-Rao bound of left + right + links")
+
+
 def test_the_commands_say_it(tmp_path: Path) -> None:
     file = write(tmp_path / "a.jsonl", named(truth_lines(points_split(TRACKS["points"])), "mine"))
     text = file.read_text("utf-8").replace('"truth"', '"left"', 1)
