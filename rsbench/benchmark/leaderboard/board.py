@@ -254,7 +254,9 @@ def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
     scores = read_table(folder / FILES[1], columns, numbers, dtype={"problem": str, "scene": str})
     shares = scores[list(track.of_kind("share"))].to_numpy()
     means = scores[list(track.of_kind("mean"))].to_numpy(dtype=np.float64)
-    right = np.all((shares >= 0.0) & (shares <= 1.0)) and np.all(np.isfinite(means))
+    right = np.all((shares >= 0.0) & (shares <= 1.0)) and np.all(np.isfinite(means)) and not scores.empty
+    if "nees" in scores and not pd.api.types.is_numeric_dtype(scores["nees"]):
+        right = False
     if scores["problem"].duplicated().any() or not right:
         raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
     return scores

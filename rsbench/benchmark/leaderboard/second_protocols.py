@@ -245,7 +245,7 @@ class SkilledReadout(DrawnReadout):
 
 
 def crps(error: float, sigma: float) -> float:
-    """Continuous ranked probability score of a Gaussian; ``abs(error)`` where ``sigma`` is 0, or too small beside it.
+    """Continuous ranked probability score of a Gaussian; ``abs(error)`` where ``sigma`` is 0 or far smaller.
 
     It is the integrated squared distance of the Gaussian's distribution function from the step at the truth, by
     the closed form of Gneiting and Raftery (JASA 2007, section 4.2).

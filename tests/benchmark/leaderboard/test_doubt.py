@@ -154,12 +154,23 @@ def test_no_other_board_accepts_an_entry(tmp_path: Path) -> None:
     theirs, ours = tmp_path / "theirs", tmp_path / "ours"
     scored = add(theirs, write(tmp_path / "a.jsonl", handed(truth_lines(SMALL), "mine", "left")), SMALL, {})
     record = json.loads((scored.folder / "entry.json").read_text("utf-8"))
-    (scored.folder / "entry.json").write_text(json.dumps(record | {"doubt": "", "accepted": "believe me"}), "utf-8")
+    (scored.folder / "entry.json").write_text(
+        json.dumps(record | {"doubt": "", "accepted": "believe me"}), "utf-8"
+    )
     assert merge(theirs, ours) == [f"points-1/{SMALL.name}/mine"]
     assert rescore(ours, SMALL) == {}
     (line,) = standings(entries_of(ours, "points-1", SMALL.name))
     assert line.rank is None and line.rank_words == "in doubt"
     assert merge(theirs, ours) == []
+
+
+def test_links_alone_are_not_all_that_a_method_uses(tmp_path: Path) -> None:
+    """As attacked: an entry that names links alone would have no peers, and the loosest of all bounds."""
+    file = write(tmp_path / "a.jsonl", handed(truth_lines(SMALL), "mine", "links", "readout"))
+    with pytest.raises(
+        RsbenchError, match=r"a.jsonl:1: uses = 'links' without 'left' or 'right': .* name the matches"
+    ):
+        add(tmp_path / "board", file, SMALL, {})
 
 
 def test_the_commands_say_it(tmp_path: Path) -> None:

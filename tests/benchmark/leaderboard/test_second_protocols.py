@@ -257,10 +257,10 @@ def test_a_score_that_is_no_number_is_damage(tmp_path: Path) -> None:
     header = {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
     file = add(tmp_path / "board", write(tmp_path / "a.jsonl", [header, *lines]), split, {}).folder / "scores.csv"
     table = pd.read_csv(file)
-    for value in (-np.inf, np.nan):
-        table.loc[0, "skill"] = value
-        table.to_csv(file, index=False)
-        with pytest.raises(RsbenchError, match="scores.csv: is damaged"):
+    bad = [table.assign(skill=-np.inf), table.assign(skill=np.nan), table.assign(nees="a"), table[:0]]
+    for each in bad:
+        each.to_csv(file, index=False)
+        with pytest.raises(RsbenchError, match=r"scores\.csv: is damaged"):
             entries_of(tmp_path / "board", split.track.id, split.name)
 
 
