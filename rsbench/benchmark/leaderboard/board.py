@@ -253,7 +253,11 @@ def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
     numbers = (*(score.key for score in track.scores), track.error)
     scores = read_table(folder / FILES[1], columns, numbers, dtype={"problem": str, "scene": str})
     shares = scores[list(track.of_kind("share"))].to_numpy()
-    if scores["problem"].duplicated().any() or not np.all((shares >= 0.0) & (shares <= 1.0)):
+    means = scores[list(track.of_kind("mean"))].to_numpy(dtype=np.float64)
+    right = np.all((shares >= 0.0) & (shares <= 1.0)) and np.all(np.isfinite(means)) and not scores.empty
+    if "nees" in scores and not pd.api.types.is_numeric_dtype(scores["nees"]):
+        right = False
+    if scores["problem"].duplicated().any() or not right:
         raise RsbenchError(f"{folder / FILES[1]}: is damaged; rsbench leaderboard rescore makes it again")
     return scores
 

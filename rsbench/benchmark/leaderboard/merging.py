@@ -19,14 +19,15 @@ from rsbench.benchmark.leaderboard.board import (
 )
 from rsbench.benchmark.leaderboard.picture_files import copy_files
 from rsbench.storage.files import write_bytes, write_json
-from rsbench.storage.untrusted_files import read_bytes
+from rsbench.storage.untrusted_files import read_bytes, read_json
 from rsbench.storage.work_folder import WORK, work_folder
 
 
 def merge(other: Path, board: Path) -> list[str]:
     """Copy the entries of another board that are not here yet; returns what was copied.
 
-    Scores are copied as they are: ``rescore`` tells whether the truth agrees.
+    Scores are copied as they are: ``rescore`` tells whether the truth agrees. What the keeper of the other board
+    accepted is in doubt again: the keeper of this one decides.
 
     Raises:
         RsbenchError: an entry of one name has two predictions; one of the boards is none, or damaged.
@@ -60,4 +61,6 @@ def _copy(scored: Scored, new: Path) -> None:
     new.mkdir(parents=True)
     for name in FILES:
         write_bytes(new / name, read_bytes(scored.folder / name))
+    if "accepted" in (record := read_json(new / FILES[2])):
+        write_json(new / FILES[2], {key: value for key, value in record.items() if key != "accepted"})
     check_files(scored.folder, scored.files, copy_files(scored.folder, scored.files, new))

@@ -53,8 +53,6 @@ SUCCESS_DEG = (1.0, 5.0)
 """A success errs by less in rotation and direction, as in the sweeps of simulated points."""
 BOUND = "cramer-rao"
 """Name of the entry whose errors are drawn from the bound."""
-_HELD = 100
-"""Problems in which a method is held against the bound of its data."""
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
 MOTION = (
@@ -154,9 +152,7 @@ class PointsTrack(MotionTrack):
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
         pairs = "both" if {"left", "right"} <= set(uses) else "left"
         seen = "links" if "links" in uses else pairs
-        held = bound_medians(self.draws, split.seed, min(len(split.truths), _HELD), seen)
-        rest = np.full(len(split.truths) - len(held["e_R_deg"]), np.inf)
-        return {name: np.concatenate([values, rest]) for name, values in held.items()}
+        return bound_medians(self.draws, split.seed, len(split.truths), seen)
 
     def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
         yield from super().oracles(split, folder)

@@ -239,19 +239,20 @@ class SkilledReadout(DrawnReadout):
             row["skill"] = 1.0 - crps(off, sigma or 0.0) / spread
             row["right" if abs(off) <= RIGHT else "wrong"] = 1.0
             if sigma is not None:
-                row["nees"] = (off / sigma) ** 2 if sigma > 0.0 else math.inf
+                z = off / sigma if sigma > 0.0 else math.inf
+                row["nees"] = z * z  # z ** 2 raises an error where it overflows
         return rows
 
 
 def crps(error: float, sigma: float) -> float:
-    """Continuous ranked probability score of a Gaussian; ``abs(error)`` at ``sigma`` 0.
+    """Continuous ranked probability score of a Gaussian; ``abs(error)`` where ``sigma`` is 0 or far smaller.
 
     It is the integrated squared distance of the Gaussian's distribution function from the step at the truth, by
     the closed form of Gneiting and Raftery (JASA 2007, section 4.2).
     """
-    if sigma == 0.0:
+    z = error / sigma if sigma > 0.0 else math.inf
+    if math.isinf(z):
         return abs(error)
-    z = error / sigma
     density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
     return sigma * (z * math.erf(z / math.sqrt(2.0)) + 2.0 * density - 1.0 / math.sqrt(math.pi))
 

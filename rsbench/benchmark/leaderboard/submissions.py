@@ -147,6 +147,10 @@ def _header(text: str, where: str, split: Split) -> Header:
         if is_now != must_be:
             raise RsbenchError(f"{where}: {field} = {is_now!r}: the truth at hand is that of {must_be!r}")
     header.check_uses(split.track, where)
+    if "links" in header.uses and not {"left", "right", "images"} & set(header.uses):
+        raise RsbenchError(
+            f"{where}: uses = 'links' without 'left' or 'right': links join matches of these; name the matches too"
+        )
     return header
 
 

@@ -12,6 +12,7 @@ from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, entries_of, rescore
+from rsbench.benchmark.leaderboard.merging import merge
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
 from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings, table
@@ -136,6 +137,40 @@ def test_every_error_is_judged_and_a_tenth_is_enough(tmp_path: Path) -> None:
     few = _erring(few, "d", 0.03)
     scored = add(tmp_path / "board", write(tmp_path / "b.jsonl", few), SPLIT, {})
     assert scored.doubt.startswith("e_R_deg is below 1e-05, exact but for rounding, in 0.")
+
+
+def test_the_truth_of_the_last_problems_is_in_doubt_too(tmp_path: Path) -> None:
+    """As attacked: bad motions in the first 50 of 250 problems, and errors of 1e-4 deg in all others."""
+    split = small_split(250)
+    lines = handed(truth_lines(split), "mine", "left", "right", "links", "readout")
+    bad, near = (_erring(_erring(lines, "w", size), "d", size) for size in (0.03, 2e-6))
+    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", [*bad[:51], *near[51:]]), split, {})
+    assert np.mean(scored.scores["e_R_deg"] < 1e-5) < 0.1 and scored.scores["auc_5"].mean() > 0.8
+    assert scored.doubt.startswith("e_R_deg is below the median at the Cramer-Rao bound of left + right + links")
+
+
+def test_no_other_board_accepts_an_entry(tmp_path: Path) -> None:
+    """A stranger's board: the truth, a doubt that was removed, and an acceptance that its author wrote."""
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    scored = add(theirs, write(tmp_path / "a.jsonl", handed(truth_lines(SMALL), "mine", "left")), SMALL, {})
+    record = json.loads((scored.folder / "entry.json").read_text("utf-8"))
+    (scored.folder / "entry.json").write_text(
+        json.dumps(record | {"doubt": "", "accepted": "believe me"}), "utf-8"
+    )
+    assert merge(theirs, ours) == [f"points-1/{SMALL.name}/mine"]
+    assert rescore(ours, SMALL) == {}
+    (line,) = standings(entries_of(ours, "points-1", SMALL.name))
+    assert line.rank is None and line.rank_words == "in doubt"
+    assert merge(theirs, ours) == []
+
+
+def test_links_alone_are_not_all_that_a_method_uses(tmp_path: Path) -> None:
+    """As attacked: an entry that names links alone would have no peers, and the loosest of all bounds."""
+    file = write(tmp_path / "a.jsonl", handed(truth_lines(SMALL), "mine", "links", "readout"))
+    with pytest.raises(
+        RsbenchError, match=r"a.jsonl:1: uses = 'links' without 'left' or 'right': .* name the matches"
+    ):
+        add(tmp_path / "board", file, SMALL, {})
 
 
 def test_the_commands_say_it(tmp_path: Path) -> None:

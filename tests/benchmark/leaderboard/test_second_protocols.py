@@ -22,6 +22,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from rsbench.benchmark.leaderboard import publishing
+from rsbench.benchmark.leaderboard.adding import add
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.motion_tracks import smooth
@@ -234,6 +235,33 @@ def test_a_wrong_ratio_with_a_small_deviation_is_the_worst_answer(tmp_path: Path
     # Squared errors over the stated variance: 0, and (0.4 / 0.01)^2.
     assert scores["sure and wrong"]["nees"].to_numpy() == pytest.approx(1600.0)
     assert scores["a blind guess"]["nees"].isna().all()
+
+
+@pytest.mark.parametrize("sigma", [1e-200, 1e-310, 5e-324])
+def test_a_deviation_beside_which_errors_overflow_is_scored_as_certain(sigma: float, tmp_path: Path) -> None:
+    split = _without_frames("readout-3")
+    split = replace(split, truths=split.truths[:3])
+    answers = {truth.name: {"readout_ratio": 0.5, "readout_sigma": sigma} for truth in split.truths}
+    scores = _read_out(split, answers, tmp_path)
+    errors = np.abs([truth.shutter.readout_ratio - 0.5 for truth in split.truths])
+    spread = spread_of([truth.shutter.readout_ratio for truth in split.truths])
+    assert scores["skill"].to_numpy() == pytest.approx(1.0 - errors / spread)
+    assert np.all(np.isinf(scores["nees"]))
+    # Where nothing is wrong with the ratio, it is exact whatever is stated.
+    assert crps(0.0, sigma) == pytest.approx(0.0, abs=1e-12) and crps(0.1, sigma) == 0.1
+
+
+def test_a_score_that_is_no_number_is_damage(tmp_path: Path) -> None:
+    split = _without_frames("readout-3")
+    lines = [{"name": truth.name, "readout_ratio": 0.5} for truth in split.truths]
+    header = {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
+    file = add(tmp_path / "board", write(tmp_path / "a.jsonl", [header, *lines]), split, {}).folder / "scores.csv"
+    table = pd.read_csv(file)
+    bad = [table.assign(skill=-np.inf), table.assign(skill=np.nan), table.assign(nees="a"), table[:0]]
+    for each in bad:
+        each.to_csv(file, index=False)
+        with pytest.raises(RsbenchError, match=r"scores\.csv: is damaged"):
+            entries_of(tmp_path / "board", split.track.id, split.name)
 
 
 # What is committed
