@@ -66,7 +66,9 @@ class MotionEstimate:
         for name in ("w", "d"):
             value = real_array(f"{name} of a motion estimate", getattr(self, name))
             if value.shape != (3,) or (self.success and not np.all(np.isfinite(value))):
-                raise ValueError(f"{name} of a motion estimate must be 3 finite numbers, got {shown(value)}")
+                raise ValueError(
+                    f"{name} of a motion estimate must be 3 finite numbers, got {shown(value.tolist())}"
+                )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
