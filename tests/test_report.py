@@ -48,7 +48,8 @@ def medians() -> Iterator[str]:
         return float(np.median(found))
 
     linear, refined = e_T("rs-stereo-linear"), e_T("rs-stereo-refined")
-    yield f"over twenty runs is {linear:.3g} deg, that of `rs-stereo-refined` {refined:.2g} deg"
+    words = "over twenty seeds of its samples, on one frame pair,"
+    yield f"{words} is {linear:.3g} deg, that of `rs-stereo-refined` {refined:.2g} deg"
     wrong = {
         row["solver"]: float(row["e_T_median"])
         for row in table("sweeps/wrong-motion.csv")
