@@ -347,7 +347,7 @@ def test_results_tell_what_laws_cost_readers_of_the_ratio(tmp_path: Path) -> Non
         f"there: {spline[CHOOSES]:.2f}, below a refusal and near a blind constant ({spline['constant']:.2f})"
         in words
     )
-    assert f"intervals of 95 % hold {100.0 * table_of.loc[CHOOSES, 'covers_95']:.0f} %" in words
+    assert f"intervals of 95 % hold {100.0 * float(table_of['covers_95'].to_dict()[CHOOSES]):.0f} %" in words
     split = _without_frames("readout-3")
     restore(LAWS_FOLDER / "predictions" / "readout-3", split, tmp_path / "board")
     (entry,) = (e for e in entries_of(tmp_path / "board", "readout-3", split.name) if e.header.method == CHOOSES)
