@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.studies.fig4_panels import Panels
+from rsbench.benchmark.studies.fig4_panels import LITERAL, Panels
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
 
@@ -27,24 +27,30 @@ INVENTED = (0, 190, 255)
 """Colour of depth where there is no surface; none of the scale's."""
 _COLOURS = 256
 _PIXELS = {"pdf": 210, "jpg": 250}
-_JPEG = {"quality": 84, "subsampling": 0, "optimize": True}
+_JPEG = {"subsampling": 0, "optimize": True}
 _WIDTH_IN, _TEXT_IN, _HEAD_IN, _BAR_IN, _GAP_IN = 7.2, 0.56, 0.2, 0.2, 0.03
 
 
-def draw_fig4(rows: list[tuple[str, Panels]], stem: Path) -> list[Path]:
-    """Draw named rows into ``stem``.pdf and ``stem``.jpg; returns the files. Equal panels give equal bytes."""
+def draw_fig4(rows: list[tuple[str, Panels]], stem: Path, quality: int = 84) -> list[Path]:
+    """Draw named rows into ``stem``.pdf and ``stem``.jpg; returns the files. Equal panels give equal bytes.
+
+    Args:
+        rows: drawn one below the other.
+        stem: of the files' names.
+        quality: of the JPEG, 1 to 95.
+    """
     from matplotlib import rc_context
 
     paths = []
     with rc_context({"font.size": 7, "font.family": "DejaVu Sans", "pdf.fonttype": 42, "svg.hashsalt": "rsbench"}):
         for kind, pixels in _PIXELS.items():
             path = stem.with_suffix(f".{kind}")
-            _draw(rows, path, pixels)
+            _draw(rows, path, pixels, quality)
             paths.append(path)
     return paths
 
 
-def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int) -> None:
+def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int, quality: int) -> None:
     from matplotlib.figure import Figure
 
     side = (_WIDTH_IN - 5 * _GAP_IN) / len(TITLES)
@@ -70,7 +76,7 @@ def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int) -> None:
     if path.suffix == ".pdf":
         figure.savefig(path, metadata={"CreationDate": None})
     else:
-        figure.savefig(path, dpi=pixels / side, pil_kwargs=_JPEG)
+        figure.savefig(path, dpi=pixels / side, pil_kwargs={**_JPEG, "quality": quality})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,16 +140,18 @@ def panel_images(panels: Panels) -> list[Image]:
 def caption(name: str, n: dict[str, Any]) -> tuple[str, ...]:
     """The lines under a row."""
     filled = n["share_other_camera"] + n["share_other_frame"]
+    literal = ", ".join(n[option] for option in LITERAL if option in n)
+    holes, by = ("black", f" ({literal})") if literal else ("inpainted", "")
     return (
         f"{name}: {n['rotation_deg']:.2g} deg and {n['translation']:.2g} m per frame, readout ratio "
         f"{n['readout_ratio']:g}; seed {n['seed']}, RANSAC seed {n['ransac_seed']}. Error of the motion: "
         f"{_small(n['e_R_deg'])} deg (rotation), {_small(n['e_T_deg'])} deg (direction).",
         f"PSNR of the frame's own pixels: {n['psnr_rolling']:.1f} dB before, {n['psnr_corrected']:.1f} dB after, "
-        f"{n['psnr_oracle']:.1f} dB with true depth and motion; of all pixels, inpainted where nobody saw: "
+        f"{n['psnr_oracle']:.1f} dB with true depth and motion; of all pixels, {holes} where nobody saw: "
         f"{n['psnr_rolling_all']:.1f} and {n['psnr_corrected_all']:.1f} dB.",
         f"SGM depth: median error {100 * n['depth_median_m']:.1f} cm, {_percent(n['depth_over_2m'])} above 2 m, "
         f"{_percent(n['depth_coverage'])} known, the rest grey{_sky(n['depth_on_sky'])}.",
-        f"Corrected frame: {_percent(n['share_here'])} its own pixels, {_percent(n['share_guessed'])} at a "
+        f"Corrected frame{by}: {_percent(n['share_here'])} its own pixels, {_percent(n['share_guessed'])} at a "
         f"guessed depth, {_percent(filled)} from the other frames, {_percent(n['share_nobody'])} seen by nobody "
         "(dark).",
     )

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rsbench.benchmark.studies.fig4_panels import Panels, load_panels, make_panels, save_panels
+from rsbench.benchmark.studies.fig4_panels import (
+    Panels,
+    correct_literally,
+    literal_options,
+    load_panels,
+    make_panels,
+    save_panels,
+)
+from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import read_dataset
 from rsbench.report.fig4 import INVENTED, caption, depth_scale, draw_fig4, few_colours, panel_images
 from rsbench.report.pictures import INVALID
+from rsbench.solvers.linear import LinearSolver
+from rsbench.vision.quality import psnr
+
+PAPERS = {"solver": "rs-stereo-linear", "features": "sift", "matcher": "sgm", "corrector": "single-view"}
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +92,35 @@ def test_the_caption_has_the_figures(panels: Panels) -> None:
     text = " ".join(caption("castle", panels.numbers))
     assert f"{panels.numbers['psnr_corrected']:.1f} dB after" in text
     assert "1.5 deg and 0.2 m per frame, readout ratio 0.8" in text
+
+
+def test_the_literal_figure_is_by_the_papers_own_components(smoke_dataset: Path) -> None:
+    """One linear solution, plain SIFT, and a frame's own pixels: no other frame's, no guess, no inpainting."""
+    options = literal_options(3)
+    assert {option: entry.name for option, entry in options.components.items()} == PAPERS
+    assert isinstance(options.solver.solver, LinearSolver) and options.motion_model is None and options.seed == 3
+    assert not (options.depth_from_motion or options.find_sky or options.inpaint)
+
+    sequence = read_dataset(smoke_dataset)[0]
+    (rows, panels), (again, _) = correct_literally(sequence, (0, 1))
+    assert [(row["side"], row["frame"]) for row in rows] == list(VIEWS)
+    assert {row["ransac_seed"] for row in rows} == {0} and {row["ransac_seed"] for row in again} == {1}
+    assert all(row.items() >= PAPERS.items() for row in (*rows, *again))
+    first, n = rows[0], panels.numbers
+    assert n["share_here"] + n["share_nobody"] == pytest.approx(1.0) and n["share_here"] == first["share_drawn"]
+    assert not np.any(panels.corrected[~panels.known])
+    drawn = psnr(panels.corrected, sequence.image("gs", "left", 0), panels.known)
+    assert first["psnr_drawn"] == n["psnr_corrected"] == pytest.approx(drawn)
+    assert first["psnr_all"] == pytest.approx(psnr(panels.corrected, sequence.image("gs", "left", 0)))
+    assert "(rs-stereo-linear, sift, sgm, single-view)" in " ".join(caption("castle", n))
+    assert "black where nobody saw" in " ".join(caption("castle", n))
+
+
+def test_the_stored_literal_figures_are_by_the_papers_own_components() -> None:
+    text = (Path(__file__).parents[2] / "results" / "fig4" / "literal.csv").read_text("utf-8")
+    rows = list(csv.DictReader(text.splitlines()))
+    assert {int(row["ransac_seed"]) for row in rows} >= set(range(5)) and len(rows) % len(VIEWS) == 0
+    assert all(row.items() >= ({"sequence": "castle"} | PAPERS).items() for row in rows)
 
 
 def test_few_colours_are_few_and_near() -> None:

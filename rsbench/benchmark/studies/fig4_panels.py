@@ -3,27 +3,47 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.predict import true_pairs
+from rsbench.benchmark.images.score import visible_pixels
+from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.studies.correction_bench import Bench
 from rsbench.benchmark.studies.correction_study import WORST
+from rsbench.capture.settle import NoMotionError
 from rsbench.core.geometry import GivenGeometry
-from rsbench.core.rig import Side
+from rsbench.core.motion import Motion
+from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.chain import uncorrected
+from rsbench.pipeline.chain import correct_frames, uncorrected
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import Pairs, frame_pairs
+from rsbench.pipeline.frame_matches import find_matches
+from rsbench.pipeline.frame_motion import find_motion
+from rsbench.solvers.engine.registry import load_solver_entry
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.vision.correction import correct_frame
-from rsbench.vision.fusion import Origin
+from rsbench.vision.corrector import load_corrector
+from rsbench.vision.feature_matcher import load_features
+from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.quality import psnr
 from rsbench.vision.stereo_depth import depth_metrics
+from rsbench.vision.stereo_matcher import load_matcher
 
-SIDE: Side = "left"
-FRAME = 0
+VIEW: View = ("left", 0)
+LITERAL = {
+    "solver": "rs-stereo-linear",
+    "features": "sift",
+    "matcher": "sgm",
+    "corrector": "single-view",
+}
+"""The components that the paper describes, by the name of their option."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,28 +68,91 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
     Where no motion is found, the frame is shown as it was, and the numbers of the correction are the worst.
     """
     bench = Bench(sequence, seed)
-    view = SIDE, FRAME
-    frames = uncorrected(bench.images, (view,))
+    frames = uncorrected(bench.images, (VIEW,))
     if bench.motion is not None:
-        frames, _ = bench.corrected(bench.sgm, bench.motion, views=(view,))
-    fused, success = frames[view], bench.motion is not None
-    rolling, truth = bench.images[view], sequence.image("gs", *view)
-    true_depth = sequence.depth("rs", *view)
-    depth = np.where(np.isfinite(bench.sgm[FRAME].depth[SIDE]), bench.sgm[FRAME].depth[SIDE], np.float32(0.0))
+        frames, _ = bench.corrected(bench.sgm, bench.motion, views=(VIEW,))
+    return _compare(sequence, seed, bench.motion, frames[VIEW], bench.sgm)
+
+
+def literal_options(seed: int) -> CorrectionOptions:
+    """The components of ``LITERAL``, and none of the steps that the paper does not describe."""
+    return CorrectionOptions(
+        solver=load_solver_entry(LITERAL["solver"]),
+        features=load_features(LITERAL["features"]),
+        matcher=load_matcher(LITERAL["matcher"]),
+        corrector=load_corrector(LITERAL["corrector"]),
+        depth_from_motion=False,
+        find_sky=False,
+        seed=seed,
+    )
+
+
+def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tuple[list[dict[str, Any]], Panels]]:
+    """Per seed of RANSAC: scores of the four views corrected with ``literal_options``, and the panels of one.
+
+    A score is the PSNR, dB, on three sets of pixels: those ``drawn`` at an estimated depth, those ``visible`` in
+    the rolling-shutter frame by the true depth and motion, and ``all``; what is not drawn is black. That of the
+    uncorrected frame on the same pixels stands beside it. Where no motion is found, the scores are the worst.
+    """
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    truths = {view: sequence.image("gs", *view) for view in VIEWS}
+    visible = visible_pixels(sequence, true_pairs(sequence, images), VIEWS)
+    rig, shutter = sequence.rig, sequence.shutter
+    matches = find_matches(images, literal_options(0))
+    pairs = frame_pairs(images, rig, literal_options(0))
+    for seed in seeds:
+        options = literal_options(seed)
+        try:
+            motion = find_motion(matches, rig, shutter, options).motion
+            frames = correct_frames(images, pairs, rig, shutter, motion, options)
+        except NoMotionError:
+            motion, frames = None, uncorrected(images)
+        rows = []
+        for view, fused in frames.items():
+            drawn = fused.origin == Origin.HERE
+            row = {"sequence": sequence.name, "ransac_seed": seed, **LITERAL, **_motion_errors(sequence, motion)}
+            row |= {
+                "side": view[0],
+                "frame": view[1],
+                "success": motion is not None,
+                "share_drawn": float(drawn.mean()),
+            }
+            for name, part in (("drawn", drawn), ("visible", visible[view]), ("all", np.ones_like(drawn))):
+                row[f"psnr_rolling_{name}"] = psnr(images[view], truths[view], part)
+                row[f"psnr_{name}"] = WORST["psnr"] if motion is None else psnr(fused.image, truths[view], part)
+            rows.append(row)
+        panels = _compare(sequence, seed, motion, frames[VIEW], pairs)
+        yield rows, replace(panels, numbers={**panels.numbers, **LITERAL})
+
+
+def _motion_errors(sequence: Sequence, motion: Motion | None) -> dict[str, float]:
+    """e_R and e_T, degrees; the worst where there is no motion."""
+    true, nothing = sequence.motion, np.full(3, np.nan)
+    w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
+    errors = pose_errors(w, d, true_w=true.w, true_d=true.d, rig=sequence.rig)
+    return {name: float(errors[name]) for name in ("e_R_deg", "e_T_deg")}
+
+
+def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused, pairs: Pairs) -> Panels:
+    """Panels of a frame that was corrected with ``motion`` and the depth of ``pairs``."""
+    side, frame = VIEW
+    rolling, truth = sequence.image("rs", *VIEW), sequence.image("gs", *VIEW)
+    true_depth, found, success = sequence.depth("rs", *VIEW), pairs[frame].depth[side], motion is not None
+    depth = np.where(np.isfinite(found), found, np.float32(0.0))
     surface = true_depth > 0
     error = np.where(surface, np.abs(depth - true_depth), np.float32(np.inf))
     error = np.where(depth > 0, error, np.float32(np.nan))
     here = fused.origin == Origin.HERE
-    truth_given = GivenGeometry(bench.rig, bench.shutter, sequence.motion)
-    oracle = correct_frame(rolling, bench.true[FRAME].depth[SIDE], truth_given, view)
-    true, errors = sequence.motion, bench.motion_errors()
+    true = sequence.motion
+    truth_given = GivenGeometry(sequence.rig, sequence.shutter, true)
+    oracle = correct_frame(rolling, np.where(surface, true_depth, np.float32(np.inf)), truth_given, VIEW)
     numbers = {
         "seed": sequence.manifest["seed"],
         "ransac_seed": seed,
         "rotation_deg": float(np.rad2deg(np.linalg.norm(true.w))),
         "translation": float(np.linalg.norm(true.d)),
         "readout_ratio": sequence.shutter.readout_ratio,
-        **{name: errors[f"{name}_ours"] for name in ("e_R_deg", "e_T_deg")},
+        **_motion_errors(sequence, motion),
         "psnr_rolling": psnr(rolling, truth, here),
         "psnr_corrected": psnr(fused.image, truth, here) if success else WORST["psnr"],
         "psnr_oracle": psnr(oracle.image, truth, here & oracle.mask),
@@ -78,7 +161,7 @@ def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
         **{f"share_{name}": share for name, share in fused.shares().items()},
         **{
             f"depth_{name}": None if math.isnan(value) else value  # without sky, or without any depth
-            for name, value in depth_metrics(depth, true_depth, bench.rig).items()
+            for name, value in depth_metrics(depth, true_depth, sequence.rig).items()
         },
     }
     return Panels(

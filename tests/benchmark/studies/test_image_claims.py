@@ -13,6 +13,7 @@ from rsbench.benchmark.studies.image_claims import (
     PUBLISHED,
     ImageClaim,
     almost_coincides,
+    coincides_literally,
     judge_image_claims,
     motion_on_images,
     sgm_is_accurate,
@@ -71,6 +72,25 @@ def test_corrected_images_are_averaged_over_views() -> None:
         "x, what the frame saw": "holds",
         "x, all pixels": "fails",
     }
+
+
+def test_the_literal_reading_averages_the_views_of_each_seed() -> None:
+    names = {"solver": "a", "features": "b", "matcher": "c", "corrector": "d"}
+    pixels = ("drawn", "visible", "all")
+    rows = [
+        names
+        | {"ransac_seed": seed}
+        | {f"psnr_rolling_{p}": 22.0 for p in pixels}
+        | {f"psnr_{p}": db for p in pixels}
+        for seed, db in ((0, 29.0), (0, 32.0), (1, 29.0), (1, 30.5))
+    ]
+    found = coincides_literally(pd.DataFrame([row | {"psnr_all": 20.0} for row in rows]))
+    assert {who: verdict(checks, "seed") for who, (checks, _) in found.items()} == {
+        "a, b, c, d: pixels with depth": "holds only for seed 0",
+        "a, b, c, d: what the frame saw": "holds only for seed 0",
+        "a, b, c, d: all pixels": "fails",
+    }
+    assert found["a, b, c, d: pixels with depth"][1] == "30.50, 29.75 dB (uncorrected: 22.00)"
 
 
 def test_a_gain_needs_an_interval_above_zero() -> None:
