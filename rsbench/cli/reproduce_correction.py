@@ -85,7 +85,7 @@ def fig4_literal(out: Path, data: Path) -> None:
             advance(sequence.name)
     write_table(folder / "literal.csv", pd.DataFrame(views))
     for path in draw_fig4([(sequence.name, panels[0])], folder / "fig4-literal", quality=60):
-        typer.echo(f"figure: {path}")
+        echo(f"figure: {path}")
     made = provenance("rsbench reproduce fig4-literal", datasets=[dataset_record(data / "paper")])
     write_json(folder / "literal-provenance.json", made)
 
