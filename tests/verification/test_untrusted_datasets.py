@@ -214,7 +214,10 @@ def test_files_that_are_not_there_are_counted(dataset: Path) -> None:
 def test_faults_move_no_cursor(dataset: Path) -> None:
     """Names of a stranger's manifest are shown as text."""
     files = json.loads((dataset / "dataset.json").read_text())["files"]
-    strange = {"planes/\x1b[2J\x07.png": {"sha256": "0" * 64, "size": 1}, "x\x9b\r.png": {}}
+    strange: dict[str, dict[str, object]] = {
+        "planes/\x1b[2J\x07.png": {"sha256": "0" * 64, "size": 1},
+        "x\x9b\r.png": {},
+    }
     change(dataset / "dataset.json", "files", files | strange)
     ran = run_here("verify", dataset, "--rerender", "no")
     assert r"planes/\x1b[2J\x07.png: missing" in ran.stderr and r"none of its sequences: x\x9b\r.png" in ran.stderr
