@@ -94,6 +94,6 @@ def of_one_camera(
     if readout_ratio is not None:
         given.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
     if camera is not None and not isinstance(camera, PinholeCamera):
-        given.check_number("camera", camera, 1.0, 179.0)
+        given.check_number("camera", camera)  # degrees, whose range the card of a camera checks
     samples = arguments.gyro_samples(gyro)
     return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=samples)
