@@ -30,8 +30,8 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.points_draws import POINTS_1
-from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED
+from rsbench.benchmark.leaderboard.splits import POINTS_1
+from rsbench.benchmark.leaderboard.track import PUBLIC_SEED
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator

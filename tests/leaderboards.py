@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.splits import Split, points_split
+from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.submissions import truth_text
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import Split
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig

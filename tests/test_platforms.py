@@ -13,7 +13,7 @@ from leaderboards import named, small_split, truth_lines, write
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.benchmark import provenance
-from rsbench.benchmark.leaderboard.adding import add
+from rsbench.benchmark.leaderboard.board import add
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers import llvm
 from rsbench.storage import caches

@@ -12,11 +12,10 @@ import pytest
 from commands import run_here
 
 import rsbench
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import entries_of, splits_of
+from rsbench.benchmark.leaderboard.board import add, entries_of, splits_of
 from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.report.board_page import build_site
 
 KEPT = Path(__file__).parent / "release_0_1"

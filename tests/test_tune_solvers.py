@@ -10,7 +10,7 @@ import pandas as pd
 import programs
 import pytest
 
-from rsbench.benchmark.leaderboard.splits import PUBLIC_SEED
+from rsbench.benchmark.leaderboard.track import PUBLIC_SEED
 from rsbench.solvers.engine.registry import load_solver_entry
 
 ROOT = Path(__file__).parents[1]

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from contextlib import AbstractContextManager
 
-    from rsbench.benchmark.leaderboard.splits import Split
     from rsbench.benchmark.leaderboard.standings import Standing
+    from rsbench.benchmark.leaderboard.track import Split
     from rsbench.pipeline.problem import Problem
 
 EPILOG = """[bold]Examples[/bold]
@@ -73,7 +73,7 @@ def export(
     secret: Hidden = False,
 ) -> None:
     """Write the inputs of a track for any language; of a public split the truth too."""
-    from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
+    from rsbench.benchmark.leaderboard.inputs import check_place, write_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 
@@ -138,7 +138,7 @@ def submit(
     workers: Workers = 1,
 ) -> None:
     """Score a file of predictions and add it to a board."""
-    from rsbench.benchmark.leaderboard.adding import add
+    from rsbench.benchmark.leaderboard.board import add
     from rsbench.benchmark.leaderboard.submissions import check_submission
     from rsbench.benchmark.provenance import provenance
 
@@ -176,8 +176,7 @@ def run(
     ] = None,
 ) -> None:
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
-    from rsbench.benchmark.leaderboard.adding import add_all
-    from rsbench.benchmark.leaderboard.board import RUN, made_by
+    from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
     from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.benchmark.provenance import provenance
 
@@ -209,7 +208,7 @@ def show(
 ) -> None:
     """Print the tables of a board."""
     from rsbench.benchmark.leaderboard.board import splits_of
-    from rsbench.benchmark.leaderboard.track_list import track_of_name
+    from rsbench.benchmark.leaderboard.tracks import track_of_name
 
     wanted = None if track is None else track_of_name(track).id
     for protocol, split in splits_of(board):
@@ -222,7 +221,7 @@ def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = 
     """Add the truth and others that know it, as rows without a rank; to correction, frames as they are too."""
     import tempfile
 
-    from rsbench.benchmark.leaderboard.adding import add_all
+    from rsbench.benchmark.leaderboard.board import add_all
     from rsbench.benchmark.provenance import provenance
 
     split = split_of(track, data, seed_file)
@@ -253,7 +252,7 @@ def merge(
     other: Annotated[Path, typer.Argument(metavar="OTHER", help="Board to copy from.")], board: _Board
 ) -> None:
     """Copy the entries of another board that this one lacks."""
-    from rsbench.benchmark.leaderboard.merging import merge
+    from rsbench.benchmark.leaderboard.board import merge
 
     for name in merge(other, board):
         echo(name)
@@ -274,8 +273,7 @@ def rescore(
     ] = None,
 ) -> None:
     """Score the stored predictions again and say which scores changed; runs no method."""
-    from rsbench.benchmark.leaderboard.board import rescore
-    from rsbench.benchmark.leaderboard.stored_predictions import restore
+    from rsbench.benchmark.leaderboard.board import rescore, restore
 
     split = split_of(track, data, seed_file)
     if stored is not None:
@@ -309,7 +307,7 @@ def _counted(problems: Iterator[Problem], advance: object) -> Iterator[Problem]:
 
 def _track_of(file: Path) -> str:
     from rsbench.benchmark.leaderboard.submissions import protocol_of
-    from rsbench.benchmark.leaderboard.track_list import track_of_id
+    from rsbench.benchmark.leaderboard.tracks import track_of_id
 
     protocol, where = protocol_of(file)
     try:

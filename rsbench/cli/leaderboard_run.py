@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from rsbench.cli.leaderboard_tracks import write_frames_of
 
 if TYPE_CHECKING:
-    from rsbench.benchmark.leaderboard.splits import Split
-    from rsbench.benchmark.leaderboard.track import Limits
+    from rsbench.benchmark.leaderboard.track import Limits, Split
     from rsbench.jobs.workers import Workers
 
 
@@ -23,7 +22,7 @@ def predict(
     limits: Limits,
 ) -> list[Path]:
     """Files of predictions of cards, in the hidden folder of the board."""
-    from rsbench.benchmark.leaderboard.running import prepare_inputs
+    from rsbench.benchmark.leaderboard.inputs import prepare_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 

@@ -32,7 +32,7 @@ def publish(
 ) -> None:
     """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
     from rsbench.benchmark.leaderboard import publishing
-    from rsbench.benchmark.leaderboard.track_list import track_of_name
+    from rsbench.benchmark.leaderboard.tracks import track_of_name
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.generation import steps_of
     from rsbench.dataset.secret_split import read_secret, secret_card
@@ -64,10 +64,10 @@ def score(
     workers: Workers = 1,
 ) -> None:
     """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
-    from rsbench.benchmark.leaderboard.adding import add
+    from rsbench.benchmark.leaderboard.board import add
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
     from rsbench.benchmark.leaderboard.submissions import check_submission
-    from rsbench.benchmark.leaderboard.track_list import track_of_id
+    from rsbench.benchmark.leaderboard.tracks import track_of_id
     from rsbench.benchmark.provenance import provenance
     from rsbench.dataset.secret_split import read_secret
 

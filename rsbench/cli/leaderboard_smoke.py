@@ -87,7 +87,7 @@ def _jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[J
         RsbenchError: no such track, or an entry that none of the tracks has.
     """
     from rsbench.benchmark.leaderboard.smoke import ENTRIES, Job
-    from rsbench.benchmark.leaderboard.track_list import TRACKS, track_of_name
+    from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_name
     from rsbench.core.errors import RsbenchError
 
     chosen = [track_of_name(track).name for track in dict.fromkeys(tracks or TRACKS)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from rsbench.benchmark.leaderboard.splits import Split
+    from rsbench.benchmark.leaderboard.track import Split
 
 Track = Annotated[
     str,
@@ -31,13 +31,13 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 
 
 def split_of(track: str, data: Path | None, seed_file: Path | None, secret: bool = False) -> Split:
-    from rsbench.benchmark.leaderboard.track_list import track_of_name
+    from rsbench.benchmark.leaderboard.tracks import track_of_name
 
     return track_of_name(track).split(data, seed_file, secret)
 
 
 def write_frames_of(split: Split, data: Path, out: Path) -> None:
-    from rsbench.benchmark.leaderboard.frame_inputs import write_frames
+    from rsbench.benchmark.leaderboard.inputs import write_frames
 
     for truth in split.truths:
         if truth.pictures is not None:

@@ -159,7 +159,7 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def card_classes() -> dict[str, list[tuple[str, type]]]:
     """By kind of card: headings of its tables and the dataclasses that they are parsed into."""
-    from rsbench.benchmark.leaderboard.answers import Answer, Header
+    from rsbench.benchmark.leaderboard.track import Answer, Header
     from rsbench.benchmark.simulated.sweep_card import SweepCard
     from rsbench.cli.component_kinds import COMPONENTS, component_kind
     from rsbench.components.plugins import CardContent

@@ -33,9 +33,8 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
 
     Of pictures the site alone is published: the answers are gigabytes.
     """
-    from rsbench.benchmark.leaderboard.board import splits_of
-    from rsbench.benchmark.leaderboard.stored_predictions import store
-    from rsbench.benchmark.leaderboard.track_list import track_of_id
+    from rsbench.benchmark.leaderboard.board import splits_of, store
+    from rsbench.benchmark.leaderboard.tracks import track_of_id
     from rsbench.cli.generate import generate
     from rsbench.cli.leaderboard import oracles, run
 
@@ -53,8 +52,8 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
 
 def entries_of_laws() -> dict[str, list[str]]:
     """By protocol, what comes with rsbench: one entry a method, and of solvers the one that chooses its law."""
+    from rsbench.benchmark.leaderboard.motion_tracks import SAME_METHOD
     from rsbench.benchmark.leaderboard.running import CHOOSES
-    from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD
 
     first = entries_of_frames()
     solvers, readers = (

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.board import Scored
-from rsbench.benchmark.leaderboard.picture_files import FOLDER, read_answer_depth, read_answer_frame
-from rsbench.benchmark.leaderboard.splits import Truth
-from rsbench.benchmark.leaderboard.true_pictures import TruePictures
+from rsbench.benchmark.leaderboard.pictures import FOLDER, TruePictures, read_answer_depth, read_answer_frame
+from rsbench.benchmark.leaderboard.track import Truth
 from rsbench.core.so3 import FloatArray
 from rsbench.report.pictures import Image, colour_map
 
@@ -48,11 +47,11 @@ def answer_images(track: str, entry: Scored, truth: Truth) -> Iterator[Named]:
         return
     for each in pictures.asked:
         if track == "depth":
-            depth = read_answer_depth(folder, truth, entry.header.png_unit_m)
+            depth = read_answer_depth(folder, pictures, entry.header.png_unit_m)
             yield each.stem, method, _depth_image(depth, pictures.depth())
             yield f"{each.stem}-error", f"{method}, error", depth_error_image(depth, pictures)
         else:
-            image, drawn = read_answer_frame(folder, truth, each)
+            image, drawn = read_answer_frame(folder, pictures, each)
             words = f"{method}, {_row(each.stem)}"
             yield each.stem, words, image
             yield (

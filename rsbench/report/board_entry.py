@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.calibration import LEVELS
-from rsbench.benchmark.leaderboard.ranking import score_interval
-from rsbench.benchmark.leaderboard.standings import Standing
+from rsbench.benchmark.leaderboard.standings import LEVELS, Standing, score_interval
 from rsbench.benchmark.statistics import in_words
 from rsbench.report.board_figures import reliability
 from rsbench.report.board_pictures import Album

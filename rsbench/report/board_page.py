@@ -14,8 +14,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rsbench.benchmark.leaderboard.board import splits_of
-from rsbench.benchmark.leaderboard.calibration import LEVELS, named_numbers
-from rsbench.benchmark.leaderboard.standings import Standing
+from rsbench.benchmark.leaderboard.standings import LEVELS, Standing, named_numbers
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score
 from rsbench.benchmark.statistics import in_words
 from rsbench.report.board_entry import entry_context

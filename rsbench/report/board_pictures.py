@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
 from rsbench.report.board_answers import ERRORS, Named, answer_images, true_images

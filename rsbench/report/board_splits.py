@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import about_split, entries_of, place
-from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, columns
 from rsbench.benchmark.leaderboard.picture_track import PictureTrack
+from rsbench.benchmark.leaderboard.pictures import PARTINGS, columns
 from rsbench.benchmark.leaderboard.standings import Standing, standings
 from rsbench.benchmark.leaderboard.track import Track
-from rsbench.benchmark.leaderboard.track_list import track_of_id
+from rsbench.benchmark.leaderboard.tracks import track_of_id
 from rsbench.report.board_figures import ErrorLine, curves, drawable, legend
 
 

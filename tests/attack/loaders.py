@@ -283,7 +283,7 @@ def _problems(folder: Path) -> Iterator[Loader]:
 
 def _answers(folder: Path) -> Loader:
     """Submitted answers; a direction that is read is 0 or has a length that can be scored."""
-    from rsbench.benchmark.leaderboard.answers import LEAST_D, Answer
+    from rsbench.benchmark.leaderboard.track import LEAST_D, Answer
     from rsbench.components.cards import parse_card
     from rsbench.storage.files import read_json
 

@@ -20,10 +20,10 @@ from analytic_dataset import write_analytic_dataset
 from browser import CHROMIUM, Browser, started
 from leaderboards import erring, named, small_split, truth_lines, write
 
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import ORACLES
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.board import ORACLES, add
+from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.track import Split
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig

@@ -12,31 +12,33 @@ An entry is written under another name and renamed, so that it is there whole or
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
+import json
+import lzma
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.answers import Header
-from rsbench.benchmark.leaderboard.doubt import doubt_about
-from rsbench.benchmark.leaderboard.exporting import split_record
-from rsbench.benchmark.leaderboard.marking import mark_all
-from rsbench.benchmark.leaderboard.picture_files import file_bytes
-from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, Submission, read_submission
-from rsbench.benchmark.leaderboard.track import Step
-from rsbench.benchmark.leaderboard.track_list import TRACKS, track_of_id
+from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
+from rsbench.benchmark.leaderboard.inputs import split_record
+from rsbench.benchmark.leaderboard.pictures import copy_files, file_bytes
+from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, read_submission
+from rsbench.benchmark.leaderboard.track import ORACLE, Header, Split, Step, Submission, mark_all
+from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_id
+from rsbench.benchmark.provenance import numeric_version
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.workers import Workers
-from rsbench.storage.files import read_table, write_json, write_table
+from rsbench.storage.files import read_table, write_bytes, write_json, write_table
 from rsbench.storage.untrusted_files import NAME, read_bytes, read_json
-from rsbench.storage.work_folder import work_folder
+from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
 RUN = "rsbench leaderboard run"
@@ -336,3 +338,235 @@ def _stored(folder: Path, split: Split) -> Submission:
     if submission.header != record.header:
         raise RsbenchError(f"{path}: its header is not that of {FILES[2]}; submit it again")
     return submission
+
+
+# Submissions become entries of a board: read, copied aside, scored together, and renamed to their places.
+
+
+class _Taken(NamedTuple):
+    """A file of predictions that becomes an entry."""
+
+    submission: Submission
+    """In the folder where the entry is made."""
+    data: bytes
+    files: dict[str, str]
+    """As of ``Recorded``."""
+
+    @property
+    def identity(self) -> list[Any]:
+        """What decides its scores, but for the split."""
+        return [hashlib.sha256(self.data).hexdigest(), sorted(self.files.items())]
+
+
+def add(
+    board: Path,
+    predictions: Path,
+    split: Split,
+    made: dict[str, Any],
+    *,
+    replace: bool = False,
+    workers: Workers = 1,
+    step: Step = lambda word: None,
+) -> Scored:
+    """Score a file of predictions and keep both.
+
+    Args:
+        made: how it came about, for entry.json.
+        replace: whether an entry of that name may be replaced.
+        workers, step: see ``mark_all``.
+
+    Raises:
+        RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
+            written, or another command is at work there.
+    """
+    (scored,) = add_all(
+        board, [predictions], split, made, replace=lambda method: replace, workers=workers, step=step
+    )
+    return scored
+
+
+def add_all(
+    board: Path,
+    files: Iterable[Path],
+    split: Split,
+    made: dict[str, Any],
+    *,
+    replace: Callable[[str], bool] = lambda method: True,
+    workers: Workers = 1,
+    step: Step = lambda word: None,
+) -> list[Scored]:
+    """``add`` for several files, which share what is found of the truth; ``replace`` is asked by the method.
+
+    Raises:
+        RsbenchError: as ``add``; where there are other files, after they are on the board.
+    """
+    read, faults = _read_all(files, split)
+    if not read and faults:
+        raise faults[0]
+    scored = list[Scored]()
+    with work_folder(board) as hidden:
+        open_board(board)
+        entries = place(board, split.track.id, split.name) / "entries"
+        taken = list[_Taken]()
+        for number, (submission, data) in enumerate(read):
+            method, new = submission.header.method, hidden / WORK / str(number)
+            if made.get("command") not in OWN:
+                refuse_reserved(submission.header, str(submission.folder))
+            refuse_same_but_case(entries, method)
+            kept = copy_files(submission.folder, split.track.files_of(submission, split), new)
+            if not replace(method):
+                refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
+            taken.append(_Taken(dataclasses.replace(submission, folder=new), data, kept))
+        write_split(board, split)
+        kept = _kept(hidden, taken, split)
+        marked = mark_all([each.submission for each in taken], split, workers, step, kept)
+        for each, scores in zip(taken, marked, strict=True):
+            if isinstance(scores, RsbenchError):
+                faults.append(scores)
+            else:
+                doubt = doubt_about(scores, each.submission.header, split)
+                scored.append(_put(each, scores, _record(each, split, made) | {"doubt": doubt}, entries))
+        remove(kept.parent)
+    if faults:
+        raise faults[0]
+    return scored
+
+
+def _kept(hidden: Path, taken: Sequence[_Taken], split: Split) -> Path:
+    """Folder for scores of these predictions by this code; those of others, whose run was cut off, are removed."""
+    of = [split.fingerprint, numeric_version(), *(each.identity for each in taken)]
+    kept = hidden / "scoring" / hashlib.sha256(json.dumps(of).encode()).hexdigest()
+    if not kept.is_dir():
+        remove(kept.parent)
+    return kept
+
+
+def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submission, bytes]], list[RsbenchError]]:
+    """Submissions with the content of their files, and what is wrong with the others."""
+    read, faults = list[tuple[Submission, bytes]](), list[RsbenchError]()
+    for file in files:
+        try:
+            read.append((read_submission(file, split), read_bytes(file)))
+        except RsbenchError as error:
+            faults.append(error)
+    return read, faults
+
+
+def _record(taken: _Taken, split: Split, made: dict[str, Any]) -> dict[str, Any]:
+    """What entry.json says."""
+    return {
+        "format": FORMAT,
+        "header": asdict(taken.submission.header),
+        "predictions_sha256": hashlib.sha256(taken.data).hexdigest(),
+        "fingerprint": split.fingerprint,
+        **({"files": taken.files} if taken.files else {}),
+        "made": made,
+    }
+
+
+def _put(taken: _Taken, scores: pd.DataFrame, record: dict[str, Any], entries: Path) -> Scored:
+    """Write an entry aside, and rename it to its place."""
+    new, folder = taken.submission.folder, entries / taken.submission.header.method
+    new.mkdir(parents=True, exist_ok=True)
+    write_bytes(new / FILES[0], taken.data)
+    write_table(new / FILES[1], scores)
+    write_json(new / FILES[2], record)
+    move_entry(new, folder)
+    return read_entry(folder)
+
+
+# Merge two boards.
+
+
+def merge(other: Path, board: Path) -> list[str]:
+    """Copy the entries of another board that are not here yet; returns what was copied.
+
+    Scores are copied as they are: ``rescore`` tells whether the truth agrees. What the keeper of the other board
+    accepted is in doubt again: the keeper of this one decides.
+
+    Raises:
+        RsbenchError: an entry of one name has two predictions; one of the boards is none, or damaged.
+    """
+    theirs = [
+        (scored, place(board, protocol, split) / "entries" / scored.header.method)
+        for protocol, split in splits_of(other)
+        for scored in entries_of(other, protocol, split)
+    ]
+    told = {scored.folder.parents[1]: about_split(scored.folder.parents[1]) for scored, _ in theirs}
+    copied = []
+    with work_folder(board) as hidden:
+        open_board(board)
+        for scored, folder in theirs:
+            refuse_another(folder, scored.predictions_sha256, scored.files)
+        for number, (scored, folder) in enumerate(theirs):
+            if not folder.exists():
+                new = hidden / WORK / str(number)
+                _copy(scored, new)
+                about = folder.parents[1] / "split.json"
+                if not about.exists():
+                    about.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(about, asdict(told[scored.folder.parents[1]]))
+                move_entry(new, folder)
+                copied.append("/".join(folder.parts[-4:-2]) + f"/{folder.name}")
+    return copied
+
+
+def _copy(scored: Scored, new: Path) -> None:
+    """An entry of another board, and nothing else that lies in its folder."""
+    new.mkdir(parents=True)
+    for name in FILES:
+        write_bytes(new / name, read_bytes(scored.folder / name))
+    if "accepted" in (record := read_json(new / FILES[2])):
+        write_json(new / FILES[2], {key: value for key, value in record.items() if key != "accepted"})
+    check_files(scored.folder, scored.files, copy_files(scored.folder, scored.files, new))
+
+
+# Predictions of a board's entries, compressed, so that anybody can score them again without running a method.
+
+SUFFIX = ".jsonl.xz"
+
+
+def store(board: Path, protocol: str, split: str, out: Path) -> list[Path]:
+    """Write the predictions of each entry of a split as ``<method>.jsonl.xz``; returns the files.
+
+    Raises:
+        RsbenchError: an entry is damaged, or a file cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    files = list[Path]()
+    for entry in entries_of(board, protocol, split):
+        data = read_bytes(entry.folder / FILES[0], SUBMISSION_BYTES)
+        files.append(out / f"{entry.header.method}{SUFFIX}")
+        write_bytes(files[-1], lzma.compress(data, preset=9))
+    return files
+
+
+def restore(stored: Path, split: Split, board: Path) -> list[Scored]:
+    """Entries of a board from what ``store`` wrote of this split, scored by the code of today.
+
+    Raises:
+        RsbenchError: there is nothing, or a file is damaged or of another split.
+    """
+    files = sorted(stored.glob(f"*{SUFFIX}"))
+    if not files:
+        raise RsbenchError(f"{stored}: holds no predictions (*{SUFFIX})")
+    made: dict[str, list[Path]] = {RUN: [], ORACLES: []}
+    with tempfile.TemporaryDirectory() as folder:
+        for file in files:
+            data, path = _unpacked(file), Path(folder) / file.name.removesuffix(SUFFIX) / FILES[0]
+            path.parent.mkdir()
+            write_bytes(path, data)
+            made[ORACLES if ORACLE in read_submission(path, split).header.uses else RUN].append(path)
+        found = [add_all(board, paths, split, {"command": command}) for command, paths in made.items()]
+    return [each for entries in found for each in entries]
+
+
+def _unpacked(file: Path) -> bytes:
+    try:
+        unpacker = lzma.LZMADecompressor()
+        data = unpacker.decompress(read_bytes(file), SUBMISSION_BYTES)
+        if not unpacker.eof:
+            raise RsbenchError(f"{file}: is cut off, or larger than {SUBMISSION_BYTES} bytes")
+    except lzma.LZMAError as error:
+        raise RsbenchError(f"{file}: is no xz file: {error}") from error
+    return data

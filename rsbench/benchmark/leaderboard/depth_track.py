@@ -16,15 +16,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.marking import Numbers
-from rsbench.benchmark.leaderboard.picture_files import FARTHEST, FOLDER, read_answer_depth
-from rsbench.benchmark.leaderboard.picture_parts import Parts, parts_within, shares
-from rsbench.benchmark.leaderboard.picture_running import CardChain, Making
-from rsbench.benchmark.leaderboard.picture_track import PictureTrack
-from rsbench.benchmark.leaderboard.splits import Split, Truth
-from rsbench.benchmark.leaderboard.submissions import Submission
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Score
-from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked, TruePictures
+from rsbench.benchmark.leaderboard.picture_track import CardChain, Making, PictureTrack
+from rsbench.benchmark.leaderboard.pictures import (
+    FARTHEST,
+    FOLDER,
+    VIEW,
+    Asked,
+    Parts,
+    TruePictures,
+    parts_within,
+    read_answer_depth,
+    shares,
+)
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Truth
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
@@ -122,7 +126,8 @@ class DepthTrack(PictureTrack):
     def hints(
         self, folder: Path, truth: Truth, png_unit_m: float | None, split: Split, wanted: bool
     ) -> Iterable[str]:
-        depth = read_answer_depth(folder, truth, png_unit_m)
+        assert truth.pictures is not None
+        depth = read_answer_depth(folder, truth.pictures, png_unit_m)
         if not wanted:
             return ()
         if split.public:
@@ -135,7 +140,7 @@ class DepthTrack(PictureTrack):
 
         def scores_of(submission: Submission, success: bool) -> Numbers:
             folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
-            return depth_scores(true, read_answer_depth(folder, truth, unit) if success else None)
+            return depth_scores(true, read_answer_depth(folder, pictures, unit) if success else None)
 
         return scores_of
 

@@ -9,29 +9,21 @@ with a small error shows neither sign: a keeper who wants to be sure runs the me
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.answers import Header
-from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.track import ORACLE
-from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.simulated.bound import Bound
+from rsbench.benchmark.leaderboard.track import ORACLE, Header, Split
 from rsbench.benchmark.statistics import share_interval
 from rsbench.benchmark.trajectory_methods import METHODS
 from rsbench.components.cards import list_cards
 from rsbench.core.errors import RsbenchError
-from rsbench.core.so3 import FloatArray
 
 COVERAGE = 0.999
 """Of the interval that must leave out one half: one honest method in two thousand at the bound is asked about."""
 _EXACT_SHARE = 0.1
 """Of the problems in which an error of a method may be exact but for rounding."""
-_DRAWS = 4000
-"""Of errors at a bound: their median is known to 3 %."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
 _BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
 """Names that were used, beside those of cards."""
@@ -86,19 +78,3 @@ def _words(hits: NDArray[np.bool_], coverage: float) -> str:
     count = int(np.count_nonzero(hits))
     low, high = share_interval(count, len(hits), coverage)
     return f"{count / len(hits):.2f} [{low:.2f}, {high:.2f}]"
-
-
-def medians_of(bounds: Sequence[Bound]) -> Mapping[str, FloatArray]:
-    """Medians (n,) of e_R_deg and e_T_deg of Gaussian errors at bounds; infinite where the data say nothing."""
-    draws = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
-    return {
-        "e_R_deg": np.array([_median(bound.rotation_axes, draws) for bound in bounds]),
-        "e_T_deg": np.array([_median(bound.direction_axes, draws) for bound in bounds]),
-    }
-
-
-def _median(axes: FloatArray, draws: FloatArray) -> float:
-    if not np.all(np.isfinite(axes)):
-        return np.inf
-    lengths = np.sqrt(np.sum((axes * draws[:, : len(axes)]) ** 2, axis=1))
-    return float(np.rad2deg(np.median(lengths)))

@@ -3,32 +3,47 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
+import pandas as pd
 
-from rsbench.benchmark.leaderboard.answers import Answer
-from rsbench.benchmark.leaderboard.doubt import medians_of
-from rsbench.benchmark.leaderboard.frame_inputs import FrameTrack
-from rsbench.benchmark.leaderboard.marking import last, named
-from rsbench.benchmark.leaderboard.points_draws import POINTS_1, Draws
-from rsbench.benchmark.leaderboard.running import SolverTrack, answer_problem
+from rsbench.benchmark.leaderboard.inputs import read_frames, read_inputs, write_inputs, write_matches
+from rsbench.benchmark.leaderboard.pictures import check_own
+from rsbench.benchmark.leaderboard.running import Choosing, SolverTrack, answer_problem, run_cards
 from rsbench.benchmark.leaderboard.splits import (
-    Split,
-    Truth,
+    POINTS_1,
+    POINTS_2,
+    Draws,
+    FrameTrack,
     exact_problem,
     points_split,
     seed_of,
     simulated_problem,
 )
-from rsbench.benchmark.leaderboard.submissions import Submission, submission_text
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Row, Score
+from rsbench.benchmark.leaderboard.submissions import submission_text
+from rsbench.benchmark.leaderboard.track import (
+    FAILED,
+    ORACLE,
+    SECONDS,
+    Answer,
+    Limits,
+    Row,
+    Score,
+    Split,
+    Step,
+    Submission,
+    Truth,
+    last,
+    named,
+)
 from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound
@@ -38,12 +53,20 @@ from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion, TwistMotion
 from rsbench.core.pose_errors import translation_of_offset
+from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
+from rsbench.dataset.match_truth import arranged, looks, seen_near
+from rsbench.dataset.matches import MATCHED
+from rsbench.dataset.sequence import Sequence as Rendered
+from rsbench.dataset.views import FAR
+from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.problem import Problem
+from rsbench.pipeline.problem import COLUMNS, Problem
 from rsbench.solvers.engine.registry import SolverEntry
-from rsbench.storage.files import write_bytes
+from rsbench.storage.files import read_table, write_bytes
+from rsbench.vision.undistortion import between_pixels
 
 AUC_DEG = (1, 5, 10)
 """Thresholds of the areas under the curve of max(e_R, e_T)."""
@@ -314,3 +337,320 @@ def _at_the_bound(split: Split, seed: int, draws: Draws) -> Iterator[dict[str, A
             "metric": True,
             "covariance": covariance.tolist(),
         }
+
+
+# Second protocols: several laws of motion, scores that separate, ratios that nobody guesses, one entry each.
+
+SAME_METHOD: Mapping[str, str] = {
+    "rs-r6p-single": "rs-r6p",
+    "rs-stereo-iterated": "rs-stereo-iterated-metric",
+    "rs-stereo-linear-symmetric": "rs-stereo-linear",
+    "rs-stereo-tracks": "rs-stereo-refined",
+}
+"""Cards of ours that are left out, each with the entry that stands for its method: versions that answer alike cost
+all others power, for the comparison of every pair is corrected for their number."""
+OPEN_DEG = 10.0
+"""Where the median error of the direction at the bound is larger, the rotation alone counts."""
+_DECADES = 2.0
+_AUC_DEG = (0.1, 1.0)
+"""Of e_R and of e_T: a rotation is known ten times as well."""
+_KEPT = ("within", "flip", "failure", "e_R_deg", "e_T_deg", "e_s", "seconds")
+"""Scores of points-1 that are shown too."""
+
+
+def nearness(over: FloatArray) -> FloatArray:
+    """Of errors (...) over their medians at the bound: 1 up to 1, 0 from 100 on, even in the logarithm."""
+    with np.errstate(divide="ignore"):
+        return np.clip(1.0 - np.log10(over) / _DECADES, 0.0, 1.0)
+
+
+class SeveralLaws(Choosing):
+    """A track whose rigs move by several laws."""
+
+    parting = "motion"
+
+
+def rounded(answer: dict[str, Any]) -> dict[str, Any]:
+    """With w and d to twelve digits, and a covariance to six: stored predictions are half as large."""
+    for name, digits in (("w", 12), ("d", 12), ("covariance", 6)):
+        if answer.get(name) is not None:
+            found = np.asarray(answer[name])
+            answer[name] = np.array([float(f"{x:.{digits}g}") for x in found.flat]).reshape(found.shape).tolist()
+    return answer
+
+
+class LawsOfPoints(SeveralLaws, PointsTrack):
+    """Of simulated matches, of four kinds of rigs that move by five laws."""
+
+    name, id = "points-2", "points-2"
+    title = "Motion from simulated matches, under several laws of motion"
+    draws = POINTS_2
+    smoke: ClassVar[tuple[str, ...]] = ()
+    scores = (
+        Score(
+            key="near_bound",
+            title="near bound",
+            hint="1 where e_R and e_T are at the Cramer-Rao bound, 0 from 100 times that on; mean of both",
+            kind="share",
+            better="higher",
+        ),
+        Score(key="near_R", title="near in R", hint="the same of e_R alone", kind="share", better="higher"),
+        Score(key="near_T", title="near in T", hint="the same of e_T alone", kind="share", better="higher"),
+        Score(key="over_R", title="e_R / bound", hint="median of e_R over its median at the bound", kind="median"),
+        Score(key="over_T", title="e_T / bound", hint="median of e_T over its median at the bound", kind="median"),
+        *(score for score in MotionTrack.scores if score.key in _KEPT),
+    )
+    error, error_title = "over_bound", "error over its median at the bound"
+
+    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+        return rounded(answer_problem(problem, entry, runner))
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        numbers = [int(truth.name[1:]) for truth in split.truths]
+        bounds = bound_medians(self.draws, split.seed, max(numbers) + 1, "links")
+        at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
+        rows = super().rows(submission, split)
+        for row, truth, R, T in zip(rows, split.truths, at_R, at_T, strict=True):
+            over_R, over_T = row["e_R_deg"] / R, row["e_T_deg"] / T
+            over = over_R, over_T if T <= OPEN_DEG else over_R
+            near = nearness(np.array(over)) if row["success"] else np.zeros(2)
+            row |= dict(
+                zip(("near_bound", "near_R", "near_T"), [float(np.mean(near)), *near.tolist()], strict=True)
+            )
+            row |= {"over_bound": math.sqrt(over[0] * over[1]), "over_R": over_R, "over_T": over_T}
+            row |= {"motion": truth.facts["motion"]}
+        return rows
+
+
+class LawsOfPoses(SeveralLaws, PoseTrack):
+    """Of rendered frames of a dataset whose motions follow several laws, with matches that are given."""
+
+    name, id = "pose-2", "pose-2"
+    title = "Motion from given matches of rendered frames, under several laws of motion"
+    smoke: ClassVar[tuple[str, ...]] = ()
+    scores = (
+        Score(
+            key="auc_apart",
+            title="AUC apart",
+            hint="mean of AUC of e_R to 0.1 deg and of e_T to 1 deg",
+            kind="share",
+            better="higher",
+        ),
+        *(
+            Score(key=key, title=title, hint=f"area under the curve of {title[4:]}", kind="share", better="higher")
+            for key, title in (("auc_R", "AUC e_R to 0.1 deg"), ("auc_T", "AUC e_T to 1 deg"))
+        ),
+        *(score for score in MotionTrack.scores if score.key in _KEPT),
+    )
+
+    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+        return rounded(answer_problem(problem, entry, runner))
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        rows = super().rows(submission, split)
+        for row, truth in zip(rows, split.truths, strict=True):
+            R = max(0.0, 1.0 - row["e_R_deg"] / _AUC_DEG[0])
+            T = R if math.isnan(row["e_T_deg"]) else max(0.0, 1.0 - row["e_T_deg"] / _AUC_DEG[1])
+            row |= {"motion": truth.motion.name, "auc_apart": 0.5 * (R + T), "auc_R": R, "auc_T": T}
+        return rows
+
+
+# Matches that a method found itself, handed in beside its motions: how many there are, and how many are right.
+#
+# They lie in ``matches/left.csv`` and the like beside the file of answers, with the columns of the given matches
+# that ``export pose`` writes. The true place of a match is where the other frame sees the surface at its first
+# end, by the true depth, which between pixels is that of one plane, and the true motion, each end at its own row's
+# time.
+
+FOLDER = "matches"
+"""Beside the file of answers."""
+RIGHT_PX = 1.0
+"""A right match ends so near to the truth."""
+FILES = tuple(f"{key}.csv" for key in COLUMNS)
+_LARGEST = 1e6
+"""px: no image is so large."""
+
+
+def match_files(beside: Path) -> list[str]:
+    """Names of the files of matches beside a file of answers.
+
+    Raises:
+        RsbenchError: something else lies in the folder ``matches``, or a link.
+    """
+    folder = beside / FOLDER
+    if not os.path.lexists(folder):
+        return []
+    found = sorted(os.listdir(folder)) if folder.is_dir() else []
+    for name in found:
+        if name not in FILES:
+            raise RsbenchError(f"{folder / name}: is not asked; there are: {', '.join(FILES)}")
+        check_own(beside, f"{FOLDER}/{name}")
+    if not found:
+        raise RsbenchError(f"{folder}: must be a folder with some of {', '.join(FILES)}, no link")
+    return found
+
+
+def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, Correspondences] | None:
+    """Matches by the name of the problem; None where there is no folder of them.
+
+    Raises:
+        RsbenchError: see ``match_files``; a file is no such table, names no problem, or has more matches of one
+            than its images have pixels.
+    """
+    names = match_files(beside)
+    tables = {name.removesuffix(".csv"): _table(beside / FOLDER / name, problems) for name in names}
+    if not tables:
+        return None
+    found: dict[str, dict[str, FloatArray]] = {problem: {} for problem in problems}
+    for key, table in tables.items():
+        for problem, rows in table.groupby("name", sort=False):
+            camera = problems[str(problem)].rig.camera
+            if len(rows) > (most := camera.width * camera.height):
+                raise RsbenchError(
+                    f"{beside / FOLDER / key}.csv: {len(rows)} matches of {problem}: more than pixels, {most}"
+                )
+            found[str(problem)][key] = rows[COLUMNS[key].split(", ")].to_numpy(dtype=np.float64)
+    return {problem: Correspondences(**sets) for problem, sets in found.items()}
+
+
+def _table(path: Path, problems: Mapping[str, Truth]) -> pd.DataFrame:
+    columns = COLUMNS[path.stem].split(", ")
+    table = read_table(path, ("name",), columns, dtype={"name": str}, keep_default_na=False, na_values=["nan"])
+    if others := sorted({*map(str, table.columns)} - {"name", *columns}):
+        raise RsbenchError(
+            f"{path}: the column {others[0][:100]!r} is not asked; there are: name, {', '.join(columns)}"
+        )
+    for name in table["name"].unique():
+        if name not in problems:
+            raise RsbenchError(f"{path}: name = {str(name)[:100]!r}: is no problem of the split")
+    wrong = ~np.all(np.abs(table[columns].to_numpy(dtype=np.float64)) < _LARGEST, axis=1)
+    if np.any(wrong):
+        raise RsbenchError(f"{path}:{int(np.argmax(wrong)) + 2}: must hold finite pixels below {_LARGEST:g}")
+    return table
+
+
+def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[str, float]:
+    """Of the matches of one problem, each counted once: their number, and the share that is right.
+
+    NaN where the method hands in none at all; of a problem without matches nothing is right.
+    """
+    if matches is None:
+        return {"matches": math.nan, "matches_1px": math.nan}
+    found = arranged(matches)
+    errors = [
+        match_errors(sequence, views, np.unique(found.pixels[found.sets == number].reshape(-1, 4), axis=0))
+        for number, views in enumerate(MATCHED.values())
+    ]
+    right = np.concatenate(errors) <= RIGHT_PX
+    return {"matches": float(len(right)), "matches_1px": float(np.mean(right)) if len(right) else 0.0}
+
+
+def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray) -> FloatArray:
+    """Distances (n,), px, of the second ends of matches (n, 4) from their true places; infinite without one.
+
+    What has no surface is infinitely far.
+    """
+    source, target = views
+    disparity = np.nan_to_num(sequence.rig.disparity(sequence.depth("rs", *source))).astype(np.float32)
+    there = between_pixels(disparity, rows[:, :2]).astype(np.float64)
+    far = np.where(there > 0.0, sequence.rig.depth(np.where(there > 0.0, there, 1.0)), FAR)
+    eyes, ahead = looks(sequence, source, rows[:, :2])
+    truth, _, _ = seen_near(sequence, target, eyes + far[:, None] * (ahead - eyes), rows[:, 2:])
+    error = np.linalg.norm(rows[:, 2:] - truth, axis=1)
+    return np.where(np.isfinite(error) & np.isfinite(there), error, np.inf)
+
+
+# The track of motions from frames alone: a method finds its own matches, and may hand them in.
+
+
+class OwnPoseTrack(Choosing, FrameTrack, MotionTrack):
+    """Of rendered frames; matches of the method's own may be handed in."""
+
+    name, id = "pose-own", "pose-own-1"
+    title = "Motion from rendered frames"
+    allowed = ("left", "right", "links", "readout", "images")
+    given = "the four rolling-shutter frames"
+    own_matches = True
+    scores = MOTION + MATCHES
+    smoke_metrics = (*MotionTrack.smoke_metrics, "matches", "matches_1px")
+    also_uses = ("images",)
+
+    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
+        return super().steps(cards, split, limits) + len(split.truths)
+
+    def run(
+        self,
+        cards: Sequence[str],
+        split: Split,
+        inputs: Path,
+        work: Path,
+        *,
+        step: Step = lambda word: None,
+        **options: Any,
+    ) -> list[Path]:
+        """Solvers get the matches that ``rsbench correct`` finds by default, and hand them in."""
+        found, matched = list[Problem](), work / "matched"
+        for problem in with_matches(read_inputs(inputs, self), inputs, CorrectionOptions()):
+            found.append(problem)
+            step(problem.name)
+        write_inputs(replace(split, public=False), found, matched)
+        files = run_cards(self, cards, split, matched, work, step=step, **options)
+        for file in files:
+            write_matches(found, file.parent / FOLDER)
+        return files
+
+    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
+        return [f"{FOLDER}/{name}" for name in match_files(submission.folder)]
+
+    def check_beside(
+        self, submission: Submission, split: Split, most: int, hints: bool
+    ) -> tuple[list[str], list[str]]:
+        try:
+            read_own_matches(submission.folder, split.by_name)
+        except RsbenchError as error:
+            return [str(error)], []
+        return [], []
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        rows, own = super().rows(submission, split), read_own_matches(submission.folder, split.by_name)
+        for row, truth in zip(rows, split.truths, strict=True):
+            assert truth.sequence is not None
+            row |= match_scores(truth.sequence, None if own is None else own[truth.name])
+        return rows
+
+
+def with_matches(problems: Iterable[Problem], inputs: Path, options: CorrectionOptions) -> Iterator[Problem]:
+    """Problems with what the features of the options find in their frames; nothing where these show no texture."""
+    for problem in problems:
+        images, scanning = read_frames(inputs, problem), problem.shutter.scanning
+        try:
+            matches = find_matches_of_rig(images, problem.rig, scanning, options)
+        except RsbenchError:  # every solver fails such a problem, and says why
+            matches = problem.correspondences
+        yield replace(problem, correspondences=matches)
+
+
+# Entries nearer to the truth than their data allow are marked, and have no rank until the board's keeper says so.
+#
+# Two signs: an error that is exact in a tenth of the problems, and errors below what the Cramer-Rao bound of the
+# data that a method names allows. An unbiased method errs by less than the median at the bound in at most half of
+# the problems. Each error of a track is judged by itself. Where no bound is known, as for rendered frames, the
+# truth with a small error shows neither sign: a keeper who wants to be sure runs the method.
+_DRAWS = 4000
+"""Of errors at a bound: their median is known to 3 %."""
+
+
+def medians_of(bounds: Sequence[Bound]) -> Mapping[str, FloatArray]:
+    """Medians (n,) of e_R_deg and e_T_deg of Gaussian errors at bounds; infinite where the data say nothing."""
+    draws = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
+    return {
+        "e_R_deg": np.array([_median(bound.rotation_axes, draws) for bound in bounds]),
+        "e_T_deg": np.array([_median(bound.direction_axes, draws) for bound in bounds]),
+    }
+
+
+def _median(axes: FloatArray, draws: FloatArray) -> float:
+    if not np.all(np.isfinite(axes)):
+        return np.inf
+    lengths = np.sqrt(np.sum((axes * draws[:, : len(axes)]) ** 2, axis=1))
+    return float(np.rad2deg(np.median(lengths)))

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
-from rsbench.benchmark.leaderboard.frame_inputs import write_frames
-from rsbench.benchmark.leaderboard.splits import Split, truth_of
-from rsbench.benchmark.leaderboard.track import Track
+from rsbench.benchmark.leaderboard.inputs import check_place, write_frames, write_inputs
+from rsbench.benchmark.leaderboard.splits import truth_of
+from rsbench.benchmark.leaderboard.track import Split, Track
 from rsbench.components.cards import card_path, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard

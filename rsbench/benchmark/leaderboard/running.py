@@ -8,7 +8,6 @@ other packages run in processes of their own with a limit of time; what they do 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,11 +20,19 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import pandas as pd
 
 from rsbench.benchmark.images.store import identity_of, read_record
-from rsbench.benchmark.leaderboard.answers import LARGEST, LEAST_D
-from rsbench.benchmark.leaderboard.exporting import write_inputs
-from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.submissions import Submission, submission_text, template_text, truth_text
-from rsbench.benchmark.leaderboard.track import ORACLE, Limits, Row, Step, Track
+from rsbench.benchmark.leaderboard.inputs import read_inputs
+from rsbench.benchmark.leaderboard.submissions import submission_text, template_text, truth_text
+from rsbench.benchmark.leaderboard.track import (
+    LARGEST,
+    LEAST_D,
+    ORACLE,
+    Limits,
+    Row,
+    Split,
+    Step,
+    Submission,
+    Track,
+)
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.capture.settle import AUTO
@@ -35,12 +42,12 @@ from rsbench.jobs.process_jobs import finished_jobs, run_jobs
 from rsbench.jobs.workers import Workers
 from rsbench.pipeline.answer import Extra, solve_problem
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.pipeline.problem import Problem, parse_problem
+from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.engine.warm_up import warm_up
 from rsbench.storage.files import sha256, write_bytes, write_json
-from rsbench.storage.untrusted_files import check_name, parse_json, read_text
+from rsbench.storage.untrusted_files import check_name
 
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
 CHOOSES = "rs-stereo-auto"
@@ -152,22 +159,6 @@ def load_entries(cards: Sequence[str], track: SolverTrack) -> dict[str, SolverEn
     for entry in entries.values():
         track.check_entry(entry)
     return entries
-
-
-def prepare_inputs(
-    split: Split,
-    problems: Callable[[], Iterator[Problem]],
-    folder: Path,
-    frames: Callable[[Path], None] = lambda folder: None,
-) -> None:
-    """Export a split into a folder, unless it holds that already; the truth stays out of it.
-
-    ``frames`` writes those into a folder.
-    """
-    stored = read_record(folder / "split.json")
-    if stored is None or stored.get("fingerprint") != split.fingerprint:
-        frames(folder)
-        write_inputs(replace(split, public=False), problems(), folder)
 
 
 def run_cards(
@@ -325,22 +316,6 @@ def _serve(track: SolverTrack, inputs: Path, limits: Limits) -> Callable[[_Job],
     return run
 
 
-def read_inputs(inputs: Path, track: Track) -> list[Problem]:
-    """The exported problems; where the readout ratio is not given, it is 0.
-
-    Raises:
-        RsbenchError: they are not there, or damaged.
-    """
-    path = inputs / "problems.jsonl"
-    unknown: dict[str, float] = {} if track.gives_readout else {"readout_ratio": 0.0}
-    found = list[Problem]()
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        where = f"{path}:{number}"
-        text = json.dumps(parse_json(line, where) | unknown) if unknown else line
-        found.append(parse_problem(text, where))
-    return found
-
-
 def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
     """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
     text = f"leaderboard {problem.name} {entry.name}"
@@ -359,3 +334,23 @@ def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -
         if length < LEAST_D:
             kept["d"] = [0.0, 0.0, 0.0]  # the rig stands still
     return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}
+
+
+# Second protocols: several laws of motion, scores that separate, ratios that nobody guesses, one entry each.
+
+
+class Choosing(SolverTrack):
+    """A track whose entries assume a law of motion, or choose one."""
+
+    def entry_of(self, card: str) -> SolverEntry:
+        if card != CHOOSES:
+            return load_solver_entry(card)
+        entry = load_solver_entry("rs-stereo-refined")
+        words = "The recommended solver under the motion model that the matches of the problem prefer"
+        return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}")
+
+    def assumed(self, entry: SolverEntry) -> str:
+        if entry.name == CHOOSES:
+            return "chosen"
+        spec = entry.solver.spec
+        return "none" if spec.shutter == "global" else spec.motion_model

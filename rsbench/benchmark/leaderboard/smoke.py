@@ -14,22 +14,14 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from rsbench.benchmark.images.store import read_record
-from rsbench.benchmark.leaderboard.exporting import write_matches
-from rsbench.benchmark.leaderboard.frame_inputs import FEATURES, FrameTrack, write_frames
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.motion_tracks import PoseTrack
-from rsbench.benchmark.leaderboard.own_matches import FOLDER as MATCHES
-from rsbench.benchmark.leaderboard.own_pose_track import with_matches
-from rsbench.benchmark.leaderboard.running import (
-    answer_problem,
-    header_of,
-    load_entries,
-    prepare_inputs,
-    read_inputs,
-)
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.inputs import prepare_inputs, read_inputs, write_frames, write_matches
+from rsbench.benchmark.leaderboard.motion_tracks import FOLDER as MATCHES
+from rsbench.benchmark.leaderboard.motion_tracks import PoseTrack, with_matches
+from rsbench.benchmark.leaderboard.running import answer_problem, header_of, load_entries
+from rsbench.benchmark.leaderboard.splits import FEATURES, FrameTrack
 from rsbench.benchmark.leaderboard.submissions import read_submission, submission_text
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread

@@ -1,20 +1,200 @@
-"""The table of a split: scores with intervals, ranks among those that use no more, ties; oracles have no rank."""
+"""Ranks of methods: confidence intervals of mean scores over scenes, ties, and ranks with intervals.
+
+Scores of one scene are not independent, so scenes count, each alike: the score of an entry is the mean over scenes
+of its mean over the problems there, and its interval is Student's, of the scenes' means. For simulated problems
+each is a scene of its own. Two entries are compared by their differences on the same scenes, all pairs corrected
+by Holm's method (Scandinavian Journal of Statistics 1979); an entry's rank lies, with the same confidence for all
+entries at once, between the number of those that are better and of those that are worse (Mogstad, Romano, Shaikh,
+Wilhelm, Review of Economic Studies 2024).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import gammaincinv, stdtr, stdtrit  # Student's distribution and its inverse
 
 from rsbench.benchmark.leaderboard.board import Scored
-from rsbench.benchmark.leaderboard.calibration import Calibration, calibration, named_numbers
-from rsbench.benchmark.leaderboard.ranking import Rank, better, ranks, scene_means, score_interval, ties
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Track
-from rsbench.benchmark.leaderboard.track_list import track_of_id
+from rsbench.benchmark.leaderboard.tracks import track_of_id
+from rsbench.benchmark.statistics import COVERAGE, Interval, median_interval, share_interval, typical_interval
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
+
+_ROUNDING = 1e-12
+"""Scores lie in [0, 1]; differences of their means below this are none."""
+
+
+class Rank(NamedTuple):
+    """A place, from 1, and the places that the data do not exclude."""
+
+    place: int
+    low: int
+    high: int
+
+
+def scene_means(values: FloatArray, scenes: Sequence[str]) -> FloatArray:
+    """Means (..., scenes), in the order of their names, of values (..., n)."""
+    names, labels = np.unique(np.asarray(scenes), return_inverse=True)
+    weights = np.zeros((len(names), len(labels)))
+    weights[labels, np.arange(len(labels))] = 1.0
+    return values @ (weights / weights.sum(axis=1, keepdims=True)).T
+
+
+def mean_interval(means: FloatArray) -> Interval:
+    """Interval of the mean of independent means (k,) of scenes; without bounds for a single scene."""
+    k = len(means)
+    if k < 2:
+        return Interval(-np.inf, np.inf)
+    half = float(stdtrit(k - 1, 0.5 + 0.5 * COVERAGE) * np.std(means, ddof=1) / np.sqrt(k))
+    middle = float(np.mean(means))
+    return Interval(middle - half, middle + half)
+
+
+def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True) -> tuple[float, float, float]:
+    """The mean over scenes of values (n,), and the ends of its interval.
+
+    A ``share`` lies in [0, 1], and so does its interval. Of yes or no of problems that are independent the
+    interval is exact; of those that share scenes it has that one inside: scenes that all say no do not bound the
+    share to 0.
+    """
+    means = scene_means(values, scenes)
+    low, high = mean_interval(means)
+    if not share:
+        return float(np.mean(means)), low, high
+    if np.all((values == 0.0) | (values == 1.0)):
+        exact = share_interval(int(np.sum(values)), len(values))
+        if len(means) == len(values):
+            return float(np.mean(means)), exact.low, exact.high
+        low, high = min(low, exact.low), max(high, exact.high)
+    return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
+
+
+def better(means: FloatArray) -> NDArray[np.bool_]:
+    """Whether entry i is better than entry j (n, n): of means (n, k) of entries and scenes, higher is better.
+
+    All that is said holds at once with ``statistics.COVERAGE``.
+    """
+    i, j = np.triu_indices(len(means), 1)
+    differences = means[i] - means[j]
+    told = _holm(_chances(differences))
+    i_first = np.mean(differences, axis=1) > 0.0
+    out = np.zeros((len(means), len(means)), dtype=np.bool_)
+    out[i, j], out[j, i] = told & i_first, told & ~i_first
+    return out
+
+
+def _chances(differences: FloatArray) -> FloatArray:
+    """Of such differences (pairs, k), or larger ones, between equal entries: two-sided p of the paired t test."""
+    k = differences.shape[1]
+    middle = np.abs(np.mean(differences, axis=1))
+    if k < 2:
+        return np.ones(len(middle))
+    spread = np.maximum(np.std(differences, axis=1, ddof=1) / np.sqrt(k), _ROUNDING)
+    return np.where(middle < _ROUNDING, 1.0, 2.0 * stdtr(k - 1, -middle / spread))
+
+
+def _holm(chances: FloatArray) -> NDArray[np.bool_]:
+    """Which of the hypotheses fall at a family-wise error of 1 - COVERAGE."""
+    order = np.argsort(chances, kind="stable")
+    limits = (1.0 - COVERAGE) / (len(chances) - np.arange(len(chances)))
+    fails = np.flatnonzero(chances[order] > limits)
+    fallen = np.zeros(len(chances), dtype=np.bool_)
+    fallen[order[: fails[0] if len(fails) else len(order)]] = True
+    return fallen
+
+
+def ranks(scores: FloatArray, beats: NDArray[np.bool_], uses: Sequence[frozenset[str]]) -> list[Rank]:
+    """The rank of each entry among those that use no more than it does.
+
+    Args:
+        scores: (n,) mean scores, higher is better.
+        beats: of ``better``.
+        uses: what each entry uses.
+    """
+    found = []
+    for i in range(len(scores)):
+        peers = np.array([j != i and uses[j] <= uses[i] for j in range(len(scores))], dtype=np.bool_)
+        before = int(np.count_nonzero(peers & (scores > scores[i] + _ROUNDING)))
+        low = int(np.count_nonzero(peers & beats[:, i]))
+        high = int(np.count_nonzero(peers & ~beats[i]))
+        found.append(Rank(1 + before, 1 + low, 1 + high))
+    return found
+
+
+def ties(beats: NDArray[np.bool_], i: int) -> list[Any]:
+    """Entries that the data do not tell from entry i."""
+    return [j for j in range(len(beats)) if j != i and not beats[i, j] and not beats[j, i]]
+
+
+# Calibration of the covariances that methods state (NEES): shown beside scores, and never ranked.
+#
+# The squared error by the stated covariance (NEES) is chi-squared where that is right, with six degrees of freedom
+# for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
+# and Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that share of problems. One
+# wild error decides about a mean, so what has an interval is the median.
+
+LEVELS = (0.5, 0.9, 0.95)
+_SEED = 0
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Of the answers that state a covariance; each triple is a value with the ends of its interval."""
+
+    stated: int
+    """How many those are."""
+    spread: Triple
+    """Median of NEES by that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
+    covers: tuple[Triple, ...]
+    """For each of ``LEVELS``, the share of truths within the ellipsoid that should hold so many."""
+    mean: float
+    """NEES over its degrees of freedom, without an interval."""
+
+
+def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
+    """Of the scores of an entry, whose answers have so many unknowns; None where no covariance was stated."""
+    if "nees" not in scores:
+        return None
+    told = scores[scores["nees"].notna()]
+    if told.empty:
+        return None
+    nees, scenes = told["nees"].to_numpy(dtype=np.float64), list(told["scene"])
+    ratio = nees / _chi_squared(0.5, unknowns)
+    alone = len(set(scenes)) == len(scenes)
+    low, high = median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)
+    return Calibration(
+        stated=len(told),
+        spread=(float(np.median(ratio)), low, high),
+        covers=tuple(
+            score_interval((nees <= _chi_squared(level, unknowns)).astype(np.float64), scenes) for level in LEVELS
+        ),
+        mean=float(np.mean(nees)) / unknowns,
+    )
+
+
+def _chi_squared(level: float, unknowns: int) -> float:
+    """Below which a share ``level`` of a chi-squared variable of so many degrees of freedom lies."""
+    return 2.0 * float(gammaincinv(0.5 * unknowns, level))
+
+
+def named_numbers(found: Calibration | None) -> dict[str, Triple]:
+    """The triples by the names of their columns; NaN where nothing was stated."""
+    nothing = (np.nan, np.nan, np.nan)
+    covers = found.covers if found else (nothing,) * len(LEVELS)
+    return {
+        "nees_ratio": found.spread if found else nothing,
+        **{f"covers_{100.0 * level:.0f}": triple for level, triple in zip(LEVELS, covers, strict=True)},
+    }
+
+
+# The table of a split: scores with intervals, ranks among those that use no more, ties; oracles have no rank.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

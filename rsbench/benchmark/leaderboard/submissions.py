@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.answers import Answer, Header, Vector
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.track import Answer, Header, Split, Submission, Vector
 from rsbench.components.cards import choices, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
@@ -30,17 +29,6 @@ _OF_SOLVE = (
 )
 """Keys that an answer of ``rsbench solve --json`` has beside those that are read."""
 _NAMED = 3
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Submission:
-    """A file without faults."""
-
-    header: Header
-    answers: Mapping[str, Answer]
-    """By the name of the problem."""
-    folder: Path
-    """Of the file; what answers hold beside it lies there."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

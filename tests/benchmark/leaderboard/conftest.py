@@ -8,8 +8,9 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 from leaderboards import ASK_PICTURES, PLANES
 
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.track import Split
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 
 
 @pytest.fixture(scope="module")

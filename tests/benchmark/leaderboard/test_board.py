@@ -17,24 +17,16 @@ from commands import assert_refused, run_here
 from leaderboards import Line, erring, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import running
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import ORACLES, entries_of, rescore, splits_of
-from rsbench.benchmark.leaderboard.exporting import write_inputs
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.merging import merge
+from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore, splits_of
+from rsbench.benchmark.leaderboard.inputs import write_inputs
 from rsbench.benchmark.leaderboard.motion_tracks import AUC_DEG
-from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
+from rsbench.benchmark.leaderboard.readout_tracks import ReadoutTrack
 from rsbench.benchmark.leaderboard.running import uses_of
-from rsbench.benchmark.leaderboard.splits import (
-    Split,
-    dataset_split,
-    points_split,
-    simulated_problem,
-)
+from rsbench.benchmark.leaderboard.splits import dataset_split, points_split, simulated_problem
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Limits
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Limits, Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import Outcome
 from rsbench.pipeline.isolated_solver import SolverRunner

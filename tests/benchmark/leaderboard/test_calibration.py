@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from rsbench.benchmark.leaderboard.calibration import LEVELS, calibration, named_numbers
+from rsbench.benchmark.leaderboard.standings import LEVELS, calibration, named_numbers
 
 
 def _scores(nees: np.ndarray, scenes: int = 0) -> pd.DataFrame:

@@ -10,13 +10,11 @@ import pytest
 from commands import assert_refused, run_here
 from leaderboards import Line, named, small_split, truth_lines, write
 
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, entries_of, rescore
-from rsbench.benchmark.leaderboard.merging import merge
+from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, add, entries_of, merge, rescore
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
 from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings, table
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.report.board_page import build_site

@@ -15,8 +15,9 @@ import pytest
 import yaml
 from leaderboards import Line, erring, files_below, lines_of, named, truth_lines, write
 
-from rsbench.benchmark.leaderboard.splits import Split, points_split
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.splits import points_split
+from rsbench.benchmark.leaderboard.track import Split
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 
 ROOT = Path(__file__).parents[3]
 BOARD = ROOT / "examples" / "board"

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from leaderboards import Line, files_below, lines_of, pictures_of, write
 
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.board import add
 from rsbench.benchmark.leaderboard.submissions import check_submission
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import write_depth, write_exr, write_png
 

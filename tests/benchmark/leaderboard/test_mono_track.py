@@ -14,10 +14,9 @@ from leaderboards import PLANES, lines_of
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.mono_track import _with_gyro
-from rsbench.benchmark.leaderboard.picture_running import Making
-from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.picture_track import Making
+from rsbench.benchmark.leaderboard.splits import dataset_split, with_gyro
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
@@ -117,7 +116,7 @@ def test_samples_of_a_pair_of_many_frames_have_its_own_times(rendered: Path) -> 
     sequence = next(iter(read_dataset(rendered)))
     (problem,) = TRACK.problems(rendered, None, 1)
     later = replace(sequence, first=1, channels=())
-    given, shifted = (_with_gyro(problem, each).correspondences.gyro for each in (sequence, later))
+    given, shifted = (with_gyro(problem, each).correspondences.gyro for each in (sequence, later))
     both = np.isin(np.round(shifted[:, 0] + 1.0, 9), np.round(given[:, 0], 9))
     assert np.count_nonzero(both) > 10
     rows = {round(float(row[0]), 9): row[1:] for row in given}

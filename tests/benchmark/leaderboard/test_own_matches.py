@@ -13,14 +13,12 @@ from analytic_dataset import PLANES, write_analytic_dataset
 from commands import run_here
 from leaderboards import truth_lines, write
 
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import ORACLES, entries_of, rescore
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.merging import merge
-from rsbench.benchmark.leaderboard.own_matches import match_scores
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.motion_tracks import match_scores
+from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion

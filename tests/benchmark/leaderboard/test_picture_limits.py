@@ -13,7 +13,7 @@ from leaderboards import ASK_PICTURES, lines_of
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.jobs.isolation import Outcome
 
 METHODS = """

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 from leaderboards import ASK_PICTURES, PLANES, lines_of, named, pictures_of, write
 
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import place
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, WINDOW, columns, texture
+from rsbench.benchmark.leaderboard.board import add, place
 from rsbench.benchmark.leaderboard.picture_track import PictureTrack
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.pictures import PARTINGS, WINDOW, columns, texture
 from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_pictures import albums
 from rsbench.report.board_splits import read_split

@@ -17,14 +17,12 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 from leaderboards import ASK_PICTURES, PLANES, lines_of, pictures_of, write
 
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import entries_of, rescore
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.merging import merge
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import LinearMotion
 from rsbench.storage.files import read_depth, read_png, write_depth, write_png

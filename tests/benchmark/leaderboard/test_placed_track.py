@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from leaderboards import lines_of
 
-from rsbench.benchmark.leaderboard.correction_track import TrueFrame
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.picture_parts import parts_within
-from rsbench.benchmark.leaderboard.placed_track import placed, seen_alike
+from rsbench.benchmark.leaderboard.correction_tracks import TrueFrame, placed, seen_alike
+from rsbench.benchmark.leaderboard.pictures import parts_within
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.vision.quality import Picture, ssim
 

@@ -18,7 +18,6 @@ import pytest
 from commands import run_here
 
 from rsbench.benchmark.leaderboard import publishing
-from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.publishing import (
     ANNOUNCEMENT,
     DATA,
@@ -28,7 +27,8 @@ from rsbench.benchmark.leaderboard.publishing import (
     read_announcement,
 )
 from rsbench.benchmark.leaderboard.submissions import read_submission, truth_text
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
 from rsbench.dataset.card import DatasetCard

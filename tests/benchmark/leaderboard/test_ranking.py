@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, ttest_1samp, ttest_rel
 
-from rsbench.benchmark.leaderboard.ranking import (
-    better,
-    mean_interval,
-    ranks,
-    scene_means,
-    score_interval,
-    ties,
-)
+from rsbench.benchmark.leaderboard.standings import better, mean_interval, ranks, scene_means, score_interval, ties
 
 ANY = frozenset({"left"})
 

@@ -11,10 +11,9 @@ from analytic_dataset import write_analytic_dataset
 from leaderboards import PLANES, jobs_here
 
 from rsbench.benchmark.leaderboard import running
-from rsbench.benchmark.leaderboard.board import entries_of, splits_of
+from rsbench.benchmark.leaderboard.board import entries_of, restore, splits_of
 from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.benchmark.leaderboard.stored_predictions import restore
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.cli import generate, reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
 

@@ -10,11 +10,10 @@ import pandas as pd
 import pytest
 from leaderboards import lines_of, named, pictures_of, write
 
-from rsbench.benchmark.leaderboard.adding import add, add_all
-from rsbench.benchmark.leaderboard.board import FILES, ORACLES, entries_of, rescore
-from rsbench.benchmark.leaderboard.marking import _serve, mark_all
-from rsbench.benchmark.leaderboard.splits import Split
+from rsbench.benchmark.leaderboard.board import FILES, ORACLES, add, add_all, entries_of, rescore
+from rsbench.benchmark.leaderboard.picture_track import _serve_scores
 from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.track import Split, mark_all
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.plain_data import decode, encode
@@ -111,7 +110,7 @@ def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_p
     assert first.pictures is not None
     changed = replace(first.pictures, files=dict.fromkeys(first.pictures.files, "0" * 64))
     broken = replace(split, truths=(replace(first, pictures=changed), second))
-    run = _serve([read_submission(split.track.write_truth(split, tmp_path), split)], broken)
+    run = _serve_scores([read_submission(split.track.write_truth(split, tmp_path), split)], broken)
     with pytest.raises(EntryFailure, match=r"is not the file that dataset\.json names"):
         run(first.name)
     (row,) = run(second.name)

@@ -12,12 +12,12 @@ from commands import assert_refused, run_here
 from leaderboards import lines_of, named, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.publishing import drawn_split
-from rsbench.benchmark.leaderboard.second_protocols import best_constant
-from rsbench.benchmark.leaderboard.splits import Split, dataset_split
+from rsbench.benchmark.leaderboard.readout_tracks import best_constant
+from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core import so3
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.secret_split import Secret

@@ -22,18 +22,23 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from rsbench.benchmark.leaderboard import publishing
-from rsbench.benchmark.leaderboard.adding import add
-from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.marking import mark
-from rsbench.benchmark.leaderboard.motion_tracks import smooth
-from rsbench.benchmark.leaderboard.points_draws import KINDS, LAWS, POINTS_2
+from rsbench.benchmark.leaderboard.board import SUFFIX, add, entries_of, restore
+from rsbench.benchmark.leaderboard.motion_tracks import SAME_METHOD, rounded, smooth
+from rsbench.benchmark.leaderboard.readout_tracks import crps, spread_of
 from rsbench.benchmark.leaderboard.running import CHOOSES
-from rsbench.benchmark.leaderboard.second_protocols import SAME_METHOD, crps, rounded, spread_of
-from rsbench.benchmark.leaderboard.splits import Split, exact_problem, points_split, simulated_problem, truth_of
+from rsbench.benchmark.leaderboard.splits import (
+    KINDS,
+    LAWS,
+    POINTS_2,
+    exact_problem,
+    points_split,
+    simulated_problem,
+    truth_of,
+)
 from rsbench.benchmark.leaderboard.standings import standings, table
-from rsbench.benchmark.leaderboard.stored_predictions import SUFFIX, restore
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS, track_of_name
+from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_name
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.cli.reproduce_leaderboard import entries_of_laws
 from rsbench.core.errors import RsbenchError

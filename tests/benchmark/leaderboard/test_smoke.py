@@ -10,7 +10,7 @@ import pytest
 from commands import assert_refused, run_here
 
 from rsbench.benchmark.leaderboard.smoke import CARD, ENTRIES, differences, read_scores
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 

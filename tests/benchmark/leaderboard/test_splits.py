@@ -12,17 +12,12 @@ import pytest
 from commands import run_here
 from leaderboards import small_split
 
-from rsbench.benchmark.leaderboard.exporting import check_place, write_inputs
-from rsbench.benchmark.leaderboard.marking import mark
+from rsbench.benchmark.leaderboard.inputs import check_place, write_inputs
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
-from rsbench.benchmark.leaderboard.splits import (
-    dataset_split,
-    exact_problem,
-    points_split,
-    simulated_problem,
-)
+from rsbench.benchmark.leaderboard.splits import dataset_split, exact_problem, points_split, simulated_problem
 from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import rs_project
 from rsbench.pipeline.problem import Problem, read_problems

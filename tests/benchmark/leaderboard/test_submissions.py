@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, motion_row
-from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, template_text
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 

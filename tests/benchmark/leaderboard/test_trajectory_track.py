@@ -12,11 +12,10 @@ from commands import assert_refused, run_here
 from leaderboards import Line, lines_of, named, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.marking import mark
 from rsbench.benchmark.leaderboard.publishing import drawn_split
-from rsbench.benchmark.leaderboard.splits import Split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
-from rsbench.benchmark.leaderboard.track_list import TRACKS
+from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.benchmark.trajectory_methods import METHODS
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera

@@ -10,38 +10,53 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice, product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.predict import true_pairs
-from rsbench.benchmark.leaderboard.marking import Numbers
-from rsbench.benchmark.leaderboard.picture_files import FOLDER, frame_png, read_answer_frame
-from rsbench.benchmark.leaderboard.picture_parts import PARTINGS, Parts, SquareErrors, parts_within
-from rsbench.benchmark.leaderboard.picture_parts import columns as parting_columns
-from rsbench.benchmark.leaderboard.picture_running import CardChain, Making
-from rsbench.benchmark.leaderboard.picture_track import PictureTrack
-from rsbench.benchmark.leaderboard.splits import Split, Truth
-from rsbench.benchmark.leaderboard.submissions import Submission
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Score
-from rsbench.benchmark.leaderboard.true_pictures import VIEW, Asked, TruePictures
+from rsbench.benchmark.leaderboard.picture_track import CardChain, Making, PictureTrack
+from rsbench.benchmark.leaderboard.pictures import (
+    FOLDER,
+    PARTINGS,
+    VIEW,
+    Asked,
+    Parts,
+    SquareErrors,
+    TruePictures,
+    frame_png,
+    parts_within,
+    read_answer_frame,
+    texture,
+)
+from rsbench.benchmark.leaderboard.pictures import columns as parting_columns
+from rsbench.benchmark.leaderboard.splits import GYRO, bare_problems, with_gyro
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Truth
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import VIEWS, View
-from rsbench.dataset import sequence as sequences
-from rsbench.dataset.layout import picture_file
-from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
+from rsbench.core.rig import FRAMES, VIEWS, View
+from rsbench.dataset.imu import MEASURED
+from rsbench.dataset.layout import exposed_file, picture_file
+from rsbench.dataset.sequence import Sequence as Rendered
+from rsbench.dataset.sequence import read_pairs
+from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four, correct_known_rows
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
+from rsbench.pipeline.mono_correction import find_own_motion, flow_matches, refusal
+from rsbench.pipeline.problem import Problem
 from rsbench.storage.files import write_bytes
 from rsbench.vision.closing import finished
-from rsbench.vision.corrector import demand_corrected, load_corrector
+from rsbench.vision.corrector import CorrectorSpec, demand_corrected, load_corrector
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.mono_fusion import find_flows
 from rsbench.vision.published_quality import flip, ssim_deepunroll, ssim_uniform
-from rsbench.vision.quality import Picture, psnr_within, ssim_within
+from rsbench.vision.quality import GAUSSIAN, Picture, psnr_within, ssim_map, ssim_within, to_unit, window_mask
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 """An image (H, W, 3) and where something was drawn (H, W)."""
@@ -141,7 +156,7 @@ class CorrectionTrack(PictureTrack):
         "epe_px",
     )
 
-    def asked(self, sequence: sequences.Sequence) -> tuple[Asked, ...]:
+    def asked(self, sequence: Rendered) -> tuple[Asked, ...]:
         """At the first row, and at others where the dataset has that truth."""
         side, frame = VIEW
         lines = sequence.shutter.lines(side)
@@ -158,7 +173,7 @@ class CorrectionTrack(PictureTrack):
         assert truth.pictures is not None
         found: set[str] = set()
         for each in truth.pictures.asked:
-            image, _ = read_answer_frame(folder, truth, each)
+            image, _ = read_answer_frame(folder, truth.pictures, each)
             if wanted and split.public:
                 others = {k.stem: truth.pictures.frame(k.row) for k in truth.pictures.asked if k != each}
                 found |= set(_readings(image, truth.pictures.frame(each.row), others))
@@ -169,7 +184,7 @@ class CorrectionTrack(PictureTrack):
 
         def scores_of(submission: Submission, success: bool) -> Numbers:
             folder = submission.folder / FOLDER
-            drawn = [read_answer_frame(folder, truth, each) for each in pictures.asked] if success else None
+            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.asked] if success else None
             return frame_scores(true, drawn, self.rows, flips=self.flips)
 
         return scores_of
@@ -346,3 +361,270 @@ def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
     counted[[0, -1]] = counted[:, [0, -1]] = False
     difference = image[counted].astype(np.float32) - truth[counted]
     return float(np.mean(difference * difference)) if difference.size else np.inf
+
+
+# Corrected frames by where things stand in them: what filters can do to a picture moves nothing.
+#
+# A frame's noise, blur and vignetting are no matter of the shutter, yet they are most of what SSIM counts on a
+# real sensor. So windows of the frame and of the truth, blurred alike, are laid over each other where they
+# correlate most, and what counts is by how far they stand off. Dense flow would not do: on a noisy frame it errs
+# by as much as a corrected frame is off; nor phase correlation, which undoes the blur.
+
+LIMIT_PX = 2.0
+"""A window that stands farther off has no part in the score."""
+WINDOW_PX, _STEP_PX, _REACH_PX = 64, 32, 4
+"""Side of a window, from one to the next, and how far it is looked for."""
+_BLUR_PX = 3.0
+"""Standard deviation of the blur of both pictures."""
+_LOOK_PX = 2.0
+"""Standard deviation of the blur under which pictures are compared: white noise is left with a seventh."""
+_LOOK_CONSTANTS = 0.1
+"""Factor of SSIM's constants: the blur takes contrast away, and beside the whole ones a tenth of it would do."""
+_TEXTURE = 5.0
+"""Grey levels by which the truth must deviate around a pixel that counts: elsewhere nothing tells where it is."""
+_LEAST = 0.25
+"""Share of a window's pixels that must count."""
+
+
+class PlacedCorrection(CorrectionTrack):
+    """Rolling-shutter frames as a global shutter would have taken them, ranked by geometry."""
+
+    name, id = "correction-2", "correction-2"
+    title = "Corrected frames, by where things stand"
+    scores = (
+        Score(
+            key="placed",
+            title="placed",
+            hint="1 where textured common pixels stand right, 0 from 2 px on and where they are not drawn",
+            kind="share",
+            better="higher",
+        ),
+        *(score for score in CorrectionTrack.scores if not score.key.startswith("flip_")),
+    )
+    flips = False
+    error, error_title = "misplaced", "1 - placed"
+    smoke: ClassVar[tuple[str, ...]] = ()
+
+    def chain(self, card: str) -> CardChain:
+        return super().chain(card).choosing()
+
+    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
+        others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)
+
+        def scores_of(submission: Submission, success: bool) -> Numbers:
+            folder = submission.folder / FOLDER
+            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.asked] if success else None
+            share = 0.0 if drawn is None else placed(true, drawn)
+            return {**others(submission, success), "placed": share, "misplaced": 1.0 - share}
+
+        return scores_of
+
+
+class SeenCorrection(PlacedCorrection):
+    """Rolling-shutter frames as a global shutter of the same sensor would have taken them."""
+
+    name, id = "correction-3", "correction-3"
+    title = "Corrected frames, by where things stand and how they look"
+    scores = (
+        Score(
+            key="corrected",
+            title="placed x picture",
+            hint="the product of the two: what stands in its place and looks like the scene there",
+            kind="share",
+            better="higher",
+        ),
+        *(score for score in PlacedCorrection.scores if score.key == "placed"),
+        Score(
+            key="picture",
+            title="picture",
+            hint="SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
+            kind="share",
+            better="higher",
+        ),
+        *(score for score in PlacedCorrection.scores if score.key != "placed"),
+    )
+    error, error_title = "uncorrected", "1 - placed x picture"
+    beside = ("placed", "picture", "failure")
+
+    def asked(self, sequence: Rendered) -> tuple[Asked, ...]:
+        """The truth is what the same sensor expects under a global shutter, without noise.
+
+        Raises:
+            RsbenchError: the dataset has a sensor and no such images.
+        """
+        asked = super().asked(sequence)
+        if sequence.sensor is None:
+            return asked
+        if not sequence.exposed_twins:
+            raise RsbenchError(
+                f"{sequence.folder}: has no global-shutter images of its sensor, which {self.id} compares with; "
+                "render the dataset again with exposed_twins = true in its card"
+            )
+        side, frame = VIEW
+        return tuple(each._replace(file=exposed_file(side, frame + sequence.first, each.row)) for each in asked)
+
+    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
+        others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)
+
+        def scores_of(submission: Submission, success: bool) -> Numbers:
+            folder, found = submission.folder / FOLDER, others(submission, success)
+            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.asked] if success else None
+            looks = 0.0 if drawn is None else seen_alike(true, drawn)
+            both = found["placed"] * looks
+            return {**found, "picture": looks, "corrected": both, "uncorrected": 1.0 - both}
+
+        return scores_of
+
+
+def seen_alike(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
+    """The mean over frames of the SSIM to their truth, both blurred, over their common pixels; at least 0.
+
+    What is not drawn counts 0. The blur leaves a sensor's noise without weight, so that a filter gains nothing;
+    contrast, colour, strong noise and holes that were filled with anything keep theirs.
+    """
+    return float(np.mean([_alike(*frame, true) for true, frame in zip(truths, frames, strict=True)]))
+
+
+def _alike(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) -> float:
+    seen, wanted = (
+        Picture(cv2.GaussianBlur(to_unit(each), (0, 0), _LOOK_PX)) for each in (image, true.picture.image)
+    )
+    windows = window_mask(drawn.shape, true.common)
+    if not np.any(windows):
+        return 1.0
+    scores = np.mean(ssim_map(seen, wanted, GAUSSIAN, _LOOK_CONSTANTS), axis=-1)
+    return max(0.0, float(np.mean(np.where(drawn, scores, 0.0)[windows])))
+
+
+def placed(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
+    """The mean over frames of the share of their textured common pixels that are drawn, each by its window's
+    distance from its place: 1 at 0, 0 from ``LIMIT_PX`` on; 1 where no window has enough texture."""
+    return float(np.mean([_placed(*frame, true) for true, frame in zip(truths, frames, strict=True)]))
+
+
+def _placed(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) -> float:
+    truth = true.picture.image
+    counted = true.common & (texture(truth) >= _TEXTURE)
+    seen, wanted = (_blurred(each) for each in (image, truth))
+    side = min(WINDOW_PX, *(size - 2 * _REACH_PX for size in counted.shape))
+    score, total = 0.0, 0
+    for y, x in product(*(range(_REACH_PX, size - side - _REACH_PX + 1, _STEP_PX) for size in counted.shape)):
+        window = np.s_[y : y + side, x : x + side]
+        count = int(np.count_nonzero(counted[window]))
+        if count < _LEAST * side * side:
+            continue
+        around = seen[y - _REACH_PX : y + side + _REACH_PX, x - _REACH_PX : x + side + _REACH_PX]
+        there = np.count_nonzero(counted[window] & drawn[window])
+        score += there * max(0.0, 1.0 - _distance(around, wanted[window]) / LIMIT_PX)
+        total += count
+    return score / total if total else 1.0
+
+
+def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float:
+    """Of the place where a window is found from the middle of what is around it, px; infinite at the rim."""
+    found = cv2.matchTemplate(around, window, cv2.TM_CCOEFF_NORMED)
+    y, x = np.unravel_index(int(np.argmax(found)), found.shape)
+    if not (0 < y < 2 * _REACH_PX and 0 < x < 2 * _REACH_PX):
+        return math.inf
+    down = _top(found[y - 1 : y + 2, x])
+    across = _top(found[y, x - 1 : x + 2])
+    return math.hypot(float(y) + down - _REACH_PX, float(x) + across - _REACH_PX)
+
+
+def _top(three: NDArray[np.float32]) -> float:
+    """Where the parabola through three neighbours is largest, from the middle one."""
+    before, middle, after = map(float, three)
+    bend = before - 2.0 * middle + after
+    return 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+
+
+def _blurred(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float32)
+
+
+# The track of corrected frames for methods that see one camera, beside those of a rig on the same frames.
+#
+# What a corrector needs is found from the two frames of that camera alone, by dense flow: matches, and a motion
+# whose translation has no length. Correctors that need the depth of a rig run in the chain of ``correction``, and
+# their entries say that they use the other camera: what it is worth.
+
+_SIDE = VIEW[0]
+_LAST = {"key": "psnr_last", "title": "PSNR last", "hint": "of the last row's time, common pixels"}
+
+
+class MonoCorrectionTrack(CorrectionTrack):
+    """Rolling-shutter frames of one camera as a global shutter would have taken them."""
+
+    name, id = "correction-mono", "correction-mono-1"
+    title = "Corrected frames of one camera"
+    allowed = (*CorrectionTrack.allowed, "gyro")
+    given = "the four rolling-shutter frames; samples of a gyroscope where the dataset has the channel imu"
+    rows = ("first", "middle", "last")
+    scores = tuple(
+        each
+        for score in CorrectionTrack.scores
+        for each in ((score, replace(score, **_LAST)) if score.key == "psnr_middle" else (score,))
+    )
+    smoke = ("mono-fusion", "flow-scaled", "zhuang", "fusion", "uncorrected", "fusion-true", ORACLE)
+
+    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        assert data is not None
+        sequences = zip(bare_problems(data), read_pairs(data), strict=True)
+        return islice((with_gyro(problem, sequence) for problem, sequence in sequences), count)
+
+    def shown(self, sequence: Rendered) -> tuple[str, ...]:
+        return (MEASURED,) if GYRO in sequence.channels else ()
+
+    def chain(self, card: str) -> CardChain:
+        made = super().chain(card)
+        spec = made.options.corrector.component.spec
+        if _of_a_rig(spec):
+            return made.choosing()
+        others = [name for name, there in (("time", "time" in spec.sees), ("gyro", "gyro" in spec.needs)) if there]
+        return made._replace(uses=("readout", "images", *others))
+
+    def corrected(self, making: Making, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
+        spec = chain.corrector.component.spec
+        if _of_a_rig(spec):
+            return super().corrected(making, chain)
+        problem, known = making.problem, Given()
+        images = {view: image for view, image in making.images.items() if view[0] == _SIDE}
+        if spec.needs & {"motion", "matches"}:
+            making.alone = making.alone or _alone(making, chain)
+            known = making.alone
+        gyro = problem.correspondences.gyro
+        known = replace(known, gyro=gyro if len(gyro) > 0 else None)
+        rig, rows, start = (
+            problem.rig.about(_SIDE),
+            [float(each.row) for each in making.asked],
+            time.perf_counter(),
+        )
+        frames = correct_known_rows(images, known, rig, problem.shutter, chain, (VIEW,), 0.0, rows)
+        spent = making.spent.get("alone", 0.0) if spec.needs & {"motion", "matches"} else 0.0
+        return frames, time.perf_counter() - start + spent
+
+
+def _of_a_rig(spec: CorrectorSpec) -> bool:
+    """Whether a corrector asks for more than one camera: for depth, or by itself for frames of the other one."""
+    return "depth" in spec.needs or ("stereo" in spec.sees and not spec.needs & {"motion", "matches"})
+
+
+def _alone(making: Making, chain: CorrectionOptions) -> Given:
+    """Matches of the asked camera over time, and its motion, whose translation has length 1.
+
+    Raises:
+        RsbenchError: its frames show none.
+    """
+    start = time.perf_counter()
+    frames = [making.images[_SIDE, frame] for frame in FRAMES]
+    flows = find_flows(frames)
+    if reason := refusal(frames, flows):
+        raise RsbenchError(reason)
+    matches = flow_matches(flows, np.random.default_rng(chain.seed))
+    rig, shutter = making.problem.rig, making.problem.shutter
+    found = find_own_motion(flows, rig, shutter, _SIDE, chain.robust, chain.seed)
+    if found.own.motion is None:
+        raise RsbenchError(found.reason)
+    making.spent["alone"] = time.perf_counter() - start
+    return Given(matches=Correspondences(left=matches), motion=found.own.motion)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from rsbench.benchmark.leaderboard.correction_track import CorrectionTrack
+from rsbench.benchmark.leaderboard.correction_tracks import (
+    CorrectionTrack,
+    MonoCorrectionTrack,
+    PlacedCorrection,
+    SeenCorrection,
+)
 from rsbench.benchmark.leaderboard.depth_track import DepthTrack
-from rsbench.benchmark.leaderboard.mono_track import MonoCorrectionTrack
-from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, PoseTrack
-from rsbench.benchmark.leaderboard.own_pose_track import OwnPoseTrack
-from rsbench.benchmark.leaderboard.placed_track import PlacedCorrection, SeenCorrection
-from rsbench.benchmark.leaderboard.readout_track import ReadoutTrack
-from rsbench.benchmark.leaderboard.second_protocols import DrawnReadout, LawsOfPoints, LawsOfPoses, SkilledReadout
+from rsbench.benchmark.leaderboard.motion_tracks import (
+    LawsOfPoints,
+    LawsOfPoses,
+    OwnPoseTrack,
+    PointsTrack,
+    PoseTrack,
+)
+from rsbench.benchmark.leaderboard.readout_tracks import DrawnReadout, ReadoutTrack, SkilledReadout
 from rsbench.benchmark.leaderboard.track import Track
 from rsbench.benchmark.leaderboard.trajectory_track import TrajectoryTrack
 from rsbench.components.cards import choices

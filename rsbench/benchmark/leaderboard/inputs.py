@@ -8,7 +8,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import read_record
-from rsbench.benchmark.leaderboard.splits import Split
-from rsbench.benchmark.leaderboard.track import Track
-from rsbench.benchmark.leaderboard.true_pictures import VIEW
+from rsbench.benchmark.leaderboard.pictures import VIEW
+from rsbench.benchmark.leaderboard.track import Split, Track
 from rsbench.core.errors import RsbenchError
-from rsbench.pipeline.problem import COLUMNS, Problem, problem_record
-from rsbench.storage.files import save_arrays, write_bytes, write_json
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.sequence import read_pairs
+from rsbench.pipeline.frame_depth import Images
+from rsbench.pipeline.problem import COLUMNS, Problem, parse_problem, problem_record
+from rsbench.storage.files import read_png, save_arrays, write_bytes, write_json
+from rsbench.storage.untrusted_files import inside, parse_json, read_bytes, read_text
 from rsbench.storage.work_folder import HIDDEN, named
 
 RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "readout_ratio")
@@ -130,3 +135,72 @@ def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArra
         arrays[key] = np.concatenate(sets)
         arrays[f"{key}_problem"] = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
     return arrays
+
+
+# Tracks of rendered frames: what is given of them, matches or the frames themselves.
+
+
+def write_frames(data: Path, out: Path) -> None:
+    """Copy the rolling-shutter frames, as ``frames/<problem>/left_0.png`` to ``right_1.png``.
+
+    Raises:
+        RsbenchError: a frame is missing or is no image of the camera's size, or cannot be written.
+    """
+    for sequence in read_pairs(data):
+        folder = out / "frames" / sequence.name
+        folder.mkdir(parents=True, exist_ok=True)
+        for side, frame in VIEWS:
+            sequence.image("rs", side, frame)  # that it can be read
+            path = inside(sequence.folder, picture_file("rs", side, frame + sequence.first))
+            write_bytes(folder / f"{side}_{frame}.png", read_bytes(path))
+
+
+def read_frames(inputs: Path, problem: Problem) -> Images:
+    """The frames of a problem, as ``write_frames`` wrote them.
+
+    Raises:
+        RsbenchError: one is missing, or is no image of the camera's size.
+    """
+    folder, camera = inputs / "frames" / problem.name, problem.rig.camera
+    size = camera.width, camera.height
+    return {view: read_png(folder / f"{view[0]}_{view[1]}.png", size) for view in VIEWS}
+
+
+# Running cards: predictions first, each kept as soon as it is made; scores come after, and run no method.
+#
+# A method sees what is exported, and nothing else. Each answer of a card is a file whose identity says from which
+# method, inputs, options and code it came: what is current is kept, so a killed run goes on where it was. Cards of
+# other packages run in processes of their own with a limit of time; what they do wrong is a failure with the
+# reason.
+
+
+def prepare_inputs(
+    split: Split,
+    problems: Callable[[], Iterator[Problem]],
+    folder: Path,
+    frames: Callable[[Path], None] = lambda folder: None,
+) -> None:
+    """Export a split into a folder, unless it holds that already; the truth stays out of it.
+
+    ``frames`` writes those into a folder.
+    """
+    stored = read_record(folder / "split.json")
+    if stored is None or stored.get("fingerprint") != split.fingerprint:
+        frames(folder)
+        write_inputs(replace(split, public=False), problems(), folder)
+
+
+def read_inputs(inputs: Path, track: Track) -> list[Problem]:
+    """The exported problems; where the readout ratio is not given, it is 0.
+
+    Raises:
+        RsbenchError: they are not there, or damaged.
+    """
+    path = inputs / "problems.jsonl"
+    unknown: dict[str, float] = {} if track.gives_readout else {"readout_ratio": 0.0}
+    found = list[Problem]()
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        where = f"{path}:{number}"
+        text = json.dumps(parse_json(line, where) | unknown) if unknown else line
+        found.append(parse_problem(text, where))
+    return found

@@ -1,0 +1,374 @@
+"""What pictures of a sequence are asked, and the truth that they are compared with.
+
+Asked is frame 1 of the left camera, the later one, for which a method may look at the frame before. Pictures of a
+split are what its fingerprint is of: a file that has changed since then is refused by name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import os
+import re
+import stat
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.images.predict import true_pairs
+from rsbench.benchmark.images.score import visible_pixels
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import VIEWS, View
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.sequence import Sequence
+from rsbench.storage.files import read_exr, read_png, sha256, write_bytes
+from rsbench.storage.untrusted_files import NAME, inside, read_bytes
+from rsbench.vision.stereo_depth import seen_by_other
+
+VIEW: View = ("left", 1)
+"""Whose depth and corrected frames are asked."""
+
+
+class Asked(NamedTuple):
+    """A picture that an answer holds."""
+
+    stem: str
+    """Of its file, such as ``left_1_middle``."""
+    row: int
+    """At whose time, counted as rows are read; of depth, 0: each pixel is of its own row's time."""
+    file: str
+    """Of the true picture, below the folder of the sequence."""
+    suffixes: tuple[str, ...] = (".png",)
+    """Of kinds of files that it may be."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TruePictures:
+    """A sequence whose files are those of a split."""
+
+    sequence: Sequence
+    asked: tuple[Asked, ...]
+    files: Mapping[str, str]
+    """SHA-256 by the path below the sequence's folder: of all that methods see, and that scores are of."""
+
+    def check(self) -> None:
+        """Raises RsbenchError when a file is not the one of the split."""
+        for name, digest in self.files.items():
+            path = inside(self.sequence.folder, name)
+            if not path.is_file() or sha256(path) != digest:
+                raise RsbenchError(f"{path}: is not the file that dataset.json names; rsbench verify says more")
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.sequence.rig.camera.width, self.sequence.rig.camera.height
+
+    def path(self, each: Asked) -> Path:
+        """File of the true picture."""
+        return inside(self.sequence.folder, each.file)
+
+    def depth(self) -> NDArray[np.float32]:
+        """(H, W) true depth, m, 0 where there is no surface."""
+        return self.sequence.depth("rs", *VIEW)
+
+    def frame(self, row: int) -> NDArray[np.uint8]:
+        """(H, W, 3) what a global shutter sees from the pose of a row that is asked for."""
+        (file,) = (each.file for each in self.asked if each.row == row)
+        return read_png(inside(self.sequence.folder, file), self.size)
+
+    def rolling(self) -> NDArray[np.uint8]:
+        """(H, W, 3) the frame as it is."""
+        return self.sequence.image("rs", *VIEW)
+
+    def seen_by_both(self, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(H, W) pixels of the frame, of that true ``depth`` (H, W), whose point the right camera sees too."""
+        return seen_by_other(depth, self.sequence.depth("rs", "right", 1), self.sequence.rig, "left")
+
+    def commons(self) -> list[NDArray[np.bool_]]:
+        """(H, W) pixels of each corrected frame whose place the rolling-shutter frame saw, the same for all."""
+        images = {view: self.sequence.image("rs", *view) for view in VIEWS}
+        pairs = true_pairs(self.sequence, images)
+        return [visible_pixels(self.sequence, pairs, (VIEW,), each.row)[VIEW] for each in self.asked]
+
+
+# Pictures that anybody hands in: beside a file of answers, ``pictures/PROBLEM/NAME.png``.
+#
+# Names are looked up, never taken from what was handed in, and no link is followed. The size of an image is known
+# from its header, before anything is decoded.
+
+FOLDER = "pictures"
+"""Beside the file of answers."""
+FARTHEST = 1e9
+"""m: no surface is farther."""
+_FILE = re.compile(
+    rf"pictures/{NAME.pattern}/left_1(_first|_middle|_last)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
+)
+"""Paths of what answers hold, below an entry: nothing else is taken from a board of somebody else."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_COLOURS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+"""Colour types of a PNG header."""
+_BYTES_OF_PIXEL = 16
+_BYTES = 1 << 16
+"""A file has at most so many, and so many for each pixel."""
+
+
+def find_picture(folder: Path, problem: str, asked: Asked) -> Path:
+    """The file of a picture below ``pictures``.
+
+    Raises:
+        RsbenchError: there is none, two of different kinds, or something that is no file of its own.
+    """
+    paths = [folder / problem / f"{asked.stem}{suffix}" for suffix in asked.suffixes]
+    found = [path for path in paths if os.path.lexists(path)]
+    if len(found) != 1:
+        names = " and ".join(path.name for path in paths)
+        problem_is = f"{len(found)} of {names} are there; keep one" if found else "is missing"
+        raise RsbenchError(f"{paths[0]}: {problem_is}; a problem without an answer says success = false")
+    check_own(folder.parent, found[0].relative_to(folder.parent).as_posix())
+    return found[0]
+
+
+def copy_files(folder: Path, names: Iterable[str], target: Path) -> dict[str, str]:
+    """Copy what lies beside a file of answers; returns the SHA-256 of each, by its name.
+
+    Args:
+        folder: where they are.
+        names: such as ``pictures/castle/left_1.exr``.
+        target: a folder, made if missing.
+
+    Raises:
+        RsbenchError: a name leads elsewhere, a file is missing, a link or too large, or cannot be written.
+    """
+    copied = {}
+    for name in names:
+        data = file_bytes(folder, name)
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(target / name, data)
+        copied[name] = hashlib.sha256(data).hexdigest()
+    return copied
+
+
+def file_bytes(folder: Path, name: str) -> bytes:
+    """The content of a file such as ``pictures/castle/left_1.exr`` below a folder; errors as ``copy_files``."""
+    if not _FILE.fullmatch(name):
+        raise RsbenchError(f"{folder}: {name[:100]!r} is no name of a file of an answer")
+    check_own(folder, name)
+    return read_bytes(folder / name)
+
+
+def check_own(folder: Path, name: str) -> None:
+    """Raises RsbenchError unless a file, and each folder on the way to it, is there and is no link."""
+    path = folder
+    *folders, file = name.split("/")
+    for part, kind, is_kind in (
+        *((each, "folder", stat.S_ISDIR) for each in folders),
+        (file, "file", stat.S_ISREG),
+    ):
+        path = path / part
+        if not os.path.lexists(path) or not is_kind(path.lstat().st_mode):
+            raise RsbenchError(f"{path}: must be a {kind} of its own, no link")
+
+
+def read_depth_map(path: Path, size: tuple[int, int], png_unit_m: float | None) -> NDArray[np.float32]:
+    """Depth (H, W), m, 0 unknown, of an EXR file or a PNG of 16 bits.
+
+    Args:
+        path: of the file.
+        size: width and height of the camera.
+        png_unit_m: metres of one step of a PNG.
+
+    Raises:
+        RsbenchError: it is no such file, or holds what no depth can be.
+    """
+    if path.suffix == ".exr":
+        _check_bytes(path, size)
+        depth = read_exr(path, ("Z",), size)[..., 0]
+    else:
+        if png_unit_m is None:
+            raise RsbenchError(f"{path}: the header must say png_unit_m, the metres of one step, such as 0.001")
+        depth = _read_png(path, size, 16, ("grey",)).astype(np.float32) * np.float32(png_unit_m)
+    for what, wrong in (
+        ("are NaN", np.isnan(depth)),
+        ("are infinite", np.isinf(depth)),
+        ("are negative", depth < 0.0),
+        (f"are above {FARTHEST:g} m", depth > FARTHEST),
+    ):
+        if np.any(wrong):
+            raise RsbenchError(f"{path}: {np.count_nonzero(wrong)} pixels {what}; unknown depth and sky are 0")
+    return depth
+
+
+def read_frame(path: Path, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A frame (H, W, 3) RGB, black where nothing was drawn, and where something was (H, W): alpha above 0.
+
+    Raises:
+        RsbenchError: it is no PNG of 8 bits in colour of the camera's size.
+    """
+    pixels = _read_png(path, size, 8, ("RGB", "RGBA"))
+    if pixels.shape[2] == 3:
+        return pixels, np.ones(pixels.shape[:2], dtype=np.bool_)
+    drawn = pixels[..., 3] > 0
+    return np.where(drawn[..., None], pixels[..., :3], np.uint8(0)), drawn
+
+
+def read_answer_frame(
+    folder: Path, pictures: TruePictures, asked: Asked
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """``read_frame`` of a problem; errors as ``find_picture`` too."""
+    return read_frame(find_picture(folder, pictures.sequence.name, asked), pictures.size)
+
+
+def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | None) -> NDArray[np.float32]:
+    """``read_depth_map`` of a problem; errors as ``find_picture`` too."""
+    (asked,) = pictures.asked
+    return read_depth_map(find_picture(folder, pictures.sequence.name, asked), pictures.size, png_unit_m)
+
+
+def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:
+    """A file that ``read_frame`` reads: without alpha where all was drawn."""
+    alpha = [] if np.all(drawn) else [np.where(drawn, np.uint8(255), np.uint8(0))]
+    ok, data = cv2.imencode(".png", np.dstack([image[..., ::-1], *alpha]))
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
+    return data.tobytes()
+
+
+def _check_bytes(path: Path, size: tuple[int, int]) -> bytes:
+    """The content of a file that is no larger than a picture of this size can be."""
+    return read_bytes(path, _BYTES + _BYTES_OF_PIXEL * size[0] * size[1])
+
+
+def _read_png(path: Path, size: tuple[int, int], bits: int, colours: tuple[str, ...]) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    data = _check_bytes(path, size)
+    if data[:8] != _PNG or data[12:16] != b"IHDR" or len(data) < 33:
+        raise RsbenchError(f"{path}: is no PNG file")
+    width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
+    if (width, height) != size:
+        raise RsbenchError(f"{path}: is {width} x {height} pixels, the camera {size[0]} x {size[1]}")
+    is_now = f"{_COLOURS.get(colour, 'unknown')} of {depth} bits"
+    if depth != bits or _COLOURS.get(colour) not in colours:
+        raise RsbenchError(f"{path}: is {is_now}: must be {' or '.join(colours)} of {bits} bits")
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+            if image.size != size:  # a second header
+                raise ValueError(f"its headers differ: {image.size[0]} x {image.size[1]} pixels")
+            pixels = np.asarray(image)
+    except Exception as error:  # Pillow raises what a damaged file makes it stumble over
+        raise RsbenchError(f"{path}: is a damaged PNG file: {' '.join(str(error).split())[:100]}") from error
+    if pixels.shape[:2] != (height, width) or pixels.ndim != (2 if colours == ("grey",) else 3):
+        raise RsbenchError(f"{path}: is {is_now}, and holds something else")
+    return pixels
+
+
+# Scores of pictures by parts of their pixels: by distance from the reference row, and by texture.
+#
+# What a part is decides the truth alone, so that all entries are scored on the same pixels.
+
+WINDOW = 9
+"""Pixels, of the square over which texture is measured."""
+_MOST = 255.0
+BoolArray = NDArray[np.bool_]
+
+
+class Parting(NamedTuple):
+    """A number of each pixel, and by which of its values pixels make up parts."""
+
+    name: str
+    title: str
+    starts: tuple[float, ...]
+    """Least value of each part, which figures write at it."""
+
+
+PARTINGS = (
+    Parting(
+        name="rows",
+        title="rows from the reference row, as a share of all (0.2: from there to 0.4)",
+        starts=(0.0, 0.2, 0.4, 0.6, 0.8),
+    ),
+    Parting(
+        name="texture",
+        title=f"texture: deviation of grey levels within {WINDOW} px (2: from there to 5)",
+        starts=(0.0, 2.0, 5.0, 10.0, 20.0),
+    ),
+)
+
+
+def columns(score: str, parting: Parting) -> list[str]:
+    """Of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
+    return [f"{score}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
+
+
+def parts_of(image: NDArray[np.uint8], row: int) -> Iterator[tuple[Parting, list[BoolArray]]]:
+    """The pixels (H, W) of each part of a picture of row ``row``'s time.
+
+    Args:
+        image: (H, W, 3) what the texture is of.
+        row: reference row.
+    """
+    height, width = image.shape[:2]
+    away = np.broadcast_to(np.abs(np.arange(height) - row)[:, None] / height, (height, width))
+    for parting, value in zip(PARTINGS, (away, texture(image)), strict=True):
+        part = np.searchsorted(parting.starts, value, side="right") - 1
+        yield parting, [part == number for number in range(len(parting.starts))]
+
+
+def texture(image: NDArray[np.uint8]) -> FloatArray:
+    """(H, W) standard deviation of the mean of the colours in a window around each pixel, 8-bit levels."""
+    grey = _mean(image.astype(np.float64))
+    mean, square = (
+        cv2.blur(each, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT_101) for each in (grey, grey * grey)
+    )
+    return np.sqrt(np.maximum(square - mean * mean, 0.0))
+
+
+Parts = dict[str, BoolArray]
+"""Pixels (H, W) of each part, by column."""
+
+
+def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolArray) -> Parts:
+    """Of the ``counted`` pixels of a picture (H, W, 3) of row ``row``'s time, by the columns of a ``score``."""
+    return {
+        name: part & counted
+        for parting, parts in parts_of(image, row)
+        for name, part in zip(columns(score, parting), parts, strict=True)
+    }
+
+
+class SquareErrors:
+    """Root mean squares of frames by part; what was not drawn is black."""
+
+    def __init__(self, score: str) -> None:
+        self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns(score, parting)}
+        """Of squared errors, and how many."""
+
+    def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], parts: Parts) -> None:
+        """A frame (H, W, 3) and its ``parts_within``; None: a failure, which errs by all levels."""
+        off = np.full(truth.shape, _MOST) if image is None else image.astype(np.float64) - truth
+        squares = _mean(off * off)
+        for name, part in parts.items():
+            inside = squares[part]
+            self._sums[name] += np.array([np.sum(inside), inside.size])
+
+    def scores(self) -> dict[str, float]:
+        """By column; NaN for a part without pixels."""
+        return {name: math.sqrt(s / n) if n else math.nan for name, (s, n) in self._sums.items()}
+
+
+def shares(parts: Parts, wrong: BoolArray) -> dict[str, float]:
+    """Share of ``wrong`` (H, W) of each part, by column; NaN for one without pixels."""
+    return {name: float(np.mean(wrong[part])) if np.any(part) else math.nan for name, part in parts.items()}
+
+
+def _mean(image: FloatArray) -> FloatArray:
+    """(H, W) of the colours of an image (H, W, 3) of whole numbers; numpy's mean takes far longer over so few."""
+    return (image[..., 0] + image[..., 1] + image[..., 2]) / 3.0
