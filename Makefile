@@ -64,7 +64,7 @@ docs: $(STAMP)
 	@echo "site: $(CURDIR)/build/docs/index.html"
 
 reference: $(STAMP)
-	@$(BIN)/python -m rsbench.cli.reference
+	@$(BIN)/python docs/make_reference.py
 
 # A venv without a working pip is what a killed `python -m venv` leaves: it is made anew.
 $(STAMP): constraints.txt pyproject.toml

@@ -169,8 +169,7 @@ def _handed(jobs: int = 2000) -> float:
     """Seconds of the processor for a job that does nothing, with distributed; the scheduler is in this process."""
     from distributed import LocalCluster
 
-    from rsbench.jobs.process_jobs import run_jobs
-    from rsbench.jobs.workers import Cluster
+    from rsbench.jobs.process_jobs import Cluster, run_jobs
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", host="127.0.0.1") as cluster:
         there = Cluster(address=cluster.scheduler_address)

@@ -21,8 +21,7 @@ from rsbench.dataset.posed_scenes import PosedScenes
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.llvm import cpu_features
 from rsbench.renderers.options import RendererOptions
-from rsbench.storage.background_writer import background_writer
-from rsbench.storage.files import sha256, write_bytes
+from rsbench.storage.files import background_writer, sha256, write_bytes
 from rsbench.storage.work_folder import files_below
 from rsbench.verification.reference_copy import FRAME, SIDE, record_of
 

@@ -30,8 +30,7 @@ import numpy as np
 
 from rsbench.dataset import generation
 from rsbench.dataset.card import load_dataset_card
-from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.jobs.workers import Cluster, Workers
+from rsbench.jobs.process_jobs import Cluster, Workers, finished_jobs
 
 SCENES = ("castle", "poles", "room")
 

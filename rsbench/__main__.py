@@ -14,7 +14,7 @@ def main() -> None:
     heard = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN]
     for number in heard:
         signal.signal(number, signal.SIG_DFL)
-    from rsbench.cli.signals import end_at_once
+    from rsbench.cli.exits import end_at_once
 
     for number in heard:
         signal.signal(number, end_at_once)

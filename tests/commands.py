@@ -19,7 +19,7 @@ from typing import NoReturn
 import pytest
 from typer.main import get_command
 
-from rsbench.cli import console, crash_log, main
+from rsbench.cli import console, exits, main
 
 
 def run_here(*arguments: object, text: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
@@ -33,7 +33,7 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
         patch.setattr(sys, "argv", words)
         if not environment:  # the options are made of some of it
             patch.setattr(main, "app", _command())
-        patch.setattr(crash_log, "describe", _raise)
+        patch.setattr(exits, "describe", _raise)
         patch.setattr(sys, "stdin", io.StringIO(text))
         for name, value in environment.items():
             patch.setenv(name, value)

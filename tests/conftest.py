@@ -18,7 +18,7 @@ from hypothesis import settings
 from skips import SkipReport
 
 from rsbench.components.imports import import_untried
-from rsbench.storage.caches import temporary, user_cache
+from rsbench.storage.work_folder import temporary, user_cache
 
 if TYPE_CHECKING:
     from rsbench.scenes.model import Light, Scene

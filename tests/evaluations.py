@@ -10,7 +10,7 @@ import pandas as pd
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
-from rsbench.storage.file_hashes import HASHES
+from rsbench.storage.files import HASHES
 
 QUICK = EvaluationOptions(solvers=("gs-8pt",), correction_solver="rs-stereo-refined")
 MACHINE = ("seconds.json", "seconds.csv", "provenance.json")

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 import rsbench
-from rsbench.cli.docs import docs, list_documents
+from rsbench.cli.small_commands import docs, list_documents
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))

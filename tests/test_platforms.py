@@ -16,7 +16,7 @@ from rsbench.benchmark import provenance
 from rsbench.benchmark.leaderboard.board import add
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers import llvm
-from rsbench.storage import caches
+from rsbench.storage import work_folder
 
 PACKAGE = Path(__file__).parents[1] / "rsbench"
 FORKING = {"fork", "forkpty", "get_context", "set_start_method", "Process", "Pool", "ProcessPoolExecutor"}
@@ -59,7 +59,7 @@ def test_every_use_of_proc_has_a_fallback(monkeypatch: pytest.MonkeyPatch) -> No
         raise FileNotFoundError(str(self))
 
     monkeypatch.setattr(Path, "read_text", missing)
-    assert provenance.processor() and caches.cpu_key() and llvm.cpu_features()
+    assert provenance.processor() and work_folder.cpu_key() and llvm.cpu_features()
 
 
 def test_names_that_differ_in_case_alone_are_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rsbench.components.plugins import own_source_version
+from rsbench.components.imports import own_source_version
 from rsbench.core.version import __version__
 from rsbench.storage.files import sha256
 

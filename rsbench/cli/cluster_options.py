@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 if TYPE_CHECKING:
-    from rsbench.jobs.workers import Workers
+    from rsbench.jobs.process_jobs import Workers
 
 Scheduler = Annotated[
     str | None,
@@ -32,7 +32,7 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
     if scheduler is None:
         return workers or default
     from rsbench.core.errors import RsbenchError
-    from rsbench.jobs.workers import Cluster
+    from rsbench.jobs.process_jobs import Cluster
 
     if workers is not None:
         raise RsbenchError(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from rsbench.cli.component_kinds import named
 from rsbench.cli.console import echo
 from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row, with_found_camera
 from rsbench.cli.correct_one_camera import (
@@ -22,6 +21,7 @@ from rsbench.cli.correct_one_camera import (
 )
 from rsbench.cli.correct_said import readout_words, say_calibration, write_page_of
 from rsbench.cli.correct_sequence import correct_sequence_given
+from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     """The corrector; ``--no-fill`` turns the filling of ours off."""
     from dataclasses import replace
 
-    from rsbench.components.plugins import component_key
+    from rsbench.components.imports import component_key
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.correctors import FusionCorrector
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at, shared_path
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
+from rsbench.cli.names import complete
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.dataset.recording import Recording
-    from rsbench.jobs.workers import Workers
+    from rsbench.jobs.process_jobs import Workers
 
 EPILOG = """[bold]Examples[/bold]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, shared_path
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
+from rsbench.cli.names import complete
 
 if TYPE_CHECKING:
     from rsbench.dataset.card import DatasetCard

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
 from rsbench.cli.leaderboard_run import predict
 from rsbench.cli.leaderboard_tracks import (
@@ -20,6 +19,7 @@ from rsbench.cli.leaderboard_tracks import (
     split_of,
     write_frames_of,
 )
+from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from rsbench.cli.leaderboard_tracks import write_frames_of
 
 if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.track import Limits, Split
-    from rsbench.jobs.workers import Workers
+    from rsbench.jobs.process_jobs import Workers
 
 
 def predict(

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
 from rsbench.cli.leaderboard_tracks import Workers
+from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
 _Seed = Annotated[

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
+from rsbench.cli.names import complete
 
 if TYPE_CHECKING:
     from rsbench.benchmark.leaderboard.smoke import Job

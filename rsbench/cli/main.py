@@ -11,27 +11,21 @@ from typing import Annotated
 import typer
 
 from rsbench.cli import (
-    check_solver,
     correct,
-    crash_log,
-    demo,
     digest,
-    docs,
-    doctor,
     evaluate,
-    export,
+    exits,
     generate,
     inspect,
     leaderboard,
     reproduce,
-    show,
     simulate,
     solve,
     verify,
-    view,
 )
-from rsbench.cli import list_cards as cards
-from rsbench.cli.signals import stoppable
+from rsbench.cli.export import EXPORT_EPILOG, VIEW_EPILOG, export, view
+from rsbench.cli.names import LIST_EPILOG, SHOW_EPILOG, list_, show
+from rsbench.cli.small_commands import CHECK_SOLVER_EPILOG, DOCS_EPILOG, check_solver, demo, docs, doctor
 from rsbench.core.errors import RsbenchError, printable
 from rsbench.core.version import __version__
 
@@ -67,40 +61,37 @@ def _root(
 ) -> None:
     from rsbench.cli.console import be_quiet
 
-    # Before OpenCV is imported, here and in children: what it warns of in a damaged image is in our line.
+    # Before OpenCV is imported, here and in child processes: our own message says what is wrong with an image.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     be_quiet(quiet)
-    warnings.showwarning = _told
+    warnings.showwarning = _show_warning
 
 
-def _told(message: Warning | str, category: type[Warning], *where: object, **more: object) -> None:
-    """A warning for users in a line; those for who writes programs are not theirs."""
+def _show_warning(message: Warning | str, category: type[Warning], *where: object, **more: object) -> None:
+    """A warning meant for users, as one line; warnings for programmers are not shown."""
     if issubclass(category, FutureWarning):
         typer.echo(f"rsbench: note: {printable(str(message))}", err=True)
 
 
-for module in (
-    demo,
-    cards,
-    show,
-    doctor,
-    generate,
-    verify,
-    digest,
-    view,
-    export,
-    solve,
-    inspect,
-    check_solver,
-    evaluate,
-    correct,
-    simulate,
-    leaderboard,
-    reproduce,
-    docs,
-):
-    module.register(app)
-
+# In the order of the help.
+app.command(epilog="[bold]Example[/bold]  rsbench demo --scene old-town --out out/demo")(demo)
+app.command("list", epilog=LIST_EPILOG)(list_)
+app.command(epilog=SHOW_EPILOG)(show)
+app.command(epilog="[bold]Example[/bold]  rsbench doctor")(doctor)
+generate.register(app)
+verify.register(app)
+digest.register(app)
+app.command(epilog=VIEW_EPILOG)(view)
+app.command(epilog=EXPORT_EPILOG)(export)
+solve.register(app)
+inspect.register(app)
+app.command("check-solver", epilog=CHECK_SOLVER_EPILOG)(check_solver)
+evaluate.register(app)
+correct.register(app)
+simulate.register(app)
+leaderboard.register(app)
+reproduce.register(app)
+app.command(epilog=DOCS_EPILOG)(docs)
 
 _NAMELESS = {
     errno.ENOSPC: "standard output",
@@ -108,13 +99,13 @@ _NAMELESS = {
     errno.EDQUOT: "standard output",
     errno.ENOENT: "the working folder, which must exist",
 }
-"""What an operation of the system failed on that names no file."""
+"""What a failed system call was about where the error names no file, by error number."""
 
 
 def run() -> None:
-    """Entry point: every error becomes one line on stderr; 2 for a user's, 70 for one that nobody foresaw."""
+    """Entry point: every error becomes one line on stderr; exit code 2 for bad input, 70 for unexpected errors."""
     try:
-        with stoppable():
+        with exits.stoppable():
             code = app(prog_name="rsbench", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except typer.TyperException as error:
@@ -122,12 +113,12 @@ def run() -> None:
     except RsbenchError as error:
         _fail(str(error), error.exit_code)
     except MemoryError:
-        _fail("there is not enough memory for it; close other programs, or ask for less at once", 1)
+        _fail("not enough memory; close other programs, or process less at once", 1)
     except Exception as error:
-        # A folder without permission, wherever it is met; or what has no name, as a full disk behind stdout.
+        # A folder without permission, wherever it is; or no file name, as for a full disk behind stdout.
         if isinstance(error, OSError) and (place := error.filename or _NAMELESS.get(error.errno or 0)):
             _fail(f"{place}: {error.strerror or error}")
-        _fail(crash_log.describe(error), crash_log.EXIT_CODE)
+        _fail(exits.describe(error), exits.EXIT_CODE)
 
 
 def _wrongly_used(error: typer.TyperException) -> None:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
+from rsbench.cli.names import complete
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from rsbench.benchmark.simulated.sweep_card import SweepCard
-    from rsbench.jobs.workers import Workers
+    from rsbench.jobs.process_jobs import Workers
 
 EPILOG = """[bold]Examples[/bold]
 

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.component_kinds import complete
 from rsbench.cli.console import echo
+from rsbench.cli.names import complete
 
 EPILOG = """[bold]Examples[/bold]
 

@@ -24,7 +24,7 @@ from typing import Any, TypeVar, overload
 from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from rsbench.storage.caches import temporary, user_cache
+from rsbench.storage.work_folder import temporary, user_cache
 
 F = TypeVar("F", bound=Callable[..., object])
 

@@ -33,28 +33,16 @@ from rsbench.components.cards import (
     parse_card,
     read_toml,
 )
-from rsbench.components.entry_points import entry_points_by_name, package_of
-from rsbench.components.identity import component_key, own_source_version, source_version
-from rsbench.components.imports import blaming, import_target, in_words, try_import
+from rsbench.components.imports import (
+    blaming,
+    component_key,
+    entry_points_by_name,
+    import_target,
+    in_words,
+    package_of,
+    try_import,
+)
 from rsbench.core.errors import RsbenchError
-
-__all__ = [
-    "Entry",
-    "Kind",
-    "Offer",
-    "RunOptions",
-    "blame",
-    "component_key",
-    "description_of",
-    "list_names",
-    "load_class",
-    "load_entry",
-    "make_component",
-    "offers",
-    "own_source_version",
-    "source_version",
-    "wrap",
-]
 
 Component = TypeVar("Component")
 Options = TypeVar("Options")

@@ -10,9 +10,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from rsbench.components.cards import card_path, parse_card, read_toml
+from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml, with_shutters
 from rsbench.components.imports import search
-from rsbench.components.shutters import SHUTTER_KEY, with_shutters
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import GivenGeometry

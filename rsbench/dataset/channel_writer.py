@@ -35,8 +35,7 @@ from rsbench.dataset.object_records import numbers_of
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
-from rsbench.storage.background_writer import Later, begun
-from rsbench.storage.files import write_exr, write_png, write_png16
+from rsbench.storage.files import Later, begun, write_exr, write_png, write_png16
 
 _BRIGHTEST = float(np.finfo(np.float16).max)
 

@@ -17,7 +17,7 @@ from rsbench.dataset.generation import build_scene, render_camera, scene_name
 from rsbench.dataset.layout import files_of
 from rsbench.dataset.posed_scenes import place_of, seen_scene
 from rsbench.renderers.options import RendererOptions
-from rsbench.storage.background_writer import background_writer
+from rsbench.storage.files import background_writer
 from rsbench.storage.work_folder import files_below
 
 if TYPE_CHECKING:

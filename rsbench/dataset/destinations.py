@@ -15,9 +15,8 @@ from rsbench.dataset.layout import is_of_sequence
 from rsbench.dataset.manifest import Files, write_manifest
 from rsbench.dataset.scene_hashes import SceneHashes
 from rsbench.dataset.sequence_identity import Plan, check_same, hashes_in, wanted_files
-from rsbench.jobs.workers import Workers
-from rsbench.storage.file_hashes import HASHES, FileHashes
-from rsbench.storage.files import read_json, sha256
+from rsbench.jobs.process_jobs import Workers
+from rsbench.storage.files import HASHES, FileHashes, read_json, sha256
 from rsbench.storage.work_folder import HIDDEN, WORK, named, unknown_files, work_folder
 
 

@@ -36,12 +36,19 @@ from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
 from rsbench.dataset.views import ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure
-from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.jobs.workers import Cluster, Workers
+from rsbench.jobs.process_jobs import Cluster, Workers, finished_jobs
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
-from rsbench.storage.background_writer import Later, background_writer
-from rsbench.storage.files import sha256, write_depth, write_json, write_mask, write_png, write_poses
+from rsbench.storage.files import (
+    Later,
+    background_writer,
+    sha256,
+    write_depth,
+    write_json,
+    write_mask,
+    write_png,
+    write_poses,
+)
 from rsbench.storage.work_folder import files_below
 from rsbench.vision.feature_matcher import load_features
 

@@ -15,8 +15,7 @@ from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.croissant import CROISSANT, croissant_of
 from rsbench.dataset.sequence import FORMAT, UNITS
-from rsbench.storage.file_hashes import HashedFile
-from rsbench.storage.files import sha256, write_json
+from rsbench.storage.files import HashedFile, sha256, write_json
 from rsbench.storage.untrusted_files import read_bytes
 
 DATASET = "dataset.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
-from rsbench.components.shutters import SHUTTER_KEY
+from rsbench.components.cards import SHUTTER_KEY
 from rsbench.core.lens import Lens
 from rsbench.dataset.motion_card import MotionCard
 from rsbench.dataset.object_records import MovingCard

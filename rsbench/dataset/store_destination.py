@@ -25,12 +25,10 @@ from rsbench.dataset.layout import is_of_sequence
 from rsbench.dataset.manifest import DATASET, Files, manifest_of, says
 from rsbench.dataset.scene_hashes import SceneHashes
 from rsbench.dataset.sequence_identity import Plan, check_same, hashes_in, wanted_files
-from rsbench.jobs.workers import Cluster, Workers
-from rsbench.storage.caches import temporary
-from rsbench.storage.file_hashes import HashedFile
-from rsbench.storage.files import sha256, write_json
+from rsbench.jobs.process_jobs import Cluster, Workers
+from rsbench.storage.files import HashedFile, sha256, write_json
 from rsbench.storage.object_store import Listed, Store, cache_of, key_of, open_store
-from rsbench.storage.work_folder import WORK, files_below, named, remove, work_folder
+from rsbench.storage.work_folder import WORK, files_below, named, remove, temporary, work_folder
 
 _OBJECTS = "objects.jsonl"
 _MANIFEST = "sequence.json"

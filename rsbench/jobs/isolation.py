@@ -4,13 +4,19 @@ A worker starts its child with the first call and keeps it for the next ones. A 
 limit, or whose child ends, is a failed ``Outcome`` with the reason; the child is killed with all processes of its
 group, and a fresh one serves the next call. What the child prints is captured. The child ends with its parent,
 even if the parent is killed. This is protection against mistakes, not against malice: the code runs as the user,
-and a process that leaves the group survives. Memory is limited where that is asked, by looking ten times a second
-at what the child uses (address space, which a system can limit, is reserved by compilers and BLAS far beyond it).
+and a process that leaves the group survives. Where memory is limited, the child's use is read ten times a second
+(the address space, which a system can limit, is reserved by compilers and BLAS far beyond what they use).
+
+What a child sends is plain data, so that the parent runs nothing that comes from there: None, a truth value, a
+number, a text, an array, or a tuple, list, dict or dataclass of such. A message is its length and an npz file:
+arrays, and the rest as JSON that refers to them.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import io
 import json
 import os
 import queue
@@ -26,8 +32,11 @@ from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any, BinaryIO, NoReturn
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rsbench.components.imports import end_with, ending, import_untried
-from rsbench.jobs.plain_data import decode, encode, receive, send
+from rsbench.storage.untrusted_files import unpack_arrays
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Of a process that computes with as many threads as they say."""
@@ -44,8 +53,12 @@ _COMMAND = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from rsbench.jobs.isolation import serve_parent; serve_parent(int(sys.argv[2]))"
 )
+_LENGTH_BYTES = 8
+_LONGEST_BYTES = 1 << 32
+_KINDS = "biufU"
+"""Of arrays: truth values, numbers and text."""
 Server = Callable[..., object]
-"""Answers one call, in the child: picklable arguments in, plain data out (see ``plain_data``)."""
+"""Answers one call, in the child: picklable arguments in, plain data out."""
 
 
 class EntryFailure(Exception):  # noqa: N818  it is no error of ours
@@ -308,6 +321,89 @@ def one_line(error: BaseException) -> str:
 def _short(text: str) -> str:
     text = " ".join(text.split())
     return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]} ..."
+
+
+# Plain data as bytes
+
+
+def encode(value: object) -> bytes:
+    """A value as bytes.
+
+    Raises:
+        TypeError: it holds something that is no plain data.
+    """
+    arrays: list[NDArray[Any]] = []
+    text = json.dumps(_flat(value, arrays))
+    buffer = io.BytesIO()
+    content = {"tree": np.array(text), **{f"array_{k}": array for k, array in enumerate(arrays)}}
+    np.savez(buffer, allow_pickle=False, **content)
+    return buffer.getvalue()
+
+
+def decode(data: bytes, classes: Mapping[str, type]) -> Any:
+    """The value of ``encode``; dataclasses are made by their constructors, and only those of ``classes``.
+
+    Raises:
+        ValueError: the bytes are no such value, or a constructor refuses its fields.
+    """
+    try:
+        arrays = unpack_arrays(io.BytesIO(data), "message", limit=len(data))  # ``encode`` compresses nothing
+        return _built(json.loads(str(arrays["tree"])), arrays, classes)
+    except ValueError:
+        raise
+    except Exception as error:  # whatever damaged bytes cause: zip, JSON, a missing key, a wrong field
+        raise ValueError(f"no message: {type(error).__name__}: {error}") from error
+
+
+def _flat(value: object, arrays: list[NDArray[Any]]) -> object:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in _KINDS:
+            raise TypeError(f"an array of {value.dtype} is no plain data")
+        arrays.append(value)
+        return {"array": len(arrays) - 1}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, (tuple, list)):
+        return {type(value).__name__: [_flat(item, arrays) for item in value]}
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {"dict": {key: _flat(item, arrays) for key, item in value.items()}}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: _flat(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
+        return {"dataclass": type(value).__name__, "fields": fields}
+    raise TypeError(f"a {type(value).__name__} is no plain data")
+
+
+def _built(tree: Any, arrays: Mapping[str, NDArray[Any]], classes: Mapping[str, type]) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    if "array" in tree:
+        return arrays[f"array_{tree['array']}"]
+    for name, kind in (("tuple", tuple), ("list", list)):
+        if name in tree:
+            return kind(_built(item, arrays, classes) for item in tree[name])
+    if "dict" in tree:
+        return {key: _built(item, arrays, classes) for key, item in tree["dict"].items()}
+    fields = {key: _built(item, arrays, classes) for key, item in tree["fields"].items()}
+    return classes[tree["dataclass"]](**fields)
+
+
+def send(stream: BinaryIO, data: bytes) -> None:
+    """Write one message."""
+    stream.write(len(data).to_bytes(_LENGTH_BYTES, "big") + data)
+    stream.flush()
+
+
+def receive(stream: BinaryIO) -> bytes | None:
+    """The next message; None at the end of the stream, or where what comes is no message."""
+    length = (
+        int.from_bytes(head, "big") if len(head := stream.read(_LENGTH_BYTES)) == _LENGTH_BYTES else _LONGEST_BYTES
+    )
+    if length >= _LONGEST_BYTES:
+        return None
+    data = stream.read(length)
+    return data if len(data) == length else None
 
 
 # In the child

@@ -6,7 +6,8 @@ import hashlib
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from rsbench.components.plugins import Entry, component_key
+from rsbench.components.imports import component_key
+from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
 from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions

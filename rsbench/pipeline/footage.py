@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration_errors import CardSigma, of_offset
-from rsbench.components.cards import parse_card, read_toml
-from rsbench.components.shutters import SHUTTER_KEY, with_shutter
+from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.given import check_number

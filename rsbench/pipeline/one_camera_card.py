@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from rsbench.components.cards import parse_card, read_toml
-from rsbench.components.shutters import SHUTTER_KEY, with_shutter
+from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import Scan
 from rsbench.pipeline.footage import CameraCard

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from rsbench.components.imports import lifeline
 from rsbench.renderers import probe_cache
-from rsbench.storage.caches import cpu_key
+from rsbench.storage.work_folder import cpu_key
 
 MINIMUM_VERSION = 17
 """15 and 16 abort on CPUs with AVX-512 ("Cannot select ... fminimum"); 14 lacks opaque pointers."""

@@ -17,8 +17,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.report import pictures
 from rsbench.report.sequence_pictures import write_pictures
-from rsbench.storage.file_hashes import HASHES, FileHashes
-from rsbench.storage.files import read_json, read_png, write_bytes
+from rsbench.storage.files import HASHES, FileHashes, read_json, read_png, write_bytes
 from rsbench.storage.work_folder import files_below, listed, named
 
 _OVERVIEW = 360

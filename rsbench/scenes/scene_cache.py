@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.identity import component_key, hash_of_files
+from rsbench.components.imports import component_key, hash_of_files
 from rsbench.scenes.model import Material, SceneBuilder, SceneMesh
-from rsbench.storage.caches import cpu_key, user_cache
+from rsbench.storage.work_folder import cpu_key, user_cache
 
 _PACKAGES = ("numpy", "trimesh", "shapely", "mapbox-earcut")
 """Decide, with the sources of ``rsbench.scenes``, what our builders make of a card."""

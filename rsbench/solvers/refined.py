@@ -9,7 +9,7 @@ from typing import Any, Literal, final
 import cv2
 import numpy as np
 
-from rsbench.components.identity import source_version
+from rsbench.components.imports import source_version
 from rsbench.components.motion_models import motion_model
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs

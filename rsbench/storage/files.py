@@ -1,4 +1,8 @@
-"""Files of a dataset: exact, deterministic bytes, written so that a killed run leaves no half file."""
+"""Files of a dataset: exact, deterministic bytes, written so that a killed run leaves no half file.
+
+Hashes of files are kept, so that a file of unchanged size and times is not read again. ``background_writer``
+writes on other threads while this one goes on.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,15 @@ import hashlib
 import io
 import json
 import os
+import stat
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -25,7 +34,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.storage.untrusted_files import check_image_size, check_size, open_regular, read_bytes, read_text
 from rsbench.storage.untrusted_files import load_arrays as load_arrays
 from rsbench.storage.untrusted_files import read_json as read_json
-from rsbench.storage.work_folder import refuse_url
+from rsbench.storage.work_folder import HIDDEN, refuse_url
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -300,3 +309,152 @@ def read_table(
 def write_table(path: Path, frame: pd.DataFrame) -> None:
     """CSV with enough digits to compare runs and few enough to read."""
     write_bytes(path, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode())
+
+
+# Hashes that are kept
+
+
+HASHES = f"{HIDDEN}/hashes.jsonl"
+"""Where a folder of results keeps hashes, below it."""
+
+
+class HashedFile(NamedTuple):
+    """A file as it was when it was hashed."""
+
+    size: int
+    modified_ns: int
+    changed_ns: int
+    """Of its content, name, owner or permissions; no tool can set it."""
+    sha256: str
+
+
+class FileHashes:
+    """SHA-256 of the files below a folder; new ones are appended to a file by ``flush``."""
+
+    def __init__(self, root: Path, store: Path, rehash: bool = False) -> None:
+        """
+        Args:
+            root: the folder.
+            store: where hashes are kept; need not exist.
+            rehash: forget what is kept.
+
+        Raises:
+            RsbenchError: the store is there and is no regular file: a named pipe, a link, a folder.
+        """
+        self._root, self._store = root, store
+        if os.path.lexists(store) and not stat.S_ISREG(store.lstat().st_mode):
+            raise RsbenchError(f"{store}: is not a regular file; remove it")
+        if rehash:
+            store.unlink(missing_ok=True)
+        self._known = _read_hashes(store)
+        self._new: list[str] = []
+
+    def of(self, name: str) -> HashedFile | None:
+        """A file by its path below the folder, with slashes; None when it is no file."""
+        path = f"{self._root}/{name}"
+        try:
+            found = os.stat(path)
+        except OSError:
+            return None
+        if not stat.S_ISREG(found.st_mode):
+            return None
+        state = found.st_size, found.st_mtime_ns, found.st_ctime_ns
+        known = self._known.get(name)
+        if known is None or known[:3] != state:
+            known = self._keep(name, HashedFile(*state, sha256(Path(path))))
+        return known
+
+    def sha256(self, path: Path) -> str:
+        """Of a file below the folder, by its path."""
+        found = self.of(path.relative_to(self._root).as_posix())
+        return sha256(path) if found is None else found.sha256
+
+    def learn(self, name: str, digest: str) -> HashedFile:
+        """Keep the hash of a file that was just written."""
+        found = os.stat(f"{self._root}/{name}")
+        return self._keep(name, HashedFile(found.st_size, found.st_mtime_ns, found.st_ctime_ns, digest))
+
+    def flush(self) -> None:
+        """Append what is new."""
+        self.append(self.taken())
+
+    def taken(self) -> list[str]:
+        """What is new, for ``append`` of another process's: here it is not new any more."""
+        lines = self._new
+        self._new = []
+        return lines
+
+    def append(self, lines: Sequence[str]) -> None:
+        """Keep lines of ``taken``."""
+        self._known |= _parsed_hashes(lines)
+        if lines:
+            with self._store.open("a", encoding="utf-8", newline="\n") as stream:
+                stream.write("\n" + "\n".join(lines) + "\n")  # the line before may have been cut by a kill
+
+    def _keep(self, name: str, file: HashedFile) -> HashedFile:
+        self._known[name] = file
+        self._new.append(json.dumps([name, *file]))
+        return file
+
+
+def _read_hashes(store: Path) -> dict[str, HashedFile]:
+    try:
+        with store.open(encoding="utf-8", errors="replace") as stream:
+            return _parsed_hashes(stream)
+    except OSError:
+        return {}
+
+
+def _parsed_hashes(lines: Iterable[str]) -> dict[str, HashedFile]:
+    known = dict[str, HashedFile]()
+    for line in lines:
+        with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or not ours
+            name, size, modified, changed, digest = json.loads(line)
+            known[name] = HashedFile(size, modified, changed, digest)
+    return known
+
+
+# On other threads
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+Later = Callable[..., "Future[Any]"]
+"""Called with a function and its arguments: it is called soon."""
+_THREADS = 2
+_WAITING = 8
+"""Jobs at most that are not done: each may hold a frame's arrays, and a disk may be slower than the renderer."""
+
+
+@contextmanager
+def background_writer() -> Iterator[Later]:
+    """Gives what hands work to other threads. At the end all of it is done.
+
+    The first error is raised at the end, or when more work is handed over; results are kept by who asked alone.
+    """
+    with ThreadPoolExecutor(_THREADS) as pool:
+        jobs: deque[Future[Any]] = deque()
+
+        def later(work: Callable[..., Any], *given: Any) -> Future[Any]:
+            while jobs and (jobs[0].done() or len(jobs) >= _WAITING):
+                jobs.popleft().result()
+            jobs.append(pool.submit(work, *given))
+            return jobs[-1]
+
+        yield later
+        while jobs:
+            jobs.popleft().result()
+
+
+def begun(later: Later, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """``work`` on each item, in order. The first are begun now, the others as results are taken."""
+    rest = iter(items)
+    waiting = deque(later(work, item) for item in islice(rest, _THREADS))
+
+    def results() -> Iterator[R]:
+        while waiting:
+            first = waiting.popleft()
+            yield first.result()
+            waiting.extend(later(work, item) for item in islice(rest, 1))
+
+    return results()

@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.file_hashes import HASHES
-from rsbench.storage.files import read_json, write_json
+from rsbench.storage.files import HASHES, read_json, write_json
 from rsbench.storage.object_store import Store, cache_of, open_store
 from rsbench.storage.work_folder import HIDDEN, LOCK, WORK, files_below, remove, work_folder
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.caches import temporary, user_cache
 from rsbench.storage.files import check_out
+from rsbench.storage.work_folder import temporary, user_cache
 
 _URL = re.compile(r"[a-z][a-z0-9+.:-]+://")
 _LOCAL = ("file", "local")

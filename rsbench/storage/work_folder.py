@@ -1,18 +1,19 @@
-"""A hidden folder in which one command at a time works for a folder of results.
+"""Folders of rsbench's own: in the user's cache, for temporary files, and hidden in a folder of results.
 
-``.rsbench/lock`` is locked for as long as a command works there, and says whose command it is. Results come
-into being in ``.rsbench/work`` and are renamed when complete. What lies in the hidden folder is rsbench's own, and
-it is the only place where rsbench removes whole folders: what it finds elsewhere is moved there first, once every
-file of it is known to be rsbench's.
+``.rsbench/lock`` is locked for as long as a command works in a folder of results, and says whose command it is.
+Results are written to ``.rsbench/work`` and renamed when complete. What lies in the hidden folder is rsbench's
+own. It is the only place where rsbench removes whole folders: what it finds elsewhere is moved there first, once
+every file of it is known to be rsbench's.
 
-The system frees the lock at the end of its process, however that ends. Where the file system has no locks, or does
-not pass them on to other hosts, the owner's record counts for ``_DEAD_S`` after its last sign of life.
+The system frees the lock when its process ends, however it ends. Where the file system has no locks, or does not
+pass them on to other hosts, the owner's record counts for ``_DEAD_S`` after it was last renewed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
 import os
 import platform
@@ -20,6 +21,7 @@ import re
 import shutil
 import stat
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +30,44 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rsbench.core.errors import RsbenchError
+
+
+def user_cache() -> Path | None:
+    """The user's cache folder for rsbench, which need not exist; None without a home folder."""
+    home = os.path.expanduser("~")
+    if os.environ.get("XDG_CACHE_HOME"):
+        return Path(os.environ["XDG_CACHE_HOME"]) / "rsbench"
+    if sys.platform == "win32" and os.environ.get("LOCALAPPDATA"):
+        return Path(os.environ["LOCALAPPDATA"]) / "rsbench"
+    if not os.path.isabs(home):  # no HOME, and no entry of this user
+        return None
+    return Path(home, "Library/Caches" if sys.platform == "darwin" else ".cache") / "rsbench"
+
+
+def temporary() -> Path | None:
+    """A folder that only this user can write: whoever writes there decides what is run."""
+    try:
+        if sys.platform == "win32":
+            return Path(tempfile.gettempdir()) / "rsbench"
+        folder = Path(tempfile.gettempdir()) / f"rsbench-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+            return folder
+        return Path(tempfile.mkdtemp(prefix="rsbench-"))
+    except OSError:
+        return None
+
+
+def cpu_key() -> str:
+    """Names the CPU model: a home folder is often shared by machines that differ."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        known = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+    except OSError:
+        known = [platform.processor()]
+    return hashlib.sha256("\n".join([platform.machine(), *known]).encode()).hexdigest()[:16]
+
 
 HIDDEN = ".rsbench"
 """Name of the hidden folder; it may be deleted when no command runs."""

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from commands import assert_refused, run_here
 
-from rsbench.cli import crash_log, main
+from rsbench.cli import exits, main
 
 
 def run(
@@ -64,7 +64,7 @@ def test_what_has_no_name_is_named(
 
 def test_logs_do_not_pile_up(cache: Path) -> None:
     for _ in range(25):
-        crash_log.describe(ValueError())
+        exits.describe(ValueError())
     assert len(list((cache / "rsbench" / "faults").iterdir())) == 20
 
 
@@ -72,7 +72,7 @@ def test_without_a_place_for_a_log_the_line_stays(
     cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cache.write_text("no folder")
-    monkeypatch.setattr(crash_log, "temporary", lambda: None)
+    monkeypatch.setattr(exits, "temporary", lambda: None)
     code, line = run(monkeypatch, capsys, RecursionError("too deep"))
     assert code == 70 and "RecursionError: too deep; no log of it could be written" in line
 

@@ -16,10 +16,9 @@ import pytest
 from commands import run_here
 
 from rsbench.cli import console
-from rsbench.cli.component_kinds import COMPONENTS, kind_names, names_of
 from rsbench.cli.main import app
+from rsbench.cli.names import COMPONENTS, kind_names, names_of, parameters_of
 from rsbench.components.cards import FORMER_NAMES, CardKind, list_cards, read_toml
-from rsbench.components.parameters import parameters_of
 from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
 
 
@@ -103,7 +102,7 @@ def test_others_are_listed_with_their_package_and_what_is_wrong_with_them(tmp_pa
 
 @pytest.mark.parametrize("name", list_solvers())
 def test_a_solver_is_shown_as_it_declares_itself(name: str) -> None:
-    from rsbench.cli.show import _about
+    from rsbench.cli.names import _about
 
     about, entry = _about(name, "solvers"), load_solver_entry(name)
     spec = entry.solver.spec
@@ -119,7 +118,7 @@ def test_a_solver_is_shown_as_it_declares_itself(name: str) -> None:
 
 
 def test_every_name_of_every_kind_can_be_shown() -> None:
-    from rsbench.cli.show import _about, _print
+    from rsbench.cli.names import _about, _print
 
     for kind in kind_names():
         for name in names_of(kind):

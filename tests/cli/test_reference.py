@@ -10,9 +10,8 @@ from typing import Any, Literal
 
 import pytest
 from commands import assert_refused, run_here
+from make_reference import all_tables, card_classes, component_classes, keys_of, pages
 
-from rsbench.cli.reference import card_classes, component_classes, pages
-from rsbench.components.card_keys import all_tables, keys_of
 from rsbench.components.cards import CardKind, list_cards, read_toml
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rsbench.cli.signals import stoppable
+from rsbench.cli.exits import stoppable
 from rsbench.components.imports import signals_later
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -67,7 +67,7 @@ def test_what_is_ignored_from_the_start_stays_ignored() -> None:
 def test_a_long_computation_is_not_waited_for() -> None:
     """One call that does not come back to Python for minutes, as a render may not for seconds."""
     code = (
-        "import hashlib, sys; from rsbench.cli.signals import stoppable\n"
+        "import hashlib, sys; from rsbench.cli.exits import stoppable\n"
         "with stoppable():\n"
         "    print('begun', flush=True)\n"
         "    hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"

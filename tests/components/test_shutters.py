@@ -9,8 +9,7 @@ import pytest
 from commands import assert_refused, run_here
 from small_scenes import write_small_card
 
-from rsbench.components.cards import list_cards, load_card
-from rsbench.components.shutters import ShutterCard, with_shutter
+from rsbench.components.cards import ShutterCard, list_cards, load_card, with_shutter
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
 from rsbench.pipeline.footage import read_rig_card

@@ -35,8 +35,7 @@ from rsbench.dataset.views import ImageView
 from rsbench.renderers.electrons import Sensor
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
-from rsbench.storage.background_writer import background_writer
-from rsbench.storage.files import read_depth, read_png, write_depth, write_png
+from rsbench.storage.files import background_writer, read_depth, read_png, write_depth, write_png
 from rsbench.verification import verification_steps, verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(64, 54, 74.0), baseline=0.3)

@@ -17,9 +17,8 @@ from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.scene_hashes import SceneHashes, scene_key
 from rsbench.jobs.process_jobs import LostJobsError
-from rsbench.storage import file_hashes
-from rsbench.storage.file_hashes import HASHES, FileHashes
-from rsbench.storage.files import sha256
+from rsbench.storage import files
+from rsbench.storage.files import HASHES, FileHashes, sha256
 from rsbench.storage.work_folder import HIDDEN, work_folder
 
 
@@ -50,7 +49,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         names.append(path.name)
         return sha256(path)
 
-    monkeypatch.setattr(file_hashes, "sha256", counted)
+    monkeypatch.setattr(files, "sha256", counted)
     return names
 
 

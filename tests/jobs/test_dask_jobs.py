@@ -22,8 +22,7 @@ from typing import Any
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.process_jobs import LostJobsError, finished_jobs, run_jobs
-from rsbench.jobs.workers import Cluster
+from rsbench.jobs.process_jobs import Cluster, LostJobsError, finished_jobs, run_jobs
 
 pytestmark = [
     pytest.mark.skipif(find_spec("distributed") is None, reason="needs rsbench[cluster]"),
@@ -160,7 +159,7 @@ def looked_at(
         return SimpleNamespace(get_current_task=worker.get_current_task, state=SimpleNamespace(tasks=tasks))
 
     monkeypatch.setattr("distributed.get_worker", watched_worker)
-    monkeypatch.setattr("rsbench.jobs.dask_jobs._WATCH_S", 0.01)
+    monkeypatch.setattr("rsbench.jobs.process_jobs._WATCH_S", 0.01)
 
 
 def test_a_watch_that_comes_late_does_not_stop_the_next_job(
@@ -236,7 +235,7 @@ def test_a_run_that_is_stopped_waits_for_no_frozen_worker(
     there: Cluster, local: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The limits are far from both: what is frozen goes on after a minute if nobody ends the wait."""
-    monkeypatch.setattr("rsbench.jobs.dask_jobs._DISMISS_S", 0.2)
+    monkeypatch.setattr("rsbench.jobs.process_jobs._DISMISS_S", 0.2)
     mark = tmp_path / "mark"
     outcomes = run_jobs(functools.partial, [f"touch {mark}; sleep 1000", "true"], there, {}, os.system)
     next(outcomes)
@@ -264,7 +263,7 @@ def _alive(pid: int) -> bool:
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rsbench.jobs.dask_jobs._CONNECT_S", 0.5)
+    monkeypatch.setattr("rsbench.jobs.process_jobs._CONNECT_S", 0.5)
     with pytest.raises(RsbenchError, match=r"^--scheduler tcp://127.0.0.1:1: "):
         list(run_jobs(functools.partial, ["1"], Cluster(address="tcp://127.0.0.1:1"), {}, eval))
 
@@ -319,7 +318,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 def test_a_scheduler_that_dies_ends_the_run_with_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rsbench.jobs.dask_jobs._CONNECT_S", 3)
+    monkeypatch.setattr("rsbench.jobs.process_jobs._CONNECT_S", 3)
     script = tmp_path / "cluster.py"
     script.write_text(CLUSTER)
     command, mark = [sys.executable, str(script)], tmp_path / "mark"

@@ -23,8 +23,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.jobs.isolation import IsolatedWorker
-from rsbench.jobs.plain_data import decode, encode
+from rsbench.jobs.isolation import IsolatedWorker, decode, encode
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.eight_point import EightPointSolver
 from rsbench.solvers.engine.base import MotionEstimate

@@ -14,8 +14,7 @@ from typing import BinaryIO
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import EntryFailure, IsolatedWorker
-from rsbench.jobs.plain_data import receive
+from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, receive
 from rsbench.jobs.process_jobs import LostJobsError, finished_jobs, run_jobs
 
 ASK = "__import__('os').getpid()"

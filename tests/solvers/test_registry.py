@@ -114,7 +114,7 @@ def entry(name: str, target: str) -> metadata.EntryPoint:
 
 def install(monkeypatch: pytest.MonkeyPatch, solver: object, *names: str) -> None:
     entries = [entry(name, f"package{k}:Solver") for k, name in enumerate(names)]
-    monkeypatch.setattr("rsbench.components.entry_points.points_of", lambda group, folders: entries)
+    monkeypatch.setattr("rsbench.components.imports.points_of", lambda group, folders: entries)
     monkeypatch.setattr(metadata.EntryPoint, "load", lambda self: solver)
 
 

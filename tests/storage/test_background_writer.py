@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.background_writer import background_writer, begun
-from rsbench.storage.files import write_bytes
+from rsbench.storage.files import background_writer, begun, write_bytes
 
 
 def test_all_is_done_at_the_end() -> None:

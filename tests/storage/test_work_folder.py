@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.file_hashes import FileHashes
+from rsbench.storage.files import FileHashes
 from rsbench.storage.work_folder import HIDDEN, WORK, files_below, listed, remove, unknown_files, work_folder
 
 HOLDS = """

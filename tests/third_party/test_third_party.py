@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from rsbench.cli.component_kinds import COMPONENTS, component_kind
+from rsbench.cli.names import COMPONENTS, component_kind
 from rsbench.components.plugins import load_class, load_entry
 from rsbench.scenes.load import load_scene
 

@@ -19,11 +19,10 @@ from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import dataset_record, provenance
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.storage.file_hashes import HASHES, FileHashes
-from rsbench.storage.files import read_json, read_table, write_json, write_table
+from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
 from rsbench.storage.work_folder import work_folder
 
 _CASES = {"pose": PoseCase, "depth": DepthCase, "correction": ImageCase}

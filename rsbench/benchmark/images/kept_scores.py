@@ -17,7 +17,7 @@ from typing import Any
 
 from rsbench.benchmark.metric_plugins import Case, MetricEntry
 from rsbench.benchmark.provenance import numeric_version, package_version
-from rsbench.components.identity import hash_of_files
+from rsbench.components.imports import hash_of_files
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import read_json, sha256, write_bytes
 from rsbench.storage.work_folder import HIDDEN

@@ -12,10 +12,9 @@ from rsbench.benchmark.images.predict import Bench, Step
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers, finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.storage.file_hashes import HASHES, FileHashes
+from rsbench.storage.files import HASHES, FileHashes
 
 Job = tuple[str, str, int]
 """Names of sequence and solver, and the number of the samples."""

@@ -21,11 +21,10 @@ from rsbench.benchmark.isolated_metric import isolated_metrics
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers, finished_jobs
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.storage.file_hashes import HASHES, FileHashes
+from rsbench.storage.files import HASHES, FileHashes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_id
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers
 from rsbench.storage.files import read_table, write_bytes, write_json, write_table
 from rsbench.storage.untrusted_files import NAME, read_bytes, read_json
 from rsbench.storage.work_folder import WORK, remove, work_folder

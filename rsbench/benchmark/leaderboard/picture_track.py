@@ -40,10 +40,8 @@ from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.capture.settle import AUTO
 from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.jobs.plain_data import decode, encode
-from rsbench.jobs.process_jobs import run_jobs
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, decode, encode, use_one_thread
+from rsbench.jobs.process_jobs import Workers, run_jobs
 from rsbench.pipeline.chain import Given
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images

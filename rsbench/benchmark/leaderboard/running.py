@@ -38,8 +38,7 @@ from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.capture.settle import AUTO
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.jobs.process_jobs import finished_jobs, run_jobs
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers, finished_jobs, run_jobs
 from rsbench.pipeline.answer import Extra, solve_problem
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem

@@ -29,7 +29,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence as Rendered
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.problem import Problem, problem_record
 from rsbench.storage.untrusted_files import check_name
 

@@ -55,7 +55,7 @@ from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_dataset
 from rsbench.jobs.isolation import use_one_thread
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.warm_up import warm_up

@@ -24,13 +24,12 @@ import numpy as np
 
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
-from rsbench.components.identity import source_version
+from rsbench.components.imports import source_version
 from rsbench.components.motion_models import motion_model
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
-from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.jobs.workers import Workers
+from rsbench.jobs.process_jobs import Workers, finished_jobs
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.solvers.engine.registry import load_solver_entries
 from rsbench.solvers.engine.warm_up import warm_up

@@ -10,7 +10,7 @@ from typing import Any
 
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
-from rsbench.components.identity import hash_of_files
+from rsbench.components.imports import hash_of_files
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import sha256, write_json
 from rsbench.storage.untrusted_files import read_json

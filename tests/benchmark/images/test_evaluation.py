@@ -14,7 +14,7 @@ from evaluations import QUICK, cell, contents, evaluate, remade, times
 from rsbench.benchmark.images.evaluation import columns_of, open_evaluation, read_scores
 from rsbench.benchmark.images.score import TABLES
 from rsbench.core.errors import RsbenchError
-from rsbench.storage import file_hashes
+from rsbench.storage import files
 from rsbench.storage.work_folder import work_folder
 
 
@@ -33,7 +33,7 @@ def test_two_runs_write_the_same_bytes(smoke_dataset: Path, evaluated: Path, tmp
 def test_a_repeated_run_makes_nothing_and_reads_no_data_again(
     smoke_dataset: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file_hashes, "sha256", lambda path: pytest.fail(f"{path} is read again"))
+    monkeypatch.setattr(files, "sha256", lambda path: pytest.fail(f"{path} is read again"))
     before = times(copy)
     evaluate(smoke_dataset, copy)
     assert remade(before, copy) == set()

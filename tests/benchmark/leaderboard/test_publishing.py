@@ -35,8 +35,7 @@ from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.manifest import write_manifest
 from rsbench.dataset.secret_split import Secret, secret_card
 from rsbench.dataset.views import image_seed
-from rsbench.storage.file_hashes import HashedFile
-from rsbench.storage.files import sha256, write_json, write_png
+from rsbench.storage.files import HashedFile, sha256, write_json, write_png
 
 TEXT = "f3b1 a secret that nobody guesses"
 SECRET = Secret(TEXT)

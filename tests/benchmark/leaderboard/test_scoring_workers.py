@@ -15,8 +15,7 @@ from rsbench.benchmark.leaderboard.picture_track import _serve_scores
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.benchmark.leaderboard.track import Split, mark_all
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import EntryFailure
-from rsbench.jobs.plain_data import decode, encode
+from rsbench.jobs.isolation import EntryFailure, decode, encode
 from rsbench.storage.files import read_png, write_depth, write_png
 
 

@@ -1,22 +1,32 @@
-"""Ctrl-C and SIGTERM: every command ends within two seconds, says how to go on, and exits with 130 or 143.
+"""How a command ends otherwise than it should: by Ctrl-C or SIGTERM, or by an unexpected error.
 
-The signal raises ``Stopped`` in the main thread, so that everything is closed in order. The main thread may be
-deep in a computation that does not come back to Python for seconds: then a thread that is woken by the same signal
-ends the process. Its children end with it, whatever they do (``rsbench.jobs.isolation``). SIGHUP is left to
-the system, which ends the process without a word.
+A signal ends every command within two seconds, with a line that says how to go on and exit code 130 or 143. It
+raises ``Stopped`` in the main thread, so that everything is closed in order. The main thread may be deep in a
+computation that does not come back to Python for seconds: then a thread that is woken by the same signal ends the
+process. Child processes end with it, whatever they do (``rsbench.jobs.isolation``). SIGHUP is left to the system.
+
+An unexpected error becomes one line for the user, and its traceback goes to a log.
 """
 
 from __future__ import annotations
 
 import contextlib
+import datetime
 import os
+import platform
 import signal
 import sys
+import tempfile
 import threading
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
+
+from rsbench.core.version import __version__
+from rsbench.storage.work_folder import temporary, user_cache
 
 _PATIENCE_S = 1.0
 _SPEECH_S = 0.3
@@ -43,7 +53,7 @@ class Stopped(BaseException):
 def end_at_once(number: int, frame: FrameType | None = None) -> NoReturn:
     """A handler for the time in which nothing has begun that must be closed."""
     with contextlib.suppress(OSError):
-        os.write(2, f"{_words()}\n".encode())
+        os.write(2, f"{_ending()}\n".encode())
     os._exit(128 + number)
 
 
@@ -70,7 +80,7 @@ def stoppable() -> Iterator[None]:
             # What a signal interrupts may turn it into an error of its own, as the import of a module does.
             if not received:
                 raise
-            _say()
+            _print_ending()
             sys.exit(128 + received[0])
         finally:
             for number in ours:
@@ -104,19 +114,53 @@ def _watch(reader: int, done: threading.Event) -> None:
     with open(reader, "rb", buffering=0) as stream:
         while byte := stream.read(1):
             if byte[0] in _SIGNALS and not done.wait(_PATIENCE_S):
-                speaker = threading.Thread(target=_say, daemon=True)
+                speaker = threading.Thread(target=_print_ending, daemon=True)
                 speaker.start()
                 speaker.join(_SPEECH_S)  # whoever should read it may have stopped reading
                 os._exit(128 + byte[0])
 
 
-def _say() -> None:
+def _print_ending() -> None:
     with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody may be left to read it
         cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
-        sys.stderr.write(f"{cursor}{_words()}\n")
+        sys.stderr.write(f"{cursor}{_ending()}\n")
         sys.stderr.flush()
 
 
-def _words() -> str:
+def _ending() -> str:
     command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
     return "; ".join(filter(None, ("interrupted", _ADVICE.get(command))))
+
+
+EXIT_CODE = 70
+"""EX_SOFTWARE of sysexits.h."""
+_KEPT = 20
+
+
+def describe(error: Exception) -> str:
+    """One line about an error that is not the user's, with the log that tells more."""
+    words = " ".join(traceback.format_exception_only(error)[-1].split())
+    log = _write_log("".join(traceback.format_exception(error)))
+    where = f"what led to it: {log}" if log is not None else "no log of it could be written"
+    whose = "the system refused" if isinstance(error, OSError) else "a fault of rsbench, not yours"
+    return f"{whose}: {words}; {where}"
+
+
+def _write_log(text: str) -> Path | None:
+    """Where the user may write, never in the current folder; the oldest logs go."""
+    now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+    system = f"rsbench {__version__}, Python {platform.python_version()}, {platform.platform()}"
+    content = f"{now}\n{system}\n{sys.argv}\n\n{text}"
+    for base in (user_cache(), temporary()):
+        if base is None:
+            continue
+        folder = base / "faults"
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(prefix=f"{now[:10]}-", suffix=".log", dir=folder)
+            with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace", newline="\n") as file:
+                file.write(content)
+            for old in sorted(folder.glob("*.log"), key=lambda path: path.stat().st_mtime)[:-_KEPT]:
+                old.unlink()
+            return Path(name)
+    return None

@@ -1,0 +1,415 @@
+"""``rsbench list`` and ``rsbench show``: names of components and cards, their kinds, and completion in a shell."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import itertools
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+
+from rsbench.cli.console import echo
+
+if TYPE_CHECKING:
+    from rsbench.components.plugins import Kind, Offer
+
+COMPONENTS = {
+    "solvers": "rsbench.solvers.engine.registry:SOLVERS",
+    "builders": "rsbench.scenes.load:BUILDERS",
+    "motions": "rsbench.components.motion_models:MOTIONS",
+    "matchers": "rsbench.vision.stereo_matcher:STEREO_MATCHERS",
+    "features": "rsbench.vision.feature_matcher:FEATURE_MATCHERS",
+    "correctors": "rsbench.vision.corrector:CORRECTORS",
+    "metrics": "rsbench.benchmark.metric_plugins:METRICS",
+}
+"""Kinds whose names may come from installed packages, and where their ``plugins.Kind`` is."""
+
+
+_GROUPS = {"builders": "rsbench.scenes"}
+"""Groups of entry points that are not called as the kind is."""
+
+
+def kind_names() -> list[str]:
+    """All kinds, sorted: the folders of cards, and components that have none."""
+    from rsbench.components.cards import CardKind
+
+    return sorted({*get_args(CardKind), *COMPONENTS})
+
+
+def component_kind(kind: str) -> Any:
+    """The ``plugins.Kind`` of a kind; None for cards that name no class."""
+    if kind not in COMPONENTS:
+        return None
+    from importlib import import_module
+
+    module, _, name = COMPONENTS[kind].partition(":")
+    return getattr(import_module(module), name)
+
+
+def names_of(kind: str) -> list[str]:
+    """Names of one kind, sorted."""
+    from rsbench.components import plugins
+    from rsbench.components.cards import list_cards
+
+    described = component_kind(kind)
+    return plugins.list_names(described) if described is not None else list(list_cards(kind))  # pyrefly: ignore[bad-argument-type]
+
+
+def complete(kind: str) -> Callable[[str], list[str]]:
+    """Completion of the names of one kind for a shell, which must be quick: cards only, and entry points."""
+
+    def names(incomplete: str) -> list[str]:
+        return [name for name in _quick_names(kind) if name.startswith(incomplete)]
+
+    return names
+
+
+def named(kind: str, text: str) -> Any:
+    """An option that takes a name of one kind or the path of a card; ``text`` is its help."""
+    return typer.Option(help=text, autocompletion=complete(kind))
+
+
+def complete_kind(incomplete: str) -> list[str]:
+    """Completion of a kind."""
+    return [name for name in kind_names() if name.startswith(incomplete)]
+
+
+def complete_any(incomplete: str) -> list[str]:
+    """Completion of a name of any kind."""
+    names = {name for kind in kind_names() for name in _quick_names(kind)}
+    return sorted(name for name in names if name.startswith(incomplete))
+
+
+def _quick_names(kind: str) -> list[str]:
+    """Names without importing what they stand for; those of classes without a card are left out."""
+    from importlib import metadata
+
+    from rsbench.components.cards import CardKind, list_cards
+
+    names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # pyrefly: ignore[bad-argument-type]
+    if kind in COMPONENTS:
+        try:
+            group = _GROUPS.get(kind, f"rsbench.{kind}")
+            names |= {point.name for point in metadata.entry_points(group=group)}
+        except Exception:  # a package whose files about itself cannot be read; ``rsbench list`` says more
+            return sorted(names)
+    return sorted(names)
+
+
+LIST_EPILOG = """[bold]Examples[/bold]
+
+  rsbench list                    [dim](the kinds)[/dim]
+
+  rsbench list solvers
+
+  rsbench list scenes --json"""
+
+
+def list_(
+    kind: Annotated[
+        str | None, typer.Argument(help="What to list; without it, the kinds.", autocompletion=complete_kind)
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="As a JSON list.")] = False,
+) -> None:
+    """List scenes, solvers, datasets and so on, with the cards to copy and edit, and who they come from."""
+    import json as json_module
+
+    from rsbench.cli.console import print_rows, say
+    from rsbench.components.cards import choices
+    from rsbench.core.errors import RsbenchError
+
+    kinds = kind_names()
+    if kind is not None and kind not in kinds:
+        raise RsbenchError(f"kind {kind!r} does not exist{choices(kind, kinds)}")
+    rows = _names_by_kind(kinds) if kind is None else entries(kind)
+    if json:
+        echo(json_module.dumps(rows))
+        return
+    columns = ("kind", "names") if kind is None else ("name", "origin", "description")
+    texts = [[row[column] for column in columns] for row in rows]
+    print_rows(
+        kind or "kinds", columns, [[", ".join(x) if isinstance(x, list) else x for x in row] for row in texts]
+    )
+    if kind is None:
+        say("rsbench list KIND lists them; rsbench show NAME tells more")
+    elif cards := [row["card"] for row in rows if row["card"]]:
+        folder = cards[0].rpartition("/")[0]
+        say(f"cards: {folder}; copy one, edit it, and pass its path (ending in .toml) instead of a name")
+
+
+def _names_by_kind(kinds: list[str]) -> list[dict[str, Any]]:
+
+    return [{"kind": kind, "names": names_of(kind)} for kind in kinds]
+
+
+def entries(kind: str) -> list[dict[str, Any]]:
+    """Name, origin, description, card and fault of everything of one kind.
+
+    What an installed package offers is loaded, to tell whether it can be; its faults are its own.
+    """
+    from rsbench.components import plugins
+    from rsbench.components.cards import list_cards
+    from rsbench.components.plugins import Offer
+
+    described = component_kind(kind)
+    if described is not None:
+        return [_row(described, offer) for offer in plugins.offers(described)]
+    cards = list_cards(kind)  # pyrefly: ignore[bad-argument-type]
+    return [_row(None, Offer(name=name, origin="rsbench", path=path)) for name, path in cards.items()]
+
+
+def _row(kind: Kind[Any, Any] | None, offer: Offer) -> dict[str, Any]:
+    from rsbench.components import plugins
+    from rsbench.components.cards import read_toml
+    from rsbench.core.errors import RsbenchError
+
+    description, broken = "", ""
+    if offer.path is not None:
+        description = str(read_toml(offer.path).get("description", ""))
+    elif kind is not None:
+        try:
+            description = plugins.description_of(kind, offer)
+        except RsbenchError as error:
+            description, broken = f"broken: {error}", str(error)
+    return {
+        "name": offer.name,
+        "origin": offer.origin,
+        "description": description,
+        "card": offer.path.as_posix() if offer.path is not None else None,
+        "broken": broken or None,
+    }
+
+
+SHOW_EPILOG = """[bold]Examples[/bold]
+
+  rsbench show rs-stereo-refined
+
+  rsbench show castle --kind builders
+
+  rsbench show ./my-solver.toml --kind solvers --json"""
+
+
+def show(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME|CARD", help="A name, or the path of a card.", autocompletion=complete_any),
+    ],
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            help="Its kind (rsbench list), where more than one has the name.", autocompletion=complete_kind
+        ),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="As one JSON object.")] = False,
+) -> None:
+    """Print what a solver needs and returns, the parameters of a component with defaults, or a card."""
+    import json as json_module
+
+    found = [_about(name, each) for each in _kinds_of(name, kind)]
+    if json:
+        echo(json_module.dumps(found[0] if len(found) == 1 else found, default=str))
+        return
+    for content in found:
+        _print(content)
+
+
+def _print(about: dict[str, Any]) -> None:
+    from rsbench.cli.console import print_rows, say
+
+    title = f"{about['kind']}: {about['name']}"
+    if "content" in about:
+        say(f"{title}\n\n{Path(about['card']).read_text('utf-8')}\ncard: {about['card']}\n")
+        return
+    rows = [
+        (key.replace("_", " "), _text(value))
+        for key, value in about.items()
+        if key not in ("kind", "name", "parameters") and value not in (None, "", [])
+    ]
+    print_rows(title, ("", ""), rows)
+    if about["parameters"]:
+        columns = ("parameter", "value", "default", "meaning")
+        print_rows(
+            "parameters", columns, [[_text(row[column]) for column in columns] for row in about["parameters"]]
+        )
+
+
+def _text(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} = {_text(item)}" for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_text(item) for item in value)
+    return str(value)
+
+
+def _kinds_of(name: str, kind: str | None) -> list[str]:
+    """Kinds in which to look a name up."""
+    from rsbench.components.cards import choices, current_name
+    from rsbench.core.errors import RsbenchError
+
+    kinds = kind_names()
+    if kind is not None:
+        if kind not in kinds:
+            raise RsbenchError(f"--kind {kind!r} does not exist{choices(kind, kinds)}")
+        return [kind]
+    if name.endswith(".toml"):
+        raise RsbenchError(f"{name}: say of which kind it is: --kind {'|'.join(kinds)}")
+    names = {each: names_of(each) for each in kinds}
+    found = [each for each in kinds if current_name(each, name) in names[each]]
+    if not found:
+        everything = sorted({one for each in names.values() for one in each})
+        raise RsbenchError(f"{name!r} does not exist{choices(name, everything)}")
+    return found
+
+
+def _about(name: str, kind: str) -> dict[str, Any]:
+    """All that can be said of one component or card."""
+    from rsbench.components import plugins
+    from rsbench.components.cards import FORMER_NAMES, card_path, read_toml
+
+    described = component_kind(kind)
+    if described is None:
+        path = card_path(kind, name)  # pyrefly: ignore[bad-argument-type]
+        return {"kind": kind, "name": path.stem, "card": path.as_posix(), "content": read_toml(path)}
+    if described.cards is None:
+        return {"kind": kind, "name": name, **_about_class(described, name)}
+    entry = plugins.load_entry(described, name)
+    return {
+        "kind": kind,
+        "name": entry.name,
+        "formerly": sorted(former for former, now in FORMER_NAMES.get(kind, {}).items() if now == entry.name),
+        "description": entry.description,
+        "origin": _origin(described, entry.name) if entry.path is None else None,
+        "card": entry.path.as_posix() if entry.path is not None else None,
+        **_about_component(entry.component),
+        **{key: value for key, value in vars(entry.options).items()},
+        "key": entry.key,
+        "parameters": parameters_of(type(entry.component), entry.component),
+    }
+
+
+def _about_component(component: object) -> dict[str, Any]:
+    """Its class, and what it declares in its ``spec``."""
+
+    cls = type(component)
+    about: dict[str, Any] = {"class": f"{cls.__module__}:{cls.__qualname__}"}
+    spec = getattr(component, "spec", None)
+    if dataclasses.is_dataclass(spec):
+        about |= {field.name: _plain(getattr(spec, field.name)) for field in dataclasses.fields(spec)}
+    return about
+
+
+def _plain(value: object) -> object:
+    """Values of a spec, as JSON has them."""
+    from collections.abc import Mapping, Set
+
+    if isinstance(value, Mapping):
+        return dict(value)
+    return sorted(value) if isinstance(value, Set) else value
+
+
+def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
+    """A class that no card describes: other cards name it, and set its parameters."""
+    from rsbench.components import plugins
+
+    cls = plugins.load_class(kind, name, Path())
+    return {
+        "description": plugins.description_of(kind, _offer(kind, name)),
+        "origin": _origin(kind, name),
+        "class": f"{cls.__module__}:{cls.__qualname__}",
+        "parameters": parameters_of(cls),
+    }
+
+
+def _offer(kind: Kind[Any, Any], name: str) -> Offer:
+    from rsbench.components import plugins
+
+    return next(offer for offer in plugins.offers(kind) if offer.name == name)
+
+
+def _origin(kind: Kind[Any, Any], name: str) -> str:
+    return _offer(kind, name).origin
+
+
+def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
+    """The parameters of a component's class, in the order of its constructor.
+
+    Args:
+        cls: a dataclass, whose fields have docstrings below them, or any class.
+        component: an object of it, for the values.
+
+    Returns:
+        ``parameter``, ``type``, ``default``, ``value`` (as a card would write them; "" when there is none) and
+        ``meaning`` of each.
+    """
+    meanings = field_docstrings(cls)
+    required = inspect.Parameter.empty
+    rows = []
+    for name, parameter in inspect.signature(cls).parameters.items():
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            continue
+        default = _default_of(cls, name, parameter.default)
+        rows.append(
+            {
+                "parameter": name,
+                "type": "" if parameter.annotation is required else _type_name(parameter.annotation),
+                "value": value_in_a_card(getattr(component, name)) if hasattr(component, name) else "",
+                "default": "required" if default is required else value_in_a_card(default),
+                "meaning": meanings.get(name, ""),
+            }
+        )
+    return rows
+
+
+def _default_of(cls: type, name: str, given: object) -> object:
+    """The default that the signature shows, or that a factory makes."""
+    for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
+        if field.name == name and field.default_factory is not dataclasses.MISSING:
+            return field.default_factory()
+    return given
+
+
+def _type_name(annotation: object) -> str:
+    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+
+
+def value_in_a_card(value: object) -> Any:
+    """A value as a card would write it; None, which no card can write, is empty text."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: value_in_a_card(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, (list, tuple)):
+        return [value_in_a_card(item) for item in value]
+    if isinstance(value, dict):
+        return {key: value_in_a_card(item) for key, item in value.items()}
+    return value if isinstance(value, bool | int | float | str) else "" if value is None else str(value)
+
+
+def field_docstrings(cls: type) -> dict[str, str]:
+    """Texts below the fields of a class and of those above it, in one line each."""
+    return {name: text for parent in reversed(cls.__mro__[:-1]) for name, text in _own_docstrings(parent)}
+
+
+@functools.cache
+def _own_docstrings(cls: type) -> tuple[tuple[str, str], ...]:
+    """Names and texts of the fields of a class itself; finding its source takes up to a tenth of a second."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):  # made in a shell, or without its source
+        return ()
+    found = []
+    for field, text in itertools.pairwise(tree.body) if isinstance(tree, ast.ClassDef) else ():
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text):
+            told = str(text.value.value)  # pyrefly: ignore[missing-attribute]
+            found.append((field.target.id, " ".join(told.split())))
+    return tuple(found)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    return (
+        isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    )

@@ -1,0 +1,137 @@
+"""Small commands: ``rsbench demo``, ``doctor``, ``docs`` and ``check-solver``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rsbench.cli.console import echo
+from rsbench.cli.names import complete
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder of the demo's data and report.")] = Path("demo-report"),
+    scene: Annotated[str, typer.Option(help="Sequence of the card 'paper': castle, old-town or room.")] = "castle",
+) -> None:
+    """Render one sequence at the paper's setting, solve, correct and score it, and write a report."""
+    from rsbench.benchmark.images.plan import EvaluationOptions
+    from rsbench.cli.compile_ahead import compiling_ahead
+    from rsbench.cli.evaluate import evaluate_dataset
+    from rsbench.cli.generate import generate
+
+    with compiling_ahead():
+        generate("paper", str(out / scene), [scene], workers=1)
+        options = EvaluationOptions(solvers=("rs-stereo-refined", "rs-stereo-linear", "gs-8pt"))
+        evaluate_dataset(out / scene, out / f"{scene}-evaluation", options, "rsbench demo")
+
+
+def doctor() -> None:
+    """Try every rendering backend in a child process, list the versions that matter, and say what to do."""
+    import pandas as pd
+
+    from rsbench.cli.console import print_table
+    from rsbench.renderers.diagnosis import advice, doctor_report
+
+    report = doctor_report()
+    rows = [{"component": row.component, "status": row.status, "detail": row.detail} for row in report]
+    print_table("rsbench doctor", pd.DataFrame(rows))
+    for line in advice(report):
+        echo(line)
+    if any(row.status == "fail" and row.component != "libLLVM" for row in report):  # without it, others render
+        raise typer.Exit(1)
+
+
+DOCS_EPILOG = """[bold]Examples[/bold]
+
+  rsbench docs                              [dim](what there is)[/dim]
+
+  less "$(rsbench docs conventions)"
+
+  cp "$(rsbench docs tour.ipynb)" . && jupyter lab tour.ipynb"""
+
+
+def docs(
+    name: Annotated[str | None, typer.Argument(help="A document or example; its path is printed.")] = None,
+) -> None:
+    """List the documents and examples that come with rsbench, or print where one of them is."""
+    from rsbench.components.cards import choices
+    from rsbench.core.errors import RsbenchError
+
+    documents = list_documents()
+    if name is not None:
+        if name not in documents:
+            raise RsbenchError(f"document {name!r} does not exist{choices(name, documents)}")
+        echo(str(documents[name]))
+        return
+    import pandas as pd
+
+    from rsbench.cli.console import print_table
+
+    rows = [{"name": known, "about": _title(path)} for known, path in documents.items()]
+    print_table("documents and examples", pd.DataFrame(rows))
+    echo("rsbench docs NAME prints the path of one")
+
+
+def list_documents() -> dict[str, Path]:
+    """Paths by name, sorted: documents without their ending, examples with it."""
+    from rsbench.components.cards import shipped_folder
+
+    examples = shipped_folder("examples", "_docs/examples")
+    pages = shipped_folder("docs", "_docs").rglob("*.md")
+    documents = {path.stem: path for path in pages if path.stem != "index" and examples not in path.parents}
+    return dict(sorted(documents.items())) | {path.name: path for path in sorted(examples.glob("*.*"))}
+
+
+def _title(path: Path) -> str:
+    """The first heading of a document or notebook."""
+    for line in path.read_text("utf-8").splitlines():
+        text = line.strip().lstrip('"').removesuffix(",").removesuffix('"').removesuffix("\\n")
+        if text.startswith("# "):
+            return text[2:]
+    return ""
+
+
+CHECK_SOLVER_EPILOG = """[bold]Examples[/bold]
+
+  rsbench check-solver gs-8pt
+
+  rsbench check-solver ./my-solver.toml --json
+
+Other packages' solvers run in a child process. Exit code 1 when a check fails; warnings are yours to judge."""
+
+
+def check_solver(
+    solver: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME|CARD", help="Name of a solver or path to its card.", autocompletion=complete("solvers")
+        ),
+    ],
+    time_limit: Annotated[
+        float | None, typer.Option(min=0.1, help="Seconds for one problem; by default what the card says.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Findings as one JSON object.")] = False,
+) -> None:
+    """Check the contract of a solver: exact data solved, equal results of equal runs, failures as values."""
+    import json as json_module
+    from dataclasses import asdict
+
+    import pandas as pd
+
+    from rsbench.benchmark.simulated.contract import check_solver as find
+    from rsbench.cli.console import print_table, say
+    from rsbench.solvers.engine.registry import load_solver_entry
+
+    entry = load_solver_entry(solver)
+    findings = find(entry, time_limit_s=time_limit)
+    failed = sum(finding.verdict == "failed" for finding in findings)
+    if json:
+        content = {"solver": entry.name, "passed": not failed, "checks": [asdict(each) for each in findings]}
+        echo(json_module.dumps(content))
+    else:
+        print_table(f"{entry.name} and the contract of solvers", pd.DataFrame([asdict(each) for each in findings]))
+        say(f"{entry.name}: {failed} of {len(findings)} checks failed")
+    if failed:
+        raise typer.Exit(1)
