@@ -154,8 +154,8 @@ def command_over_generate(folder: Path, *words: str) -> tuple[Work, Work]:
 
 def asked_over_matched(data: Path) -> tuple[Work, Work]:
     """``inspect`` of four frames 900 x 900 of which nothing is known, and the matches that it reads."""
-    from rsbench.capture.estimate import conclude, examine
-    from rsbench.capture.settle import known_of
+    from rsbench.capture.shutter_decision import known_of
+    from rsbench.capture.two_frame_estimate import conclude, examine
     from rsbench.dataset.sequence import read_dataset
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.frame_matches import match_unknown

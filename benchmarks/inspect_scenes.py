@@ -21,8 +21,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.estimate import conclude, examine
-from rsbench.capture.scans import Scans
+from rsbench.capture.hypotheses import Scans
+from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig, View
 from rsbench.core.shutter import Scanning
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard

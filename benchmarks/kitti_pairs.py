@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 from score_kitti import read_rig, step
 
-from rsbench.capture.estimate import CERTAIN, conclude, examine
-from rsbench.capture.settle import NoMotionError, as_global, known_of, shutter_found
+from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
+from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource

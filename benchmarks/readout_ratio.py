@@ -16,12 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
-from rsbench.capture.calibration_errors import NO_ERRORS
-from rsbench.capture.estimate import Capture, conclude, examine
-from rsbench.capture.fit import CaptureCost, Likelihood
-from rsbench.capture.hypotheses import MODELS, RATIO, UNKNOWNS, Hypothesis
-from rsbench.capture.scans import Scans, TimedMatches
-from rsbench.capture.settle import known_of
+from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.hypotheses import (
+    MODELS,
+    RATIO,
+    UNKNOWNS,
+    CaptureCost,
+    Hypothesis,
+    Likelihood,
+    Scans,
+    TimedMatches,
+)
+from rsbench.capture.shutter_decision import known_of
+from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

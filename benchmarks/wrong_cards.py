@@ -18,7 +18,8 @@ import numpy as np
 from foreign_frames import ROWS, picture, write_case
 from foreign_world import read_photographs
 
-from rsbench.capture.self_calibration import CardSigma, FoundCamera
+from rsbench.capture.calibration import CardSigma
+from rsbench.capture.self_calibration import FoundCamera
 from rsbench.core.lens import Lens
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.pipeline.correction_options import CorrectionOptions

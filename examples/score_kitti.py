@@ -19,9 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS, CardSigma, recalibrated
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.trajectory_stream import stream_trajectory
+from rsbench.capture.calibration import NO_ERRORS, CardSigma, RefusedFramesError, recalibrated
+from rsbench.capture.trajectory_estimate import stream_trajectory
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

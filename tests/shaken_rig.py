@@ -6,11 +6,8 @@ import numpy as np
 import scipy
 from scipy.spatial.transform import Rotation
 
-from rsbench.capture.trajectory_estimate import (
-    Trajectory,
-)
-from rsbench.capture.trajectory_prior import Prior
-from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve
+from rsbench.capture.trajectory_estimate import Trajectory
+from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, Prior, evaluate, make_curve
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import StereoRig

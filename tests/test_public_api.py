@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import rsbench
 from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.benchmark.simulated.simulation import Simulation
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.projection import RSProjection
 from rsbench.dataset.sequence import Sequence
 from rsbench.solvers.engine.robust_motion import RobustEstimate

@@ -82,7 +82,7 @@ def under_model(
     Raises:
         RsbenchError: no such model, or the solver can take no other than its own.
     """
-    from rsbench.capture.settle import AUTO
+    from rsbench.capture.model_choice import AUTO
     from rsbench.pipeline.frame_motion import check_model, chosen_model, entry_of, motion_of, or_spline, widened
     from rsbench.solvers.engine.robust_motion import estimate_motion
 

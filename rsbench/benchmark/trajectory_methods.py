@@ -9,8 +9,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS
-from rsbench.capture.settle import AUTO, NoMotionError
+from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.model_choice import AUTO
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import estimate_trajectory
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences

@@ -1,46 +1,67 @@
-"""The focal length and the first radial coefficient of both cameras from the matches of a moving rig.
+"""The focal length of a rig or of one camera, and k1 of a rig, from matches while the camera turns.
 
 Cards of real rigs are a little wrong. A wrong focal length or lens bends what a rotation does to the image, so
-matches of a rig that turns show it, beside motion and shutter; of one that drives straight on they do not.
+matches of a rig that turns show it, beside motion and shutter; matches of a rig that moves straight on do not.
+
+Pairs of frames of one camera are less certain than the noise of their matches says: a hand shakes between two
+frames, and motion that no model describes is taken for a focal length. Only the scatter from pair to pair shows by
+how much, so this scatter, with a prior on it, counts as an error of each pair.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import FOCAL, OFFSET, RADIAL, CardSigma
-from rsbench.capture.estimate import CERTAIN, Window, conclude, examine
-from rsbench.capture.hypotheses import Known
-from rsbench.capture.scans import Scans
-from rsbench.capture.settle import as_global, known_of
+from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, RADIAL, CardSigma
+from rsbench.capture.hypotheses import Known, Scans, scans_of
+from rsbench.capture.shutter_decision import as_global, examine_alone, known_of
+from rsbench.capture.two_frame_estimate import CERTAIN, Window, conclude, examine
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import Scanning
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 _TELLING = 0.5
 """Standard deviation over the prior's, at most, of what is told."""
+
+
 _LEAST_TURN = np.deg2rad(0.25)
 """Per frame period: where a rig turns less, errors of the calibration say more of a focal length than the motion
 does, and it is not asked. From a straight drive (KITTI) it came out 6 % too long, at a stated deviation of 2 %."""
+
+
 _FEWEST_TURNS = 3
 """Windows of a rig whose rows show that its calibration errs: by their scatter alone is it known how much of that
 they take for a focal length (KITTI: single windows are off by up to eleven deviations)."""
+
+
 _LEFT_OVER = 0.03
 """Share of a focal length by which it is off, about, where the calibration errs in more than its terms hold: found
 4 % too short from a KITTI excerpt that turns, at a deviation of 1 % by the scatter of its windows."""
+
+
 _TOGETHER = np.array([2e-4, 2e-4])
 """Share of a focal length, and k1, by which the errors that matches of pictures share put them off: without it
 deviations of 21 pairs of traced frames were too small by a half (``benchmarks/wrong_cards.py``)."""
+
+
 _MOST_ROUNDS, _SETTLED = 4, 0.1
 """Behind a lens the error is linear only nearby: again from what was found, until it moves by few deviations."""
+
+
 _TERMS = [FOCAL, RADIAL]
+
+
 _LATER = "is found with the errors of the calibration that rows show"
+
+
 _OPEN = "as the card has it: the matches cannot tell; turn the rig, or give more frames"
 
 
@@ -86,7 +107,7 @@ def find_camera(
 
     Args:
         sigma: of the card; what it is sure of is not looked for.
-        readout_ratio, scanning: as ``settle.known_of`` takes them.
+        readout_ratio, scanning: as ``shutter_decision.known_of`` takes them.
     """
     scanning = scanning if readout_ratio is None else scanning or Scanning()
     known = known_of(windows[0], rig, readout_ratio, scanning)
@@ -171,3 +192,130 @@ def _turn(window: Window) -> float:
         return 0.0
     best = max(window.evidence.peaks.values(), key=lambda peak: peak.value)
     return float(np.linalg.norm(best.fit.theta[:3]))
+
+
+PRIOR = 0.35
+"""Standard deviation of the logarithm of a focal length over the width of the image, about 0: lenses from a half
+to two widths, of 90 to 28 degrees, are within two of them."""
+
+
+_MATCHES, _SAMPLES = 400, 100
+"""Of a pair, and of samples of them: neighbours in dense flow err alike."""
+
+
+_MODELS = ("inertial", "accelerated")
+
+
+_NEARBY, _PAIR_ROUNDS = 0.3, 4
+"""Share of a focal length that is found at once; one that is off by more is looked for again from there."""
+
+
+_LEAST_PAIR_TURN, _LEAST_PAIR_MOVED = np.deg2rad(1.0), 0.01
+"""Per frame period, and the widths by which that moves the image: what turns less shows more of the errors of the
+flow than of a focal length, and a focal length that is far too short makes turns look large."""
+
+
+_EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
+"""Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
+
+
+_SHARED = 0.05
+"""By which the pairs of a video err alike."""
+
+
+_LEAST_TURNING = 0.5
+"""Share of the pairs: where few seem to turn, they seem so by what they err."""
+
+
+_BROKEN, _LEAST_GOOD = 3.0, 0.75
+"""Prior deviations beyond which a pair shows its shaking alone, and the share that must not be so."""
+
+
+_TELLING_PAIRS = 0.65
+"""Standard deviation over the prior's, at most, of what is told."""
+
+
+class PairFocal(NamedTuple):
+    """What one pair of frames says."""
+
+    log: float
+    """Logarithm of the focal length over the width of the image."""
+    sigma: float
+    """By the noise of the matches alone."""
+    turn: float
+    """Radians per frame period."""
+
+    @property
+    def turns(self) -> bool:
+        """Whether the camera turned enough to show it."""
+        return self.turn >= _LEAST_PAIR_TURN and self.turn * np.exp(self.log) >= _LEAST_PAIR_MOVED
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundFocal:
+    """Focal length of a camera, px."""
+
+    focal: float
+    """The most probable one; where the pairs do not tell it, the width of the image."""
+    sigma: float
+    told: bool
+    pairs: int
+    """That it rests on."""
+
+
+def focal_of_pair(
+    matches: FloatArray, size: tuple[int, int], shutter: RollingShutter, options: RobustOptions, seed: int = 0
+) -> PairFocal | None:
+    """What matches (n, 4) x0, y0, x1, y1, px, in random order, say; None where no motion explains them.
+
+    Args:
+        size: width and height, px.
+        shutter: of the camera.
+    """
+    width, height = size
+    quick = replace(options, max_iterations=min(options.max_iterations, _SAMPLES))
+    expected = np.array(NO_ERRORS)
+    expected[FOCAL] = PRIOR
+    known = Known(
+        ratio=shutter.readout_ratio,
+        scans=(scans_of(shutter),),
+        delay=0.0,
+        calibration_sigma=tuple(expected.tolist()),
+        models=_MODELS,
+    )
+    focal, found = float(width), None
+    for _ in range(_PAIR_ROUNDS):
+        camera = PinholeCamera.centred(width, height, focal)
+        capture = conclude([examine_alone(matches[:_MATCHES], camera, known, quick, seed)])
+        best = capture.likeliest
+        if best is None:
+            return None
+        error, focal = best.calibration[FOCAL], focal / (1.0 - best.calibration[FOCAL])
+        turn = float(np.linalg.norm(capture.peaks[capture.motion_model].fit.theta[:3]))
+        found = PairFocal(float(np.log(focal / width)), best.calibration_sigma[FOCAL] / (1.0 - error), turn)
+        if abs(error) < _NEARBY or abs(found.log) > _BROKEN * PRIOR:
+            break
+    return found
+
+
+def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
+    """What all pairs of a video of this width say together."""
+    solved = [each for each in pairs if each is not None]
+    turning = [each for each in solved if each.turns]
+    good = [each for each in turning if abs(each.log) <= _BROKEN * PRIOR]
+    untold = FoundFocal(focal=float(width), sigma=PRIOR * width, told=False, pairs=len(good))
+    if not good or len(good) < _LEAST_GOOD * len(turning) or len(turning) < _LEAST_TURNING * len(solved):
+        return untold
+    logs, own = np.array([each.log for each in good]), np.array([each.sigma for each in good])
+    scatter = _EXPECTED
+    for _ in range(10):
+        weights = 1.0 / (scatter**2 + own**2)
+        mean = float(weights @ logs / np.sum(weights))
+        squares = _EXPECTED_WEIGHT * _EXPECTED**2 + float(np.sum((logs - mean) ** 2))
+        scatter = float(np.sqrt(squares / (_EXPECTED_WEIGHT + len(good) - 1)))
+    variance = 1.0 / float(np.sum(weights)) + _SHARED**2
+    sigma = (1.0 / variance + 1.0 / PRIOR**2) ** -0.5
+    if sigma > _TELLING_PAIRS * PRIOR:
+        return untold
+    focal = width * float(np.exp(mean * sigma**2 / variance))
+    return FoundFocal(focal=focal, sigma=sigma * focal, told=True, pairs=len(good))

@@ -1,19 +1,20 @@
 """The spline of largest posterior probability: robust Levenberg-Marquardt steps on banded normal equations.
 
-Noise, its tails and the strength of the prior are found on the way: the first two by maximum likelihood, the last
-by maximum evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992).
+The descent starts from the motions of neighbouring frames, one after the other (``first_curve``). Noise, its tails
+and the strength of the prior are estimated on the way: the first two by maximum likelihood, the last by maximum
+evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992), as are the knots and the kind of prior
+(``choose``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.trajectory_data import Past, TimedTracks
 from rsbench.capture.trajectory_gyro import (
     Border,
     Drift,
@@ -26,28 +27,80 @@ from rsbench.capture.trajectory_gyro import (
     learned,
     sensed,
 )
-from rsbench.capture.trajectory_kernels import Tails, add_tracks
-from rsbench.capture.trajectory_noise import LEAST_SCALE_PX, REACH, observed
-from rsbench.capture.trajectory_prior import Prior, Roughness, anchors, log_prior, roughness
-from rsbench.capture.trajectory_spline import Curve, from_pose_at, moved
+from rsbench.capture.trajectory_spline import (
+    ContinuousMotion,
+    Curve,
+    NotDefiniteError,
+    Prior,
+    Roughness,
+    anchors,
+    approximated,
+    band_factor,
+    band_inner,
+    band_log_determinant,
+    band_solve,
+    control_count,
+    evaluate,
+    from_pose_at,
+    log_prior,
+    make_curve,
+    moved,
+    roughness,
+)
+from rsbench.capture.trajectory_tracks import (
+    LEAST_SCALE_PX,
+    REACH,
+    Past,
+    Tails,
+    TimedTracks,
+    add_tracks,
+    is_of_one_camera,
+    observed,
+    thinned,
+)
 from rsbench.core import so3
+from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
 
 NORMAL = 1e9
 """Degrees of freedom of tails that are none."""
+
+
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
+
+
 _FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
+
+
 _FLAT_COST, _NEAR = 1e-3, 1.0
+
+
 _MANY = 300
 """Tracks from which on it pays to share them."""
+
+
 _LEAST_WIDTH = 5
 """Control poses that the prior ties, and a moment of a gyroscope."""
+
+
 ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
+
+
 _TELLING = 2.0
 """Accelerations that tracks must determine, at least, to say how strong they are."""
+
+
 _STRENGTHS = (1e-10, 1e2)
 """Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
+
+
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
 
 
@@ -211,7 +264,7 @@ def information(
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
     each = replace(tracks, share=share)
     found = normal_equations(curve, each, Tails(NORMAL, tails.scale), silent, expected, drift=drift)
-    return banded.factor(held(found, curve, tracks, ANCHORED)), found.border
+    return band_factor(held(found, curve, tracks, ANCHORED)), found.border
 
 
 def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> FloatArray:
@@ -230,8 +283,8 @@ def log_evidence(found: Fit, precision: float) -> float:
     """
     curve, equations = found.curve, found.equations
     anchor = anchors(curve, equations.band.shape[1], precision)
-    lower = banded.factor(equations.band + anchor)
-    after = banded.log_determinant(lower)
+    lower = band_factor(equations.band + anchor)
+    after = band_log_determinant(lower)
     if equations.sensed is not None and equations.border is not None and found.drift is not None:
         after += eliminated(lower, equations.border).log_determinant
         after += equations.sensed.count * float(np.log(found.drift.variance))
@@ -311,11 +364,11 @@ def _step(matrix: FloatArray, here: Equations, damping: float) -> FloatArray | N
     damped = matrix.copy()
     damped[:, 0] += damping * here.band[:, 0]
     try:
-        lower = banded.factor(damped)
+        lower = band_factor(damped)
         if here.border is None:
-            return -banded.solve(lower, here.gradient)
+            return -band_solve(lower, here.gradient)
         return np.concatenate(bordered_step(lower, here.gradient, here.border))
-    except banded.NotDefiniteError:
+    except NotDefiniteError:
         return None
 
 
@@ -344,7 +397,7 @@ def fit(
     for _ in range(_ROUNDS):
         curve, here, drift = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND, drift)
         last = _strengths_of(prior, drift)
-        old, lower = tails.scale, banded.factor(held(here, curve, tracks, ANCHORED))
+        old, lower = tails.scale, band_factor(held(here, curve, tracks, ANCHORED))
         used, determined, better, drift = _strengths(here, lower, prior, drift)
         if not settled:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
@@ -368,7 +421,7 @@ def _strengths(
     """Numbers of parameters that tracks determine, and of accelerations and errors of a gyroscope that are left
     beside them (2 or 3,); the prior and the gyroscope's noise of more evidence."""
     inverse, old = bordered_inverse(lower, here.border), np.array([prior.rotation, prior.position])
-    tied = np.array([banded.inner(inverse, band) for band in here.rough.bands]) / old
+    tied = np.array([band_inner(inverse, band) for band in here.rough.bands]) / old
     determined = np.maximum(here.rough.count - tied, 1e-3)
     new = np.where(determined > _TELLING, np.clip(here.rough.squares / determined, *_STRENGTHS), old)
     used = len(lower) - 6.0 - float(np.sum(tied))
@@ -376,3 +429,151 @@ def _strengths(
         own, left, drift = learned(here.sensed, drift, lower, inverse, here.border)
         used, determined = used + len(drift.errors) - own, np.append(determined, left)
     return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1])), drift
+
+
+_SOME = 250
+"""Tracks of a window, about: enough to begin with."""
+
+
+_SUSPECT = 4.0
+"""Times the error of a window whose motion is made of its neighbours', from which on its own is wrong."""
+
+
+def window_motions(
+    windows: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter, seed: int
+) -> list[Motion | None]:
+    """The paper's motion in each window, of some of its tracks; None where they show none."""
+    out, solver = list[Motion | None](), RefinedSolver(one_camera=is_of_one_camera(windows))
+    for window in thinned(windows, _SOME):
+        rng = np.random.default_rng(seed)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            found = estimate_motion(window, rig, shutter, solver, RobustOptions(), rng).estimate
+        out.append(LinearMotion(found.w, found.d) if found.success else None)
+    return out
+
+
+def first_curve(
+    motions: Sequence[Motion | None], tracks: TimedTracks, span: tuple[float, float], interval: float
+) -> Curve:
+    """A spline along the motions of the windows; one that is missing or wrong is made of its neighbours'.
+
+    Args:
+        span: times of the first and the last line.
+    """
+    known = np.array([motion is not None for motion in motions])
+    rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
+    own = _chained(_bridged(rates, known), span, interval)
+    others = np.stack([_without(rates, known, k) for k in range(len(rates))])
+    bridged = _chained(others, span, interval)
+    errors = [_median_errors(squared_errors(curve, tracks), tracks) for curve in (own, bridged)]
+    known &= ~(errors[0] > _SUSPECT * errors[1])
+    return _chained(_bridged(rates, known), span, interval)
+
+
+def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:
+    """A spline, longer: along the motions of the windows from ``start`` on, to a time."""
+    known = np.array([motion is not None for motion in motions])
+    if not np.any(known):
+        motions, known = [ContinuousMotion.of(curve).from_time(start - 1.0)], np.ones(1, dtype=np.bool_)
+    rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
+    rates = _bridged(rates, known)
+    count = control_count(curve.first, last, curve.interval)
+    taus = curve.first + curve.interval * (np.arange(count) - 1.0)
+    ahead = from_pose_at(_chained(rates, (0.0, max(last - start, 1.0)), curve.interval), 0.0)
+    own, later = evaluate(curve, taus)[0], evaluate(ahead, taus - start)[0]
+    here = evaluate(curve, float(start))[0]
+    R, p = curve.R, curve.p
+    for k in range(len(p), count):
+        far = taus[k] > start
+        pose = compose(Pose(later.R[k], later.t[k]), here) if far else Pose(own.R[k], own.t[k])
+        R, p = np.concatenate([R, pose.R[None]]), np.concatenate([p, -(pose.R.T @ pose.t)[None]])
+    return make_curve(curve.first, curve.interval, R, p)
+
+
+def _median_errors(squares: FloatArray, tracks: TimedTracks) -> FloatArray:
+    """(windows,) of the tracks of each window; 0 of none."""
+    chosen = [squares[members] for members in tracks.members]
+    return np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen])
+
+
+def _bridged(rates: FloatArray, known: BoolArray) -> FloatArray:
+    """Rates (n, 6), those that are not known between those of neighbours; 0 where none is."""
+    if not np.any(known):
+        return np.zeros_like(rates)
+    places = np.arange(len(rates))
+    return np.stack([np.interp(places, places[known], column[known]) for column in rates.T], axis=1)
+
+
+def _without(rates: FloatArray, known: BoolArray, k: int) -> FloatArray:
+    """What the neighbours of window k say of it (6,)."""
+    others = known.copy()
+    others[k] = False
+    return _bridged(rates, others)[k]
+
+
+def _chained(rates: FloatArray, span: tuple[float, float], interval: float) -> Curve:
+    """Through the poses that rates of rotation and translation (n, 6) lead to."""
+    poses = [Pose(np.eye(3), np.zeros(3))]
+    for rate in rates:
+        poses.append(compose(Pose(*LinearMotion(rate[:3], rate[3:]).body_from_world(1.0)), poses[-1]))
+    taus = span[0] + interval * (np.arange(control_count(*span, interval)) - 1.0)
+    controls = []
+    for tau in taus:
+        k = int(np.clip(np.floor(tau), 0, len(rates) - 1))
+        along = LinearMotion(rates[k, :3], rates[k, 3:]).body_from_world(tau - k)
+        controls.append(inverse(compose(along, poses[k])))
+    R = np.swapaxes(np.stack([each.R for each in controls]), 1, 2)
+    return make_curve(span[0], interval, R, np.stack([each.t for each in controls]))
+
+
+MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Frame periods."""
+
+
+_PRECISION = 1e12
+
+
+_WORTH = 1.0
+"""Logarithm of evidence that another choice must gain."""
+
+
+def choose(found: Fit, tracks: TimedTracks, intervals: Sequence[float]) -> Fit:
+    """The fit of most evidence, by climbing from one: its memory, then its smoothness, then its knots."""
+    best, most = found, log_evidence(found, _PRECISION)
+
+    def better(trial: Callable[[], Fit]) -> bool:
+        nonlocal best, most
+        try:
+            other = trial()
+            evidence = log_evidence(other, _PRECISION)
+        except NotDefiniteError:
+            return False
+        gained = evidence > most + _WORTH
+        if gained:
+            best, most = other, evidence
+        return gained
+
+    def with_memory(memory: float, smooth: int) -> Fit:
+        return again(best, best.curve, tracks, memory, smooth)
+
+    start = int(np.argmin(np.abs(np.log(np.array(MEMORIES) / best.prior.memory))))
+    for way in (-1, 1):
+        place = start + way
+        while 0 <= place < len(MEMORIES) and better(lambda: with_memory(MEMORIES[place], best.prior.smooth)):  # noqa: B023
+            place += way
+        if place != start + way:
+            break
+    better(lambda: with_memory(best.prior.memory, 3 - best.prior.smooth))
+    for interval in intervals:
+        if abs(interval - best.curve.interval) > 1e-9:
+            curve = approximated(
+                lambda tau: evaluate(best.curve, tau)[0], (best.curve.first, best.curve.last), interval
+            )
+            better(lambda: again(best, curve, tracks, best.prior.memory, best.prior.smooth))  # noqa: B023
+    return best
+
+
+def again(found: Fit, curve: Curve, tracks: TimedTracks, memory: float, smooth: int) -> Fit:
+    """A fit under another prior or with other knots, with the same tails and the same tracks."""
+    prior = found.prior._replace(memory=memory, smooth=smooth)
+    return fit(curve, tracks, prior, tails=found.tails, trust=found.trust, drift=found.drift)

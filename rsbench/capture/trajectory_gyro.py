@@ -1,9 +1,9 @@
-"""A gyroscope beside the matches of a sequence: how fast it turns at its moments, and what it errs by.
+"""A gyroscope beside the matches of a sequence: the rates that it measures, and its errors.
 
-A sample is a measurement of the spline's rate at its time, of white noise, so that nothing is integrated: neither
-gaps nor slow sampling matter. What it errs by is found with the spline: a bias that stays, how far its clock is
-off, and what its axes and scales are off by are unknowns beside the control poses, a border of 13 columns beside
-the band; then the noise's variance.
+A sample is a measurement of the spline's rate at its time, with white noise, so that nothing is integrated: gaps
+and slow sampling do no harm. Its errors are estimated with the spline: a constant bias, the offset of its clock,
+and errors of its axes and scales are unknowns beside the control poses, a border of 13 columns beside the band;
+then the variance of the noise.
 """
 
 from __future__ import annotations
@@ -13,32 +13,56 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.trajectory_poses import blank_views, fill_views
-from rsbench.capture.trajectory_prior import add_blocks
-from rsbench.capture.trajectory_spline import Curve
+from rsbench.capture.trajectory_spline import (
+    Curve,
+    NotDefiniteError,
+    add_blocks,
+    band_inner,
+    band_inverse,
+    band_solve,
+    blank_views,
+    fill_views,
+)
 from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
 _APART = 1 / 16
 """Frame periods: samples that are closer are taken together. A filter in the sensor makes their noise alike, and
 the mean over an eighth of a period blunts what a hand shakes."""
+
+
 _MOMENT = 1e-3
 """Half of the time over which the spline's turn is taken for its rate: far above rounding, far below a knot."""
+
+
 _BIAS = 1e-2
 """Standard deviation of the bias, rad per frame period, before anything is seen: 0.3 rad/s at 30 Hz."""
+
+
 _SHIFT, FARTHEST = 0.2, 0.5
 """Standard deviation of the shift of its clock, frame periods, before anything is seen, and the largest that is
 looked for: a quarter of the period of the fastest shakes of a hand."""
+
+
 _CROOKED, _MOST_CROOKED = 0.02, 0.3
 """Standard deviation of axes and scales before anything is seen, rad and relative, and the largest errors of them
 that are believed."""
+
+
 ERRORS = 13
+
+
 _EXPECTED = np.array([_BIAS] * 3 + [_SHIFT] + [_CROOKED] * 9)
+
+
 _LEAST_VARIANCE = 1e-12
 """rad^2 per frame period: far below that of any gyroscope, and above rounding."""
+
+
 _TELLING = 2.0
 """Errors beside those that the spline follows, at least, to say how large they are."""
+
+
 _UNLIKE, _NOISY = 0.3, 3.0
 """Root mean square of a gyroscope's errors, over that of how its rates vary and over that of its own noise, from
 which on both it contradicts the matches."""
@@ -224,26 +248,26 @@ class Eliminated(NamedTuple):
 
 def eliminated(lower: FloatArray, border: Border) -> Eliminated:
     """Raises NotDefiniteError."""
-    follows = banded.solve(lower, border.mixed)
+    follows = band_solve(lower, border.mixed)
     left = border.corner - border.mixed.T @ follows
     try:
         root = np.linalg.cholesky(0.5 * (left + left.T))
     except np.linalg.LinAlgError as error:
-        raise banded.NotDefiniteError(str(error)) from None
+        raise NotDefiniteError(str(error)) from None
     inverse = np.linalg.inv(root)
     return Eliminated(follows, inverse.T @ inverse, 2.0 * float(np.sum(np.log(np.diagonal(root)))))
 
 
 def bordered_step(lower: FloatArray, gradient: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
     """Newton's step of control poses (6 controls,) and a gyroscope's errors (13,). Raises NotDefiniteError."""
-    alone, rest = banded.solve(lower, gradient), eliminated(lower, border)
+    alone, rest = band_solve(lower, gradient), eliminated(lower, border)
     step = -rest.covariance @ (border.slope - border.mixed.T @ alone)
     return -alone - rest.follows @ step, step
 
 
 def bordered_inverse(lower: FloatArray, border: Border | None) -> FloatArray:
     """Covariance of control poses, in its band, with a gyroscope's errors that are not known beside them."""
-    inverse = banded.inverse_band(lower)
+    inverse = band_inverse(lower)
     if border is None:
         return inverse
     rest = eliminated(lower, border)
@@ -263,7 +287,7 @@ def learned(
         inverse: see ``bordered_inverse``.
     """
     rest = eliminated(lower, border)
-    tied = banded.inner(inverse, found.band) + np.sum(rest.covariance * found.border.corner)
+    tied = band_inner(inverse, found.band) + np.sum(rest.covariance * found.border.corner)
     tied -= 2.0 * np.sum((rest.follows @ rest.covariance) * found.border.mixed)
     used = float(tied) / drift.variance
     left = found.count - used

@@ -1,33 +1,113 @@
-"""A cubic B-spline through control poses: rotations cumulative on SO(3), positions of the body in the world.
+"""The spline of a trajectory: its poses and their derivatives, its prior, and banded matrices.
+
+A cubic B-spline through control poses: rotations cumulative on SO(3), positions of the body in the world.
 
     R(u) = exp(b3 O[i+2]) exp(b2 O[i+1]) exp(b1 O[i]) C[i],   O[k] = log(C[k+1] C[k]^T)
     p(u) = p[i] + b1 (p[i+1] - p[i]) + b2 (p[i+2] - p[i+1]) + b3 (p[i+3] - p[i+2])
 
-with C body_from_world and the b of ``core.spline_motion``. Rotations and positions do not mix, as they
-would on SE(3), so that a body that nothing pushes goes straight in the world while it turns. C. Sommer, V. Usenko,
-D. Schubert, N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR
-2020, for the derivatives.
+with C body_from_world and the b of ``core.spline_motion``. Rotations and positions do not mix, as they would on
+SE(3), so that a body without forces moves straight in the world while it turns. C. Sommer, V. Usenko, D. Schubert,
+N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for the
+derivatives.
+
+The prior says how hands, heads and vehicles shake. Accelerations, about each axis and along it, are stationary
+noise that forgets within a time (R. Singer, Estimating optimal tracking filter performance for manned maneuvering
+targets, IEEE Trans. AES 1970): as second differences d of the control poses, (1 - rho L)^m d is white, L the step
+back by a knot and rho = exp(-interval / memory). White accelerations, whose memory is 0, would allow a tremor at
+any rate; white jerk lets the rig run away. T. Barfoot, C. Tong, S. Sarkka, Batch continuous-time trajectory
+estimation as exactly sparse Gaussian process regression, RSS 2014, for such priors of trajectories.
+
+Banded symmetric matrices are stored by columns: entry (j, i) of a band (n, width) is element (j + i, j) of the
+matrix.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from numpy.typing import ArrayLike
+import scipy
+from numpy.typing import ArrayLike, NDArray
 
+from rsbench.components.compiled import compiled
 from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.vectors import Vector, apply, coefficients, dot, fill_rotation, plus, times
+
+
+class NotDefiniteError(ValueError):
+    """A matrix without a Cholesky factor."""
+
+
+def band_factor(band: FloatArray) -> FloatArray:
+    """Lower Cholesky factor, a band.
+
+    Raises:
+        NotDefiniteError: there is none.
+    """
+    try:
+        lower = scipy.linalg.cholesky_banded(band.T, lower=True, check_finite=False)
+    except np.linalg.LinAlgError as error:
+        raise NotDefiniteError(str(error)) from None
+    return np.ascontiguousarray(lower.T)
+
+
+def band_solve(lower: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution (n, ...) for a right-hand side (n, ...)."""
+    return np.asarray(scipy.linalg.cho_solve_banded((lower.T, True), right, check_finite=False))
+
+
+def band_log_determinant(lower: FloatArray) -> float:
+    """Of the matrix with this factor."""
+    return 2.0 * float(np.sum(np.log(lower[:, 0])))
+
+
+def band_inner(a: FloatArray, b: FloatArray) -> float:
+    """Trace of the product of two bands."""
+    return float(np.sum(a[:, 0] * b[:, 0]) + 2.0 * np.sum(a[:, 1:] * b[:, 1:]))
+
+
+@compiled
+def band_inverse(lower: FloatArray) -> FloatArray:
+    """The elements of the inverse that lie in the band of the factor.
+
+    K. Takahashi, J. Fagan, M. Chen, Formation of a sparse bus impedance matrix, PICA 1973: from the last column to
+    the first, each from those below it.
+    """
+    n, width = lower.shape
+    out, square, column = np.zeros((n, width)), np.zeros((width, width)), np.zeros(width)
+    for j in range(n - 1, -1, -1):
+        count = min(width, n - j)
+        pivot = lower[j, 0]
+        # square: the inverse's part of the rows and columns j + 1 .. j + count - 1
+        for a in range(1, count):
+            for b in range(a, count):
+                square[a, b] = square[b, a] = out[j + a, b - a]
+        diagonal = 1.0 / (pivot * pivot)
+        for a in range(1, count):
+            total = 0.0
+            for b in range(1, count):
+                total += square[a, b] * lower[j, b]
+            column[a] = -total / pivot
+        for a in range(1, count):
+            out[j, a] = column[a]
+            diagonal -= lower[j, a] * column[a] / pivot
+        out[j, 0] = diagonal
+    return out
+
 
 _ORDER = 4
 """Control poses that a time feels."""
+
+
 _SAME = 1e-9
 
 
@@ -193,3 +273,378 @@ class ContinuousMotion(Motion):
         curve = make_curve(parameters["first"], parameters["interval"], so3.exp(rows[:, :3]), rows[:, 3:])
         (R, t), _, _ = evaluate(curve, 1.0)
         return so3.log(R), t
+
+
+class Views(NamedTuple):
+    """Poses at n times."""
+
+    index: NDArray[np.int64]
+    """(n,) the first of the four control poses that a time feels."""
+    R: FloatArray
+    """(n, 3, 3) body_from_world."""
+    p: FloatArray
+    """(n, 3) in the world, metres."""
+    spin: FloatArray
+    """(n, 3) dR/dtau = [spin]x R."""
+    speed: FloatArray
+    """(n, 3) dp/dtau."""
+    turn: FloatArray
+    """(n, 4, 3, 3) how the body turns when a control pose does, each about its own axes."""
+    share: FloatArray
+    """(n, 4) how p moves when a control pose does."""
+
+
+@compiled(error_model="numpy")
+def blank_views(count: int) -> Views:
+    """Room for so many poses."""
+    return Views(
+        np.zeros(count, dtype=np.int64),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 4, 3, 3)),
+        np.zeros((count, 4)),
+    )
+
+
+@compiled(error_model="numpy")
+def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
+    """The poses at times (n,)."""
+    work = np.zeros((5, 3, 3))
+    for k in range(len(taus)):
+        fill_view(curve, taus[k], views, k, work)
+
+
+@compiled(error_model="numpy")
+def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) -> None:
+    """The pose at one time, as number ``k``; work (5, 3, 3)."""
+    count = len(curve.p)
+    place = (tau - curve.first) / curve.interval
+    i = min(max(math.floor(place), 0), count - 4)
+    u = place - i
+    b = ((5 + u * (3 + u * (u - 3))) / 6, (1 + u * (3 + u * (3 - 2 * u))) / 6, u * u * u / 6)
+    rates = (0.5 + u * (0.5 * u - 1), 0.5 + u * (1 - u), 0.5 * u * u)
+    views.index[k] = i
+    views.share[k, 0], views.share[k, 1] = 1 - b[0], b[0] - b[1]
+    views.share[k, 2], views.share[k, 3] = b[1] - b[2], b[2]
+    p, speed = _row(curve.p, i), (0.0, 0.0, 0.0)
+    for j in range(3):
+        along = plus(_row(curve.p, i + j + 1), -1.0, _row(curve.p, i + j))
+        p, speed = plus(p, b[j], along), plus(speed, rates[j] / curve.interval, along)
+    _set(views.p, k, p)
+    _set(views.speed, k, speed)
+    _fill_turn(curve, i, b, rates, views, k, work)
+
+
+@compiled(error_model="numpy")
+def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: int, work: FloatArray) -> None:
+    """Rotation, its rate and its derivatives: from the last factor to the first."""
+    before, factor, jacobian, product, by_step = work[0], work[1], work[2], work[3], work[4]
+    turn, spin = views.turn[k], (0.0, 0.0, 0.0)
+    for m in range(3):
+        for n in range(3):
+            before[m, n], turn[3, m, n] = 1.0 if m == n else 0.0, 0.0
+    for j in range(2, -1, -1):
+        step, inverse = _row(curve.steps, i + j), curve.inverse_left[i + j]
+        spin = plus(spin, rates[j] / curve.interval, apply(before, step))
+        phi = times(b[j], step)
+        one, half, sixth, _, _ = coefficients(dot(phi, phi))
+        fill_rotation(phi, 1.0 - half * dot(phi, phi), one, half, factor)
+        fill_rotation(phi, one, half, sixth, jacobian)
+        _multiply(before, jacobian, product)
+        _multiply(product, inverse, by_step)
+        for m in range(3):
+            for n in range(3):
+                turn[j + 1, m, n] += b[j] * by_step[m, n]
+        _multiply_transposed(product, inverse, by_step)
+        for m in range(3):
+            for n in range(3):
+                turn[j, m, n] = -b[j] * by_step[m, n]
+        _multiply(before, factor, product)
+        before, product = product, before  # to copy one takes seconds to compile, for the error of unlike shapes
+    for m in range(3):
+        for n in range(3):
+            turn[0, m, n] += before[m, n]
+    _multiply(before, curve.R[i], views.R[k])
+    _set(views.spin, k, spin)
+
+
+@compiled(error_model="numpy")
+def _row(rows: FloatArray, i: int) -> Vector:
+    return (rows[i, 0], rows[i, 1], rows[i, 2])
+
+
+@compiled(error_model="numpy")
+def _set(rows: FloatArray, i: int, value: Vector) -> None:
+    rows[i, 0], rows[i, 1], rows[i, 2] = value
+
+
+@compiled(error_model="numpy")
+def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    for m in range(3):
+        for n in range(3):
+            out[m, n] = a[m, 0] * b[0, n] + a[m, 1] * b[1, n] + a[m, 2] * b[2, n]
+
+
+@compiled(error_model="numpy")
+def _multiply_transposed(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """a b^T."""
+    for m in range(3):
+        for n in range(3):
+            out[m, n] = a[m, 0] * b[n, 0] + a[m, 1] * b[n, 1] + a[m, 2] * b[n, 2]
+
+
+_WIDEST = (1.0, 10.0)
+"""Rates, radians and metres per frame period, that are expected before anything is seen."""
+
+
+class Prior(NamedTuple):
+    """Accelerations that are expected."""
+
+    memory: float
+    """Frame periods after which they are forgotten."""
+    smooth: int
+    """m: 1 or 2; the power of fast shaking falls with its rate to the power of -4 - 2 m."""
+    rotation: float
+    """Variance of angular accelerations about each axis, rad^2 per frame period^4."""
+    position: float
+    """Variance of accelerations along each axis, m^2 per frame period^4."""
+
+
+class Roughness(NamedTuple):
+    """Sums of squared accelerations, whitened; over the variances of a prior, twice its cost."""
+
+    squares: FloatArray
+    """(2,) of rotations and of positions."""
+    gradients: FloatArray
+    """(2, 6 controls) of half the squares."""
+    bands: FloatArray
+    """(2, 6 controls, width) Gauss-Newton matrices of half the squares, see ``trajectory_tracks.add_tracks``."""
+    count: int
+    """Accelerations of either kind, scalar."""
+    log_density: float
+    """Logarithm of the density of control poses of one axis, at unit variances and but for constants."""
+
+
+def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
+    """Weights of successive second differences, for accelerations of unit variance.
+
+    One row for each of the first ``smooth`` differences, which know less of what was before, and one for all
+    later ones.
+    """
+    rho = float(np.exp(-interval / memory)) if memory > 0.0 else 0.0
+    unit = interval**-2
+    if smooth == 1:
+        rows = [np.array([1.0]), np.array([-rho, 1.0]) / np.sqrt(1.0 - rho**2)]
+    else:
+        r = 2.0 * rho / (1.0 + rho**2)
+        late = np.array([rho**2, -2.0 * rho, 1.0]) * np.sqrt((1.0 + rho**2) / (1.0 - rho**2) ** 3)
+        rows = [np.array([1.0]), np.array([-r, 1.0]) / np.sqrt(1.0 - r**2), late]
+    return [unit * row for row in rows]
+
+
+def roughness(
+    curve: Curve, memory: float, smooth: int, width: int, begins: bool = True, until: int | None = None
+) -> Roughness:
+    """Of a spline, in bands of a width (at least 6 (smooth + 3)).
+
+    Args:
+        begins: whether nothing is known of accelerations before the first control pose; without it, differences
+            that need them are left out.
+        until: number of a control pose; only differences that begin before it.
+    """
+    n, steps = len(curve.p), (curve.steps, np.diff(curve.p, axis=0))
+    gradients, bands = np.zeros((2, 6 * n)), np.zeros((2, 6 * n, width))
+    squares, log_density, total = np.zeros(2), -float(np.log(curve.interval)), 0
+    for number, row in enumerate(whitening(curve.interval, memory, smooth)):
+        late = number == smooth
+        if not late and not begins:
+            continue
+        count = max(min(n - 2 - smooth, n if until is None else until), 0) if late else 1
+        log_density += count * float(np.log(row[-1]))
+        total += 3 * count
+        weights = -np.diff(np.concatenate([[0.0], row, [0.0]]))
+        by = np.zeros((2, count, len(weights) + 1, 3, 3))
+        for j, c in enumerate(weights):
+            left = curve.inverse_left[j : j + count]
+            by[0, :, j + 1] += c * left
+            by[0, :, j] -= c * np.swapaxes(left, 1, 2)
+            by[1, :, j + 1] += c * np.eye(3)
+            by[1, :, j] -= c * np.eye(3)
+        for kind in range(2):
+            errors = np.asarray(sum(c * steps[kind][j : j + count] for j, c in enumerate(weights)))
+            add_blocks(gradients[kind], bands[kind], by[kind], errors, np.arange(count), 3 * kind)
+            squares[kind] += np.sum(errors**2)
+    return Roughness(squares, gradients, bands, total, log_density)
+
+
+def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
+    """Logarithm of the density of a prior at its mode, but for constants that are the same for any knots.
+
+    All second differences, one rate and one pose are as good as the control poses: the matrix between them has the
+    determinant 1.
+    """
+    sizes = 0.5 * rough.count * float(np.log(prior.rotation) + np.log(prior.position))
+    return 6.0 * rough.log_density - sizes
+
+
+def add_blocks(
+    gradient: FloatArray,
+    band: FloatArray,
+    by: FloatArray,
+    errors: FloatArray,
+    first: NDArray[np.int64],
+    part: int,
+) -> None:
+    """Add normal equations of errors (n, m) whose derivatives (n, k, m, 3) are by k successive control poses.
+
+    Args:
+        first: (n,) number of the first of these poses.
+        part: 0 or 3: rotations or positions.
+    """
+    by, errors = np.ascontiguousarray(by), np.ascontiguousarray(errors)
+    _add_blocks(gradient, band, by, errors, first, part)
+
+
+@compiled
+def _add_blocks(
+    gradient: FloatArray,
+    band: FloatArray,
+    by: FloatArray,
+    errors: FloatArray,
+    first: NDArray[np.int64],
+    part: int,
+) -> None:
+    count, controls, size, _ = by.shape
+    for k in range(count):
+        for a in range(3 * controls):
+            row, i = 6 * (first[k] + a // 3) + part + a % 3, a % 3
+            for m in range(size):
+                gradient[row] += by[k, a // 3, m, i] * errors[k, m]
+            for b in range(a + 1):
+                column, j, total = 6 * (first[k] + b // 3) + part + b % 3, b % 3, 0.0
+                for m in range(size):
+                    total += by[k, a // 3, m, i] * by[k, b // 3, m, j]
+                band[column, row - column] += total
+
+
+def anchors(curve: Curve, width: int, precision: float) -> FloatArray:
+    """Band (6 controls, width) of what a roughness leaves free: the pose at time 0, and a rate.
+
+    They are the same for any knots. ``precision`` is that of the pose at time 0.
+    """
+    n = len(curve.p)
+    band, views = np.zeros((6 * n, width)), blank_views(1)
+    fill_views(curve, np.zeros(1), views)
+    first, nothing, unused = views.index, np.zeros((1, 3)), np.zeros(6 * n)
+    root = np.sqrt(precision)
+    add_blocks(unused, band, root * views.turn, nothing, first, 0)
+    add_blocks(unused, band, root * views.share[..., None, None] * np.eye(3), nothing, first, 3)
+    middle = np.array([(n - 2) // 2])
+    for kind in range(2):
+        by = np.array([-1.0, 1.0])[None, :, None, None] / curve.interval / _WIDEST[kind] * np.eye(3)
+        add_blocks(unused, band, by, nothing, middle, 3 * kind)
+    return band
+
+
+_SAMPLES, _STEPS = 4, 4
+
+
+def approximated(
+    body_from_world: Callable[[FloatArray], Pose], span: tuple[float, float], interval: float
+) -> Curve:
+    """The spline next to poses at times (n,), of a motion that lasts for a span."""
+    count = control_count(*span, interval)
+    R, t = body_from_world(np.asarray(span[0] + interval * (np.arange(count) - 1.0), dtype=np.float64))
+    curve = make_curve(span[0], interval, R, _positions(R, t))
+    shares = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    taus = [span[0] + interval * (np.arange(count - 3) + share) for share in shares]
+    wanted = [body_from_world(each) for each in taus]
+    first = np.arange(count - 3)
+    for _ in range(_STEPS):
+        gradient, band = np.zeros(6 * count), np.zeros((6 * count, 24))
+        band[:, 0] = 1e-9
+        views = blank_views(count - 3)
+        for each, (R, t) in zip(taus, wanted, strict=True):
+            fill_views(curve, each, views)
+            turned = so3.log(R @ np.swapaxes(views.R, 1, 2))
+            add_blocks(gradient, band, views.turn, turned, first, 0)
+            by = views.share[..., None, None] * np.eye(3)
+            add_blocks(gradient, band, by, _positions(R, t) - views.p, first, 3)
+        curve = moved(curve, band_solve(band_factor(band), gradient))
+    return curve
+
+
+def _positions(R: FloatArray, t: FloatArray) -> FloatArray:
+    """Of bodies in the world (n, 3)."""
+    return -(np.swapaxes(R, 1, 2) @ t[..., None])[..., 0]
+
+
+def pose_covariance(curve: Curve, inverse: FloatArray, taus: FloatArray) -> FloatArray:
+    """Covariance (n, 6, 6) of poses at times (n,): turns of the body, radians, and its positions, metres.
+
+    Args:
+        inverse: of the normal matrix, in its band.
+    """
+    views, by = _derivatives(curve, taus)
+    return np.asarray(by @ _block(inverse, views, views) @ np.swapaxes(by, 1, 2))
+
+
+def covariance_between(curve: Curve, inverse: FloatArray, start: float, taus: FloatArray) -> FloatArray:
+    """Covariance (n, 6, 6) of poses at times (n,), seen from the pose at another one.
+
+    Raises:
+        ValueError: a time so far away that the band does not hold what both have in common.
+    """
+    one, by_one = _derivatives(curve, np.full(len(taus), start))
+    other, by = _derivatives(curve, taus)
+    if 6 * (np.max(np.abs(other.index - one.index), initial=0) + 4) > inverse.shape[1]:
+        raise ValueError(f"times that far from {start:g} have covariances of their own only")
+    # R' = R R_s^T turns by dR - R' dR_s; q = R_s (p - p_s) moves by R_s (dp - dp_s) + dR_s x q.
+    R, R_s = other.R, one.R
+    relative = R @ np.swapaxes(R_s, 1, 2)
+    q = (R_s @ (other.p - one.p)[..., None])[..., 0]
+    A, B = np.zeros((len(taus), 6, 6)), np.zeros((len(taus), 6, 6))
+    A[:, :3, :3], A[:, 3:, 3:] = np.eye(3), R_s
+    B[:, :3, :3], B[:, 3:, :3], B[:, 3:, 3:] = -relative, -so3.hat(q), -R_s
+    by, by_one = A @ by, B @ by_one
+    cross = by @ _block(inverse, other, one) @ np.swapaxes(by_one, 1, 2)
+    own = by @ _block(inverse, other, other) @ np.swapaxes(by, 1, 2)
+    first = by_one @ _block(inverse, one, one) @ np.swapaxes(by_one, 1, 2)
+    return np.asarray(own + first + cross + np.swapaxes(cross, 1, 2))
+
+
+def _derivatives(curve: Curve, taus: FloatArray) -> tuple[Views, FloatArray]:
+    """Poses at times (n,) and their derivatives (n, 6, 24) by the control poses that they feel."""
+    taus = np.clip(np.asarray(taus, dtype=np.float64), curve.first, curve.last)
+    views = blank_views(len(taus))
+    fill_views(curve, taus, views)
+    by = np.zeros((len(taus), 6, 4, 6))
+    by[:, :3, :, :3] = np.swapaxes(views.turn, 1, 2)
+    by[:, 3:, :, 3:] = views.share[:, None, :, None] * np.eye(3)[:, None, :]
+    return views, by.reshape(len(taus), 6, 24)
+
+
+def _block(inverse: FloatArray, a: Views, b: Views) -> FloatArray:
+    """Covariances (n, 24, 24) of the control poses that times feel."""
+    rows, columns = (6 * views.index[:, None] + np.arange(24) for views in (a, b))
+    low = np.minimum(rows[:, :, None], columns[:, None])
+    high = np.maximum(rows[:, :, None], columns[:, None])
+    return inverse[low, high - low]
+
+
+def motion_covariance(curve: Curve, inverse: FloatArray, start: float) -> FloatArray | None:
+    """Covariance (6, 6) of w and d, of the motion over a period, seen from the body at its start."""
+    (here, there), _, _ = evaluate(curve, np.array([start, start + 1.0]))
+    R = here[1] @ here[0].T
+    t = there[1] - R @ there[0]
+    # w moves by J^-1 of a turn of the body about its own axes, and t = -R p by that turn and by p.
+    by = np.zeros((6, 6))
+    by[:3, :3] = np.linalg.inv(so3.left_jacobian(so3.log(R)))
+    by[3:, :3], by[3:, 3:] = -so3.hat(t), -R
+    try:
+        between = covariance_between(curve, inverse, start, np.array([start + 1.0]))[0]
+    except ValueError:  # the band is too narrow
+        return None
+    return np.asarray(by @ between @ by.T)

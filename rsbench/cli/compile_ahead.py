@@ -61,7 +61,7 @@ def compile_all(line: int) -> None:
 def parts() -> list[Callable[[], object]]:
     """What compiles the spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-    from rsbench.capture.shaken import shaken_motion
+    from rsbench.capture.two_frame_spline import shaken_motion
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.motion import LinearMotion
     from rsbench.core.rig import FRAMES, StereoRig

@@ -86,7 +86,7 @@ def correct(
 
 def _correct_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
     """Exit 1 where no motion or no correction is found; ``close``: narrow holes of corrected frames."""
-    from rsbench.capture.settle import NoMotionError
+    from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.pipeline.isolated_parts import Isolation
     from rsbench.vision.closing import finished
@@ -148,7 +148,7 @@ def _correct_four(
 ) -> None:
     from dataclasses import replace
 
-    from rsbench.capture.calibration_errors import NO_ERRORS
+    from rsbench.capture.calibration import NO_ERRORS
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import fresh_folder, motion_record, rig_record, write_frame, write_record
     from rsbench.dataset.corrected_video import refuse_video

@@ -12,7 +12,7 @@ from rsbench.cli.console import echo
 from rsbench.cli.correct_said import listed
 
 if TYPE_CHECKING:
-    from rsbench.capture.focal_alone import FoundFocal
+    from rsbench.capture.self_calibration import FoundFocal
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
@@ -235,8 +235,8 @@ def _correct_into(
 
 def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> FoundShutter:
     """Exit 1 where the frames do not show it."""
-    from rsbench.capture.settle import NoMotionError
-    from rsbench.capture.trajectory_shutter import LONGEST
+    from rsbench.capture.sequence_shutter import LONGEST
+    from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.console import progress_bar
     from rsbench.pipeline.mono_shutter import IN_ORDER, find_shutter
 
@@ -293,7 +293,7 @@ def _known(
     camera: PinholeCamera, focal: FoundFocal | None, found: FoundShutter, options: MonoOptions
 ) -> dict[str, Any]:
     """What the correction assumed or found."""
-    from rsbench.capture.settle import record_of
+    from rsbench.capture.shutter_decision import record_of
     from rsbench.dataset.corrected_frames import MASK_VALUES
 
     best = None if found.capture is None else found.capture.likeliest

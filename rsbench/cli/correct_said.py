@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
-    from rsbench.capture.estimate import Capture
+    from rsbench.capture.two_frame_estimate import Capture
     from rsbench.core.shutter import RollingShutter
 
 _MOST_LISTED = 8

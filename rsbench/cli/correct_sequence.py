@@ -13,7 +13,7 @@ from rsbench.cli.correct_input import sized, target_row, with_found_camera
 from rsbench.cli.correct_said import listed, readout_words, say_calibration, write_page_of
 
 if TYPE_CHECKING:
-    from rsbench.capture.estimate import Capture
+    from rsbench.capture.two_frame_estimate import Capture
     from rsbench.cli.correct_input import Given
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
@@ -87,7 +87,7 @@ def _run_key(
 
 def _look(sources: Sources, rig: StereoRig, card: RigCard, options: CorrectionOptions) -> Found:
     """The shutter, what the calibration is wrong by, and how both were found; None where they are given."""
-    from rsbench.capture.calibration_errors import NO_ERRORS
+    from rsbench.capture.calibration import NO_ERRORS
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
     from rsbench.pipeline.sequence_capture import WINDOWS, estimate_sequence_capture

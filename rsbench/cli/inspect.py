@@ -13,7 +13,7 @@ from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from rsbench.capture.estimate import Capture, Window
+    from rsbench.capture.two_frame_estimate import Capture, Window
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.footage import FrameSource, RigCard
@@ -75,8 +75,8 @@ def inspect(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per rig, each on a line.")] = False,
 ) -> None:
     """Estimate scan direction, readout ratio and delay of each camera from matches, where they tell it."""
-    from rsbench.capture.estimate import conclude
     from rsbench.capture.hypotheses import MODELS
+    from rsbench.capture.two_frame_estimate import conclude
     from rsbench.solvers.engine.kernel_type import load_kernel
 
     options = _Options(tuple(motion_model or MODELS), windows, features, seed)
@@ -121,8 +121,8 @@ def _cases(
 def _of_problems(path: Path, options: _Options) -> Iterator[_Case | RsbenchError]:
     import sys
 
-    from rsbench.capture.estimate import examine
     from rsbench.capture.hypotheses import Known
+    from rsbench.capture.two_frame_estimate import examine
     from rsbench.pipeline.problem import read_problems
 
     for problem in read_problems(str(path), sys.stdin):
@@ -201,8 +201,8 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
     """Of successive frames, evenly over the sequence."""
     from itertools import pairwise
 
-    from rsbench.capture.estimate import examine
     from rsbench.capture.hypotheses import Known
+    from rsbench.capture.two_frame_estimate import examine
     from rsbench.core.shutter import Scanning
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import check_alike
@@ -229,7 +229,7 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
 
 def _record(case: _Case, found: Capture) -> dict[str, Any]:
     """What JSON says of one rig; what is not told is null."""
-    from rsbench.capture.settle import candidates_of
+    from rsbench.capture.shutter_decision import candidates_of
 
     named, best = (found.likeliest if known else None for known in (found.named, found.told))
     return {
@@ -255,7 +255,7 @@ def _record(case: _Case, found: Capture) -> dict[str, Any]:
 
 
 def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
-    from rsbench.capture.scans import scans_of
+    from rsbench.capture.hypotheses import scans_of
 
     if shutter is None:
         return None

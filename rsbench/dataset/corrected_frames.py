@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, TERMS, in_words
-from rsbench.capture.estimate import Capture
-from rsbench.capture.settle import record_of
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, TERMS, in_words
+from rsbench.capture.shutter_decision import record_of
 from rsbench.capture.trajectory_gyro import GyroFound
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig

@@ -7,18 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import recalibrated
-from rsbench.capture.estimate import Capture, conclude, examine
-from rsbench.capture.settle import (
-    AUTO,
-    ModelChoice,
-    NoMotionError,
-    as_global,
-    choose_model,
-    known_of,
-    record_of,
-    shutter_found,
-)
+from rsbench.capture.calibration import recalibrated
+from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model
+from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, record_of, shutter_found
+from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.sequence_shutter import shutter_of_sequence
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, Trajectory, estimate_trajectory
-from rsbench.capture.trajectory_shutter import shutter_of_sequence
 from rsbench.components import arguments
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig

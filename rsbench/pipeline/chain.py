@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import of_offset
-from rsbench.capture.estimate import Capture
+from rsbench.capture.calibration import of_offset
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion

@@ -31,7 +31,7 @@ class CorrectionOptions:
     corrector: CorrectorEntry = field(default_factory=lambda: load_corrector("fusion"))
     robust: RobustOptions = field(default_factory=RobustOptions)
     motion_model: str | None = None
-    """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.settle``."""
+    """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.model_choice``."""
     target_row: float = 0.0
     """The time of this row of the frame is the time of its corrected image."""
     depth_from_motion: bool = True

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration_errors import CardSigma, of_offset
+from rsbench.capture.calibration import CardSigma, of_offset
 from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import islice
 
-from rsbench.capture.calibration_errors import CardSigma
-from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.calibration import CardSigma, RefusedFramesError
 from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsbench.capture.rectification import RefusedFramesError, check_rig
+from rsbench.capture.calibration import RefusedFramesError, check_rig
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import SIDES, Side, StereoRig

@@ -6,29 +6,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, recalibrated
-from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
-from rsbench.capture.hypotheses import MODELS
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.scans import scans_of
-from rsbench.capture.settle import (
-    AUTO,
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
+from rsbench.capture.hypotheses import MODELS, scans_of
+from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
+from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
-    ModelChoice,
     NoMotionError,
     as_global,
-    choose_model,
     known_of,
     reversed_scans,
     runs_backwards,
     scans_by_laws,
     shutter_found,
-    spline_choice,
-    spread_by_unknowns,
 )
-from rsbench.capture.shaken import log_odds_of_opposite, shaken_motion
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
+from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
+from rsbench.capture.two_frame_spline import log_odds_of_opposite, shaken_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -75,7 +69,7 @@ class FoundMotion:
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
     calibration: tuple[float, ...] = NO_ERRORS
-    """What was taken from the matches before, see ``calibration_errors.TERMS``."""
+    """What was taken from the matches before, see ``calibration.TERMS``."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None when it is the solver's."""
     gyro: GyroFound | None = None
@@ -300,7 +294,7 @@ def solve_frames(
     """Motion and shutter from matches; what is None of the shutter is found with the motion.
 
     Args:
-        calibration: what the calibration is wrong by (``calibration_errors.TERMS``); None has it found where the
+        calibration: what the calibration is wrong by (``calibration.TERMS``); None has it found where the
             row differences of the matches show that it is wrong.
         scanning: how the cameras read; None: found with the readout ratio; rows from the top where that is given.
         doubt: raised where the cameras read rows together, see ``match_unknown``.

@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.trajectory_alone import way_of_two
+from rsbench.capture.two_frame_spline import way_of_two
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import InertialMotion, Motion
 from rsbench.core.rig import Side, StereoRig, View

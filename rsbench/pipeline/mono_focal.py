@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.focal_alone import FoundFocal, PairFocal, conclude_focal, focal_of_pair
+from rsbench.capture.self_calibration import FoundFocal, PairFocal, conclude_focal, focal_of_pair
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.mono_shutter import matched_pairs

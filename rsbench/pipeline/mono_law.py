@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import NO_ERRORS
-from rsbench.capture.estimate import CERTAIN, conclude, examine
-from rsbench.capture.settle import known_of, motion_at
+from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.model_choice import motion_at
+from rsbench.capture.shutter_decision import known_of
+from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import AcceleratedMotion, InertialMotion, Motion

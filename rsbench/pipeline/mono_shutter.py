@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.camera_alone import (
-    capture_along,
+from rsbench.capture.calibration import RefusedFramesError
+from rsbench.capture.hypotheses import scans_of
+from rsbench.capture.sequence_shutter import LONGEST, capture_along
+from rsbench.capture.shutter_decision import (
+    LEAST_BACKWARDS,
+    NoMotionError,
     conclude_alone,
     examine_alone,
     fits_backwards,
     known_alone,
+    runs_backwards,
     shutter_alone,
 )
-from rsbench.capture.estimate import Capture, Window
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.scans import scans_of
-from rsbench.capture.settle import LEAST_BACKWARDS, NoMotionError, runs_backwards
-from rsbench.capture.trajectory_shutter import LONGEST
+from rsbench.capture.two_frame_estimate import Capture, Window
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning

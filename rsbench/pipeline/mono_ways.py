@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from rsbench.capture.trajectory_alone import trajectory_alone
+from rsbench.capture.two_frame_spline import trajectory_alone
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.mono_correction import FoundOwnMotion, on_way

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from rsbench.capture.estimate import CERTAIN, Capture, conclude, examine
-from rsbench.capture.estimate import Window as Examined
-from rsbench.capture.hypotheses import Known
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.scans import GLOBAL
-from rsbench.capture.settle import NoMotionError, as_global, known_of, shutter_found
-from rsbench.capture.trajectory_check import SUCCESSIVE, shakes
-from rsbench.capture.trajectory_data import ENOUGH
-from rsbench.capture.trajectory_shutter import LONGEST, capture_of_sequence
+from rsbench.capture.calibration import RefusedFramesError
+from rsbench.capture.hypotheses import GLOBAL, Known
+from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
+from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
+from rsbench.capture.trajectory_tracks import ENOUGH
+from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
+from rsbench.capture.two_frame_estimate import Window as Examined
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.settle import AUTO, NoMotionError
-from rsbench.capture.trajectory_data import ENOUGH
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError
+from rsbench.capture.model_choice import AUTO
+from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.capture.trajectory_tracks import ENOUGH
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter, Scanning
@@ -72,7 +72,7 @@ def correct_sequence(
     back uncorrected. Both say why.
 
     Args:
-        calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
+        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
         scanning: how the cameras read their lines; None: rows from the top, both at once.
         first: number of the first frame that is wanted.
         gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; of one that ``takes_gyro``.

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import recalibrated
+from rsbench.capture.calibration import recalibrated
+from rsbench.capture.trajectory_estimate import StreamedWindow, stream_trajectory
 from rsbench.capture.trajectory_spline import ContinuousMotion
-from rsbench.capture.trajectory_stream import StreamedWindow, stream_trajectory
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
@@ -61,7 +61,7 @@ def on_one_trajectory(
 
     Args:
         windows: in order.
-        calibration: what the calibration is wrong by, see ``calibration_errors.TERMS``.
+        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
         gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence. It bridges any number of windows:
             far from those with matches it alone tells how the rig turns, and nobody where it is.
     """

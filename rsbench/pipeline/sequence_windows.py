@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.rectification import RefusedFramesError
+from rsbench.capture.calibration import RefusedFramesError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side
 from rsbench.pipeline.footage import FrameSource, check_alike

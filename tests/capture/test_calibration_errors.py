@@ -6,18 +6,9 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.calibration_errors import (
-    LENS,
-    NO_ERRORS,
-    OFFSET,
-    ROWS,
-    TERMS,
-    in_words,
-    ray_shifts,
-    recalibrated,
-)
-from rsbench.capture.estimate import conclude, examine
-from rsbench.capture.settle import known_of
+from rsbench.capture.calibration import LENS, NO_ERRORS, OFFSET, ROWS, TERMS, in_words, ray_shifts, recalibrated
+from rsbench.capture.shutter_decision import known_of
+from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.camera_alone import conclude_alone, examine_alone, fits_backwards, known_alone, shutter_alone
-from rsbench.capture.estimate import Capture
-from rsbench.capture.scans import Scans
-from rsbench.capture.settle import NoMotionError, runs_backwards
+from rsbench.capture.hypotheses import Scans
+from rsbench.capture.shutter_decision import (
+    NoMotionError,
+    conclude_alone,
+    examine_alone,
+    fits_backwards,
+    known_alone,
+    runs_backwards,
+    shutter_alone,
+)
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig

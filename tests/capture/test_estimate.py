@@ -8,12 +8,22 @@ import scipy
 from commands import run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.estimate import Capture, _product, conclude, examine
-from rsbench.capture.evidence import Peak
-from rsbench.capture.fit import CaptureFit
-from rsbench.capture.hypotheses import DELAY, LEAST_RATIO, RATIO, UNKNOWNS, Hypothesis, Known
-from rsbench.capture.scans import ALL_SCANS, Scans, TimedMatches, line_of, scans_of
-from rsbench.capture.start import find_lag, first_shutter
+from rsbench.capture.hypotheses import (
+    ALL_SCANS,
+    DELAY,
+    LEAST_RATIO,
+    RATIO,
+    UNKNOWNS,
+    CaptureFit,
+    Hypothesis,
+    Known,
+    Scans,
+    TimedMatches,
+    line_of,
+    scans_of,
+)
+from rsbench.capture.hypothesis_ranking import Peak, find_lag, first_shutter
+from rsbench.capture.two_frame_estimate import Capture, _product, conclude, examine
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import Lens

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.focal_alone import PRIOR, PairFocal, conclude_focal, focal_of_pair
+from rsbench.capture.self_calibration import PRIOR, PairFocal, conclude_focal, focal_of_pair
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import InertialMotion
 from rsbench.core.rig import StereoRig

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.estimate import conclude, examine
-from rsbench.capture.fit import BEYOND_RATIO
-from rsbench.capture.scans import Scans, TimedMatches
-from rsbench.capture.start import without_leaps
+from rsbench.capture.hypotheses import BEYOND_RATIO, Scans, TimedMatches
+from rsbench.capture.hypothesis_ranking import without_leaps
+from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from rsbench.capture.calibration_errors import of_offset
-from rsbench.capture.estimate import Candidate, Capture, nearly_global
-from rsbench.capture.hypotheses import Known
-from rsbench.capture.scans import GLOBAL, Scans
-from rsbench.capture.settle import as_global
+from rsbench.capture.calibration import of_offset
+from rsbench.capture.hypotheses import GLOBAL, Known, Scans
+from rsbench.capture.shutter_decision import as_global
+from rsbench.capture.two_frame_estimate import Candidate, Capture, nearly_global
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 

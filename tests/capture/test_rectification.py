@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.capture.calibration_errors import of_offset, recalibrated
-from rsbench.capture.rectification import RefusedFramesError, judge_stereo, row_pattern
+from rsbench.capture.calibration import RefusedFramesError, judge_stereo, of_offset, recalibrated, row_pattern
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.calibration_errors import FOCAL, LENS, NO_ERRORS, RADIAL, CardSigma, ray_shifts
-from rsbench.capture.fit import CaptureCost, Likelihood
-from rsbench.capture.hypotheses import CALIBRATION, Hypothesis, Known
-from rsbench.capture.scans import Scans, TimedMatches
+from rsbench.capture.calibration import FOCAL, LENS, NO_ERRORS, RADIAL, CardSigma, ray_shifts
+from rsbench.capture.hypotheses import CALIBRATION, CaptureCost, Hypothesis, Known, Likelihood, Scans, TimedMatches
 from rsbench.capture.self_calibration import _mended, find_camera
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera

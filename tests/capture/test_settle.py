@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
-from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET, of_offset, recalibrated
-from rsbench.capture.estimate import Capture, conclude, examine
-from rsbench.capture.fit import CaptureCost, Likelihood
-from rsbench.capture.hypotheses import ACCELERATION, MODELS, RATIO, UNKNOWNS, Hypothesis, Known
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.scans import GLOBAL, Scans, TimedMatches, scans_of
-from rsbench.capture.settle import (
-    AUTO,
-    NoMotionError,
-    choose_model,
-    known_of,
-    motion_at,
-    runs_backwards,
-    shutter_found,
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, of_offset, recalibrated
+from rsbench.capture.hypotheses import (
+    ACCELERATION,
+    GLOBAL,
+    MODELS,
+    RATIO,
+    UNKNOWNS,
+    CaptureCost,
+    Hypothesis,
+    Known,
+    Likelihood,
+    Scans,
+    TimedMatches,
+    scans_of,
 )
+from rsbench.capture.model_choice import AUTO, choose_model, motion_at
+from rsbench.capture.shutter_decision import NoMotionError, known_of, runs_backwards, shutter_found
+from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

@@ -6,10 +6,10 @@ from scipy.spatial.transform import Rotation
 from shaken_rig import HEIGHT, RATIO, RIG, SHAKES, SHUTTER, Law, matches, sines, times
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import MODELS
-from rsbench.capture.rectification import RefusedFramesError
-from rsbench.capture.settle import NoMotionError
-from rsbench.capture.shaken import shaken_motion
+from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.capture.two_frame_spline import shaken_motion
 from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsbench.capture.start import Lag, with_lag_taken
+from rsbench.capture.hypothesis_ranking import Lag, with_lag_taken
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.lens import Lens

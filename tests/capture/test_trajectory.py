@@ -21,13 +21,15 @@ from shaken_rig import (
     times,
 )
 
-from rsbench.capture.trajectory_data import pack_windows
-from rsbench.capture.trajectory_estimate import TrajectoryOptions, estimate_trajectory, trajectory_bound
+from rsbench.capture.trajectory_estimate import (
+    TrajectoryOptions,
+    estimate_trajectory,
+    stream_trajectory,
+    trajectory_bound,
+)
 from rsbench.capture.trajectory_fit import fit
-from rsbench.capture.trajectory_kernels import Tails
-from rsbench.capture.trajectory_prior import Prior
-from rsbench.capture.trajectory_spline import ContinuousMotion
-from rsbench.capture.trajectory_stream import stream_trajectory
+from rsbench.capture.trajectory_spline import ContinuousMotion, Prior
+from rsbench.capture.trajectory_tracks import Tails, pack_windows
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
 from rsbench.core.so3 import FloatArray

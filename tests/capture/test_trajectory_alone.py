@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.capture.camera_alone import capture_along
-from rsbench.capture.trajectory_alone import trajectory_alone, way_of_two
+from rsbench.capture.sequence_shutter import capture_along
 from rsbench.capture.trajectory_spline import ContinuousMotion
+from rsbench.capture.two_frame_spline import trajectory_alone, way_of_two
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

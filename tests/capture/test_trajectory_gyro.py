@@ -6,10 +6,14 @@ import scipy
 from scipy.spatial.transform import Rotation
 from shaken_rig import HEIGHT, RIG, SHAKES, SHUTTER, Law, matches, row_errors_deg, sines, times
 
-from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.trajectory_data import TimedTracks
-from rsbench.capture.trajectory_estimate import TrajectoryOptions, estimate_trajectory
-from rsbench.capture.trajectory_fit import ANCHORED, held, normal_equations
+from rsbench.capture.trajectory_estimate import (
+    StreamedWindow,
+    TrajectoryOptions,
+    _State,
+    estimate_trajectory,
+    stream_trajectory,
+)
+from rsbench.capture.trajectory_fit import ANCHORED, held, normal_equations, window_motions
 from rsbench.capture.trajectory_gyro import (
     ERRORS,
     Border,
@@ -21,9 +25,14 @@ from rsbench.capture.trajectory_gyro import (
     learned,
     sensed,
 )
-from rsbench.capture.trajectory_spline import Curve, evaluate, make_curve, moved
-from rsbench.capture.trajectory_start import window_motions
-from rsbench.capture.trajectory_stream import StreamedWindow, _State, stream_trajectory
+from rsbench.capture.trajectory_spline import (
+    Curve,
+    band_factor,
+    evaluate,
+    make_curve,
+    moved,
+)
+from rsbench.capture.trajectory_tracks import TimedTracks
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.so3 import FloatArray
 
@@ -99,7 +108,7 @@ def test_a_border_is_solved_as_a_dense_matrix() -> None:
     band = np.stack([np.concatenate([np.diagonal(H, -i), np.zeros(i)]) for i in range(width)], axis=1)
     J = rng.normal(size=(4 * n, 4))
     border = Border(rng.normal(size=(n, 4)), J.T @ J, rng.normal(size=4))
-    whole, gradient, lower = dense(band, border), rng.normal(size=n), banded.factor(band)
+    whole, gradient, lower = dense(band, border), rng.normal(size=n), band_factor(band)
     step = np.concatenate(bordered_step(lower, gradient, border))
     np.testing.assert_allclose(step, -np.linalg.solve(whole, np.concatenate([gradient, border.slope])), rtol=1e-9)
     inverse = np.linalg.inv(whole)

@@ -9,14 +9,24 @@ import scipy
 from scipy.spatial.transform import Rotation
 from shaken_rig import RIG, SHUTTER, matches, sines
 
-from rsbench.capture import trajectory_banded as banded
-from rsbench.capture.trajectory_choice import approximated
-from rsbench.capture.trajectory_data import ENOUGH, pack_windows, telling
 from rsbench.capture.trajectory_fit import NORMAL, information, normal_equations
-from rsbench.capture.trajectory_kernels import Tails
-from rsbench.capture.trajectory_poses import blank_views, fill_views
-from rsbench.capture.trajectory_prior import Prior, roughness, whitening
-from rsbench.capture.trajectory_spline import ContinuousMotion, Curve, evaluate, make_curve, moved
+from rsbench.capture.trajectory_spline import (
+    ContinuousMotion,
+    Curve,
+    Prior,
+    approximated,
+    band_factor,
+    band_inverse,
+    band_log_determinant,
+    blank_views,
+    evaluate,
+    fill_views,
+    make_curve,
+    moved,
+    roughness,
+    whitening,
+)
+from rsbench.capture.trajectory_tracks import ENOUGH, Tails, pack_windows, telling
 from rsbench.components.motion_models import motion_record, read_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import LinearMotion
@@ -161,11 +171,11 @@ def test_the_inverse_of_a_band() -> None:
     A = np.tril(np.triu(rng.normal(size=(n, n)), -width + 1))
     dense = A @ A.T + np.eye(n)
     band = np.stack([np.concatenate([np.diagonal(dense, -i), np.zeros(i)]) for i in range(width)], axis=1)
-    lower = banded.factor(band)
+    lower = band_factor(band)
     inverse = np.linalg.inv(dense)
     for i in range(width):
-        np.testing.assert_allclose(banded.inverse_band(lower)[: n - i, i], np.diagonal(inverse, -i), rtol=1e-9)
-    assert banded.log_determinant(lower) == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
+        np.testing.assert_allclose(band_inverse(lower)[: n - i, i], np.diagonal(inverse, -i), rtol=1e-9)
+    assert band_log_determinant(lower) == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
 
 
 def test_a_window_is_seen_from_its_own_first_row() -> None:

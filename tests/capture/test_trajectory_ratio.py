@@ -5,10 +5,9 @@ import pytest
 import shaken_rig
 from shaken_rig import RATIO, RIG, SHAKES, matches, sines
 
-from rsbench.capture.estimate import Capture
-from rsbench.capture.scans import GLOBAL
-from rsbench.capture.trajectory_ratio import ratio_of_sequence
-from rsbench.capture.trajectory_shutter import capture_of_sequence
+from rsbench.capture.hypotheses import GLOBAL
+from rsbench.capture.sequence_shutter import capture_of_sequence, ratio_of_sequence
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.shutter import Scanning
 

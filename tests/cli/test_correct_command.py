@@ -17,10 +17,9 @@ import pytest
 from commands import assert_refused, bytes_below, run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.calibration_errors import of_offset
-from rsbench.capture.estimate import conclude, examine
-from rsbench.capture.hypotheses import Known
-from rsbench.capture.scans import Scans
+from rsbench.capture.calibration import of_offset
+from rsbench.capture.hypotheses import Known, Scans
+from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.cli.correct_said import readout_words, say_calibration
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import LinearMotion

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences

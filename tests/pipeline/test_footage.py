@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from shaken_rig import RIG, SHAKES, SHUTTER, matches, sines, times
 
-from rsbench.capture.calibration_errors import NO_ERRORS
+from rsbench.capture.calibration import NO_ERRORS
 from rsbench.core.correspondences import Correspondences
 from rsbench.dataset.corrected_frames import motion_record
 from rsbench.pipeline.correction_options import CorrectionOptions

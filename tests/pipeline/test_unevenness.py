@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.capture.trajectory_choice import approximated
-from rsbench.capture.trajectory_spline import ContinuousMotion
+from rsbench.capture.trajectory_spline import ContinuousMotion, approximated
 from rsbench.components.motion_models import make_motion
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray, exp

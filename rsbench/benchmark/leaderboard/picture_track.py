@@ -37,7 +37,7 @@ from rsbench.benchmark.leaderboard.track import (
     named,
 )
 from rsbench.benchmark.provenance import numeric_version, processor
-from rsbench.capture.settle import AUTO
+from rsbench.capture.model_choice import AUTO
 from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, decode, encode, use_one_thread

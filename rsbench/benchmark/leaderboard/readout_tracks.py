@@ -30,10 +30,9 @@ from rsbench.benchmark.leaderboard.track import (
     last,
     named,
 )
-from rsbench.capture.estimate import conclude, examine
-from rsbench.capture.hypotheses import MODELS
-from rsbench.capture.scans import scans_of
-from rsbench.capture.settle import known_of
+from rsbench.capture.hypotheses import MODELS, scans_of
+from rsbench.capture.shutter_decision import known_of
+from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES

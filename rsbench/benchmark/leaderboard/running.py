@@ -35,7 +35,7 @@ from rsbench.benchmark.leaderboard.track import (
 )
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.simulated.trials import Information, enter
-from rsbench.capture.settle import AUTO
+from rsbench.capture.model_choice import AUTO
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs, run_jobs

@@ -15,7 +15,7 @@ from rsbench.benchmark.studies.correction_methods import ON_REQUEST
 from rsbench.benchmark.studies.layer_methods import asked_layers
 from rsbench.benchmark.studies.resumable_rows import Row
 from rsbench.benchmark.studies.rotation_methods import asked_rotation
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.geometry import GivenGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View

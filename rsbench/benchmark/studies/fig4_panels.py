@@ -16,7 +16,7 @@ from rsbench.benchmark.images.score import visible_pixels
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.studies.correction_bench import Bench
 from rsbench.benchmark.studies.correction_study import WORST
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.geometry import GivenGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row
-from rsbench.capture.settle import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View

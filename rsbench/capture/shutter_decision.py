@@ -1,52 +1,70 @@
-"""What a correction takes from what the matches say: a shutter and a motion model, or words for why not.
+"""The shutter that a correction uses: from the matches of a rig or of one camera, or an error that says why not.
 
-What is known is given and not looked for (``known_of``). What was found is used where it is sure, or where it does
-not matter; else the message names what the matches leave open, what that trades against, and what would settle it.
+``known_of`` collects what is given; it is not estimated. An estimate is used where it is certain, or where its
+error does not matter. Otherwise the message names what the matches leave undetermined, what that trades against,
+and the remedy. One camera that turns or passes things shows its readout by how far lines that are read later have
+moved; a motion along its lines shows nothing. Lengths are in any unit there: the estimate does not depend on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from rsbench.capture.calibration_errors import FOCAL, NO_ERRORS, OFFSET, term_sizes
-from rsbench.capture.estimate import CERTAIN, Candidate, Capture, conclude, examine, nearly_global
-from rsbench.capture.evidence import Peak
-from rsbench.capture.hypotheses import ACCELERATION, CALIBRATION, MODELS, Known
-from rsbench.capture.rectification import row_pattern
-from rsbench.capture.scans import ALL_SCANS, GLOBAL, Scans, scans_of
-from rsbench.capture.trajectory_data import thinned
-from rsbench.components.motion_models import make_motion
+from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, row_pattern, term_sizes
+from rsbench.capture.hypotheses import ALL_SCANS, CALIBRATION, GLOBAL, MODELS, Known, Scans, scans_of
+from rsbench.capture.hypothesis_ranking import COARSE, Peak
+from rsbench.capture.trajectory_tracks import thinned
+from rsbench.capture.two_frame_estimate import (
+    CERTAIN,
+    Candidate,
+    Capture,
+    Window,
+    conclude,
+    examine,
+    nearly_global,
+)
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import Motion
+from rsbench.core.motion import LinearMotion, Motion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernel_type import load_kernel
-from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
 
-AUTO = "auto"
+OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 """Standard deviation of a ratio that frames are corrected with, at most; more where it moves no pixel by this."""
+
+
 _PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
 """Standard deviation of each error of a calibration over the size of the row differences, px: rows show some,
 and the others come from the same calibration. From 0.1 px on there are any to find, of as many left-right matches:
 rendered pairs show 0.02 px at most, two excerpts of KITTI odometry 1.1 px."""
+
+
 _LEAST_SIZE = 1e-3
 """px that 1 of a term moves a pixel by, at least: of an image of a narrow field there is little of the others."""
+
+
 _FROM_GLOBAL = 3.0
 """Deviations from 0 of a ratio, at least, of lines that are said to be read one after the other: a pair of KITTI,
 whose calibration errs, gave 0.25 +- 0.09 from the left, at a probability of 0.98."""
-_SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
-"""Differences of motions that say nothing, as between all models under a global shutter."""
+
+
 _CLEARLY, LEAST_BACKWARDS, _NEAR = 0.999, 0.25, 0.2
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
+
+
 _FEW = 600
 """Tracks, or matches of one camera, that tell of most frames that time runs forward."""
+
+
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
 
@@ -232,123 +250,6 @@ def scans_by_laws(
     return found
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ModelChoice:
-    """What the matches say about the motion model."""
-
-    used: str
-    parameters: Mapping[str, float]
-    """Of the model used, beside w and d."""
-    probability: Mapping[str, float]
-    """Of each model that was tried, the most probable first."""
-    decided: bool
-    """Whether the first of them is beyond doubt."""
-    rival: str
-    """The most probable one of the others; empty where none was tried."""
-    d_angle_deg: float
-    """Between the d of the model used and that of the rival."""
-    d_length_percent: float
-    """By how much the rival's d is longer."""
-    spread: FloatArray
-    """(6, 6) what not knowing the ratio, the offset and the model's own parameters adds to the covariance."""
-
-    def record(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return {
-            "text": str(self),
-            "used": self.used,
-            "decided": self.decided,
-            "probability": dict(self.probability),
-            "rival": self.rival,
-            "d_angle_to_rival_deg": self.d_angle_deg,
-            "d_length_of_rival_percent": self.d_length_percent,
-        }
-
-    def __str__(self) -> str:
-        shares = ", ".join(f"{name} {_percent(p)}" for name, p in list(self.probability.items())[:3] if p >= 0.001)
-        head = self.used if self.decided else f"cannot tell, so {self.used} is used"
-        if not self.rival:
-            return head
-        if self.d_angle_deg < _SAME_DEG and abs(self.d_length_percent) < _SAME_PERCENT:
-            return f"{self.used}; the others give the same motion"
-        change = f"with {self.rival} d turns by {self.d_angle_deg:.2g} deg and its length changes by "
-        return f"{head} ({shares}); {change}{self.d_length_percent:+.2g} %"
-
-
-def _percent(p: float) -> str:
-    return f"{100.0 * p:.1f} %" if p <= 0.999 else "> 99.9 %"
-
-
-def choose_model(capture: Capture, asked: str = AUTO) -> ModelChoice | None:
-    """The model found, else linear, the paper's, unless it is excluded; None where no hypothesis was judged.
-
-    Args:
-        asked: a model that is used whatever the matches prefer.
-    """
-    if asked not in (AUTO, *capture.peaks) or not capture.peaks:
-        return None
-    probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
-    best = next(iter(probability))
-    undecided = probability[best] < CERTAIN and probability.get("linear", 0.0) > 1.0 - CERTAIN
-    used = asked if asked != AUTO else "linear" if undecided else best
-    rival = next((name for name in probability if name != used), "")
-    d = motion_at(capture.peaks[used]).d
-    other = motion_at(capture.peaks[rival]).d if rival else d
-    angle, percent = _apart(d, other)
-    return ModelChoice(
-        used=used,
-        parameters=_parameters(capture.peaks[used]),
-        probability=probability,
-        decided=used == best and probability[best] >= CERTAIN,
-        rival=rival,
-        d_angle_deg=angle,
-        d_length_percent=percent,
-        spread=spread_by_unknowns(capture.peaks[used]),
-    )
-
-
-def spline_choice(choice: ModelChoice | None, spline: Motion, law: Motion, probability: float) -> ModelChoice:
-    """The choice of a spline of that probability, in place of the law that was used, chosen or not."""
-    laws = {law.name: 1.0} if choice is None else choice.probability
-    angle, percent = _apart(spline.d, law.d)
-    return ModelChoice(
-        used=spline.name,
-        parameters={},
-        probability={spline.name: probability, **{name: (1.0 - probability) * p for name, p in laws.items()}},
-        decided=True,
-        rival=law.name,
-        d_angle_deg=angle,
-        d_length_percent=percent,
-        spread=np.zeros((6, 6)),
-    )
-
-
-def _apart(d: FloatArray, other: FloatArray) -> tuple[float, float]:
-    """Angle between two translations, degrees, and by how many per cent the other one is longer."""
-    angle = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))
-    length = max(float(np.linalg.norm(d)), 1e-12)
-    return float(angle), 100.0 * (float(np.linalg.norm(other)) / length - 1.0)
-
-
-def _parameters(peak: Peak) -> dict[str, float]:
-    accelerated = peak.fit.hypothesis.motion_model == "accelerated"
-    return {"acceleration": float(peak.fit.unknowns[ACCELERATION])} if accelerated else {}
-
-
-def motion_at(peak: Peak) -> Motion:
-    """The motion of the body, metres, that a hypothesis found."""
-    model = peak.fit.hypothesis.motion_model
-    w, d = load_kernel(model, _parameters(peak)).motion(peak.fit.theta)
-    return make_motion(model, w, d, _parameters(peak))
-
-
-def spread_by_unknowns(peak: Peak) -> FloatArray:
-    """(6, 6) what not knowing the ratio and the other unknowns adds to the covariance of w and d."""
-    J = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak)).motion_jacobian(peak.fit.theta)
-    slope = J @ peak.trade[:6]
-    return np.asarray(J @ peak.fit.spread @ J.T + peak.sigma**2 * np.outer(slope, slope))
-
-
 def record_of(capture: Capture) -> dict[str, Any]:
     """What was found of the shutter and how sure it is, as JSON holds it."""
     best = capture.likeliest
@@ -386,3 +287,92 @@ def candidates_of(capture: Capture) -> list[dict[str, Any]]:
         }
         for each in capture.candidates
     ]
+
+
+_LOOK, _CLEARLY_LESS = 500, 0.97
+"""Matches of a quick look at the order of frames, and the share of the noise that is less than by chance."""
+
+
+def rig_of(camera: PinholeCamera) -> StereoRig:
+    """A rig whose body is where this camera is, the left one; there are no matches of the right one."""
+    return StereoRig(camera=camera, baseline=1.0).about("left")
+
+
+def known_alone(scan: Scan | None = None) -> Known:
+    """What is known of a camera whose readout ratio is not: that there is one, and perhaps its ``scan``.
+
+    The opposite scan stays possible: it is what frames in the wrong order show. Columns are for who says so: what
+    one camera's flow errs by may look like them.
+    """
+    said = Scans(scan or "top", scan or "top")
+    return Known(scans=(GLOBAL, said, reversed_scans(said)), delay=0.0)
+
+
+def examine_alone(
+    matches: FloatArray, camera: PinholeCamera, known: Known, options: RobustOptions, seed: int = 0
+) -> Window:
+    """Matches (n, 4) x0, y0, x1, y1, px, of two frames of a camera under each hypothesis; with outliers."""
+    given = Correspondences(left=matches)
+    return examine(given, rig_of(camera), known, options, seed, _start(given, camera, known, options, seed))
+
+
+def _start(
+    matches: Correspondences, camera: PinholeCamera, known: Known, options: RobustOptions, seed: int
+) -> Motion | None:
+    """The motion under a shutter between those that are possible; None when there is none."""
+    starts = {scans.left for scans in known.scans}
+    scan, ratio = next(each for each in COARSE if ("global" if each[1] == 0.0 else each[0]) in starts)
+    shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
+    rng = np.random.default_rng(seed)
+    found = estimate_motion(matches, rig_of(camera), shutter, RefinedSolver(one_camera=True), options, rng)
+    return LinearMotion(w=found.estimate.w, d=found.estimate.d) if found.estimate.success else None
+
+
+def fits_backwards(
+    matches: FloatArray, camera: PinholeCamera, shutter: RollingShutter, options: RobustOptions, seed: int = 0
+) -> bool:
+    """Whether matches (n, 4) fit better where lines are read from the other side: a quick look, no judgement."""
+    noise = list[float]()
+    for scan in (shutter.scan_of("left"), OPPOSITE[shutter.scan_of("left")]):
+        seen = replace(shutter, scan=scan)
+        solver, rng = RefinedSolver(motion_model="inertial", one_camera=True), np.random.default_rng(seed)
+        given = Correspondences(left=matches[:: max(len(matches) // _LOOK, 1)])
+        found = estimate_motion(given, rig_of(camera), seen, solver, options, rng)
+        noise.append(found.estimate.noise_px or np.inf if found.estimate.success else np.inf)
+    return noise[1] < _CLEARLY_LESS * noise[0]
+
+
+def conclude_alone(windows: Sequence[Window]) -> Capture:
+    """What all windows of a camera say together; a global shutter where all that they allow is one or nearly."""
+    capture = conclude(windows)
+    candidates = nearly_global(capture)
+    return capture if candidates is None else replace(capture, candidates=candidates, named=True)
+
+
+def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
+    """The shutter of the most probable candidate.
+
+    Raises:
+        NoMotionError: there is none, or the frames leave open what would matter; in words.
+    """
+    best = capture.likeliest
+    if best is None:
+        raise NoMotionError(f"cannot tell how the camera reads: {capture.reason}. {_GIVE}")
+    certain = best.probability >= CERTAIN
+    harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
+    if certain and (best.sigma <= _MAX_SIGMA or harmless):
+        return shutter_of(best, rig_of(camera))
+    if certain:
+        how = f"{_words(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
+    else:
+        likely = [each for each in capture.candidates if each.probability > 0.1]
+        how = ", or ".join(f"{_words(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
+    raise NoMotionError(f"cannot tell the readout ratio: the frames show {how}. {_GIVE}")
+
+
+_GIVE = "Give readout_ratio in the camera's card, or frames in which the camera turns, or more frames"
+
+
+def _words(candidate: Candidate) -> str:
+    start = candidate.scans.left
+    return "all lines read at once" if start == "global" else f"lines read from the {start}"

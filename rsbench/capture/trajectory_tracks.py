@@ -1,36 +1,52 @@
-"""Compiled: reprojection errors of points that a moving rig sees at many times, with the points left out.
+"""The matches of a sequence as tracks, their reprojection errors, and the distribution of these.
 
 A track is any number of ends: pixels of one point, each with its camera and time. Its point, (x, y, 1) / rho in
-the camera of the first end, is found by few Gauss-Newton steps and left out of the normal equations (Schur
-complement; B. Triggs et al., Bundle Adjustment, 2000). A pixel that is shifted is also read at another time, which
-counts in the noise of an end. Nothing is linear in the motion but for those steps. A track weighs as under a
-multivariate t distribution (``solvers.engine.heavy_tails``).
+the camera of the first end, is found by few Gauss-Newton steps and eliminated from the normal equations (Schur
+complement; B. Triggs et al., Bundle Adjustment, 2000), in compiled functions. A pixel that is shifted is also read
+at another time, which counts in the noise of an end. Nothing is linear in the motion but for those steps. A track
+weighs as under a multivariate t distribution (``solvers.engine.heavy_tails``).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from rsbench.capture.trajectory_poses import Views, blank_views, fill_view
-from rsbench.capture.trajectory_spline import Curve
+from rsbench.capture.trajectory_gyro import GyroSteps
+from rsbench.capture.trajectory_spline import Curve, Views, blank_views, fill_view
 from rsbench.components.compiled import compiled
+from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, unlinked_pairs
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.vectors import Vector, apply, apply_transposed, cross, plus, times
 
 BEHIND = 1e12
 """Squared error, px^2, of a track whose point lies behind a camera."""
+
+
 _NEAREST = 1e-3
 """Least ratio of depths at two ends."""
+
+
 _POINT_STEPS = 2
 """Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
+
+
 _ROUGH_RHO = 3.0
 """1/m: deviation of inverse depths about 0 that is expected where a track does not show its own."""
+
+
 _UNCERTAIN = 0.3
 """px: what an expected inverse depth counts as much as."""
+
+
 END = 10
 """Numbers of an end."""
 
@@ -344,3 +360,252 @@ def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, 
         xs, ys, zs = x[j:], y[j:], z[j:]
         for i in range(size - j):
             out[i] += weight * (row[i] - xs[i] * a - ys[i] * b - zs[i] * c)
+
+
+_TAILS = (3.0, 5.0, 10.0, 30.0)
+"""Degrees of freedom to choose from, as in ``heavy_tails``."""
+
+
+REACH = 10.0
+"""Errors, in scales, beyond which a track is wrong."""
+
+
+LEAST_SCALE_PX = 1e-3
+
+
+def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:
+    """Distribution of errors, and which tracks (n,) are right, 1 or 0.
+
+    Args:
+        used: degrees of freedom that the trajectory has taken.
+    """
+    scale = tails.scale
+    near = squares <= freedom * (REACH * scale) ** 2
+    if not np.any(near):
+        return tails, np.ones(len(squares))
+    q, p = squares[near], freedom[near]
+    left = max(float(np.sum(p)) - used, 0.1 * float(np.sum(p)))
+    found = [Tails(nu, _scale(q, p, nu, scale, left)) for nu in _TAILS]
+    best = max(found, key=lambda each: _likelihood(q, p, each))
+    return best, (squares <= freedom * (REACH * best.scale) ** 2).astype(np.float64)
+
+
+def _scale(q: FloatArray, p: FloatArray, nu: float, scale: float, left: float) -> float:
+    """Of the largest likelihood (parameter-expanded EM, see ``heavy_tails``)."""
+    count = len(p) + (float(np.sum(p)) - left) / nu
+    for _ in range(50):
+        weights = (nu + p) / (nu + q / scale**2)
+        last, scale = scale, max(float(np.sqrt(weights @ q / left * count / np.sum(weights))), LEAST_SCALE_PX)
+        if abs(scale - last) <= 1e-4 * scale:
+            break
+    return scale
+
+
+def _likelihood(q: FloatArray, p: FloatArray, tails: Tails) -> float:
+    """Logarithm, without terms that are the same for all."""
+    nu, scale = tails
+    gammaln = scipy.special.gammaln
+    norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
+    return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(q / (nu * scale**2))))
+
+
+IntArray = NDArray[np.int64]
+
+
+ENOUGH = 400
+"""Tracks of a window from which on its pairs say little more, and take longer than all else."""
+
+
+LONGEST = 5
+"""Frames of a track: more would couple more control poses for little."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Past:
+    """What matches that are gone say of the first control poses of a spline: a quadratic cost."""
+
+    R: FloatArray
+    """(k, 3, 3) the control poses about which it is known."""
+    p: FloatArray
+    """(k, 3)."""
+    gradient: FloatArray
+    """(6 k,), and where there is a gyroscope more, of its errors."""
+    H: FloatArray
+    """(6 k, 6 k), likewise."""
+    errors: FloatArray | None = None
+    """(m,) of the gyroscope, about which it is known."""
+
+    def without_gyro(self) -> Past:
+        """The same of the control poses alone, whatever the errors of a gyroscope are."""
+        if self.errors is None:
+            return self
+        k = 6 * len(self.p)
+        solved = np.linalg.solve(self.H[k:, k:], np.column_stack([self.H[k:, :k], self.gradient[k:]]))
+        H = self.H[:k, :k] - self.H[:k, k:] @ solved[:, :-1]
+        gradient = self.gradient[:k] - self.H[:k, k:] @ solved[:, -1]
+        return Past(R=self.R, p=self.p, gradient=gradient, H=0.5 * (H + H.T))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TimedTracks:
+    """Tracks, as ``trajectory_tracks.add_tracks`` takes them."""
+
+    ends: FloatArray
+    """(e, 10)."""
+    starts: IntArray
+    """(n + 1,) first end of each track, and e."""
+    members: tuple[IntArray, ...]
+    """For each window, the track (m,) of each of its tracks, left pairs and right pairs that no track repeats."""
+    focal: FloatArray
+    """(2,) fx, fy, px."""
+    past: Past | None = None
+    """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
+    share: float = 1.0
+    """What a track counts beside the prior: less than 1 where errors of neighbouring tracks are alike."""
+    gyro: GyroSteps | None = None
+    """What a gyroscope says of the times that the spline lasts; None: there is none."""
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @property
+    def freedom(self) -> FloatArray:
+        """(n,) degrees of freedom of each track's error."""
+        return 2.0 * np.diff(self.starts) - 3.0
+
+    @property
+    def span(self) -> tuple[FloatArray, FloatArray]:
+        """Times (n,) of the earliest and the latest end of each track."""
+        taus = self.ends[:, 2]
+        return np.minimum.reduceat(taus, self.starts[:-1]), np.maximum.reduceat(taus, self.starts[:-1])
+
+
+def thinned(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
+    """About so many tracks of each window, and no pairs where there are as many as that; of one camera, pairs."""
+    if is_of_one_camera(windows):
+        return [Correspondences(left=each.left[:: max(len(each.left) // count, 1)]) for each in windows]
+    few = [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
+    return [some if len(some.tracks) >= count else each for some, each in zip(few, windows, strict=True)]
+
+
+def is_of_one_camera(windows: Sequence[Correspondences]) -> bool:
+    """Whether there are matches of the left camera alone."""
+    return not any(len(each.tracks) or len(each.right) for each in windows)
+
+
+def telling(window: Correspondences) -> Correspondences:
+    """What is looked at of a window: its tracks alone, where there are enough."""
+    return Correspondences(tracks=window.tracks) if len(window.tracks) >= ENOUGH else window
+
+
+def pack_windows(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    right: Sequence[FloatArray] | None = None,
+    first: int = 0,
+    past: Past | None = None,
+    share: float = 1.0,
+) -> TimedTracks:
+    """The tracks of windows, and their pairs that no track repeats; window k is of the frames k and k + 1.
+
+    Args:
+        right: for each window, which of its members (m,) are right (not 0): of those, ones that meet in a frame
+            are one track; None: none is linked to another.
+        first: number of the first window.
+        past: of those before.
+        share: what a track counts beside the prior.
+    """
+    members = [np.zeros(0, dtype=np.int64) for _ in windows]
+    ends, owners = list[FloatArray](), list[IntArray]()
+    count = offset = 0
+    for sides in (SIDES, SIDES[:1], SIDES[1:]):
+        pixels = [_pixels(window, sides) for window in windows]
+        known = [_known(right, k, len(members[k]), len(rows)) for k, rows in enumerate(pixels)]
+        numbers, count = _numbered(pixels, known, offset)
+        for k, own in enumerate(numbers):
+            new = own >= 0 if k == 0 else ~np.isin(own, numbers[k - 1])
+            for frame, chosen in ((0, new), (1, np.ones(len(own), dtype=np.bool_))):
+                for i, side in enumerate(sides):
+                    place = 2 * (frame * len(sides) + i)
+                    ends.append(
+                        pack_ends(pixels[k][chosen, place : place + 2], first + k + frame, side, rig, shutter)
+                    )
+                    owners.append(own[chosen])
+            members[k] = np.concatenate([members[k], own])
+        offset = count
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return TimedTracks(
+        ends=np.ascontiguousarray(np.concatenate(ends)[order]),
+        starts=np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))]).astype(np.int64),
+        members=tuple(members),
+        focal=np.array([rig.camera.fx, rig.camera.fy]),
+        past=past,
+        share=share,
+    )
+
+
+def _known(right: Sequence[FloatArray] | None, window: int, first: int, count: int) -> BoolArray:
+    return np.zeros(count, dtype=np.bool_) if right is None else right[window][first : first + count] != 0.0
+
+
+def _pixels(window: Correspondences, sides: Sequence[Side]) -> FloatArray:
+    """Tracks (n, 8), or pairs (n, 4) that no track repeats."""
+    if len(sides) == 2:
+        return window.tracks
+    pairs: FloatArray = getattr(window, sides[0])
+    return pairs[unlinked_pairs(window, sides[0])]
+
+
+def _numbered(pixels: Sequence[FloatArray], right: Sequence[BoolArray], first: int) -> tuple[list[IntArray], int]:
+    """Numbers (n,) of the tracks that the rows of each window belong to, from ``first`` on, and the next number.
+
+    A row that is right goes on with such a track of the window before that ends where it begins, if that has fewer
+    than ``LONGEST`` frames.
+    """
+    out, count = list[IntArray](), first
+    numbers, lengths, ends = (
+        np.zeros(0, dtype=np.int64),
+        np.zeros(0, dtype=np.int64),
+        pixels[0][:0, : pixels[0].shape[1] // 2],
+    )
+    for rows, known in zip(pixels, right, strict=True):
+        half = rows.shape[1] // 2
+        open_ = np.flatnonzero(lengths < LONGEST)
+        met = _met(rows[:, :half], ends[open_], known)
+        goes_on = met >= 0
+        own, length = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), 2, dtype=np.int64)
+        before = open_[met[goes_on]]
+        own[goes_on], length[goes_on] = numbers[before], lengths[before] + 1
+        fresh = len(rows) - len(before)
+        own[~goes_on] = count + np.arange(fresh)
+        count += fresh
+        out.append(own)
+        numbers, lengths, ends = own[known], length[known], rows[known, half:]
+    return out, count
+
+
+def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
+    """For each place (n, c) the nearest of others (m, c) within the tolerance, each once; -1 for none."""
+    out = -np.ones(len(begins), dtype=np.int64)
+    if len(begins) == 0 or len(ends) == 0:
+        return out
+    from scipy.spatial import cKDTree  # takes as long to load as all else that a solver needs
+
+    found = cKDTree(ends).query(begins, p=np.inf, distance_upper_bound=BEYOND_PX)
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+    order = np.argsort(distance, kind="stable")
+    order = order[np.isfinite(distance[order]) & known[order]]
+    _, firsts = np.unique(nearest[order], return_index=True)
+    out[order[firsts]] = nearest[order[firsts]]
+    return out
+
+
+def pack_ends(pixels: FloatArray, frame: int, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """Ends (n, 10) of pixels (n, 2) of one image."""
+    out = np.zeros((len(pixels), END))
+    out[:, :2], out[:, 2] = rig.camera.unproject(pixels)[:, :2], shutter.pixel_time(pixels, frame, side)
+    out[:, 3:7], out[:, 7:9] = rig.camera.ideal_by_pixel(pixels).reshape(-1, 4), shutter.rate(side)
+    out[:, 9] = rig.offset(side)[0]
+    return out

@@ -1,10 +1,10 @@
 """What the cameras of a rig did, from matches alone: motion, readout ratio, scans, delay, disparity offset.
 
-Hypotheses are data: how each of the two cameras reads (all lines at once, or from one of the four sides: 25
+The hypotheses are data: how each of the two cameras reads (all lines at once, or from one of the four sides: 25
 scans), how the rig moves (``hypotheses.MODELS``), and whether the right camera is late. Each is fitted by maximum
-likelihood with heavy tails (``fit``), and compared by its evidence: the likelihood integrated over its unknowns
-(Laplace's approximation) times what was expected before. Ratio, scans and motion model are found together: a ratio
-under the wrong motion model is wrong by many of its own deviations.
+likelihood with heavy tails, and they are compared by their evidence: the likelihood integrated over the unknowns
+(Laplace's approximation) times the prior probability. Ratio, scans and motion model are estimated together,
+because a ratio under the wrong motion model is wrong by many of its own standard deviations.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rsbench.capture.calibration_errors import NO_ERRORS, OFFSET
-from rsbench.capture.evidence import Peak, WindowEvidence, window_evidence
-from rsbench.capture.hypotheses import CALIBRATION, DELAY, Hypothesis, Known
-from rsbench.capture.scans import GLOBAL, Scans
-from rsbench.capture.start import find_lag, find_start, without_leaps
+from rsbench.capture.calibration import NO_ERRORS, OFFSET
+from rsbench.capture.hypotheses import CALIBRATION, DELAY, GLOBAL, Hypothesis, Known, Scans
+from rsbench.capture.hypothesis_ranking import (
+    Peak,
+    WindowEvidence,
+    find_lag,
+    find_start,
+    window_evidence,
+    without_leaps,
+)
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
@@ -30,21 +35,39 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CERTAIN = 0.95
 """Probability of what is told."""
+
+
 MAX_SIGMA = 0.015
 """Standard deviation, at most, of a readout ratio that is told: 0.03 is then two of them."""
+
+
 FEWEST = 30
 """Matches between two times."""
+
+
 _LEAST_SHARE = 0.3
 """Of the matches, that must agree with what is told."""
+
+
 _NEARLY, _SMALL = 0.06, 0.15
 """Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
 the ratios that the matches then allow."""
+
+
 _STILL_PX = 1.0
+
+
 _UNLIKELY = 0.01
+
+
 _EXPECTED = {"top": 0.5, "global": 0.25, "bottom": 0.1, "left": 0.04, "right": 0.04}
 """Probability, before matches are seen, of cameras that read alike, by where they begin."""
+
+
 _APART, _ONE_GLOBAL = 0.06, 0.01
 """Probability of cameras that roll in different ways, and of one camera that rolls beside one that does not."""
+
+
 _LATE = 0.2
 """Probability, before matches are seen, that the right camera is late."""
 
@@ -60,7 +83,7 @@ class Candidate:
     delay: float
     delay_sigma: float
     calibration: tuple[float, ...] = NO_ERRORS
-    """What the calibration is wrong by, see ``calibration_errors.TERMS``."""
+    """What the calibration is wrong by, see ``calibration.TERMS``."""
     calibration_sigma: tuple[float, ...] = NO_ERRORS
 
 

@@ -1,0 +1,140 @@
+"""The motion model that a correction uses: one of the models that the matches support, or a spline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rsbench.capture.hypotheses import ACCELERATION
+from rsbench.capture.hypothesis_ranking import Peak
+from rsbench.capture.two_frame_estimate import CERTAIN, Capture
+from rsbench.components.motion_models import make_motion
+from rsbench.core.motion import Motion
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.kernel_type import load_kernel
+
+AUTO = "auto"
+
+
+_SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
+"""Differences of motions that say nothing, as between all models under a global shutter."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModelChoice:
+    """What the matches say about the motion model."""
+
+    used: str
+    parameters: Mapping[str, float]
+    """Of the model used, beside w and d."""
+    probability: Mapping[str, float]
+    """Of each model that was tried, the most probable first."""
+    decided: bool
+    """Whether the first of them is beyond doubt."""
+    rival: str
+    """The most probable one of the others; empty where none was tried."""
+    d_angle_deg: float
+    """Between the d of the model used and that of the rival."""
+    d_length_percent: float
+    """By how much the rival's d is longer."""
+    spread: FloatArray
+    """(6, 6) what not knowing the ratio, the offset and the model's own parameters adds to the covariance."""
+
+    def record(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {
+            "text": str(self),
+            "used": self.used,
+            "decided": self.decided,
+            "probability": dict(self.probability),
+            "rival": self.rival,
+            "d_angle_to_rival_deg": self.d_angle_deg,
+            "d_length_of_rival_percent": self.d_length_percent,
+        }
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{name} {_percent(p)}" for name, p in list(self.probability.items())[:3] if p >= 0.001)
+        head = self.used if self.decided else f"cannot tell, so {self.used} is used"
+        if not self.rival:
+            return head
+        if self.d_angle_deg < _SAME_DEG and abs(self.d_length_percent) < _SAME_PERCENT:
+            return f"{self.used}; the others give the same motion"
+        change = f"with {self.rival} d turns by {self.d_angle_deg:.2g} deg and its length changes by "
+        return f"{head} ({shares}); {change}{self.d_length_percent:+.2g} %"
+
+
+def _percent(p: float) -> str:
+    return f"{100.0 * p:.1f} %" if p <= 0.999 else "> 99.9 %"
+
+
+def choose_model(capture: Capture, asked: str = AUTO) -> ModelChoice | None:
+    """The model found, else linear, the paper's, unless it is excluded; None where no hypothesis was judged.
+
+    Args:
+        asked: a model that is used whatever the matches prefer.
+    """
+    if asked not in (AUTO, *capture.peaks) or not capture.peaks:
+        return None
+    probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
+    best = next(iter(probability))
+    undecided = probability[best] < CERTAIN and probability.get("linear", 0.0) > 1.0 - CERTAIN
+    used = asked if asked != AUTO else "linear" if undecided else best
+    rival = next((name for name in probability if name != used), "")
+    d = motion_at(capture.peaks[used]).d
+    other = motion_at(capture.peaks[rival]).d if rival else d
+    angle, percent = _apart(d, other)
+    return ModelChoice(
+        used=used,
+        parameters=_parameters(capture.peaks[used]),
+        probability=probability,
+        decided=used == best and probability[best] >= CERTAIN,
+        rival=rival,
+        d_angle_deg=angle,
+        d_length_percent=percent,
+        spread=spread_by_unknowns(capture.peaks[used]),
+    )
+
+
+def spline_choice(choice: ModelChoice | None, spline: Motion, law: Motion, probability: float) -> ModelChoice:
+    """The choice of a spline of that probability, in place of the law that was used, chosen or not."""
+    laws = {law.name: 1.0} if choice is None else choice.probability
+    angle, percent = _apart(spline.d, law.d)
+    return ModelChoice(
+        used=spline.name,
+        parameters={},
+        probability={spline.name: probability, **{name: (1.0 - probability) * p for name, p in laws.items()}},
+        decided=True,
+        rival=law.name,
+        d_angle_deg=angle,
+        d_length_percent=percent,
+        spread=np.zeros((6, 6)),
+    )
+
+
+def _apart(d: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Angle between two translations, degrees, and by how many per cent the other one is longer."""
+    angle = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))
+    length = max(float(np.linalg.norm(d)), 1e-12)
+    return float(angle), 100.0 * (float(np.linalg.norm(other)) / length - 1.0)
+
+
+def _parameters(peak: Peak) -> dict[str, float]:
+    accelerated = peak.fit.hypothesis.motion_model == "accelerated"
+    return {"acceleration": float(peak.fit.unknowns[ACCELERATION])} if accelerated else {}
+
+
+def motion_at(peak: Peak) -> Motion:
+    """The motion of the body, metres, that a hypothesis found."""
+    model = peak.fit.hypothesis.motion_model
+    w, d = load_kernel(model, _parameters(peak)).motion(peak.fit.theta)
+    return make_motion(model, w, d, _parameters(peak))
+
+
+def spread_by_unknowns(peak: Peak) -> FloatArray:
+    """(6, 6) what not knowing the ratio and the other unknowns adds to the covariance of w and d."""
+    J = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak)).motion_jacobian(peak.fit.theta)
+    slope = J @ peak.trade[:6]
+    return np.asarray(J @ peak.fit.spread @ J.T + peak.sigma**2 * np.outer(slope, slope))
