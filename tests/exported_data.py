@@ -18,7 +18,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.interop.writers.exporter import export_dataset
-from rsbench.interop.writers.image_poses import Images
+from rsbench.interop.writers.sequence_views import Images
 
 WIDTH, HEIGHT = 64, 49
 """Row 24 is the middle of the readout."""

@@ -131,7 +131,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
     from rsbench.benchmark.recordings import depth_scores, pose_scores
     from rsbench.cli.console import print_table, say
     from rsbench.core.errors import RsbenchError
-    from rsbench.interop.readers.formats import read_others
+    from rsbench.interop.readers.layouts import read_others
     from rsbench.storage.files import check_out, write_table
     from rsbench.storage.mirror import name_of
     from rsbench.vision.stereo_matcher import load_matcher

@@ -79,7 +79,7 @@ def export(
     from rsbench.interop.writers.exporter import export_dataset
 
     with late_progress(f"exporting to {to}") as advance:
-        told = export_dataset(
+        notes = export_dataset(
             folder,
             to.value,
             out,
@@ -87,7 +87,7 @@ def export(
             only=tuple(sequence or ()),
             progress=advance,
         )
-    for sentence in told:
+    for sentence in notes:
         say(f"note: {sentence}")
     echo(f"{out}: {to}; README.txt says what it holds")
 

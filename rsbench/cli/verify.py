@@ -146,9 +146,8 @@ def _verify_ours(
 def _verify_others(folder: Path, layout: str) -> None:
     """Files, sizes, depth and matches under poses and row times, and disparities, as far as a layout has them."""
     from rsbench.cli.console import late_progress, print_rows, say
-    from rsbench.interop.readers.check import agreements, disparity_faults, file_faults
-    from rsbench.interop.readers.formats import read_others
-    from rsbench.interop.readers.sight_check import NEAR_PX, sights
+    from rsbench.interop.readers.check import NEAR_PX, agreements, disparity_faults, file_faults, sights
+    from rsbench.interop.readers.layouts import read_others
 
     recordings, faults = read_others(folder, layout), list[str]()
     depths, seen = list[list[str]](), list[list[str]]()

@@ -136,7 +136,7 @@ def _through(P: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def test_disparities_that_a_png_cannot_hold_are_unknown_and_counted(tmp_path: Path) -> None:
-    from rsbench.interop.writers.kitti_folders import disparity_values
+    from rsbench.interop.writers.kitti_and_kalibr import disparity_values
 
     values, lost = disparity_values(np.array([[np.nan, 1e-4, 0.002, 1.0, 255.998, 300.0]]))
     assert values.tolist() == [[0, 0, 1, 256, 65535, 0]] and lost == 2
@@ -185,7 +185,7 @@ def test_carla_rs_velocities_and_radial_depth(tmp_path: Path, turning: bool) -> 
         assert worst > 0.1 and "up to" in note["told"][0]
     else:
         assert worst < SAME_PX and note["told"] == [
-            "the two cameras are sequences of their own: that one is late is not said"
+            "the two cameras are sequences of their own: the delay of the right one is not written"
         ]
     assert sorted(path.name for path in (out / "planes/seq_left").iterdir()) == [
         *(

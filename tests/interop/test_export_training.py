@@ -17,7 +17,7 @@ from exported_data import dataset, exported, only
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
-from rsbench.interop.writers import webdataset_shards
+from rsbench.interop.writers import frame_samples
 from rsbench.interop.writers.frame_samples import FrameSamples
 from rsbench.storage import untrusted_files
 from rsbench.storage.files import read_depth, read_png
@@ -48,7 +48,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_webdataset_reads_every_frame(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(webdataset_shards, "SHARD_SAMPLES", 2)
+    monkeypatch.setattr(frame_samples, "SHARD_SAMPLES", 2)
     out, note = exported(made, "webdataset", tmp_path / "out")
     shards = sorted(str(path) for path in out.glob("*.tar"))
     assert len(shards) == 3 and note == {"samples": 5, "told": []}

@@ -16,12 +16,15 @@ from commands import run_here
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.interop.readers.carla import read_carla
 from rsbench.interop.readers.check import agreements
-from rsbench.interop.readers.colmap import read_colmap
-from rsbench.interop.readers.euroc import read_euroc
-from rsbench.interop.readers.formats import read_others
-from rsbench.interop.readers.stereo import read_kitti, read_middlebury
+from rsbench.interop.readers.layouts import (
+    read_carla,
+    read_colmap,
+    read_euroc,
+    read_kitti,
+    read_middlebury,
+    read_others,
+)
 
 Array = NDArray[Any]
 

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from rsbench.benchmark.recorded_corrections import correction_scores, pairs_with_truth
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
-from rsbench.interop.readers.carla import read_carla
 from rsbench.interop.readers.check import file_faults
-from rsbench.interop.readers.fastec import read_fastec
+from rsbench.interop.readers.layouts import read_carla, read_fastec
 from rsbench.vision.corrector import load_corrector
 
 WIDE, HIGH, PX = 160, 120, 9.0

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
-from rsbench.interop.readers.carla import read_carla
-from rsbench.interop.readers.colmap import read_colmap
-from rsbench.interop.readers.sight_check import epipolar_distance, sights
+from rsbench.interop.readers.check import epipolar_distance, sights
+from rsbench.interop.readers.layouts import read_carla, read_colmap
 
 
 def write_points(folder: Path, shift: float = 0.0) -> Path:

@@ -12,8 +12,8 @@ from commands import run_here
 from exported_data import dataset, only
 
 from rsbench.core.so3 import FloatArray
-from rsbench.interop.writers.image_poses import View
 from rsbench.interop.writers.match_colours import Scene, Strips, found_strips, line_seconds
+from rsbench.interop.writers.sequence_views import View
 
 NEEDS_RERUN = pytest.mark.skipif(find_spec("rerun") is None, reason="rerun is not installed: rsbench[view]")
 

@@ -1,1 +1,0 @@
-"""Data in layouts of others, read in place: what a layout says, and nothing that it does not."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
-from rsbench.interop.readers.text import numbers
+from rsbench.interop.readers.layouts import numbers
 from rsbench.storage.untrusted_files import read_text
 
 _TITLES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")

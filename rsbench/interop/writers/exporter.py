@@ -1,46 +1,46 @@
-"""Datasets in the layouts of others: which there are, what each holds, and writing all of it or nothing."""
+"""Datasets in the layouts of other projects: a table of the formats, and writing all of an export or nothing."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.corrected_frames import fresh_folder
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.interop.writers.corrected_folder import ABOUT as ABOUT_CORRECTED
-from rsbench.interop.writers.corrected_folder import check as check_corrected
-from rsbench.interop.writers.corrected_folder import export_corrected, is_corrected, read_corrected_folder
-from rsbench.interop.writers.image_poses import Images, write_lines
+from rsbench.interop.writers.colmap_and_tum import (
+    COLMAP,
+    CORRECTED_ABOUT,
+    TUM,
+    check_corrected,
+    export_corrected,
+    is_corrected,
+    read_corrected_folder,
+)
+from rsbench.interop.writers.deep_unroll_folders import CARLA_RS, FASTEC_RS
+from rsbench.interop.writers.frame_samples import HUGGINGFACE, WEBDATASET
+from rsbench.interop.writers.kitti_and_kalibr import KALIBR, KITTI
+from rsbench.interop.writers.sequence_views import Format, Images, Note, write_lines
+from rsbench.interop.writers.splatting import GSPLAT, NERFSTUDIO
 from rsbench.storage.files import check_out, write_json
 
 Progress = Callable[[str], None]
 RECORD, README = "export.json", "README.txt"
 
 
-class Format(NamedTuple):
-    """A layout of others."""
-
-    module: str
-    """Below ``rsbench.interop.writers``; has ``ABOUT``, ``check`` and ``write``, or ``write_all``."""
-    images: tuple[Images, ...]
-    """Those of which it can be made, the default first; none: it holds no image, or all."""
-
-
 FORMATS = {
-    "colmap": Format("colmap_text", ("gs", "rs")),
-    "tum": Format("tum_text", ()),
-    "kalibr": Format("kalibr_yaml", ()),
-    "nerfstudio": Format("nerfstudio_json", ("rs", "gs")),
-    "gsplat": Format("gsplat_arrays", ("rs", "gs")),
-    "kitti": Format("kitti_folders", ("gs", "rs")),
-    "carla-rs": Format("carla_folders", ()),
-    "fastec-rs": Format("fastec_folders", ()),
-    "webdataset": Format("webdataset_shards", ()),
-    "huggingface": Format("huggingface_folder", ()),
+    "colmap": COLMAP,
+    "tum": TUM,
+    "kalibr": KALIBR,
+    "nerfstudio": NERFSTUDIO,
+    "gsplat": GSPLAT,
+    "kitti": KITTI,
+    "carla-rs": CARLA_RS,
+    "fastec-rs": FASTEC_RS,
+    "webdataset": WEBDATASET,
+    "huggingface": HUGGINGFACE,
 }
 
 
@@ -59,15 +59,16 @@ def export_dataset(
         folder: of the dataset, or of what ``rsbench correct`` made of footage.
         name: of the format.
         out: a folder that is empty, missing, or of an earlier export, which is replaced.
-        images: None is what the format holds best.
+        images: None chooses the format's default.
         only: names of sequences; all when empty.
         progress: called with the name of each sequence that is written.
 
     Returns:
-        What the format cannot hold of these sequences, in sentences; they are in README.txt too.
+        What the format cannot represent of these sequences, in sentences; README.txt has them too.
 
     Raises:
-        RsbenchError: no such format, no dataset, what the format cannot hold, or ``out`` cannot be written.
+        RsbenchError: no such format, no dataset, a sequence that the format cannot represent, or ``out`` cannot be
+            written.
     """
     if name not in FORMATS:
         raise RsbenchError(f"--to {name}: must be one of {', '.join(FORMATS)}")
@@ -79,16 +80,16 @@ def export_dataset(
         raise RsbenchError(f"--images {images}: {name} {one}")
     chosen: Images = images or (kind.images[0] if kind.images else "rs")
     sequences = chosen_sequences(folder, only)
-    module: Any = import_module(f"rsbench.interop.writers.{kind.module}")
     for sequence in sequences:
-        module.check(sequence, chosen)
+        if fault := kind.fault(sequence, chosen):
+            raise RsbenchError(f"--to {name}: sequence {sequence.name}: {fault}")
     check_out(out)
     with fresh_folder(out, "rsbench export") as fresh:
-        notes = dict[str, dict[str, Any]]()
-        for sequence, note in zip(sequences, _written(module, sequences, fresh, chosen), strict=True):
+        notes = dict[str, Note]()
+        for sequence, note in zip(sequences, _written(kind, sequences, fresh, chosen), strict=True):
             notes[sequence.name] = note
             progress(sequence.name)
-        return _tell(fresh, name, module.ABOUT, notes, {"images": chosen} if kind.images else {})
+        return _write_record(fresh, name, kind.about, notes, {"images": chosen} if kind.images else {})
 
 
 def _export_corrected(
@@ -104,29 +105,31 @@ def _export_corrected(
     with fresh_folder(out, "rsbench export") as fresh:
         notes = {corrected.name: export_corrected(corrected, name, fresh)}
         progress(corrected.name)
-        return _tell(fresh, name, ABOUT_CORRECTED[name], notes, {})
+        return _write_record(fresh, name, CORRECTED_ABOUT[name], notes, {})
 
 
-def _tell(fresh: Path, name: str, about: str, notes: dict[str, dict[str, Any]], more: dict[str, Any]) -> list[str]:
-    """Write what is there, for people and programs; returns what had to be said."""
-    told = [f"{key}: {sentence}" for key, note in notes.items() for sentence in note["told"]]
+def _write_record(fresh: Path, name: str, about: str, notes: dict[str, Note], more: dict[str, Any]) -> list[str]:
+    """Write README.txt for people and export.json for programs; returns the sentences of all notes."""
+    sentences = [f"{key}: {sentence}" for key, (words, _) in notes.items() for sentence in words]
     record = {"format": 1, "rsbench": __version__, "to": name, "about": about, **more}
-    write_json(fresh / RECORD, {**record, "sequences": notes})
-    readme = [f"Written by rsbench {__version__}: rsbench export --to {name}", "", about, *told]
+    sequences = {key: {**fields, "told": words} for key, (words, fields) in notes.items()}
+    write_json(fresh / RECORD, {**record, "sequences": sequences})
+    readme = [f"Written by rsbench {__version__}: rsbench export --to {name}", "", about, *sentences]
     write_lines(fresh / README, readme)
-    return told
+    return sentences
 
 
-def _written(module: Any, sequences: list[Sequence], fresh: Path, images: Images) -> Iterator[dict[str, Any]]:
-    if hasattr(module, "write_all"):  # of files that hold several sequences
-        yield from module.write_all(sequences, fresh)
+def _written(kind: Format, sequences: list[Sequence], fresh: Path, images: Images) -> Iterator[Note]:
+    if kind.write_all is not None:
+        yield from kind.write_all(sequences, fresh)
         return
+    assert kind.write is not None
     for sequence in sequences:
-        yield module.write(sequence, fresh, images)
+        yield kind.write(sequence, fresh, images)
 
 
 def chosen_sequences(folder: Path, only: tuple[str, ...]) -> list[Sequence]:
-    """Those of a dataset that are named, all without names; RsbenchError for a name that none has."""
+    """The sequences of these names, or all of a dataset without names; RsbenchError for an unknown name."""
     sequences = read_dataset(folder)
     names = [sequence.name for sequence in sequences]
     if unknown := [name for name in only if name not in names]:

@@ -12,7 +12,7 @@ from rsbench.core.rig import VIEWS
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence
-from rsbench.interop.writers.image_poses import View
+from rsbench.interop.writers.sequence_views import View
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.vision.feature_matcher import load_features

@@ -28,16 +28,16 @@ from rsbench.core.se3 import inverse
 from rsbench.core.so3 import quaternion
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence
-from rsbench.interop.writers.image_poses import (
+from rsbench.interop.writers.match_colours import Scene, Strips, line_seconds
+from rsbench.interop.writers.sequence_views import (
     CORNER_PX,
     View,
     corner_matrix,
     first_second,
     line_poses,
     views_in_time,
+    world_points,
 )
-from rsbench.interop.writers.match_colours import Scene, Strips, line_seconds
-from rsbench.interop.writers.surface_points import world_points
 from rsbench.storage.untrusted_files import inside, read_bytes
 
 _FIRST_LINE, _LAST_LINE = np.array([240, 228, 66]), np.array([0, 114, 178])

@@ -1,0 +1,657 @@
+"""Data in the layouts of other projects, read in place: what a layout contains, and nothing that it does not.
+
+**COLMAP**'s text model: cameras.txt, images.txt and, where it exists, points3D.txt. Its pixels are counted from
+the corner of the image, ours from the centre of the first pixel: half a pixel less. A quaternion is (w, x, y, z),
+and a pose ``cam_from_world``, as ours. The layout has no times: images are ordered by name, one pose each, without
+a shutter.
+
+**EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the
+sensor's coordinates to the body's, ``data.csv`` times in nanoseconds and file names; poses are those of the body,
+p and q = (w, x, y, z), in ``mocap0`` or ``state_groundtruth_estimate0``. Times are whole numbers: as floats they
+would lose 256 ns. The layout does not describe a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1;
+camera 0 is global) is published beside it, and its times are taken as those of the first row.
+
+**Carla-RS** (Liu et al., Deep Shutter Unrolling Network, CVPR 2020): a sequence is a folder with ``gt_vel.log``
+(wx, wy, wz in rad/s and x, y, z per second), ``%04d_rs.png``, and where depth was rendered ``%04d_rs.depth`` or
+``.pdepth``; ``%04d_gs_f.png`` and ``%04d_gs_m.png`` are global-shutter images of the first row and of row ``height
+// 2``, ``%04d_mask.png`` the pixels that the authors score. The rest is known from its generator (UnrealCV of the
+same authors, Python/capture_rolling_shutter.py):
+
+- exp([w t]x), v t is the pose of the camera at time t **in the camera at time 0**: ``cam_from_world`` is its
+  inverse, rotation and translation grow apart (no screw), and the translation is turned by the rotation;
+- row r of frame k is read at k / FPS + r times the row's readout, which is 1 / FPS / rows: a readout ratio of 1;
+- the field of view is 90 degrees: fx is half the width, and the principal point the middle of the image, which is
+  (width - 1) / 2 here and width / 2 in their own code;
+- ``.depth`` is the distance along the ray, ``.pdepth`` is z, computed from it with their principal point.
+
+**Fastec-RS** (the same paper): a sequence is a folder with ``%03d_rolling.png``, ``%03d_global_first.png``, taken
+at the time of the first row, and ``%03d_global_middle.png``, of row ``height // 2``. Rows are those of successive
+frames of a high-speed camera, so the readout ratio is 1. There is no calibration, depth or motion.
+
+**Middlebury** (2014 and 2021): a scene is a folder with ``im0.png``, ``im1.png``, ``calib.txt`` and ``disp0.pfm``.
+Its principal points may differ by ``doffs``: z = baseline f / (d + doffs); lengths are millimetres; a PFM begins
+with its lowest row, and unknown disparities are infinite.
+
+**KITTI** (stereo 2012 and 2015): a folder with ``image_2``, ``image_3`` (or 0 and 1, grey), ``disp_occ_0`` (or
+``disp_occ``) and ``calib_cam_to_cam`` (or ``calib``). Disparities have 16 bits, 256 to the pixel, 0 unknown; the
+baseline is the difference of the fourth numbers of the projection matrices, each -fx times the camera's position.
+Neither Middlebury nor KITTI has times of rows, and no shutter is assumed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache, partial
+from operator import attrgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from rsbench.components.cards import choices
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.lens import Lens
+from rsbench.core.rig import SIDES, Side, View
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray, from_quaternion
+from rsbench.dataset.recording import PoseAt, Recording
+from rsbench.pipeline.footage import read_frame
+from rsbench.pipeline.one_camera_card import DEFAULT_FOCAL
+from rsbench.storage.files import read_grey_png
+from rsbench.storage.untrusted_files import inside, read_bytes, read_text
+
+
+def numbers(text: str, where: object, count: int | None = None) -> FloatArray:
+    """(n,) finite numbers apart by blanks or commas; RsbenchError for others, or another count."""
+    words = text.replace(",", " ").split()
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        raise RsbenchError(f"{where}: {text.strip()[:60]!r}: must be numbers") from None
+    if (count is not None and len(values) != count) or not np.all(np.isfinite(values)):
+        wanted = "finite numbers" if count is None else f"{count} finite numbers"
+        raise RsbenchError(f"{where}: {text.strip()[:60]!r}: must be {wanted}")
+    return values
+
+
+def lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Lines that are not empty and no comment (#), each with where it stands."""
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield f"{path}:{number}", line
+
+
+def only_file(folder: Path, *names: str) -> Path:
+    """The first of some files that is there; RsbenchError for none."""
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    raise RsbenchError(f"{folder}: holds no {' or '.join(names)}")
+
+
+def rotation(q: FloatArray, where: object) -> FloatArray:
+    """(3, 3) of a quaternion (w, x, y, z), made of length one; RsbenchError where it is far from that."""
+    length = float(np.linalg.norm(q))
+    if not abs(length - 1.0) < 1e-2:
+        raise RsbenchError(f"{where}: quaternion {q.tolist()} has length {length:g}, not 1")
+    return from_quaternion(q)
+
+
+_COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
+    "SIMPLE_PINHOLE": ("f cx cy", None),
+    "PINHOLE": ("fx fy cx cy", None),
+    "SIMPLE_RADIAL": ("f cx cy k1", "brown-conrady"),
+    "RADIAL": ("f cx cy k1 k2", "brown-conrady"),
+    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "brown-conrady"),
+    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "kannala-brandt"),
+    "RADIAL_FISHEYE": ("f cx cy k1 k2", "kannala-brandt"),
+    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "kannala-brandt"),
+}
+"""Parameters in their order, and the lens that has them."""
+_CORNER = 0.5
+
+
+class Shot(NamedTuple):
+    """An image: its name, its pose, and what gives pixels and points that are seen there."""
+
+    name: str
+    pose: Pose
+    seen: Callable[[], tuple[FloatArray, FloatArray]] | None
+
+
+def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
+    """One recording of each camera, its images in the order of their names.
+
+    Args:
+        folder: holds cameras.txt and images.txt.
+        images: folder to which names of images are relative; None: ``images`` in the folder, or one or two above.
+
+    Raises:
+        RsbenchError: a file is missing or wrong, or a camera model has no counterpart.
+    """
+    cameras = dict(_colmap_camera(where, line) for where, line in lines(only_file(folder, "cameras.txt")))
+    root = images or next(
+        (each / "images" for each in (folder, *folder.parents[:2]) if (each / "images").is_dir()), folder
+    )
+    shots: dict[str, list[Shot]] = {}
+    points = folder / "points3D.txt"
+    path = only_file(folder, "images.txt")
+    rows = [line for line in read_text(path).splitlines() if not line.lstrip().startswith("#")]
+    while rows and not rows[-1].strip():
+        rows.pop()
+    for number, line in enumerate(rows[::2]):  # every second one lists points, and may be empty
+        where = f"{path}, image {number + 1}"
+        name, camera, pose = _colmap_image(where, line)
+        if camera not in cameras:
+            raise RsbenchError(f"{path}: {name} is of camera {camera}, which cameras.txt lacks")
+        seen = partial(_colmap_points_seen, points, "".join(rows[2 * number + 1 : 2 * number + 2]), where)
+        shots.setdefault(camera, []).append(Shot(name, pose, seen if points.is_file() else None))
+    return [
+        _colmap_recording(camera, cameras[camera], sorted(each, key=attrgetter("name")), root)
+        for camera, each in shots.items()
+    ]
+
+
+def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
+    words = line.split()
+    if len(words) < 5 or words[1] not in _COLMAP_MODELS:
+        known = ", ".join(_COLMAP_MODELS)
+        raise RsbenchError(f"{where}: camera model {words[1] if len(words) > 1 else ''!r}: must be one of {known}")
+    keys, model = _COLMAP_MODELS[words[1]]
+    values = dict(zip(keys.split(), numbers(" ".join(words[4:]), where, len(keys.split())).tolist(), strict=True))
+    size = numbers(" ".join(words[2:4]), where, 2)
+    fx, fy = values.pop("fx", values.get("f", 0.0)), values.pop("fy", values.pop("f", 0.0))
+    cx, cy = values.pop("cx") - _CORNER, values.pop("cy") - _CORNER
+    try:
+        lens = None if model is None else Lens(model=model, **values)  # pyrefly: ignore[bad-argument-type]
+        camera = PinholeCamera(width=int(size[0]), height=int(size[1]), fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {error}") from error
+    return words[0], camera
+
+
+def _colmap_image(where: str, line: str) -> tuple[str, str, Pose]:
+    words = line.split(maxsplit=9)
+    if len(words) != 10:
+        raise RsbenchError(f"{where}: must be a number, a quaternion, a translation, a camera and a name")
+    values = numbers(" ".join(words[1:8]), where, 7)
+    return words[9].strip(), words[8], Pose(rotation(values[:4], where), values[4:])
+
+
+def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
+    """Pixels and points of a line of x, y and a point's number, -1 for none."""
+    known, values = _colmap_points(points), numbers(line, where)
+    if len(values) % 3:
+        raise RsbenchError(f"{where}: its points must be x, y and a number each")
+    rows = [row for row in values.reshape(-1, 3) if int(row[2]) in known]
+    found = np.array([known[int(row[2])] for row in rows]).reshape(-1, 3)
+    return np.array(rows).reshape(-1, 3)[:, :2] - _CORNER, found
+
+
+@lru_cache(maxsize=2)
+def _colmap_points(path: Path) -> dict[int, FloatArray]:
+    """Places by number."""
+    found = {}
+    for where, line in lines(path):
+        number, *place = numbers(" ".join(line.split()[:4]), where, 4)
+        found[int(number)] = np.array(place)
+    return found
+
+
+def _colmap_recording(number: str, camera: PinholeCamera, shots: list[Shot], root: Path) -> Recording:
+    files: dict[View, Path] = {("left", k): inside(root, shot.name) for k, shot in enumerate(shots)}
+    R, t = np.array([shot.pose.R for shot in shots]), np.array([shot.pose.t for shot in shots])
+    return Recording(
+        name=f"camera {number}",
+        cameras={"left": camera},
+        images=files,
+        poses={"left": partial(_pose_of_image, R, t)},
+        sightings={("left", k): shot.seen for k, shot in enumerate(shots) if shot.seen is not None},
+        notes=("the layout does not say when images were taken, or how rows were read",),
+    )
+
+
+def _pose_of_image(R: FloatArray, t: FloatArray, tau: FloatArray) -> Pose:
+    """The pose of an image at its whole number; NaN between, where nothing is known."""
+    tau = np.asarray(tau, dtype=np.float64)
+    index = np.clip(np.rint(tau), 0, len(R) - 1).astype(np.int64)
+    known = index == tau
+    return Pose(np.where(known[..., None, None], R[index], np.nan), np.where(known[..., None], t[index], np.nan))
+
+
+_LENSES = {
+    "radial-tangential": ("brown-conrady", ("k1", "k2", "p1", "p2")),
+    "radtan": ("brown-conrady", ("k1", "k2", "p1", "p2")),
+    "equidistant": ("kannala-brandt", ("k1", "k2", "k3", "k4")),
+}
+_EUROC_POSES = ("state_groundtruth_estimate0", "mocap0", "gt0")
+_YAML_KEY = re.compile(r"^[ \t]*(\w+):[ \t]*(\[[^\]]*\]|[^\n#]*)", re.MULTILINE)
+
+
+def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) -> list[Recording]:
+    """The sequence of a folder that is, or holds, ``mav0`` (or the cameras themselves).
+
+    Args:
+        line_delays_s: seconds between rows of the cameras that are known to roll, or 0 of a global one.
+
+    Raises:
+        RsbenchError: files that are missing, or not what they should be.
+    """
+    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    sensors = {side: root / f"cam{k}" for k, side in enumerate(SIDES) if (root / f"cam{k}").is_dir()}
+    if "left" not in sensors:
+        raise RsbenchError(f"{root}: holds no folder cam0")
+    yamls = {side: _read_yaml(path / "sensor.yaml") for side, path in sensors.items()}
+    cameras = {side: _euroc_camera(yamls[side], sensors[side] / "sensor.yaml") for side in sensors}
+    body_from = {side: _euroc_extrinsics(yamls[side], sensors[side] / "sensor.yaml") for side in sensors}
+    times = {side: _euroc_times(path) for side, path in sensors.items()}
+    stamps = [stamp for stamp in times["left"] if all(stamp in times[side] for side in sensors)]
+    if len(stamps) < 2:
+        raise RsbenchError(f"{root}: the cameras have {len(stamps)} times in common; two are needed")
+    period = float(np.median(np.diff(stamps))) * 1e-9
+    images: dict[View, Path] = {(s, k): times[s][stamp] for s in sensors for k, stamp in enumerate(stamps)}
+    apart = None if "right" not in sensors else compose(inverse(body_from["right"]), body_from["left"])
+    world = _trajectory(root, stamps[0], period)
+    shutters = {
+        side: _euroc_shutter(cameras[side].height, delay, period, root)
+        for side, delay in (line_delays_s or {}).items()
+    }
+    return [
+        Recording(
+            name=folder.name,
+            cameras=cameras,
+            images=images,
+            shutters=shutters,
+            frame_period_s=period,
+            right_from_left=apart,
+            poses={} if world is None else {s: partial(_camera_pose, world, body_from[s]) for s in sensors},
+            notes=() if shutters else ("the layout does not say how rows are read",),
+        )
+    ]
+
+
+def _read_yaml(path: Path) -> dict[str, str]:
+    return {key: value.strip() for key, value in _YAML_KEY.findall(read_text(path))}
+
+
+def _yaml_numbers(fields: Mapping[str, str], key: str, path: Path, count: int) -> FloatArray:
+    if key not in fields:
+        raise RsbenchError(f"{path}: {key!r} is required")
+    return numbers(fields[key].strip("[]").replace("\n", " "), f"{path}: {key}", count)
+
+
+def _euroc_camera(fields: Mapping[str, str], path: Path) -> PinholeCamera:
+    width, height = _yaml_numbers(fields, "resolution", path, 2)
+    fx, fy, cx, cy = _yaml_numbers(fields, "intrinsics", path, 4)
+    model = fields.get("distortion_model", "none").strip('"')
+    lens = None
+    if model in _LENSES:
+        name, keys = _LENSES[model]
+        values = _yaml_numbers(fields, "distortion_coefficients", path, len(keys))
+        lens = Lens(model=name, **dict(zip(keys, values.tolist(), strict=True)))  # pyrefly: ignore[bad-argument-type]
+    elif model != "none":
+        raise RsbenchError(f"{path}: distortion_model = {model!r}: must be one of {', '.join(_LENSES)}")
+    try:
+        return PinholeCamera(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
+    except ValueError as error:
+        raise RsbenchError(f"{path}: {error}") from error
+
+
+def _euroc_extrinsics(fields: Mapping[str, str], path: Path) -> Pose:
+    """``body_from_camera``."""
+    T = _yaml_numbers(fields, "data", path, 16).reshape(4, 4)
+    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+        raise RsbenchError(f"{path}: T_BS: its rotation is none")
+    return Pose(T[:3, :3], T[:3, 3])
+
+
+def _euroc_times(folder: Path) -> dict[int, Path]:
+    """Files by nanosecond."""
+    out = {}
+    for where, line in lines(folder / "data.csv"):
+        stamp, _, name = line.partition(",")
+        if not stamp.strip().isdigit():
+            raise RsbenchError(f"{where}: {stamp!r}: must be nanoseconds, a whole number")
+        out[int(stamp)] = inside(folder / "data", name.strip())
+    return dict(sorted(out.items()))
+
+
+def _trajectory(root: Path, start_ns: int, period_s: float) -> PoseAt | None:
+    """``world_from_body`` by time in frame periods; None where there is none."""
+    path = next((root / name / "data.csv" for name in _EUROC_POSES if (root / name / "data.csv").is_file()), None)
+    if path is None:
+        return None
+    stamps, rows = list[float](), list[tuple[FloatArray, FloatArray]]()
+    for where, line in lines(path):
+        stamp, _, rest = line.partition(",")
+        if not stamp.strip().isdigit():
+            raise RsbenchError(f"{where}: {stamp!r}: must be nanoseconds, a whole number")
+        values = numbers(rest, where)
+        if len(values) < 7:
+            raise RsbenchError(f"{where}: must be a time, a position and a quaternion")
+        stamps.append((int(stamp) - start_ns) * 1e-9 / period_s)
+        rows.append((rotation(values[3:7], where), values[:3]))
+    tau = np.array(stamps)
+    if len(tau) < 2 or not np.all(np.diff(tau) > 0.0):
+        raise RsbenchError(f"{path}: must hold at least two times that grow")
+    turns = Slerp(tau, Rotation.from_matrix(np.array([R for R, _ in rows])))
+    return partial(_between, tau, turns, np.array([p for _, p in rows]))
+
+
+def _between(known: FloatArray, turns: Slerp, places: FloatArray, tau: FloatArray) -> Pose:
+    """Between two known poses, the way along a straight line and the turn at constant speed; NaN beyond them."""
+    tau = np.asarray(tau, dtype=np.float64)
+    held = np.clip(tau, known[0], known[-1])
+    R = turns(held.ravel()).as_matrix().reshape(*tau.shape, 3, 3)
+    p = np.stack([np.interp(held, known, places[:, axis]) for axis in range(3)], axis=-1)
+    beyond = held != tau
+    return Pose(np.where(beyond[..., None, None], np.nan, R), np.where(beyond[..., None], np.nan, p))
+
+
+def _camera_pose(world_from_body: PoseAt, body_from_camera: Pose, tau: FloatArray) -> Pose:
+    return inverse(compose(world_from_body(tau), body_from_camera))
+
+
+def _euroc_shutter(height: int, line_delay_s: float, period_s: float, root: Path) -> RollingShutter:
+    ratio = line_delay_s * height / period_s
+    if not 0.0 <= ratio <= 1.0:
+        raise RsbenchError(
+            f"{root}: a line delay of {1e6 * line_delay_s:g} us makes a readout ratio of {ratio:.3f}"
+        )
+    return RollingShutter(height=height, readout_ratio=ratio)
+
+
+_CARLA_FPS = 20.0
+"""Of the published data, where no rs_calib.txt says otherwise."""
+
+
+def read_carla(folder: Path) -> list[Recording]:
+    """Every sequence below a folder, or the folder itself.
+
+    Raises:
+        RsbenchError: no gt_vel.log, or a file that is not what it should be.
+    """
+    found = sorted(path.parent for path in [folder, *folder.glob("**")] for path in path.glob("gt_vel.log"))
+    if not found:
+        raise RsbenchError(f"{folder}: holds no gt_vel.log, as sequences of Carla-RS do")
+    return [_read_carla_sequence(each) for each in dict.fromkeys(found)]
+
+
+def _read_carla_sequence(folder: Path) -> Recording:
+    images: dict[View, Path] = {("left", frame): path for frame, path in _carla_pictures(folder, "rs").items()}
+    if not images:
+        raise RsbenchError(f"{folder}: holds no 0000_rs.png")
+    height, width = read_frame(next(iter(images.values()))).shape[:2]
+    camera = PinholeCamera.centred(width, height, width / 2)
+    fps, row_s, known = _carla_timing(folder, height)
+    ratio = row_s * height * fps
+    if not 0.0 <= ratio <= 1.0 + 1e-6:
+        raise RsbenchError(f"{folder}: rows of {1e3 * row_s} ms at {fps} Hz make a readout ratio of {ratio:.3f}")
+    velocity = [numbers(line, where, 6) for where, line in lines(folder / "gt_vel.log")]
+    if len(velocity) != 1:
+        raise RsbenchError(f"{folder / 'gt_vel.log'}: has {len(velocity)} velocities, not one")
+    w, v = velocity[0][:3] / fps, velocity[0][3:] / fps
+    depths = {view: reader for view in images if (reader := _carla_depth(folder, view[1], camera)) is not None}
+    assumed = f"no rs_calib.txt: {_CARLA_FPS:g} Hz and a readout ratio of 1 are those of the published data"
+    return Recording(
+        name=folder.name,
+        cameras={"left": camera},
+        images=images,
+        shutters={"left": RollingShutter(height=height, readout_ratio=min(ratio, 1.0))},
+        frame_period_s=1.0 / fps,
+        poses={"left": partial(_carla_pose, w, v)},
+        depths=depths,
+        truths={
+            ("left", frame, row): path
+            for kind, row in (("gs_f", 0), ("gs_m", height // 2))
+            for frame, path in _carla_pictures(folder, kind).items()
+        },
+        masks={("left", frame): path for frame, path in _carla_pictures(folder, "mask").items()},
+        notes=() if known else (assumed,),
+    )
+
+
+def _carla_pictures(folder: Path, kind: str) -> dict[int, Path]:
+    """Files of images of one kind, by frame."""
+    found = sorted(folder.glob(f"[0-9][0-9][0-9][0-9]_{kind}.*"))
+    return {int(path.name[:4]): path for path in found if path.suffix in (".png", ".jpg")}
+
+
+def _carla_pose(w: FloatArray, v: FloatArray, tau: FloatArray) -> Pose:
+    """``cam_from_world`` at times (...), velocities per frame period."""
+    tau = np.asarray(tau, dtype=np.float64)[..., None]
+    return inverse(Pose(so3.exp(tau * w), tau * v))
+
+
+def _carla_timing(folder: Path, height: int) -> tuple[float, float, bool]:
+    """Frames a second, seconds a row, and whether a file says so: rs_calib.txt here or one folder up."""
+    for path in (folder / "rs_calib.txt", folder.parent / "rs_calib.txt"):
+        if path.is_file():
+            fields = dict(line.split(":", 1) for _, line in lines(path) if ":" in line)
+            keys = ("FPS", "ROW_READOUT_TIME(ms)")
+            if not all(key in fields for key in keys):
+                raise RsbenchError(f"{path}: must say {' and '.join(keys)}")
+            fps, row_ms = (float(numbers(fields[key], path, 1)[0]) for key in keys)
+            if not fps > 0.0:
+                raise RsbenchError(f"{path}: FPS = {fps}: must be positive")
+            return fps, 1e-3 * row_ms, True
+    return _CARLA_FPS, 1.0 / _CARLA_FPS / height, False
+
+
+def _carla_depth(folder: Path, frame: int, camera: PinholeCamera) -> Callable[[], FloatArray] | None:
+    for suffix, radial in ((".depth", True), (".pdepth", False)):
+        path = folder / f"{frame:04d}_rs{suffix}"
+        if path.is_file():
+            return partial(_read_carla_depth, path, camera, radial)
+    return None
+
+
+def _read_carla_depth(path: Path, camera: PinholeCamera, radial: bool) -> FloatArray:
+    rows = [numbers(line, where, camera.width) for where, line in lines(path)]
+    if len(rows) != camera.height:
+        raise RsbenchError(f"{path}: has {len(rows)} rows, not {camera.height}")
+    distance = np.array(rows)
+    if not radial:
+        return distance
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return distance / np.linalg.norm(camera.unproject(np.stack([x, y], axis=-1)), axis=-1)
+
+
+_DIGITS = "[0-9][0-9][0-9]"
+
+
+def read_fastec(folder: Path) -> list[Recording]:
+    """Every sequence below a folder, or the folder itself.
+
+    Raises:
+        RsbenchError: no frame, or the first one of a sequence is no image.
+    """
+    places = sorted({path.parent for path in folder.rglob(f"{_DIGITS}_rolling.png")})
+    if not places:
+        raise RsbenchError(f"{folder}: holds no 000_rolling.png, as sequences of Fastec-RS do")
+    return [_read_fastec_sequence(place, folder) for place in places]
+
+
+def _read_fastec_sequence(place: Path, folder: Path) -> Recording:
+    images: dict[View, Path] = {
+        ("left", frame): path for frame, path in _fastec_pictures(place, "rolling").items()
+    }
+    height, width = read_frame(next(iter(images.values()))).shape[:2]
+    focal = DEFAULT_FOCAL * width
+    kinds = (("global_first", 0), ("global_middle", height // 2))
+    return Recording(
+        name=place.name if place == folder else place.relative_to(folder).as_posix(),
+        cameras={"left": PinholeCamera.centred(width, height, focal)},
+        images=images,
+        shutters={"left": RollingShutter(height=height, readout_ratio=1.0)},
+        truths={
+            ("left", frame, row): path
+            for kind, row in kinds
+            for frame, path in _fastec_pictures(place, kind).items()
+        },
+        notes=(f"no calibration: a focal length of {focal:g} px, the width, and a readout ratio of 1 are taken",),
+    )
+
+
+def _fastec_pictures(place: Path, kind: str) -> dict[int, Path]:
+    """Files of images of one kind, by frame."""
+    return {int(path.name[:3]): path for path in sorted(place.glob(f"{_DIGITS}_{kind}.png"))}
+
+
+_MM = 1e-3
+
+
+def read_middlebury(folder: Path) -> list[Recording]:
+    """Every scene below a folder, or the folder itself."""
+    found = sorted(path.parent for path in folder.glob("**/calib.txt") if (path.parent / "im0.png").is_file())
+    if not found:
+        raise RsbenchError(f"{folder}: holds no scene of Middlebury: no calib.txt beside an im0.png")
+    return [_middlebury(each) for each in found]
+
+
+def _middlebury(folder: Path) -> Recording:
+    path = folder / "calib.txt"
+    fields = {key.strip(): value for _, line in lines(path) for key, _, value in [line.partition("=")]}
+    for key in ("cam0", "cam1", "baseline", "width", "height"):
+        if key not in fields:
+            raise RsbenchError(f"{path}: {key!r} is required")
+    K0, K1 = (numbers(re.sub(r"[\[\];]", " ", fields[key]), path, 9).reshape(3, 3) for key in ("cam0", "cam1"))
+    width, height, baseline = (float(numbers(fields[key], path, 1)[0]) for key in ("width", "height", "baseline"))
+    offset = float(numbers(fields["doffs"], path, 1)[0]) if "doffs" in fields else float(K1[0, 2] - K0[0, 2])
+    left, right = (_pinhole(K, int(width), int(height), path) for K in (K0, K1))
+    images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
+    disparities: dict[View, Callable[[], FloatArray]] = {}
+    views: tuple[View, ...] = (("left", 0), ("right", 0))
+    for view, name in zip(views, ("disp0.pfm", "disp1.pfm"), strict=True):
+        if (folder / name).is_file():
+            disparities[view] = partial(_middlebury_disparities, folder / name, offset)
+    return Recording(
+        name=folder.name,
+        cameras={"left": left, "right": right},
+        images={view: image for view, image in images.items() if image.is_file()},
+        right_from_left=_apart(_MM * baseline),
+        disparities=disparities,
+    )
+
+
+def _pinhole(K: FloatArray, width: int, height: int, path: Path) -> PinholeCamera:
+    try:
+        return PinholeCamera(width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+    except ValueError as error:
+        raise RsbenchError(f"{path}: {error}") from error
+
+
+def _apart(baseline: float) -> Pose:
+    return Pose(np.eye(3), np.array([-baseline, 0.0, 0.0]))
+
+
+def _middlebury_disparities(path: Path, offset: float) -> FloatArray:
+    """Disparities (H, W) of a grey PFM, with the offset of the principal points; NaN where unknown."""
+    data = read_bytes(path)
+    found = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+]+)\s", data)
+    if found is None:
+        raise RsbenchError(f"{path}: is no grey PFM")
+    width, height, scale = int(found[1]), int(found[2]), float(found[3])
+    values = data[found.end() :]
+    if len(values) != 4 * width * height:
+        raise RsbenchError(f"{path}: has {len(values)} bytes of numbers, not those of {width} x {height}")
+    # A negative scale says that the lowest byte comes first; the lowest row always does.
+    rows = np.frombuffer(values, dtype="<f4" if scale < 0.0 else ">f4").reshape(height, width)[::-1]
+    return np.where(np.isfinite(rows) & (rows > 0.0), rows + offset, np.nan).astype(np.float64)
+
+
+def read_kitti(folder: Path) -> list[Recording]:
+    """Every pair that has disparities, and the pictures of the next time where they are there."""
+    images = next(
+        (names for names in (("image_2", "image_3"), ("image_0", "image_1")) if _has_folders(folder, names)), None
+    )
+    if images is None:
+        raise RsbenchError(f"{folder}: holds no folders image_2 and image_3, or image_0 and image_1")
+    truth = next((name for name in ("disp_occ_0", "disp_occ") if (folder / name).is_dir()), None)
+    calib = next((name for name in ("calib_cam_to_cam", "calib") if (folder / name).is_dir()), None)
+    if calib is None:
+        raise RsbenchError(f"{folder}: holds no folder calib_cam_to_cam or calib")
+    firsts = sorted((folder / images[0]).glob("*_10.png"))
+    if not firsts:
+        raise RsbenchError(f"{folder / images[0]}: holds no 000000_10.png")
+    return [_kitti(folder, images, truth, calib, path.name[:-7]) for path in firsts]
+
+
+def _has_folders(folder: Path, names: tuple[str, str]) -> bool:
+    return all((folder / name).is_dir() for name in names)
+
+
+def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, number: str) -> Recording:
+    path = only_file(folder / calib, f"{number}.txt")
+    fields = {key.strip(): value for _, line in lines(path) for key, _, value in [line.partition(":")]}
+    matrices = []
+    for name in names:
+        keys = (f"P_rect_0{name[-1]}", f"P{name[-1]}")
+        key = next((each for each in keys if each in fields), None)
+        if key is None:
+            raise RsbenchError(f"{path}: has neither {keys[0]} nor {keys[1]}")
+        matrices.append(numbers(fields[key], path, 12).reshape(3, 4))
+    files: dict[View, Path] = {
+        (side, frame): folder / name / f"{number}_1{frame}.png"
+        for side, name in zip(SIDES, names, strict=True)
+        for frame in (0, 1)
+    }
+    height, width = read_frame(files["left", 0]).shape[:2]
+    left, right = (_pinhole(P[:, :3], width, height, path) for P in matrices)
+    baseline = matrices[0][0, 3] / matrices[0][0, 0] - matrices[1][0, 3] / matrices[1][0, 0]
+    offset = right.cx - left.cx
+    found = None if truth is None else folder / truth / f"{number}_10.png"
+    read = (
+        None
+        if found is None or not found.is_file()
+        else partial(_kitti_disparities, found, (width, height), offset)
+    )
+    return Recording(
+        name=number,
+        cameras={"left": left, "right": right},
+        images={view: file for view, file in files.items() if file.is_file()},
+        right_from_left=_apart(float(baseline)),
+        disparities={} if read is None else {("left", 0): read},
+    )
+
+
+def _kitti_disparities(path: Path, size: tuple[int, int], offset: float) -> FloatArray:
+    values = read_grey_png(path, size, 16)
+    return np.where(values > 0, values / 256.0 + offset, np.nan)
+
+
+_TUM_RSVI = {"left": 0.0, "right": 29.4737e-6}
+"""Line delays, s: D. Schubert et al., Rolling-Shutter Modelling for Direct Visual-Inertial Odometry, IROS 2019."""
+
+
+def _read_tum_rsvi(folder: Path) -> list[Recording]:
+    return read_euroc(folder, _TUM_RSVI)  # pyrefly: ignore[bad-argument-type]
+
+
+FORMATS: Mapping[str, Callable[[Path], list[Recording]]] = {
+    "carla-rs": read_carla,
+    "colmap": read_colmap,
+    "euroc": read_euroc,
+    "fastec-rs": read_fastec,
+    "kitti": read_kitti,
+    "middlebury": read_middlebury,
+    "tum-rsvi": _read_tum_rsvi,
+}
+
+
+def read_others(folder: Path, format_name: str) -> list[Recording]:
+    """The recordings of a folder in some layout.
+
+    Raises:
+        RsbenchError: no such layout, or the folder does not have it.
+    """
+    if format_name not in FORMATS:
+        raise RsbenchError(f"--from {format_name}: is no layout{choices(format_name, FORMATS)}")
+    if not folder.is_dir():
+        raise RsbenchError(f"{folder}: no such folder")
+    return FORMATS[format_name](folder)

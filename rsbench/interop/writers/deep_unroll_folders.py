@@ -1,0 +1,188 @@
+"""The layouts of Carla-RS and Fastec-RS (Liu, Cui, Larsson, Pollefeys, Deep Shutter Unrolling Network, CVPR 2020).
+
+Carla-RS, as its generator writes it (ethliup/UnrealCV, ``capture_rolling_shutter.py``): each camera's frames are a
+folder with gt_vel.log, wx wy wz x y z of the camera in its own axes at the first row, rad/s and m/s: the pose of a
+row that is read t seconds later is ``camera_0 from camera_t`` = (exp(w t), v t). The loader of DeepUnrollNet
+negates them. Depth is text, radial: along the ray, not z.
+
+Fastec-RS: frames and their truth, without calibration, depth or motion, as the loader of DeepUnrollNet
+(``dataset_fastec_rs.py``) expects them.
+"""
+
+from __future__ import annotations
+
+import io
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core import so3
+from rsbench.core.rig import SIDES, Side
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.sequence import Sequence
+from rsbench.interop.writers.sequence_views import (
+    CORNER_PX,
+    Format,
+    Images,
+    Note,
+    Points,
+    View,
+    about_moving_objects,
+    camera_velocity,
+    compare_rows,
+    first_pose,
+    number,
+    numbers,
+    reads_from_top,
+    seen_by,
+    write_lines,
+)
+from rsbench.storage.files import write_bytes
+from rsbench.storage.untrusted_files import inside, read_bytes
+
+_CARLA_ABOUT = (
+    "SEQUENCE/seq_left and seq_right, each with NNNN_rs.png, NNNN_gs_f.png (the twin of the first row), "
+    "NNNN_gs_m.png (of row height // 2, where the dataset has that twin), NNNN_rs.depth and NNNN_gs_f.depth"
+    " (text, metres along the ray, 0 = no surface) and gt_vel.log (rad/s and m/s of the camera in its own "
+    "axes at its first row); SEQUENCE/rs_calib.txt and intrinsics.txt, whose pixels have (0, 0) in the "
+    "corner of the image. The loader of DeepUnrollNet takes .png with img_ext, and negates the velocities. "
+    "There are no masks and no flow."
+)
+_CARLA_LAW = "constant velocities from the first row of the first frame on"
+_LOADED = 10
+
+
+def _carla_fault(sequence: Sequence, images: Images) -> str:
+    if sequence.rig.camera.lens is not None:
+        return "its cameras have no lens; choose other sequences"
+    return "" if reads_from_top(sequence) else "its rows are read from the top; choose other sequences"
+
+
+def _write_carla(sequence: Sequence, root: Path, images: Images) -> Note:
+    folder = root / sequence.name
+    for side in SIDES:
+        place = folder / f"seq_{side}"
+        place.mkdir(parents=True)
+        velocity = " ".join(number(each) for each in np.concatenate(first_velocity(sequence, side)))
+        write_lines(
+            place / "gt_vel.log", ["# Ground truth velocity in camera frame", "# wx, wy, wz, x, y, z", velocity]
+        )
+        for frame in range(sequence.frames):
+            _write_carla_frame(sequence, View(side, frame), place)
+    _write_carla_calibration(sequence, folder)
+    views = [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
+    sentences, record = compare_rows(sequence, views, partial(_carla_pixels, sequence), _CARLA_LAW)
+    if sequence.frames > _LOADED:
+        sentences.append(f"the loader of DeepUnrollNet takes the first {_LOADED} of {sequence.frames} frames")
+    if sequence.shutter.right_delay:
+        sentences.append("the two cameras are sequences of their own: the delay of the right one is not written")
+    return sentences + about_moving_objects(sequence), record
+
+
+def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArray]:
+    """Angular and linear velocity (3,) of a camera in its own axes at the first row of frame 0, rad/s and m/s."""
+    linear, angular = camera_velocity(sequence, side, float(sequence.shutter.start(0, side)))
+    return angular, linear
+
+
+def _write_carla_frame(sequence: Sequence, view: View, place: Path) -> None:
+    middle = sequence.shutter.lines(view.side) // 2
+    names = {"rs": picture_file("rs", view.side, view.frame), "gs_f": picture_file("gs", view.side, view.frame)}
+    if middle in sequence.twins:
+        names["gs_m"] = picture_file("gs", view.side, view.frame, middle)
+    for name, file in names.items():
+        write_bytes(place / f"{view.frame:04d}_{name}.png", read_bytes(inside(sequence.folder, file)))
+    for name, depth in (
+        ("rs", sequence.depth("rs", view.side, view.frame)),
+        ("gs_f", sequence.depth("gs", view.side, view.frame)),
+    ):
+        write_bytes(place / f"{view.frame:04d}_{name}.depth", _depth_text(radial(sequence, depth)))
+
+
+def radial(sequence: Sequence, depth: NDArray[np.float32]) -> FloatArray:
+    """Distances (H, W) along the rays of depths z (H, W)."""
+    camera = sequence.rig.camera
+    return depth * np.linalg.norm(camera.unproject(camera.pixel_grid()), axis=-1)
+
+
+def _depth_text(values: FloatArray) -> bytes:
+    """As ``np.savetxt``, with the nine digits of a float32."""
+    stream = io.StringIO()
+    np.savetxt(stream, values, fmt="%.9g")
+    return stream.getvalue().encode()
+
+
+def _write_carla_calibration(sequence: Sequence, folder: Path) -> None:
+    camera, shutter = sequence.rig.camera, sequence.shutter
+    delay_ms = 1e3 * shutter.readout_ratio * sequence.frame_period_s / shutter.lines("left")
+    rows = ["#Rolling shutter camera intrinsic parameters", f"FPS: {number(1.0 / sequence.frame_period_s)}"]
+    rows += [f"ROW_READOUT_TIME(ms): {number(delay_ms)}", f"RESOLUTION_H: {camera.height}"]
+    write_lines(folder / "rs_calib.txt", [*rows, f"RESOLUTION_W: {camera.width}"])
+    values = numbers([camera.fx, camera.fy, camera.cx + CORNER_PX, camera.cy + CORNER_PX])
+    lines = ["# Camera intrinsic parameters", "", "numCameras 2", ""]
+    for k in range(2):
+        lines += [f"devName cam{k}", "# resolution: nCols, nRows", f"resolution {camera.width} {camera.height}"]
+        lines += ["# K: fx fy cx cy with pinhole camera model", f"K {values}", ""]
+    write_lines(folder / "intrinsics.txt", lines)
+
+
+def _carla_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
+    """Pixels (n, 2) where Carla-RS's motion model sees the points."""
+    w, v = first_velocity(sequence, view.side)
+    shutter = sequence.shutter
+    tau = shutter.line_time(points.pixels[:, 1], view.frame, view.side) - shutter.start(0, view.side)
+    seconds = (sequence.frame_period_s * tau)[:, None]
+    moved = inverse(Pose(so3.exp(seconds * w), seconds * v))
+    start = first_pose(sequence, View(view.side, 0))
+    return seen_by(sequence, compose(moved, start), points.world)
+
+
+_FASTEC_ABOUT = (
+    "SEQUENCE_left and SEQUENCE_right, each with NNN_rolling.png, NNN_global_first.png (the twin of the first "
+    "row), NNN_global_middle.png (of row height // 2, where the dataset has that twin) and meta.log, by which "
+    "the loader knows the folder of a sequence. There is no calibration, depth or motion: a readout ratio of 1 "
+    "is what those who use the layout assume."
+)
+_META = "meta.log"
+"""By which the loader knows the folder of a sequence; it does not read it."""
+_MOST = 1000
+"""Frames that three digits number."""
+
+
+def _fastec_fault(sequence: Sequence, images: Images) -> str:
+    if not reads_from_top(sequence):
+        return "its rows are read from the top; choose other sequences"
+    many = sequence.frames > _MOST
+    return f"its frames have three digits, {sequence.frames} are more; choose other sequences" if many else ""
+
+
+def _write_fastec(sequence: Sequence, root: Path, images: Images) -> Note:
+    shutter = sequence.shutter
+    middle = shutter.height // 2
+    for side in SIDES:
+        place = root / f"{sequence.name}_{side}"
+        place.mkdir(parents=True)
+        write_lines(place / _META, [f"# {sequence.name}, {side} camera: readout ratio {shutter.readout_ratio:g}"])
+        for frame in range(sequence.frames):
+            names = {"rolling": picture_file("rs", side, frame), "global_first": picture_file("gs", side, frame)}
+            if middle in sequence.twins:
+                names["global_middle"] = picture_file("gs", side, frame, middle)
+            for name, file in names.items():
+                path = place / f"{frame:03d}_{name}.png"
+                write_bytes(path, read_bytes(inside(sequence.folder, file)))
+    sentences = []
+    if middle not in sequence.twins:
+        sentences.append(f"there is no twin of row {middle}, so no NNN_global_middle.png, which training reads")
+    if shutter.readout_ratio != 1.0:
+        sentences.append(
+            f"the readout ratio is {shutter.readout_ratio:g}, where those who use the layout assume 1"
+        )
+    return sentences, {}
+
+
+CARLA_RS = Format(_CARLA_ABOUT, (), _write_carla, fault=_carla_fault)
+FASTEC_RS = Format(_FASTEC_ABOUT, (), _write_fastec, fault=_fastec_fault)

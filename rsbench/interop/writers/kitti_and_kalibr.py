@@ -1,0 +1,186 @@
+"""KITTI's folders and Kalibr's calibration files.
+
+KITTI's odometry benchmark: image_2 (left), image_3 (right), calib.txt, times.txt, poses (3 x 4
+``world_from_camera`` of the left camera, the first being the identity); its stereo benchmark: disp_occ_0, a PNG of
+16 bits, disparity times 256, 0 where it is not known.
+
+Kalibr's camchain.yaml and imu.yaml have the fields of ``kalibr_common/ConfigReader.py``; ``line_delay`` (s) is
+what its rolling-shutter calibration writes. ``T_cn_cnm1`` transforms from the previous camera.
+
+Pixels are ours in both: (0, 0) is the centre of the first one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core.rig import SIDES, Side
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.imu import Imu
+from rsbench.dataset.sequence import Sequence
+from rsbench.interop.writers.sequence_views import (
+    Format,
+    Images,
+    Note,
+    View,
+    about_moving_objects,
+    copy_image,
+    first_pose,
+    first_second,
+    matrix,
+    number,
+    numbers,
+    reads_from_top,
+    world_from_camera,
+    write_lines,
+)
+from rsbench.storage.files import write_bytes, write_png16
+
+_KITTI_ABOUT = (
+    "sequences/SEQUENCE holds image_2 (left), image_3 (right), disp_occ_0 (of the left camera, what the "
+    "right one cannot see included), calib.txt and times.txt; poses/SEQUENCE.txt the poses of the left "
+    "camera, relative to its first one. Disparities are rounded to 1/256 px; 0 is unknown."
+)
+_SCALE, _LARGEST = 256.0, 65535
+_ONE_POSE = "the images are rolling-shutter frames: poses are those of the line that is read first"
+
+
+def _kitti_fault(sequence: Sequence, images: Images) -> str:
+    if sequence.rig.camera.lens is not None:
+        return "its images are rectified, these are seen through a lens; choose other sequences"
+    if images == "gs" and sequence.shutter.right_delay:
+        return "the right camera is late, so a pair is of two times; choose other sequences"
+    if images == "rs" and not sequence.shutter.rows_together:
+        return "the cameras do not read each row at one time; take --images gs"
+    return ""
+
+
+def _write_kitti(sequence: Sequence, root: Path, images: Images) -> Note:
+    folder = root / "sequences" / sequence.name
+    lefts = [View("left", frame) for frame in range(sequence.frames)]
+    (folder / "disp_occ_0").mkdir(parents=True)
+    lost = 0
+    for view in lefts:
+        depth = sequence.depth(images, "left", view.frame)
+        values, beyond = disparity_values(sequence.rig.disparity(depth))
+        lost += beyond
+        write_png16(folder / "disp_occ_0" / f"{view.frame:06d}.png", values)
+        for number_, side in zip((2, 3), SIDES, strict=True):
+            path = folder / f"image_{number_}" / f"{view.frame:06d}.png"
+            copy_image(sequence, View(side, view.frame), images, path)
+    write_lines(folder / "calib.txt", _kitti_calibration(sequence))
+    write_lines(folder / "times.txt", [number(first_second(sequence, view)) for view in lefts])
+    start = matrix(first_pose(sequence, lefts[0]))
+    places = [start @ world_from_camera(first_pose(sequence, view)) for view in lefts]
+    (root / "poses").mkdir(exist_ok=True)
+    write_lines(root / "poses" / f"{sequence.name}.txt", [numbers(place[:3]) for place in places])
+    sentences = [_ONE_POSE] if images == "rs" else []
+    if lost:
+        sentences.append(f"{lost} disparities are too small or too large for the format, and unknown there")
+    return sentences + about_moving_objects(sequence), {}
+
+
+def disparity_values(disparity: FloatArray) -> tuple[NDArray[np.uint16], int]:
+    """Values of the PNG for disparities (H, W) px, NaN where unknown; and how many it cannot represent."""
+    scaled = np.round(_SCALE * np.nan_to_num(disparity, nan=0.0))
+    representable = (scaled >= 1.0) & (scaled <= _LARGEST)
+    beyond = np.count_nonzero(np.isfinite(disparity) & ~representable)
+    return np.where(representable, scaled, 0.0).astype(np.uint16), int(beyond)
+
+
+def _kitti_calibration(sequence: Sequence) -> list[str]:
+    """P0 to P3 (3 x 4) from the frame of the left camera; the grey cameras 0 and 1 stand where 2 and 3 do."""
+    left = np.concatenate([sequence.rig.camera.K, np.zeros((3, 1))], axis=1)
+    right = left.copy()
+    right[0, 3] = -sequence.rig.camera.fx * sequence.rig.baseline
+    return [f"P{k}: {numbers(right if k % 2 else left)}" for k in range(4)]
+
+
+_KALIBR_ABOUT = (
+    "SEQUENCE/camchain.yaml: cam0 is the left camera, cam1 the right one; imu.yaml where the sequence has "
+    "an IMU. A frame's stamp is the time of its row 0, line_delay the seconds from each row to the next."
+)
+
+
+def _kalibr_fault(sequence: Sequence, images: Images) -> str:
+    lens = sequence.rig.camera.lens
+    if not reads_from_top(sequence):
+        return "its line delay is of rows that are read from the top; choose other sequences"
+    if lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0:
+        return "its lens radtan has k1, k2, p1, p2 but no k3; choose other sequences"
+    return ""
+
+
+def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
+    folder = root / sequence.name
+    folder.mkdir(parents=True)
+    blocks = [
+        f"cam{k}:\n" + "".join(f"  {line}\n" for line in _kalibr_camera(sequence, side))
+        for k, side in enumerate(SIDES)
+    ]
+    write_bytes(folder / "camchain.yaml", "".join(blocks).encode())
+    sentences = list[str]()
+    if delay := sequence.shutter.right_delay * sequence.frame_period_s:
+        sentences.append(
+            f"camera chains have no delay of a camera: stamps of cam1 are {number(delay)} s after those of cam0"
+        )
+    if sequence.imu is not None:
+        write_bytes(folder / "imu.yaml", _yaml_imu(sequence.imu).encode())
+        if sequence.imu.clock_drift:
+            sentences.append(
+                f"the IMU's clock drifts by {number(sequence.imu.clock_drift)}, for which there is no field"
+            )
+    return sentences, {}
+
+
+def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
+    camera, lens, shutter = sequence.rig.camera, sequence.rig.camera.lens, sequence.shutter
+    if lens is None:
+        model, values = "none", list[float]()
+    elif lens.model == "kannala-brandt":
+        model, values = "equidistant", [lens.k1, lens.k2, lens.k3, lens.k4]
+    else:
+        model, values = "radtan", [lens.k1, lens.k2, lens.p1, lens.p2]
+    lines = [
+        "camera_model: pinhole",
+        f"intrinsics: {_yaml_list([camera.fx, camera.fy, camera.cx, camera.cy])}",
+        f"distortion_model: {model}",
+        f"distortion_coeffs: {_yaml_list(values)}",
+        f"resolution: [{camera.width}, {camera.height}]",
+        f"rostopic: /{side}/image_raw",
+        f"line_delay: {number(shutter.readout_ratio * sequence.frame_period_s / shutter.lines(side))}",
+    ]
+    if side == "right":
+        lines += _yaml_transform("T_cn_cnm1", sequence.rig.offset("right") - sequence.rig.offset("left"))
+    if sequence.imu is not None:
+        lines += _yaml_transform("T_cam_imu", sequence.rig.offset(side))
+        lines.append(f"timeshift_cam_imu: {number(sequence.imu.time_offset_s)}")
+    return lines
+
+
+def _yaml_transform(name: str, translation: FloatArray) -> list[str]:
+    return [f"{name}:", *(f"- {_yaml_list(row)}" for row in matrix(Pose(np.eye(3), translation)).tolist())]
+
+
+def _yaml_list(values: list[float]) -> str:
+    return f"[{', '.join(map(number, values))}]"
+
+
+def _yaml_imu(imu: Imu) -> str:
+    fields = {
+        "rostopic": "/imu",
+        "update_rate": number(imu.rate_hz),
+        "accelerometer_noise_density": number(imu.accelerometer_noise_density),
+        "accelerometer_random_walk": number(imu.accelerometer_random_walk),
+        "gyroscope_noise_density": number(imu.gyroscope_noise_density),
+        "gyroscope_random_walk": number(imu.gyroscope_random_walk),
+    }
+    return "".join(f"{name}: {value}\n" for name, value in fields.items())
+
+
+KITTI = Format(_KITTI_ABOUT, ("gs", "rs"), _write_kitti, fault=_kitti_fault)
+KALIBR = Format(_KALIBR_ABOUT, (), _write_kalibr, fault=_kalibr_fault)

@@ -1,0 +1,323 @@
+"""What exports share: poses of images, others' pixel conventions, surface points, and the row-motion error.
+
+Surface points are world points of depth maps and where the images of a sequence see them, exactly: what a
+reconstruction holds. The row-motion error is the distance, px, of a format's model of how a camera moves during
+the readout from the true motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.projection import ProjectionStatus, project_at, row_poses, rs_project
+from rsbench.core.rig import SIDES, Side
+from rsbench.core.se3 import Pose, inverse, transform
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.object_records import numbers_of
+from rsbench.dataset.sequence import Sequence
+from rsbench.storage.files import write_bytes
+from rsbench.storage.untrusted_files import inside, read_bytes
+
+Note = tuple[list[str], dict[str, Any]]
+"""What a format cannot represent of a sequence, in sentences; and fields of its record in export.json."""
+Images = Literal["rs", "gs"]
+"""Rolling-shutter frames, or their global-shutter twins from the pose of the line that is read first."""
+CORNER_PX = 0.5
+"""Added to pixels where a format has the corner of the image at (0, 0); ours has the centre of a pixel there."""
+
+
+class Format(NamedTuple):
+    """A layout of another project."""
+
+    about: str
+    """What its files hold, for README.txt."""
+    images: tuple[Images, ...]
+    """The images that it can be made of, the default first; empty where it holds none, or both."""
+    write: Callable[[Sequence, Path, Images], Note] | None = None
+    """Writes one sequence to a folder of its name below a root."""
+    write_all: Callable[[list[Sequence], Path], Iterator[Note]] | None = None
+    """Writes files that hold several sequences; yields after each."""
+    fault: Callable[[Sequence, Images], str] = lambda sequence, images: ""
+    """Why a sequence cannot be written, with a remedy; empty where it can."""
+
+
+class View(NamedTuple):
+    """One image of a sequence."""
+
+    side: Side
+    frame: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.side}_{self.frame:04d}.png"
+
+
+def views_in_time(sequence: Sequence) -> list[View]:
+    """Left 0, right 0, left 1, and so on."""
+    return [View(side, frame) for frame in range(sequence.frames) for side in SIDES]
+
+
+def first_pose(sequence: Sequence, view: View) -> Pose:
+    """``cam_from_world`` (3, 3), (3,) of the line that is read first: that of the global-shutter twin."""
+    start = sequence.shutter.start(view.frame, view.side)
+    return sequence.rig.cam_from_world(sequence.motion, start, view.side)
+
+
+def line_poses(sequence: Sequence, view: View) -> Pose:
+    """``cam_from_world`` (lines, 3, 3), (lines, 3) in the order of the image."""
+    return row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
+
+
+def first_second(sequence: Sequence, view: View) -> float:
+    """When the line that is read first is read, s; 0 is row 0 of frame 0."""
+    return sequence.frame_period_s * float(sequence.shutter.start(view.frame, view.side))
+
+
+def camera_velocity(sequence: Sequence, side: Side, tau: float) -> tuple[FloatArray, FloatArray]:
+    """Linear and angular velocity (3,) of a camera in its own axes, m/s and rad/s, at a time in frame periods.
+
+    A point of the world is at x = R X + t in the camera and R' = [w]x R, so it moves by w x (x - t) + t', which is
+    -(v + a x x) of a camera that moves by v and turns by a: a = -w, v = w x t - t'.
+    """
+    w, rate = sequence.motion.velocity(tau)
+    t = sequence.rig.cam_from_world(sequence.motion, tau, side).t
+    return (so3.cross(w, t) - rate) / sequence.frame_period_s, -w / sequence.frame_period_s
+
+
+def matrix(pose: Pose) -> FloatArray:
+    """Homogeneous (..., 4, 4) of a transform."""
+    out = np.zeros((*pose.t.shape[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = pose.R, pose.t, 1.0
+    return out
+
+
+def world_from_camera(pose: Pose) -> FloatArray:
+    """Homogeneous (..., 4, 4) of the inverse of ``cam_from_world``."""
+    return matrix(inverse(pose))
+
+
+def corner_matrix(camera: PinholeCamera) -> FloatArray:
+    """Calibration matrix (3, 3), lens apart, of pixels whose (0, 0) is the corner of the image."""
+    K = camera.ideal.K
+    K[:2, 2] += CORNER_PX
+    return K
+
+
+def copy_image(sequence: Sequence, view: View, images: Images, path: Path) -> None:
+    """The PNG of a view, byte for byte."""
+    source = inside(sequence.folder, picture_file(images, view.side, view.frame + sequence.first))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, read_bytes(source))
+
+
+def number(value: float) -> str:
+    """A decimal number that reads back as it was, with a point: YAML 1.1 takes 1e-05 for a word."""
+    text = repr(float(value))
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+def numbers(values: object) -> str:
+    """Decimal numbers with blanks between, row by row."""
+    return " ".join(number(value) for value in np.ravel(np.asarray(values, dtype=np.float64)))
+
+
+def write_lines(path: Path, lines: list[str]) -> None:
+    """Text in UTF-8, each line with its end."""
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
+
+
+def reads_from_top(sequence: Sequence) -> bool:
+    """Whether both cameras read their rows from the top."""
+    return {sequence.shutter.scan_of(side) for side in SIDES} == {"top"}
+
+
+def about_moving_objects(sequence: Sequence) -> list[str]:
+    """A sentence about moving objects, for formats of a static world."""
+    if not sequence.moving:
+        return []
+    count = len(sequence.moving)
+    return [f"{count} object{'s' if count > 1 else ''} move in the images; the format knows a still world alone"]
+
+
+_POINTS = 50_000
+"""Of a sequence, nearly."""
+_MOST_OF_AN_IMAGE = 2_000
+_AROUND = 4
+"""Frames before and after its own in which a point is looked for."""
+_SAME = 2e-3
+"""Share by which the depth of a point may differ from that of the surface that is seen there."""
+
+
+class Points(NamedTuple):
+    """Points (n) of the surfaces of one image."""
+
+    world: FloatArray
+    """(n, 3) m, in the world of the sequence."""
+    pixels: NDArray[np.int64]
+    """(n, 2) x, y."""
+    colours: NDArray[np.uint8]
+    """(n, 3) sRGB."""
+
+
+class Observations(NamedTuple):
+    """Which points of a list an image sees, and where."""
+
+    index: NDArray[np.int64]
+    """(m,)"""
+    pixels: FloatArray
+    """(m, 2) exact, not whole."""
+
+
+class Surfaces(NamedTuple):
+    """Points of all images of a sequence, each seen by two at least."""
+
+    world: FloatArray
+    """(n, 3)"""
+    colours: NDArray[np.uint8]
+    """(n, 3)"""
+    seen: dict[View, Observations]
+    """Indices into the points."""
+
+
+def world_points(sequence: Sequence, view: View, images: Images, step: int) -> Points:
+    """Points at the centres of every ``step``-th pixel in both directions, of what stands still and has depth."""
+    depth = sequence.depth(images, view.side, view.frame)
+    still = (depth > 0) & (numbers_of(sequence.labels(images, view.side, view.frame)) == 0)
+    grid = np.zeros_like(still)
+    grid[step // 2 :: step, step // 2 :: step] = True
+    y, x = np.nonzero(still & grid)
+    pixels = np.stack([x, y], axis=-1)
+    colours = sequence.image(images, view.side, view.frame)[y, x]
+    x_in_cam = depth[y, x, None].astype(np.float64) * sequence.rig.camera.unproject(pixels)
+    return Points(transform(inverse(pixel_poses(sequence, view, images, pixels)), x_in_cam), pixels, colours)
+
+
+def pixel_poses(sequence: Sequence, view: View, images: Images, pixels: NDArray[np.int64]) -> Pose:
+    """``cam_from_world`` (n, 3, 3), (n, 3) at which an image sees whole pixels (n, 2)."""
+    if images == "gs":
+        still = first_pose(sequence, view)
+        return Pose(*(np.broadcast_to(part, (len(pixels), *part.shape)) for part in still))
+    lines = pixels[:, sequence.shutter.axis(view.side)]
+    return Pose(*(part[lines] for part in line_poses(sequence, view)))
+
+
+def observe(sequence: Sequence, view: View, images: Images, world: FloatArray) -> Observations:
+    """Points (n, 3) that an image sees: inside it, not seen twice, and not behind what its depth shows."""
+    rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
+    if images == "gs":
+        start = shutter.start(view.frame, view.side)
+        found = project_at(rig, motion, view.side, start, world)
+        pixels, z = found[:, :2], found[:, 2]
+        once = rig.camera.contains(np.nan_to_num(pixels, nan=-np.inf))
+    else:
+        rolling = rs_project(rig, shutter, motion, view.side, view.frame, world)
+        pixels, z, once = rolling.pixels, rolling.depth, rolling.status == ProjectionStatus.SEEN
+    index = np.flatnonzero(once)
+    depth = sequence.depth(images, view.side, view.frame)
+    index = index[_on_surface(depth, pixels[index], z[index])]
+    return Observations(index, pixels[index])
+
+
+def _on_surface(depth: NDArray[np.float32], pixels: FloatArray, z: FloatArray) -> NDArray[np.bool_]:
+    """Whether a map (H, W) shows points at depths (n) at pixels (n, 2); on a plane 1 / z is linear."""
+    height, width = depth.shape
+    if min(height, width) < 2:
+        return np.zeros(len(z), dtype=np.bool_)
+    x0 = np.clip(np.floor(pixels[:, 0]), 0, width - 2).astype(np.int64)
+    y0 = np.clip(np.floor(pixels[:, 1]), 0, height - 2).astype(np.int64)
+    corners = np.stack([depth[y0 + j, x0 + i] for j in (0, 1) for i in (0, 1)], axis=-1).astype(np.float64)
+    known = np.all(corners > 0, axis=-1)
+    near = 1.0 / np.where(corners > 0, corners, 1.0)
+    u, v = pixels[:, 0] - x0, pixels[:, 1] - y0
+    upper = near[:, 0] + u * (near[:, 1] - near[:, 0])
+    lower = near[:, 2] + u * (near[:, 3] - near[:, 2])
+    return known & (np.abs(z * (upper + v * (lower - upper)) - 1.0) < _SAME)
+
+
+def surfaces(sequence: Sequence, images: Images) -> Surfaces:
+    """Points of the depth of every image, and every image near in time that sees them."""
+    views = views_in_time(sequence)
+    camera = sequence.rig.camera
+    wanted = min(_MOST_OF_AN_IMAGE, max(_POINTS // len(views), 1))
+    step = max(math.ceil(math.sqrt(camera.width * camera.height / wanted)), 1)
+    worlds, colours, origins = list[FloatArray](), list[NDArray[np.uint8]](), list[NDArray[np.int64]]()
+    for number, view in enumerate(views):
+        points = world_points(sequence, view, images, step)
+        worlds.append(points.world)
+        colours.append(points.colours)
+        origins.append(np.full(len(points.world), number, dtype=np.int64))
+    world, origin = np.concatenate(worlds), np.concatenate(origins)
+    frames = np.array([view.frame for view in views])[origin]
+    seen = dict[View, Observations]()
+    for view in views:
+        near = np.flatnonzero(np.abs(frames - view.frame) <= _AROUND)
+        found = observe(sequence, view, images, world[near])
+        seen[view] = Observations(near[found.index], found.pixels)
+    return _seen_twice(Surfaces(world, np.concatenate(colours), seen))
+
+
+def _seen_twice(found: Surfaces) -> Surfaces:
+    """Without the points that fewer than two images see."""
+    counts = np.zeros(len(found.world), dtype=np.int64)
+    for each in found.seen.values():
+        np.add.at(counts, each.index, 1)
+    keep = counts >= 2
+    place = np.cumsum(keep) - 1
+    seen = {
+        view: Observations(place[each.index[keep[each.index]]], each.pixels[keep[each.index]])
+        for view, each in found.seen.items()
+    }
+    return Surfaces(found.world[keep], found.colours[keep], seen)
+
+
+Law = Callable[[View, Points], FloatArray]
+"""Pixels (n, 2), in our convention, at which a format says that the lines of ``points.pixels`` see the points."""
+_TRIED = 5_000
+"""Pixels of each image."""
+
+
+def largest_row_error(sequence: Sequence, views: list[View], law: Law) -> float:
+    """The largest distance, px, between where frames see points of their depth, and where a format's law has them.
+
+    Each point is moved by the law's pose of the line that truly saw it. 0 where no image has depth.
+    """
+    camera = sequence.rig.camera
+    step = max(math.ceil(math.sqrt(camera.width * camera.height / _TRIED)), 1)
+    worst = 0.0
+    for view in views:
+        points = world_points(sequence, view, "rs", step)
+        away = np.linalg.norm(law(view, points) - points.pixels, axis=-1)
+        if len(away):  # NaN: behind the camera of the law, which is far off
+            worst = max(worst, float(np.max(np.nan_to_num(away, nan=math.inf))))
+    return worst
+
+
+def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> Note:
+    """The largest row-motion error of a law and, where it is not exact, a sentence.
+
+    1e-6 px is the accuracy to which our own numbers read back.
+    """
+    error = largest_row_error(sequence, views, law)
+    sentence = f"the format's motion of the rows ({name}) is up to {error:.2g} px from the true one"
+    return [] if error < 1e-6 else [sentence], {"largest_row_error_px": error}
+
+
+def seen_by(sequence: Sequence, poses: Pose, world: FloatArray) -> FloatArray:
+    """Pixels (n, 2) of world points (n, 3) from poses ``cam_from_world`` (n, 3, 3), (n, 3)."""
+    return sequence.rig.camera.project(transform(poses, world))
+
+
+def lines_of(sequence: Sequence, view: View, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many lines were read before those of pixels (n, 2)."""
+    shutter = sequence.shutter
+    lines = pixels[:, shutter.axis(view.side)]
+    return np.abs(lines - shutter.first_line(view.side))
