@@ -37,9 +37,7 @@ from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.solvers.engine.line_errors import usable_lines
-from rsbench.solvers.line_triplets import Features, LineTripletSolver
-from rsbench.solvers.triplets import PATTERNS, newton
+from rsbench.solvers.triplets import PATTERNS, Features, LineTripletSolver, newton, usable_lines
 from rsbench.vision.features import match_stereo_frames
 from rsbench.vision.lines import match_lines
 

@@ -20,10 +20,9 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
-from rsbench.core.moving_objects import MovingObject, poses_of
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.geometry import MovingObject, poses_of
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.backend import start_backend

@@ -33,7 +33,7 @@ from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import SIDES, VIEWS
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.vision.feature_matcher import find_correspondences, load_features
 

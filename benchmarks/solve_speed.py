@@ -25,11 +25,10 @@ from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.five_point import five_point
-from rsbench.solvers.engine.minimal import solve_triples
-from rsbench.solvers.engine.packed import pack, pack_pairs
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
+from rsbench.solvers.engine.packed import pack, pack_pairs, solve_triples
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.refined import five_point
 
 CAMERA = PinholeCamera.centred(900, 900, 810.0)
 RIG = StereoRig(camera=CAMERA, baseline=0.6)

@@ -59,10 +59,9 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.base import BESIDE, MotionEstimate
-from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
+from rsbench.solvers.engine.base import BESIDE, MotionEstimate, list_solvers, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import write_json, write_table
 
 FOLDER = Path(__file__).parents[1] / "results/solvers"

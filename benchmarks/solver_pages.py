@@ -20,8 +20,7 @@ import pandas as pd
 
 from rsbench.benchmark.statistics import share_interval
 from rsbench.components.cards import list_cards
-from rsbench.solvers.engine.base import BESIDE
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.base import BESIDE, SolverEntry, load_solver_entry
 from rsbench.storage.files import write_bytes
 
 ROOT = Path(__file__).parents[1]

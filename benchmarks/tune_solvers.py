@@ -38,10 +38,9 @@ from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.statistics import COVERAGE, RESAMPLES, average_interval
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import Solver, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import write_json, write_table
 
 SEED = 7

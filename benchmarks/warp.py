@@ -16,9 +16,9 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import GivenGeometry
-from rsbench.core.motion import LinearMotion
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.correction import correct_frame
@@ -46,7 +46,7 @@ def depth_map(size: int) -> np.ndarray:
     return depth.astype(np.float32)
 
 
-def wall(size: int) -> tuple[np.ndarray, GivenGeometry, np.ndarray]:
+def wall(size: int) -> tuple[np.ndarray, FixedGeometry, np.ndarray]:
     """Depth, moving camera and colours (size, size, 3) float32 of the scene."""
     camera = PinholeCamera.centred(size, size, 1384.6 * size / 900)
     rig = StereoRig(camera=camera, baseline=0.5)
@@ -54,7 +54,7 @@ def wall(size: int) -> tuple[np.ndarray, GivenGeometry, np.ndarray]:
     w, d = np.deg2rad(0.4) * np.array([0.6, 1.0, -0.5]), 0.3 * np.array([0.6, -0.4, 0.7])
     motion = LinearMotion(w / np.linalg.norm([0.6, 1.0, -0.5]), d / np.linalg.norm([0.6, -0.4, 0.7]))
     colour = np.random.default_rng(0).random((size, size, 3), dtype=np.float32)
-    return depth_map(size), GivenGeometry(rig, shutter, motion), colour
+    return depth_map(size), FixedGeometry(rig, shutter, motion), colour
 
 
 def both(size: int) -> tuple[Callable[[], object], Callable[[], object]]:

@@ -20,7 +20,7 @@ from foreign_world import read_photographs
 
 from rsbench.capture.calibration import CardSigma
 from rsbench.capture.self_calibration import FoundCamera
-from rsbench.core.lens import Lens
+from rsbench.core.camera import Lens
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame, read_rig_card

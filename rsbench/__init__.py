@@ -25,15 +25,14 @@ if TYPE_CHECKING:
         stereo_depth,
         verify,
     )
+    from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.correspondences import Correspondences
     from rsbench.core.errors import RsbenchError
-    from rsbench.core.motion import AcceleratedMotion, LinearMotion, TwistMotion
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.core.spline_motion import SplineMotion
-    from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
-    from rsbench.solvers.engine.registry import list_solvers, load_solver
+    from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec, list_solvers, load_solver
 
 __all__ = [
     "AcceleratedMotion",
@@ -65,9 +64,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AcceleratedMotion": "rsbench.core.motion",
+    "AcceleratedMotion": "rsbench.components.motion_models",
     "Correspondences": "rsbench.core.correspondences",
-    "LinearMotion": "rsbench.core.motion",
+    "LinearMotion": "rsbench.components.motion_models",
     "MotionEstimate": "rsbench.solvers.engine.base",
     "PinholeCamera": "rsbench.core.camera",
     "RollingShutter": "rsbench.core.shutter",
@@ -76,9 +75,9 @@ _HOMES = {
     "SolverSpec": "rsbench.solvers.engine.base",
     "SplineMotion": "rsbench.core.spline_motion",
     "StereoRig": "rsbench.core.rig",
-    "TwistMotion": "rsbench.core.motion",
-    "list_solvers": "rsbench.solvers.engine.registry",
-    "load_solver": "rsbench.solvers.engine.registry",
+    "TwistMotion": "rsbench.components.motion_models",
+    "list_solvers": "rsbench.solvers.engine.base",
+    "load_solver": "rsbench.solvers.engine.base",
 }
 """Modules of the names that ``rsbench.api`` does not define itself."""
 

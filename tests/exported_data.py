@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from analytic_dataset import write_analytic_dataset
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

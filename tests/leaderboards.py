@@ -14,8 +14,8 @@ from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.submissions import truth_text
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from programs import ROOT
 from scipy.optimize import brentq
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import AcceleratedMotion, InertialMotion, LinearMotion, Motion, TwistMotion
+from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.footage import read_rig_card

@@ -19,13 +19,13 @@ import rsbench
 from rsbench.benchmark.simulated.contract import CHECKS, check_solver
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.cards import CardKind, list_cards, read_toml
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import load_dataset_card
-from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
+from rsbench.solvers.engine.base import list_solvers, load_solver_entry
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -174,7 +174,7 @@ def test_a_solver_is_taken_by_name_by_card_and_as_it_is(tmp_path: Path) -> None:
     data = rsbench.simulate(RIG, SHUTTER, MOTION, pairs=40, tracks=0, noise_px=0.1)
     assert "gs-8pt" in rsbench.list_solvers()
     card = tmp_path / "mine.toml"
-    card.write_text('class = "rsbench.solvers.eight_point:EightPointSolver"\n')
+    card.write_text('class = "rsbench.solvers.essential_matrix:EightPointSolver"\n')
     solver = rsbench.load_solver("gs-8pt")
     assert_type(solver, rsbench.Solver)
     answers = [

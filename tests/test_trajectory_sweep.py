@@ -34,7 +34,7 @@ def test_points_are_seen_where_their_rows_are_read(program: ModuleType) -> None:
 
 def test_the_truth_errs_by_nothing_and_a_still_rig_by_the_motion(program: ModuleType) -> None:
     from rsbench.benchmark.trajectory_methods import along
-    from rsbench.core.motion import LinearMotion
+    from rsbench.components.motion_models import LinearMotion
 
     setting = program.Setting(shake=0.0)
     law = program.hand(setting, np.random.default_rng(1))

@@ -11,7 +11,7 @@ import programs
 import pytest
 
 from rsbench.benchmark.leaderboard.track import PUBLIC_SEED
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "results/tuning"

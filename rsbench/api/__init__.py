@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rsbench.api.correcting import correct as correct
 from rsbench.api.estimating import estimate_trajectory as estimate_trajectory
-from rsbench.components import arguments
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.geometry import check_image, check_motion, check_moving_rig, check_rows, check_view, four_images
 from rsbench.core.motion import Motion
 from rsbench.core.projection import RSProjection, rs_project
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -53,8 +53,8 @@ def project(
         ``pixels`` (..., 2), ``depth`` (...) z in the camera of that row, ``tau`` (...) its time, ``status`` (...):
         0 seen, 1 never seen, 2 seen twice (the first is given), 3 not converged. NaN where nothing was seen.
     """
-    arguments.check_view(side, frame)
-    arguments.check_moving_rig(rig, shutter, motion)
+    check_view(side, frame)
+    check_moving_rig(rig, shutter, motion)
     return rs_project(rig, shutter, motion, side, frame, arguments.world_points(points))
 
 
@@ -95,8 +95,8 @@ def simulate(
     options = SimulationOptions(
         pairs=pairs, tracks=tracks, noise_px=noise_px, outlier_ratio=outlier_ratio, depth=depth, shape=shape
     )
-    arguments.check_moving_rig(rig, shutter, motion)
-    given.check_whole("seed", seed, 0)
+    check_moving_rig(rig, shutter, motion)
+    arguments.check_whole("seed", seed, 0)
     return simulate_points(rig, shutter, motion, options, np.random.default_rng(seed))
 
 
@@ -130,15 +130,15 @@ def estimate_motion(
         ValueError: an argument of another type or out of its range.
     """
     from rsbench.api.estimating import under_model
-    from rsbench.solvers.engine.registry import entry_of
+    from rsbench.solvers.engine.base import entry_of
     from rsbench.solvers.engine.robust_motion import RobustOptions
     from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
 
-    given.check_type("correspondences", correspondences, Correspondences)
+    arguments.check_type("correspondences", correspondences, Correspondences)
     if motion_model is not None:
         arguments.name_or_path("motion_model", motion_model)
-    arguments.check_rows(rig, shutter)
-    given.check_whole("seed", seed, 0)
+    check_rows(rig, shutter)
+    arguments.check_whole("seed", seed, 0)
     options = RobustOptions()
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
@@ -178,8 +178,8 @@ def pose_errors(
 
     if not isinstance(found, RobustEstimate | MotionEstimate):
         raise ValueError(f"found: must be what estimate_motion returned or a MotionEstimate, got {type(found)}")
-    arguments.check_motion(rig, motion)
-    given.check_one_of("reference_point", reference_point, ("body", "left", None))
+    check_motion(rig, motion)
+    arguments.check_one_of("reference_point", reference_point, ("body", "left", None))
     estimate = found if isinstance(found, MotionEstimate) else found.estimate
     point = "body" if isinstance(found, MotionEstimate) else found.reference_point
     errors = scoring.pose_errors(
@@ -211,7 +211,7 @@ def match(images: Series[Image], *, features: str | Path = "sift-refined") -> Co
     from rsbench.vision.feature_matcher import load_features
 
     return find_matches(
-        arguments.four_images(images),
+        four_images(images),
         CorrectionOptions(features=load_features(arguments.name_or_path("features", features))),
     )
 
@@ -229,9 +229,9 @@ def stereo_depth(
     """
     from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 
-    given.check_one_of("side", side, SIDES)
-    given.check_type("rig", rig, StereoRig)
-    left, right = arguments.check_image("left", left, rig), arguments.check_image("right", right, rig)
+    arguments.check_one_of("side", side, SIDES)
+    arguments.check_type("rig", rig, StereoRig)
+    left, right = check_image("left", left, rig), check_image("right", right, rig)
     disparity = find_disparities(load_matcher(arguments.name_or_path("matcher", matcher)), left, right, rig)[
         SIDES.index(side)
     ]
@@ -264,7 +264,7 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
 
-    given.check_whole("workers", workers, 1)
+    arguments.check_whole("workers", workers, 1)
     place = arguments.path("out", out)
     dataset = load_dataset_card(arguments.name_or_path("card", card))
     if sequences is not None:
@@ -330,8 +330,8 @@ def evaluate(
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.benchmark.images.score import TABLES
 
-    given.check_whole("seeds", seeds, 1, 1_000_000)
-    given.check_whole("seed", seed, 0)
+    arguments.check_whole("seeds", seeds, 1, 1_000_000)
+    arguments.check_whole("seed", seed, 0)
     options = EvaluationOptions(
         solvers=arguments.names("solvers", solvers),
         correction_solver=str(arguments.name_or_path("correct_with", correct_with)),

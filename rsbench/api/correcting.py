@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 
@@ -98,7 +98,7 @@ def correct(
     """
     from rsbench.pipeline import array_correction
 
-    given.check_one_of("inpaint", inpaint, (None, True, False))
+    arguments.check_one_of("inpaint", inpaint, (None, True, False))
     if (rig is None) == (camera is None):
         raise ValueError("rig: give a StereoRig, or camera = a PinholeCamera, degrees or 'unknown'; one of both")
     if rig is None:
@@ -116,5 +116,5 @@ def _check_own(*components: object) -> None:
     for name, value, default in zip(names, components, _COMPONENTS, strict=True):
         if not isinstance(value, str | Path | None) or value != default:
             raise ValueError(
-                f"{name} = {given.shown(value)}: is chosen for a stereo rig; leave it out with camera"
+                f"{name} = {arguments.shown(value)}: is chosen for a stereo rig; leave it out with camera"
             )

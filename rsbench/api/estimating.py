@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.components import arguments
-from rsbench.core import given
-from rsbench.core.correspondences import Correspondences
+from rsbench.core import arguments
+from rsbench.core.correspondences import Correspondences, gyro_samples
+from rsbench.core.geometry import check_rows
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 
 if TYPE_CHECKING:
     from rsbench.capture.trajectory_estimate import Trajectory
-    from rsbench.solvers.engine.registry import SolverEntry
+    from rsbench.solvers.engine.base import SolverEntry
     from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
 
 
@@ -56,11 +56,11 @@ def estimate_trajectory(
     """
     from rsbench.pipeline.array_trajectory import matches_of, trajectory_of
 
-    given.check_whole("seed", seed, 0)
-    given.check_type("rig", rig, StereoRig)
+    arguments.check_whole("seed", seed, 0)
+    arguments.check_type("rig", rig, StereoRig)
     if shutter is not None:
-        arguments.check_rows(rig, shutter)
-    samples = arguments.gyro_samples(gyro)
+        check_rows(rig, shutter)
+    samples = gyro_samples(gyro)
     windows = [each for each in arguments.items("sequence", sequence) if isinstance(each, Correspondences)]
     if len(windows) != len(sequence):
         windows = matches_of(sequence, rig, str(arguments.name_or_path("features", features)))

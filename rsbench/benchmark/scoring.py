@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rsbench.benchmark.metric_plugins import METRICS, Case, MetricEntry
 from rsbench.components import plugins
+from rsbench.core.arguments import LARGEST
 from rsbench.core.errors import RsbenchError
-from rsbench.core.given import LARGEST
 from rsbench.core.pose_errors import (
     WORST_ANGLE,
     WORST_SCALE,

@@ -13,10 +13,11 @@ from rsbench.capture.calibration import NO_ERRORS
 from rsbench.capture.model_choice import AUTO
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import estimate_trajectory
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
-from rsbench.core.gyro_motion import GyroMotion
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.correspondences import Correspondences, stereo_points, with_depth
+from rsbench.core.imu import GyroMotion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
@@ -24,7 +25,6 @@ from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_motion
 from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
-from rsbench.solvers.engine.stereo_points import stereo_points, with_depth
 
 _INLIER_PX, _FEWEST, _DRAWS = 1.5, 6, 1000
 """Of P3P in RANSAC: threshold, fewest inliers, and samples."""

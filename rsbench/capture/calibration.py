@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.camera import Lens, inverse_2x2
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens, inverse_2x2
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match

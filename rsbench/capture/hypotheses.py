@@ -15,16 +15,14 @@ from typing import Literal, get_args
 import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS, STRETCHING, TERMS, ray_shifts, ray_stretches
+from rsbench.components.motion_kernels import MotionKernel
+from rsbench.components.motion_models import AcceleratedKernel, any_law, load_kernel
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.any_law import any_law
-from rsbench.solvers.engine.capture_terms import add_pairs, add_tracks
-from rsbench.solvers.engine.heavy_tails import HeavyTailed
-from rsbench.solvers.engine.kernel_type import MotionKernel, load_kernel
-from rsbench.solvers.engine.motion_kernels import AcceleratedKernel
-from rsbench.solvers.engine.packed import Packed, pack
+from rsbench.solvers.engine.packed import HeavyTailed, Packed, pack
+from rsbench.solvers.engine.residuals import add_pairs, add_tracks
 
 Start = Literal["global", "top", "bottom", "left", "right"]
 """The side of the image at which a camera begins to read, or ``global`` for all lines at once."""

@@ -40,8 +40,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, without_len
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.heavy_tails import heavy_tailed
-from rsbench.solvers.engine.per_measurement import each_term
+from rsbench.solvers.engine.packed import each_term, heavy_tailed
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 

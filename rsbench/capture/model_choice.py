@@ -11,10 +11,9 @@ import numpy as np
 from rsbench.capture.hypotheses import ACCELERATION
 from rsbench.capture.hypothesis_ranking import Peak
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture
-from rsbench.components.motion_models import make_motion
+from rsbench.components.motion_models import load_kernel, make_motion
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.kernel_type import load_kernel
 
 AUTO = "auto"
 

@@ -20,9 +20,8 @@ from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, RADIAL, CardSi
 from rsbench.capture.hypotheses import Known, Scans, scans_of
 from rsbench.capture.shutter_decision import as_global, examine_alone, known_of
 from rsbench.capture.two_frame_estimate import CERTAIN, Window, conclude, examine
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
-from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray

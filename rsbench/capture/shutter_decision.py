@@ -27,10 +27,11 @@ from rsbench.capture.two_frame_estimate import (
     examine,
     nearly_global,
 )
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray

@@ -58,9 +58,10 @@ from rsbench.capture.trajectory_tracks import (
     observed,
     thinned,
 )
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
@@ -259,7 +260,7 @@ def information(
     Raises:
         NotDefiniteError: they do not determine the spline.
     """
-    # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``heavy_tails``.
+    # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
     expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     silent = prior or Prior(1.0, 1, np.inf, np.inf)
     each = replace(tracks, share=share)

@@ -34,13 +34,13 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.components.compiled import compiled
+from rsbench.components.motion_kernels import Vector, apply, coefficients, dot, fill_rotation, plus, times
 from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.vectors import Vector, apply, coefficients, dot, fill_rotation, plus, times
 
 
 class NotDefiniteError(ValueError):

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from rsbench.capture.trajectory_gyro import GyroSteps
 from rsbench.capture.trajectory_spline import Curve, Views, blank_views, fill_view
 from rsbench.components.compiled import compiled
+from rsbench.components.motion_kernels import Vector, apply, apply_transposed, cross, plus, times
 from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.vectors import Vector, apply, apply_transposed, cross, plus, times
 
 BEHIND = 1e12
 """Squared error, px^2, of a track whose point lies behind a camera."""

@@ -26,11 +26,10 @@ from rsbench.capture.hypothesis_ranking import (
     window_evidence,
     without_leaps,
 )
-from rsbench.core.correspondences import Correspondences, temporal_pairs
+from rsbench.core.correspondences import Correspondences, join_stereo, temporal_pairs
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.so3 import FloatArray
-from rsbench.core.track_building import join_stereo
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CERTAIN = 0.95

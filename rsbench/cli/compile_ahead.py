@@ -62,8 +62,8 @@ def parts() -> list[Callable[[], object]]:
     """What compiles the spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
     from rsbench.capture.two_frame_spline import shaken_motion
+    from rsbench.components.motion_models import LinearMotion
     from rsbench.core.camera import PinholeCamera
-    from rsbench.core.motion import LinearMotion
     from rsbench.core.rig import FRAMES, StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.chain import correct_frames, find_depth

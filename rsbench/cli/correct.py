@@ -112,7 +112,7 @@ def _options(
 
     from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.frame_motion import model_to_use
-    from rsbench.solvers.engine.registry import load_solver_entry
+    from rsbench.solvers.engine.base import load_solver_entry
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher
 

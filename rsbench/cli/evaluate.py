@@ -194,7 +194,7 @@ _ON_REQUEST = (
 
 def every_solver() -> list[str]:
     """Names of those that come with rsbench or are installed, each solver once, but those to be asked for."""
-    from rsbench.solvers.engine.registry import list_solvers
+    from rsbench.solvers.engine.base import list_solvers
 
     return [name for name in list_solvers() if name not in _ON_REQUEST]
 

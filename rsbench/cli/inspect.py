@@ -77,7 +77,7 @@ def inspect(
     """Estimate scan direction, readout ratio and delay of each camera from matches, where they tell it."""
     from rsbench.capture.hypotheses import MODELS
     from rsbench.capture.two_frame_estimate import conclude
-    from rsbench.solvers.engine.kernel_type import load_kernel
+    from rsbench.components.motion_models import load_kernel
 
     options = _Options(tuple(motion_model or MODELS), windows, features, seed)
     for model in options.models:

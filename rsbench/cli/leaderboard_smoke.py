@@ -180,8 +180,7 @@ def _compare(stored: Path, found: dict[str, Any], known: dict[str, Any], frames:
 def own_solvers() -> list[str]:
     """Names of the solvers that come with rsbench and need no more than ``points`` gives, each once."""
     from rsbench.components.plugins import offers
-    from rsbench.solvers.engine.base import BESIDE
-    from rsbench.solvers.engine.registry import SOLVERS, load_solver_entry
+    from rsbench.solvers.engine.base import BESIDE, SOLVERS, load_solver_entry
 
     own = [offer.name for offer in offers(SOLVERS) if offer.origin == "rsbench"]
     return [name for name in own if not BESIDE.keys() & load_solver_entry(name).solver.spec.minimum]

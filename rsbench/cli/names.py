@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rsbench.components.plugins import Kind, Offer
 
 COMPONENTS = {
-    "solvers": "rsbench.solvers.engine.registry:SOLVERS",
+    "solvers": "rsbench.solvers.engine.base:SOLVERS",
     "builders": "rsbench.scenes.load:BUILDERS",
     "motions": "rsbench.components.motion_models:MOTIONS",
     "matchers": "rsbench.vision.stereo_matcher:STEREO_MATCHERS",

@@ -122,7 +122,7 @@ def check_solver(
 
     from rsbench.benchmark.simulated.contract import check_solver as find
     from rsbench.cli.console import print_table, say
-    from rsbench.solvers.engine.registry import load_solver_entry
+    from rsbench.solvers.engine.base import load_solver_entry
 
     entry = load_solver_entry(solver)
     findings = find(entry, time_limit_s=time_limit)

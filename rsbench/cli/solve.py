@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rsbench.pipeline.answer import Extra
-    from rsbench.solvers.engine.registry import SolverEntry
+    from rsbench.solvers.engine.base import SolverEntry
     from rsbench.solvers.engine.robust_motion import RobustOptions
 
 EPILOG = """[bold]Examples[/bold]
@@ -74,7 +74,7 @@ def solve(
         return
     if not problems:
         raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
-    from rsbench.solvers.engine.registry import load_solver_entries
+    from rsbench.solvers.engine.base import load_solver_entries
 
     wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
     entries = load_solver_entries(solver or ["rs-stereo-refined"])

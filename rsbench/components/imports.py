@@ -33,7 +33,7 @@ from rsbench.core.errors import RsbenchError
 
 _NUMERIC_ROOMS = ("core", "solvers", "vision", "capture", "pipeline")
 """Packages whose source decides what a component of ours answers."""
-_NUMERIC_FILES = ("components/compiled.py", "components/motion_models.py")
+_NUMERIC_FILES = ("components/compiled.py", "components/motion_kernels.py", "components/motion_models.py")
 """Modules outside these packages of which that is true too."""
 
 
@@ -193,6 +193,23 @@ _threads: list[threading.Thread] = []
 """Those that others' code started."""
 _folders: list[str] = []
 """Folders of cards on ``sys.path``, the last used first."""
+_RENAMED = {
+    "rsbench.solvers.affine_parameters": "rsbench.solvers.free_velocities",
+    "rsbench.solvers.dai": "rsbench.solvers.free_velocities",
+    "rsbench.solvers.eight_point": "rsbench.solvers.essential_matrix",
+    "rsbench.solvers.gyro": "rsbench.solvers.gyro_and_gravity",
+    "rsbench.solvers.iterated": "rsbench.solvers.linear",
+    "rsbench.solvers.line_triplets": "rsbench.solvers.triplets",
+    "rsbench.solvers.opencv_five_point": "rsbench.solvers.essential_matrix",
+    "rsbench.solvers.p3p": "rsbench.solvers.poselib",
+    "rsbench.solvers.poselib_mono": "rsbench.solvers.poselib",
+    "rsbench.solvers.poselib_pnp": "rsbench.solvers.poselib",
+    "rsbench.solvers.poselib_stereo": "rsbench.solvers.poselib",
+    "rsbench.solvers.scaled": "rsbench.solvers.zhuang",
+    "rsbench.solvers.twelve_parameters": "rsbench.solvers.free_velocities",
+    "rsbench.solvers.upright": "rsbench.solvers.gyro_and_gravity",
+}
+"""Modules that users' cards may name and whose classes have moved: the module of each now."""
 
 
 @contextlib.contextmanager
@@ -223,6 +240,7 @@ def in_words(error: BaseException) -> str:
 def import_target(target: str, folder: Path | None, where: str) -> object:
     """What ``package.module:Class`` names; modules in a folder are found too."""
     module, _, name = target.partition(":")
+    module = _RENAMED.get(module, module)
     if not all(part.isidentifier() for part in [*module.split("."), name]):
         raise RsbenchError(f"{where}: must be 'package.module:Class'")
     with blaming(where, "cannot be imported"):

@@ -1,24 +1,48 @@
-"""Motion models by name: the one place that turns a name in a card, a file or a solver's spec into a class.
+"""Motion models: the table of their names, rsbench's own models and their kernels, and motions as JSON.
 
-A name is one of rsbench's own, an entry point of the group ``rsbench.motions``, or ``package.module:Class``.
+A name in a card, a file or a solver's spec is one of rsbench's own models (``MOTIONS.built_in``), an entry
+point of the group ``rsbench.motions``, or ``package.module:Class``. A model of rsbench's own is a class, a
+kernel (``motion_kernels.MotionKernel``) where solvers can assume it, and a row of the table, all of them here.
+Kernels and classes are the same motion: ``rsbench.core.epipolar.row_pair_pose`` of the class is what the kernel
+computes.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rsbench.components.cards import choices
+from rsbench.components.compiled import compiled
 from rsbench.components.imports import blaming, import_target
+from rsbench.components.motion_kernels import (
+    KERNELS,
+    MotionKernel,
+    Moved,
+    Vector,
+    apply,
+    coefficients,
+    cross,
+    dot,
+    fill_rotation,
+    kernel_for,
+    plus,
+    times,
+)
 from rsbench.components.plugins import Kind, NoOptions, list_names, load_class
-from rsbench.core import so3
+from rsbench.core import arguments, so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
 
 MOTIONS: Kind[Motion, NoOptions] = Kind(
     singular="motion model",
@@ -26,12 +50,12 @@ MOTIONS: Kind[Motion, NoOptions] = Kind(
     base=Motion,
     options=NoOptions,
     built_in={
-        "linear": "rsbench.core.motion:LinearMotion",
-        "twist": "rsbench.core.motion:TwistMotion",
-        "inertial": "rsbench.core.motion:InertialMotion",
-        "accelerated": "rsbench.core.motion:AcceleratedMotion",
+        "linear": "rsbench.components.motion_models:LinearMotion",
+        "twist": "rsbench.components.motion_models:TwistMotion",
+        "inertial": "rsbench.components.motion_models:InertialMotion",
+        "accelerated": "rsbench.components.motion_models:AcceleratedMotion",
         "spline": "rsbench.core.spline_motion:SplineMotion",
-        "trajectory": "rsbench.core.trajectory_motion:TrajectoryMotion",
+        "trajectory": "rsbench.core.spline_motion:TrajectoryMotion",
     },
 )
 _SAME = 1e-9
@@ -146,3 +170,474 @@ def _check_ends(motion: Motion, where: str) -> None:
     for time, wrong in ((0, "the identity"), (1, "(exp([w]x), d)")):
         if not max(float(np.max(np.abs(part[time]))) for part in missed) <= _SAME:
             raise RsbenchError(f"{where}: its pose at time {time} is not {wrong}")
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class LinearMotion(Motion):
+    """The paper's model, equations (2)-(5): R(tau) = exp(tau [w]x), t(tau) = tau d."""
+
+    name: ClassVar[str] = "linear"
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        return Pose(so3.exp(tau * self.w), tau * self.d)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        shape = (*np.shape(tau), 3)
+        return np.broadcast_to(self.w, shape), np.broadcast_to(self.d, shape)
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        shape = (*np.shape(tau), 3)
+        return np.zeros(shape), np.zeros(shape)
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.d))
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class TwistMotion(Motion):
+    """Constant body twist (a screw): the pose is exp(tau xi) with exp(xi) = (exp([w]x), d)."""
+
+    name: ClassVar[str] = "twist"
+
+    @cached_property
+    def v(self) -> FloatArray:
+        """Linear part (3,) of the twist, metres per frame period."""
+        return np.asarray(np.linalg.solve(so3.left_jacobian(self.w), self.d), dtype=np.float64)
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        return Pose(so3.exp(tau * self.w), tau * (so3.left_jacobian(tau * self.w) @ self.v))
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        R, _ = self.body_from_world(tau)
+        return np.broadcast_to(self.w, (*np.shape(tau), 3)), R @ self.v
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        w, speed = self.velocity(tau)
+        return np.zeros(speed.shape), so3.cross(w, speed)
+
+    def from_time(self, start: float) -> Motion:
+        return self  # a screw looks the same from everywhere on it
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.v))
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class InertialMotion(Motion):
+    """A body that nothing pushes: constant velocity in the world and constant rate of turn.
+
+    The body's centre is at tau c in the world, c = -R(1)^T d, so
+
+        R(tau) = exp(tau [w]x),  t(tau) = -tau R(tau) c = tau exp((tau - 1) [w]x) d.
+    """
+
+    name: ClassVar[str] = "inertial"
+
+    def _ahead(self, tau: FloatArray) -> FloatArray:
+        """-R(tau) c (..., 3): the world's velocity as seen from the body; tau (..., 1)."""
+        return so3.exp((tau - 1.0) * self.w) @ self.d
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        return Pose(so3.exp(tau * self.w), tau * self._ahead(tau))
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        ahead = self._ahead(tau)
+        return np.broadcast_to(self.w, ahead.shape), ahead + tau * so3.cross(self.w, ahead)
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        tau = np.asarray(tau, dtype=np.float64)[..., None]
+        turned = so3.cross(self.w, self._ahead(tau))
+        return np.zeros(turned.shape), 2.0 * turned + tau * so3.cross(self.w, turned)
+
+    def from_time(self, start: float) -> Motion:
+        return InertialMotion(self.w, so3.exp(start * self.w) @ self.d)
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        turn, speed = float(np.linalg.norm(self.w)), float(np.linalg.norm(self.d))
+        return turn, speed * (1.0 + max(abs(first), abs(last)) * turn)
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class AcceleratedMotion(Motion):
+    """Constant acceleration along the paper's path: R(tau) = exp(beta [w]x), t(tau) = beta d, with
+
+        beta(tau) = (tau + k tau^2 / 2) 2 / (2 + k),   so that beta(1) = 1.
+
+    B. Zhuang, L.-F. Cheong, G. H. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017,
+    for the differential model; here the displacement is that of the exact one.
+    """
+
+    name: ClassVar[str] = "accelerated"
+    acceleration: float = 0.2
+    """k, per frame period: the speed grows by k times its value at time 0 in each period; above -1/2, or the rig
+    would stop and turn back before time 2, when the last row of frame 1 is read at the latest."""
+
+    def __init__(self, w: ArrayLike, d: ArrayLike, acceleration: float = 0.2) -> None:
+        super().__init__(w, d)
+        arguments.check_number("acceleration", acceleration)
+        if not acceleration > -0.5:
+            raise ValueError(f"acceleration = {acceleration}: must be a number above -0.5")
+        object.__setattr__(self, "acceleration", float(acceleration))
+
+    def share(self, tau: ArrayLike) -> FloatArray:
+        """beta (...) of the displacement of one period, at times ``tau`` (...)."""
+        tau, k = np.asarray(tau, dtype=np.float64), self.acceleration
+        return np.asarray((tau + 0.5 * k * tau * tau) * (2.0 / (2.0 + k)))
+
+    def speed(self, tau: ArrayLike) -> FloatArray:
+        """Derivative (...) of ``share``."""
+        tau, k = np.asarray(tau, dtype=np.float64), self.acceleration
+        return np.asarray((1.0 + k * tau) * (2.0 / (2.0 + k)))
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        beta = self.share(tau)[..., None]
+        return Pose(so3.exp(beta * self.w), beta * self.d)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        speed = self.speed(tau)[..., None]
+        return speed * self.w, speed * self.d
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        k, shape = self.acceleration, (*np.shape(tau), 3)
+        change = 2.0 * k / (2.0 + k)
+        return np.broadcast_to(change * self.w, shape), np.broadcast_to(change * self.d, shape)
+
+    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
+        speed = float(np.max(np.abs(self.speed([first, last]))))
+        return speed * float(np.linalg.norm(self.w)), speed * float(np.linalg.norm(self.d))
+
+
+@compiled
+def rotate(w: Vector, a: float, R: FloatArray, A: FloatArray) -> None:
+    """Fill R = exp(a [w]x) (the paper's (2) and (3), Rodrigues) and A = a J(a w), so that dR = [A dw]x R."""
+    phi = times(a, w)
+    s = dot(phi, phi)
+    c0, c1, c2, _, _ = coefficients(s)
+    fill_rotation(phi, 1.0 - c1 * s, c0, c1, R)
+    fill_rotation(phi, a * (1.0 - c2 * s), a * c1, a * c2, A)
+
+
+@compiled(inline="always")  # else LLVM keeps the call, which costs a third of the residuals
+def linear_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """T = tau1 d - tau0 R d: the paper's (6) with R exact. NumPy: ``epipolar.row_pair_pose`` of LinearMotion."""
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    rotate(w, tau1 - tau0, R, A)
+    Rv = apply(R, v)
+    turn = cross(w, Rv)
+    T = plus(times(tau1, v), -tau0, Rv)
+    return T, plus(times(-1.0, Rv), tau0, turn), plus(v, -tau0, turn), times(-1.0, w), w
+
+
+@compiled
+def linear_translation_jacobian(
+    theta: FloatArray, tau0: float, R: FloatArray, A: FloatArray, tau1: float, T_w: FloatArray, T_v: FloatArray
+) -> None:
+    """dT/dw_j = -tau0 [A_j]x R d and dT/dd = tau1 I - tau0 R."""
+    Rv = apply(R, (theta[3], theta[4], theta[5]))
+    for j in range(3):
+        column = cross((A[0, j], A[1, j], A[2, j]), Rv)
+        for i in range(3):
+            T_w[i, j] = -tau0 * column[i]
+            T_v[i, j] = -tau0 * R[i, j]
+        T_v[j, j] += tau1
+
+
+@final
+@kernel_for(LinearMotion)
+@dataclass(frozen=True)
+class LinearKernel(MotionKernel):
+    """The paper's motion; v is d."""
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        return linear_move(theta, tau0, tau1, R, A)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        linear_translation_jacobian(theta, tau0, R, A, tau1, T_w, T_v)
+
+
+@compiled
+def turned(phi: Vector, v: Vector) -> Vector:
+    """exp([phi]x) v."""
+    c0, c1, _, _, _ = coefficients(dot(phi, phi))
+    once = cross(phi, v)
+    return plus(plus(v, c0, once), c1, cross(phi, once))
+
+
+@compiled
+def inertial_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """T = a exp(tau1 w) v, a = tau1 - tau0."""
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    a = tau1 - tau0
+    rotate(w, a, R, A)
+    ahead = turned(times(tau1, w), v)
+    back = times(-1.0, ahead)
+    return times(a, ahead), back, plus(ahead, a, cross(w, ahead)), times(-1.0, w), w
+
+
+@compiled
+def inertial_translation_jacobian(
+    theta: FloatArray, tau0: float, tau1: float, T_w: FloatArray, T_v: FloatArray
+) -> None:
+    """Of ``inertial_move``."""
+    a, phi = tau1 - tau0, times(tau1, (theta[0], theta[1], theta[2]))
+    ahead = turned(phi, (theta[3], theta[4], theta[5]))
+    _, c1, c2, _, _ = coefficients(dot(phi, phi))
+    for j in range(3):
+        e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        once = cross(phi, e)
+        spin = plus(plus(e, c1, once), c2, cross(phi, once))  # column j of J(phi)
+        by_w, by_v = cross(spin, ahead), turned(phi, e)
+        for i in range(3):
+            T_w[i, j] = a * tau1 * by_w[i]
+            T_v[i, j] = a * by_v[i]
+
+
+@final
+@kernel_for(InertialMotion)
+@dataclass(frozen=True)
+class InertialKernel(MotionKernel):
+    """Constant velocity in the world; v is that of the world in the body at time 0: T = a exp(tau1 w) v."""
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        return inertial_move(theta, tau0, tau1, R, A)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        inertial_translation_jacobian(theta, tau0, tau1, T_w, T_v)
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        return np.concatenate([w, so3.exp(-w) @ d], dtype=np.float64)
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return theta[:3], so3.exp(theta[:3]) @ theta[3:]
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        out, (w, d) = np.eye(6), self.motion(theta)
+        out[3:, :3] = -so3.hat(d) @ so3.left_jacobian(w)
+        out[3:, 3:] = so3.exp(w)
+        return out
+
+
+@compiled
+def beta(k: float, tau: float) -> tuple[float, float]:
+    """beta(tau) of a constant acceleration k (Zhuang et al., ICCV 2017), 1 at tau = 1, and its derivative."""
+    scale = 2.0 / (2.0 + k)
+    return scale * (tau + 0.5 * k * tau * tau), scale * (1.0 + k * tau)
+
+
+@compiled
+def accelerated_move(k: float, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """``linear_move`` at the times beta(tau)."""
+    (beta0, speed0), (beta1, speed1) = beta(k, tau0), beta(k, tau1)
+    T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
+    return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
+
+
+@compiled
+def accelerated_translation_jacobian(
+    k: float,
+    theta: FloatArray,
+    tau0: float,
+    R: FloatArray,
+    A: FloatArray,
+    tau1: float,
+    T_w: FloatArray,
+    T_v: FloatArray,
+) -> None:
+    """Of ``accelerated_move``."""
+    beta0, beta1 = beta(k, tau0)[0], beta(k, tau1)[0]
+    linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
+
+
+@final
+@kernel_for(AcceleratedMotion)
+@dataclass(frozen=True)
+class AcceleratedKernel(MotionKernel):
+    """Constant acceleration: the paper's motion at the times beta(tau); v is d."""
+
+    acceleration: float
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        return accelerated_move(self.acceleration, theta, tau0, tau1, R, A)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        accelerated_translation_jacobian(self.acceleration, theta, tau0, R, A, tau1, T_w, T_v)
+
+
+@compiled
+def twist_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+    """T = a J(a w) v, a = tau1 - tau0."""
+    w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
+    rotate(w, tau1 - tau0, R, A)
+    Rv = apply(R, v)
+    return apply(A, v), times(-1.0, Rv), Rv, times(-1.0, w), w
+
+
+@compiled
+def twist_translation_jacobian(
+    theta: FloatArray, tau0: float, tau1: float, A: FloatArray, T_w: FloatArray, T_v: FloatArray
+) -> None:
+    """Of ``twist_move``."""
+    a = tau1 - tau0
+    twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
+    for i in range(3):
+        for j in range(3):
+            T_v[i, j] = A[i, j]
+
+
+@final
+@kernel_for(TwistMotion)
+@dataclass(frozen=True)
+class TwistKernel(MotionKernel):
+    """Constant twist; v is its linear part: T = a J(a w) v, a = tau1 - tau0."""
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        return twist_move(theta, tau0, tau1, R, A)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        twist_translation_jacobian(theta, tau0, tau1, A, T_w, T_v)
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)], dtype=np.float64)
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return theta[:3], so3.left_jacobian(theta[:3]) @ theta[3:]
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        out, step = np.eye(6), 1e-6
+        for j in range(3):
+            shift = step * np.eye(6)[j]
+            out[3:, j] = (self.motion(theta + shift)[1] - self.motion(theta - shift)[1]) / (2 * step)
+        out[3:, 3:] = so3.left_jacobian(theta[:3])
+        return out
+
+
+@compiled
+def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
+    """dT/dw of T = a (v + b phi x v + c phi x (phi x v)), phi = a w."""
+    _, b, c, db, dc = coefficients(dot(phi, phi))
+    once = cross(phi, v)
+    along = plus(times(db, once), dc, cross(phi, once))
+    pv = dot(phi, v)
+    fill_rotation(v, a * a * c * pv, -a * a * b, 0.0, T_w)
+    for i in range(3):
+        for j in range(3):
+            T_w[i, j] += a * a * (c * (phi[i] * v[j] - 2 * v[i] * phi[j]) + along[i] * phi[j])
+
+
+_NUMBERS: dict[type[MotionKernel], float] = {LinearKernel: 0.0, TwistKernel: 1.0, InertialKernel: 2.0}
+"""Of the laws without parameters; an accelerated one has 3."""
+
+
+@final
+@dataclass(frozen=True)
+class AnyLaw(MotionKernel):
+    """Any of the laws of motion of this package."""
+
+    number: float
+    acceleration: float = 0.0
+
+    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
+        if self.number == 0.0:
+            return linear_move(theta, tau0, tau1, R, A)
+        if self.number == 1.0:
+            return twist_move(theta, tau0, tau1, R, A)
+        if self.number == 2.0:
+            return inertial_move(theta, tau0, tau1, R, A)
+        return accelerated_move(self.acceleration, theta, tau0, tau1, R, A)
+
+    def translation_jacobian(
+        self,
+        theta: FloatArray,
+        tau0: float,
+        tau1: float,
+        R: FloatArray,
+        A: FloatArray,
+        T_w: FloatArray,
+        T_v: FloatArray,
+    ) -> None:
+        if self.number == 0.0:
+            linear_translation_jacobian(theta, tau0, R, A, tau1, T_w, T_v)
+        elif self.number == 1.0:
+            twist_translation_jacobian(theta, tau0, tau1, A, T_w, T_v)
+        elif self.number == 2.0:
+            inertial_translation_jacobian(theta, tau0, tau1, T_w, T_v)
+        else:
+            accelerated_translation_jacobian(self.acceleration, theta, tau0, R, A, tau1, T_w, T_v)
+
+
+def any_law(kernel: MotionKernel) -> MotionKernel:
+    """The kernel as ``AnyLaw``; that of another package as it is."""
+    if isinstance(kernel, AcceleratedKernel):
+        return AnyLaw(3.0, kernel.acceleration)
+    number = _NUMBERS.get(type(kernel))
+    return kernel if number is None else AnyLaw(number)
+
+
+def quick_law(kernel: MotionKernel) -> MotionKernel:
+    """The kernel as solvers use it: that of the paper's law, which they assume by default, has code of its own."""
+    return kernel if isinstance(kernel, LinearKernel) else any_law(kernel)
+
+
+def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -> MotionKernel:
+    """Kernel of a motion model with such parameters.
+
+    Raises:
+        RsbenchError: no such model, it cannot have such parameters, or it has no kernel: one line.
+    """
+    model = motion_model(motion_name)
+    if model not in KERNELS:
+        known = ", ".join(sorted(other.name for other in KERNELS))
+        raise RsbenchError(
+            f"motion model {motion_name!r} has no kernel, so no solver can assume it; these have: {known}"
+        )
+    motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), KERNELS[model]
+    return kernel(**{field.name: float(getattr(motion, field.name)) for field in dataclasses.fields(kernel)})  # pyrefly: ignore[bad-argument-type]
+
+
+def has_kernel(motion_name: str) -> bool:
+    """Whether solvers can assume a motion model; RsbenchError when it does not exist."""
+    return motion_model(motion_name) in KERNELS

@@ -1,20 +1,182 @@
-"""The camera; the only place that knows the pixel convention, and what a lens does to it.
+"""The camera and its lens; the only place that knows the pixel convention.
 
 Pixel coordinates are (x, y) and the centre of the top-left pixel is (0, 0), so a centred principal point of a
-900 x 900 image is (449.5, 449.5). Camera frame: x right, y down, z forward. Pixels are those of the image as the
-sensor has it, distorted by the lens; "ideal" pixels are those of the same camera without it.
+900 x 900 image is (449.5, 449.5). Camera frame: x right, y down, z forward. Pixels are those of the image as
+the sensor has it, distorted by the lens; "ideal" pixels are those of the same camera without it.
+
+A lens maps ideal coordinates, x / z and y / z of a point in the camera frame, to distorted ones; these times
+the focal length, plus the principal point, are pixels. Both lens models are OpenCV's, coefficient for
+coefficient.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core import given
-from rsbench.core.lens import Lens, inverse_2x2
+from rsbench.core import arguments
+from rsbench.core.arguments import LARGEST_PX
 from rsbench.core.so3 import FloatArray
+
+LensModel = Literal["brown-conrady", "kannala-brandt"]
+WIDEST = 1.5
+"""Angle from the optical axis, rad, beyond which a fisheye shows nothing here: rays have z = 1."""
+_CONVERGED = 1e-14
+"""Newton steps end when they are as short as this, relative to 1 + the radius: rounding."""
+_MOST_STEPS = 40
+_UNUSED = {"brown-conrady": ("k4",), "kannala-brandt": ("p1", "p2")}
+
+
+class Distorted(NamedTuple):
+    """Distorted coordinates with their derivative."""
+
+    xy: FloatArray
+    """(..., 2); NaN where the lens does not see the point."""
+    jacobian: FloatArray
+    """(..., 2, 2) by the ideal coordinates."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Coefficients of a lens; those that are 0 may be left out.
+
+    ``brown-conrady``: D. Brown, Close-range camera calibration, 1971; OpenCV's k1, k2, p1, p2, k3.
+    ``kannala-brandt``: J. Kannala, S. Brandt, PAMI 2006, eq. 6; OpenCV's fisheye k1 to k4.
+
+    Raises:
+        ValueError: a coefficient that is not finite or that the model does not have.
+    """
+
+    model: LensModel
+    """``brown-conrady``: radial and tangential distortion of ordinary lenses; ``kannala-brandt``: fisheye
+    lenses."""
+    k1: float = 0.0
+    """First radial coefficient, as OpenCV has it."""
+    k2: float = 0.0
+    """Second radial coefficient."""
+    p1: float = 0.0
+    """First tangential coefficient; of ``brown-conrady`` alone."""
+    p2: float = 0.0
+    """Second tangential coefficient; of ``brown-conrady`` alone."""
+    k3: float = 0.0
+    """Third radial coefficient."""
+    k4: float = 0.0
+    """Fourth radial coefficient; of ``kannala-brandt`` alone."""
+
+    def __post_init__(self) -> None:
+        arguments.check_one_of("lens model", self.model, get_args(LensModel))
+        for field in fields(self)[1:]:
+            arguments.check_number(f"lens {field.name}", getattr(self, field.name))
+        arguments.keep_plain(self)
+        for name in _UNUSED[self.model]:
+            if getattr(self, name) != 0.0:
+                raise ValueError(f"lens {name} = {getattr(self, name)}: {self.model} has no such coefficient")
+
+    @cached_property
+    def reach(self) -> float:
+        """Ideal radius up to which the distorted radius grows; beyond it the polynomial folds back."""
+        if self.model == "brown-conrady":
+            return math.sqrt(_first_root([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3]))
+        slope = [1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3, 9.0 * self.k4]
+        return math.tan(min(math.sqrt(_first_root(slope)), WIDEST))
+
+    def distort(self, xy: ArrayLike) -> Distorted:
+        """Distorted coordinates of ideal ones (..., 2); NaN beyond ``reach``."""
+        ideal = np.asarray(xy, dtype=np.float64)
+        radius = np.hypot(ideal[..., 0], ideal[..., 1])
+        known = np.where((radius < self.reach)[..., None], ideal, np.nan)
+        return self._brown(known) if self.model == "brown-conrady" else self._kannala(known)
+
+    def undistort(self, xy: ArrayLike) -> FloatArray:
+        """Ideal coordinates (..., 2) of distorted ones (..., 2), by Newton's method; NaN where it finds none.
+
+        What comes back is within ``reach``, does not fold, and distorts to ``xy`` but for rounding.
+        """
+        wanted = np.asarray(xy, dtype=np.float64)
+        flat = wanted.reshape(-1, 2)
+        ideal = self._start(flat)
+        done = np.zeros(len(flat), dtype=np.bool_)
+        for _ in range(_MOST_STEPS):
+            left = np.flatnonzero(~done & np.isfinite(ideal[:, 0]))
+            if len(left) == 0:
+                break
+            found, J = self.distort(ideal[left])
+            step = _solve(J, flat[left] - found)
+            ideal[left] += step
+            done[left] = np.max(np.abs(step), axis=-1) <= _CONVERGED * (1.0 + np.abs(ideal[left]).max(axis=-1))
+        J = self.distort(ideal).jacobian
+        with np.errstate(invalid="ignore"):
+            good = done & (J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0] > 0.0) & (J[:, 0, 0] > 0.0)
+        return np.where(good[:, None], ideal, np.nan).reshape(wanted.shape)
+
+    def _start(self, distorted: FloatArray) -> FloatArray:
+        """Where Newton's method starts: at the same radius, within half of the reach."""
+        radius = np.hypot(distorted[:, 0], distorted[:, 1])
+        most = 0.5 * self.reach
+        return distorted * np.where(radius > most, most / np.where(radius > 0.0, radius, 1.0), 1.0)[:, None]
+
+    def _brown(self, ideal: FloatArray) -> Distorted:
+        x, y = ideal[..., 0], ideal[..., 1]
+        s = x * x + y * y
+        gain = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
+        bend = 2.0 * (self.k1 + s * (2.0 * self.k2 + s * 3.0 * self.k3))
+        p1, p2 = self.p1, self.p2
+        xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
+        yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+        across = bend * x * y + 2.0 * (p1 * x + p2 * y)
+        by_x = gain + bend * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        by_y = gain + bend * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        return Distorted(np.stack([xd, yd], axis=-1), _matrix(by_x, across, by_y))
+
+    def _kannala(self, ideal: FloatArray) -> Distorted:
+        x, y = ideal[..., 0], ideal[..., 1]
+        s = x * x + y * y
+        r = np.sqrt(s)
+        angle = np.arctan(r)
+        a = angle * angle
+        k1, k2, k3, k4 = self.k1, self.k2, self.k3, self.k4
+        bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
+        slope = 1.0 + a * (3.0 * k1 + a * (5.0 * k2 + a * (7.0 * k3 + a * 9.0 * k4)))
+        central = s < 1e-12  # atan r = r - r^3 / 3: what is left out is below rounding
+        gain = np.where(central, 1.0 + s * (k1 - 1.0 / 3.0), bent / np.where(central, 1.0, r))
+        bend = np.where(central, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + s) - gain) / np.where(central, 1.0, s))
+        J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
+        return Distorted(ideal * gain[..., None], J)
+
+
+def _matrix(by_x: FloatArray, across: FloatArray, by_y: FloatArray) -> FloatArray:
+    """Symmetric (..., 2, 2)."""
+    return np.stack([np.stack([by_x, across], axis=-1), np.stack([across, by_y], axis=-1)], axis=-2)
+
+
+def inverse_2x2(J: FloatArray) -> FloatArray:
+    """Inverses of matrices (..., 2, 2); not finite where there is none."""
+    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(_stack_2x2(d, -b, -c, a) / (a * d - b * c)[..., None, None])
+
+
+def _stack_2x2(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+    return np.stack([np.stack([a, b], axis=-1), np.stack([c, d], axis=-1)], axis=-2)
+
+
+def _solve(J: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray((inverse_2x2(J) @ right[..., None])[..., 0])
+
+
+def _first_root(coefficients: list[float]) -> float:
+    """Smallest positive root of a polynomial, lowest power first; infinite when it has none."""
+    # What is nothing beside the others puts a root beyond all images, and would overflow as a divisor.
+    small = 1e-100 * max(map(abs, coefficients))
+    roots = np.polynomial.polynomial.polyroots([c if abs(c) > small else 0.0 for c in coefficients])
+    real = roots.real[(np.abs(roots.imag) <= 1e-6 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(np.min(real, initial=np.inf))
+
 
 _TRIED = 33
 """Columns and rows of the points, spread over the whole image, at which a lens must be invertible."""
@@ -39,14 +201,16 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            given.check_whole(f"camera {name}", getattr(self, name), 1, given.LARGEST_SIZE)
+            arguments.check_whole(f"camera {name}", getattr(self, name), 1, arguments.LARGEST_SIZE)
         for name in ("fx", "fy"):
-            given.check_positive(f"camera {name}", getattr(self, name), given.LARGEST_PX, "pixels")
+            arguments.check_positive(f"camera {name}", getattr(self, name), LARGEST_PX, "pixels")
         for name in ("cx", "cy"):
-            given.check_number(f"camera {name}", getattr(self, name), -given.LARGEST_PX, given.LARGEST_PX)
-        given.keep_plain(self)
+            arguments.check_number(
+                f"camera {name}", getattr(self, name), -arguments.LARGEST_PX, arguments.LARGEST_PX
+            )
+        arguments.keep_plain(self)
         if self.lens is not None:
-            given.check_type("camera lens", self.lens, Lens)
+            arguments.check_type("camera lens", self.lens, Lens)
             self._check_lens(self.lens)
 
     def _check_lens(self, lens: Lens) -> None:
@@ -64,7 +228,7 @@ class PinholeCamera:
     def centred(cls, width: int, height: int, focal: float) -> PinholeCamera:
         """Square pixels and the principal point in the middle of the image; ValueError as of the class."""
         for name, size in (("width", width), ("height", height)):
-            given.check_whole(f"camera {name}", size, 1, given.LARGEST_SIZE)
+            arguments.check_whole(f"camera {name}", size, 1, arguments.LARGEST_SIZE)
         return cls(width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
 
     @property

@@ -24,8 +24,9 @@ class RsbenchError(Exception):
     A word of more than ``_WORD`` characters, which is user's text, is shortened to its ends.
     """
 
-    def __init__(self, message: str = "") -> None:
-        super().__init__(re.sub(rf"\S{{{_WORD + 1},}}", lambda word: f"{word[0][:60]}...{word[0][-20:]}", message))
-
     exit_code = 2
     """Of the command that it ends."""
+
+    def __init__(self, message: object = "") -> None:
+        shortened = re.sub(rf"\S{{{_WORD + 1},}}", lambda word: f"{word[0][:60]}...{word[0][-20:]}", str(message))
+        super().__init__(shortened)

@@ -1,13 +1,27 @@
-"""A moving rig as one object: cameras, shutter and motion, with the objects that it passes."""
+"""A moving rig as one object: cameras, shutter and motion, with the rigid objects that it passes.
+
+The frame of an object is the world as it is at time 0: a point of the object is at ``X`` then, and at
+``world_from_object(tau) X`` later. Seen from this frame the object stands still and the rig moves as
+``RelativeMotion`` says, so everything that holds for points that stand still (rows that see them, depth, flow)
+holds for points of the object too.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol, final
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core import arguments, so3
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
-from rsbench.core.moving_objects import MovingObject
-from rsbench.core.rig import FRAMES, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
+from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
 
 
 class MovingRig(Protocol):
@@ -30,7 +44,7 @@ class Geometry(MovingRig, Protocol):
     def objects(self) -> tuple[MovingObject, ...]: ...
 
 
-class GivenGeometry(NamedTuple):
+class FixedGeometry(NamedTuple):
     """A ``Geometry`` that is no sequence."""
 
     rig: StereoRig
@@ -39,3 +53,184 @@ class GivenGeometry(NamedTuple):
     frames: int = len(FRAMES)
     objects: tuple[MovingObject, ...] = ()
     """Those that move by themselves, in the order of their numbers from 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObject:
+    """A rigid body: R(tau), t(tau) of its motion turn it about its pivot and shift it."""
+
+    pivot: FloatArray
+    """(3,) metres, world frame at time 0."""
+    motion: Motion
+    """Not of the rig: ``X(tau) = pivot + R(tau) (X - pivot) + t(tau)``."""
+
+    def world_from_object(self, tau: ArrayLike) -> Pose:
+        """Pose (..., 3, 3), (..., 3) at times (...); the identity at 0."""
+        R, t = self.motion.body_from_world(tau)
+        return Pose(R, t + self.pivot - R @ self.pivot)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Of ``world_from_object``, as ``Motion.velocity``."""
+        R, _ = self.motion.body_from_world(tau)
+        w_rate, t_rate = self.motion.velocity(tau)
+        return w_rate, t_rate - so3.cross(w_rate, R @ self.pivot)
+
+    def from_time(self, start: float, body: Pose) -> MovingObject:
+        """The same seen from a later time, which is its time 0, in the world that is the rig's ``body`` then."""
+        motion = TurnedMotion(self.motion.from_time(start), body.R)
+        return MovingObject(body.R @ self.pivot + body.t, motion)
+
+
+def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
+    """``world_from_object`` (objects, ..., 3, 3), (objects, ..., 3) at times (...); None where there are none."""
+    if not objects:
+        return None
+    poses = [each.world_from_object(tau) for each in objects]
+    return Pose(np.stack([each.R for each in poses]), np.stack([each.t for each in poses]))
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class TurnedMotion(Motion):
+    """Another motion told in turned axes: R(tau) and t(tau) become ``A R A^T`` and ``A t``."""
+
+    name: ClassVar[str] = "turned"
+    motion: Motion
+    axes: FloatArray
+    """A (3, 3): turned from the axes of ``motion``."""
+
+    def __init__(self, motion: Motion, axes: FloatArray) -> None:
+        super().__init__(axes @ motion.w, axes @ motion.d)
+        object.__setattr__(self, "motion", motion)
+        object.__setattr__(self, "axes", axes)
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        R, t = self.motion.body_from_world(tau)
+        return Pose(self.axes @ R @ self.axes.T, t @ self.axes.T)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        w_rate, t_rate = self.motion.velocity(tau)
+        return w_rate @ self.axes.T, t_rate @ self.axes.T
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class RelativeMotion(Motion):
+    """The rig's motion seen from a moving object: ``body_from_object``."""
+
+    name: ClassVar[str] = "relative"
+    rig: Motion
+    body: MovingObject
+
+    def __init__(self, rig: Motion, body: MovingObject) -> None:
+        object.__setattr__(self, "rig", rig)
+        object.__setattr__(self, "body", body)
+        end = self.body_from_world(1.0)
+        super().__init__(so3.log(end.R), end.t)
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        return compose(self.rig.body_from_world(tau), self.body.world_from_object(tau))
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        R, _ = self.rig.body_from_world(tau)
+        w_rate, t_rate = self.rig.velocity(tau)
+        own_w, own_t = self.body.velocity(tau)
+        _, place = self.body.world_from_object(tau)
+        turned = (R @ own_w[..., None])[..., 0]
+        carried = (R @ own_t[..., None])[..., 0]
+        return w_rate + turned, t_rate + so3.cross(w_rate, (R @ place[..., None])[..., 0]) + carried
+
+
+_IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
+
+
+def check_times(readout_ratio: float | None, target_row: float, rig: StereoRig) -> None:
+    """Raises ValueError unless the ratio (None: unknown) and the row of an image are in their ranges."""
+    if readout_ratio is not None:
+        arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+    arguments.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
+
+
+def check_ideal(rig: StereoRig, what: str) -> None:
+    """Raises RsbenchError where cameras have a lens, which ``what`` does not take."""
+    if rig.camera.lens is not None:
+        raise RsbenchError(
+            f"camera.lens = {rig.camera.lens.model!r}: {what} takes images without distortion; undistort first"
+        )
+
+
+def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
+    """Raises RsbenchError for cameras with a lens or another scan, which ``what`` does not take."""
+    check_ideal(rig, what)
+    if not shutter.plain:
+        s = shutter.scanning
+        raise RsbenchError(
+            f"scan = {s.scan!r}, right_scan = {s.right_scan!r}, right_delay = {s.right_delay}: {what} takes rows "
+            "from the top, read by both cameras at once"
+        )
+
+
+def check_view(side: str, frame: int) -> None:
+    """Raises ValueError unless there is such a side, and may be such a frame."""
+    arguments.check_one_of("side", side, SIDES)
+    arguments.check_whole("frame", frame, 0, arguments.LARGEST_SIZE)
+
+
+def check_motion(rig: StereoRig, motion: Motion) -> None:
+    """Raises ValueError unless they are what they are called."""
+    arguments.check_type("rig", rig, StereoRig)
+    arguments.check_type("motion", motion, Motion)
+
+
+def check_moving_rig(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> None:
+    """Raises ValueError unless they are what they are called, and the shutter is of the rig's cameras."""
+    check_rows(rig, shutter)
+    check_motion(rig, motion)
+
+
+def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
+    """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
+    arguments.check_type("rig", rig, StereoRig)
+    arguments.check_type("shutter", shutter, RollingShutter)
+    if shutter.width not in (None, rig.camera.width):
+        raise ValueError(
+            f"shutter.width = {shutter.width}: must be that of the camera, {rig.camera.width} columns"
+        )
+    if shutter.height != rig.camera.height:
+        raise ValueError(
+            f"shutter.height = {shutter.height}: must be that of the camera, {rig.camera.height} rows"
+        )
+
+
+def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) -> dict[View, NDArray[Any]]:
+    """Images left 0, right 0, left 1, right 1 by side and frame.
+
+    Raises:
+        ValueError: not four, not uint8 or uint16, not alike, or not of the size of the rig's cameras.
+    """
+    if len(arguments.items("images", images)) != 4:
+        raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
+    views: dict[View, NDArray[Any]] = {}
+    for (side, frame), image in zip(((s, f) for f in FRAMES for s in SIDES), images, strict=True):
+        views[side, frame] = check_image(f"image {side} {frame}", image, rig)
+    first = views["left", 0]
+    for (side, frame), image in views.items():
+        if image.shape != first.shape or image.dtype != first.dtype:
+            what = f"{image.dtype} {image.shape}, but image left 0 is {first.dtype} {first.shape}"
+            raise ValueError(f"image {side} {frame}: is {what}; all must be alike")
+    return views
+
+
+def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArray[Any]:
+    """The image; raises ValueError unless it is (H, W) or (H, W, 3), uint8 or uint16, of the cameras' size."""
+    if not isinstance(image, np.ndarray) or image.dtype not in _IMAGE_TYPES:
+        kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{name}: must be an array of uint8 or uint16, got {kind}")
+    if image.size == 0:
+        raise ValueError(f"{name}: must have pixels, got shape {image.shape}")
+    if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
+        raise ValueError(f"{name}: must have shape (H, W) or (H, W, 3), got {image.shape}")
+    if rig is not None and image.shape[:2] != (rig.camera.height, rig.camera.width):
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise ValueError(f"{name}: is {size} pixels, the rig's cameras {rig.camera.width} x {rig.camera.height}")
+    return image

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core import given, so3
+from rsbench.core import arguments, so3
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
@@ -40,8 +40,8 @@ class Motion(ABC):
     name: ClassVar[str]
 
     def __init__(self, w: ArrayLike, d: ArrayLike) -> None:
-        object.__setattr__(self, "w", given.vector("motion w", w))
-        object.__setattr__(self, "d", given.vector("motion d", d))
+        object.__setattr__(self, "w", arguments.vector("motion w", w))
+        object.__setattr__(self, "d", arguments.vector("motion d", d))
 
     @abstractmethod
     def body_from_world(self, tau: ArrayLike) -> Pose:
@@ -103,149 +103,6 @@ class Motion(ABC):
     def drawn(cls, parameters: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
         """The parameters, with those drawn that are random by default; ``rng`` is used for nothing else."""
         return dict(parameters)
-
-
-@final
-@dataclass(frozen=True, eq=False, init=False)
-class LinearMotion(Motion):
-    """The paper's model, equations (2)-(5): R(tau) = exp(tau [w]x), t(tau) = tau d."""
-
-    name: ClassVar[str] = "linear"
-
-    def body_from_world(self, tau: ArrayLike) -> Pose:
-        tau = np.asarray(tau, dtype=np.float64)[..., None]
-        return Pose(so3.exp(tau * self.w), tau * self.d)
-
-    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        shape = (*np.shape(tau), 3)
-        return np.broadcast_to(self.w, shape), np.broadcast_to(self.d, shape)
-
-    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        shape = (*np.shape(tau), 3)
-        return np.zeros(shape), np.zeros(shape)
-
-    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
-        return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.d))
-
-
-@final
-@dataclass(frozen=True, eq=False, init=False)
-class TwistMotion(Motion):
-    """Constant body twist (a screw): the pose is exp(tau xi) with exp(xi) = (exp([w]x), d)."""
-
-    name: ClassVar[str] = "twist"
-
-    @cached_property
-    def v(self) -> FloatArray:
-        """Linear part (3,) of the twist, metres per frame period."""
-        return np.asarray(np.linalg.solve(so3.left_jacobian(self.w), self.d), dtype=np.float64)
-
-    def body_from_world(self, tau: ArrayLike) -> Pose:
-        tau = np.asarray(tau, dtype=np.float64)[..., None]
-        return Pose(so3.exp(tau * self.w), tau * (so3.left_jacobian(tau * self.w) @ self.v))
-
-    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        R, _ = self.body_from_world(tau)
-        return np.broadcast_to(self.w, (*np.shape(tau), 3)), R @ self.v
-
-    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        w, speed = self.velocity(tau)
-        return np.zeros(speed.shape), so3.cross(w, speed)
-
-    def from_time(self, start: float) -> Motion:
-        return self  # a screw looks the same from everywhere on it
-
-    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
-        return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.v))
-
-
-@final
-@dataclass(frozen=True, eq=False, init=False)
-class InertialMotion(Motion):
-    """A body that nothing pushes: constant velocity in the world and constant rate of turn.
-
-    The body's centre is at tau c in the world, c = -R(1)^T d, so
-
-        R(tau) = exp(tau [w]x),  t(tau) = -tau R(tau) c = tau exp((tau - 1) [w]x) d.
-    """
-
-    name: ClassVar[str] = "inertial"
-
-    def _ahead(self, tau: FloatArray) -> FloatArray:
-        """-R(tau) c (..., 3): the world's velocity as seen from the body; tau (..., 1)."""
-        return so3.exp((tau - 1.0) * self.w) @ self.d
-
-    def body_from_world(self, tau: ArrayLike) -> Pose:
-        tau = np.asarray(tau, dtype=np.float64)[..., None]
-        return Pose(so3.exp(tau * self.w), tau * self._ahead(tau))
-
-    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        tau = np.asarray(tau, dtype=np.float64)[..., None]
-        ahead = self._ahead(tau)
-        return np.broadcast_to(self.w, ahead.shape), ahead + tau * so3.cross(self.w, ahead)
-
-    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        tau = np.asarray(tau, dtype=np.float64)[..., None]
-        turned = so3.cross(self.w, self._ahead(tau))
-        return np.zeros(turned.shape), 2.0 * turned + tau * so3.cross(self.w, turned)
-
-    def from_time(self, start: float) -> Motion:
-        return InertialMotion(self.w, so3.exp(start * self.w) @ self.d)
-
-    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
-        turn, speed = float(np.linalg.norm(self.w)), float(np.linalg.norm(self.d))
-        return turn, speed * (1.0 + max(abs(first), abs(last)) * turn)
-
-
-@final
-@dataclass(frozen=True, eq=False, init=False)
-class AcceleratedMotion(Motion):
-    """Constant acceleration along the paper's path: R(tau) = exp(beta [w]x), t(tau) = beta d, with
-
-        beta(tau) = (tau + k tau^2 / 2) 2 / (2 + k),   so that beta(1) = 1.
-
-    B. Zhuang, L.-F. Cheong, G. H. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017,
-    for the differential model; here the displacement is that of the exact one.
-    """
-
-    name: ClassVar[str] = "accelerated"
-    acceleration: float = 0.2
-    """k, per frame period: the speed grows by k times its value at time 0 in each period; above -1/2, or the rig
-    would stop and turn back before time 2, when the last row of frame 1 is read at the latest."""
-
-    def __init__(self, w: ArrayLike, d: ArrayLike, acceleration: float = 0.2) -> None:
-        super().__init__(w, d)
-        given.check_number("acceleration", acceleration)
-        if not acceleration > -0.5:
-            raise ValueError(f"acceleration = {acceleration}: must be a number above -0.5")
-        object.__setattr__(self, "acceleration", float(acceleration))
-
-    def share(self, tau: ArrayLike) -> FloatArray:
-        """beta (...) of the displacement of one period, at times ``tau`` (...)."""
-        tau, k = np.asarray(tau, dtype=np.float64), self.acceleration
-        return np.asarray((tau + 0.5 * k * tau * tau) * (2.0 / (2.0 + k)))
-
-    def speed(self, tau: ArrayLike) -> FloatArray:
-        """Derivative (...) of ``share``."""
-        tau, k = np.asarray(tau, dtype=np.float64), self.acceleration
-        return np.asarray((1.0 + k * tau) * (2.0 / (2.0 + k)))
-
-    def body_from_world(self, tau: ArrayLike) -> Pose:
-        beta = self.share(tau)[..., None]
-        return Pose(so3.exp(beta * self.w), beta * self.d)
-
-    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        speed = self.speed(tau)[..., None]
-        return speed * self.w, speed * self.d
-
-    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        k, shape = self.acceleration, (*np.shape(tau), 3)
-        change = 2.0 * k / (2.0 + k)
-        return np.broadcast_to(change * self.w, shape), np.broadcast_to(change * self.d, shape)
-
-    def fastest(self, first: float, last: float) -> tuple[float, float] | None:
-        speed = float(np.max(np.abs(self.speed([first, last]))))
-        return speed * float(np.linalg.norm(self.w)), speed * float(np.linalg.norm(self.d))
 
 
 @final

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core import so3
-from rsbench.core.lens import inverse_2x2
+from rsbench.core.camera import inverse_2x2
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose, transform

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose
@@ -42,10 +42,10 @@ class StereoRig:
     """The point whose motion is described: the body's, in the middle of the baseline, or one camera's centre."""
 
     def __post_init__(self) -> None:
-        given.check_type("camera", self.camera, PinholeCamera)
-        given.check_positive("baseline", self.baseline, given.LARGEST_M, "metres")
-        given.check_one_of("origin", self.origin, ("middle", "left", "right"))
-        given.keep_plain(self)
+        arguments.check_type("camera", self.camera, PinholeCamera)
+        arguments.check_positive("baseline", self.baseline, arguments.LARGEST_M, "metres")
+        arguments.check_one_of("origin", self.origin, ("middle", "left", "right"))
+        arguments.keep_plain(self)
 
     def offset(self, side: Side) -> FloatArray:
         """``x_in_cam = x_in_body + offset`` (3,): the camera stands at minus the offset."""

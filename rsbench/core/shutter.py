@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.so3 import FloatArray
 
 Scan = Literal["top", "bottom", "left", "right"]
@@ -89,17 +89,17 @@ class RollingShutter:
     """Number of columns; needed where columns are read."""
 
     def __post_init__(self) -> None:
-        given.check_whole("shutter height", self.height, 1, given.LARGEST_SIZE)
-        given.check_number("readout_ratio", self.readout_ratio, 0.0, 1.0)
-        given.check_one_of("scan", self.scan, get_args(Scan))
+        arguments.check_whole("shutter height", self.height, 1, arguments.LARGEST_SIZE)
+        arguments.check_number("readout_ratio", self.readout_ratio, 0.0, 1.0)
+        arguments.check_one_of("scan", self.scan, get_args(Scan))
         if self.right_scan is not None:
-            given.check_one_of("right_scan", self.right_scan, get_args(Scan))
-        given.check_number("right_delay", self.right_delay, -_LONGEST_DELAY, _LONGEST_DELAY)
+            arguments.check_one_of("right_scan", self.right_scan, get_args(Scan))
+        arguments.check_number("right_delay", self.right_delay, -_LONGEST_DELAY, _LONGEST_DELAY)
         if self.width is not None:
-            given.check_whole("shutter width", self.width, 1, given.LARGEST_SIZE)
+            arguments.check_whole("shutter width", self.width, 1, arguments.LARGEST_SIZE)
         if self.width is None and not {self.scan, self.scan_of("right")} <= {"top", "bottom"}:
             raise ValueError("shutter width must be given where columns are read")
-        given.keep_plain(self)
+        arguments.keep_plain(self)
 
     @property
     def plain(self) -> bool:

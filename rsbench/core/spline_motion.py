@@ -1,15 +1,28 @@
-"""Hand-held motion: a cumulative cubic B-spline on SE(3) through given or drawn control poses.
+"""Motions along splines: a shaken rig (``SplineMotion``), and a path through poses (``TrajectoryMotion``).
 
-S. Lovegrove, A. Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial
-fusion with application to rolling shutter cameras, BMVC 2013, for the spline; C. Sommer, V. Usenko, D. Schubert,
-N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for its
-velocity. They write world_from_body; here the poses are its inverse, so the factors stand the other way round:
+``SplineMotion`` is a cumulative cubic B-spline on SE(3) through given or drawn control poses. S. Lovegrove, A.
+Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial fusion with
+application to rolling shutter cameras, BMVC 2013, for the spline; C. Sommer, V. Usenko, D. Schubert, N. Demmel,
+D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for its
+velocity. They write world_from_body; here the poses are its inverse, so the factors are in the opposite order:
 
     P(u) = exp(b3 O[i+3]) exp(b2 O[i+2]) exp(b1 O[i+1]) C[i],   O[k] = log(C[k] C[k-1]^-1)
 
     b1 = (5 + 3u - 3u^2 + u^3) / 6,  b2 = (1 + 3u + 3u^2 - 2u^3) / 6,  b3 = u^3 / 6
 
 in the interval i, u in [0, 1]. It is twice continuously differentiable.
+
+A shake may also be given by its power spectrum (``ShakeSpectrum``): in each band every rotation and translation
+is a sum of sines, one in each of as many equal parts of the band, with random frequencies and phases; a
+Gaussian process of that flat spectrum as their number grows (S. Rice, Mathematical Analysis of Random Noise,
+1944). A longer shake begins as a shorter one does.
+
+``TrajectoryMotion`` interpolates positions and unit quaternions (of one sign along the path) together,
+component by component, by the cubic spline that is twice continuously differentiable (C. de Boor, A Practical
+Guide to Splines, 1978; not-a-knot condition at both ends); the quaternion is then normalised. Poses are met to
+rounding; between them the spline of a path f with step h errs by about 5/384 h^4 max |f''''| (C. Hall, W.
+Meyer, J. Approx. Theory 1976). Turning or moving the frame of all poses turns or moves the path, and nothing
+else.
 """
 
 from __future__ import annotations
@@ -23,11 +36,79 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.core import given, se3, so3
+from rsbench.core import arguments, se3, so3
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose, compose, inverse
-from rsbench.core.shake_spectrum import ShakeSpectrum
 from rsbench.core.so3 import FloatArray
+
+_SINES = 8
+"""Of a band, for each axis."""
+_FASTEST = 0.25
+"""Cycles of a band for each interval of the control poses, at most: a cubic spline through four points of a sine
+differs from it by less than 3 % of its size."""
+_MOST_BANDS = 32
+_LARGEST_DEG, _LARGEST_M = 45.0, 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class ShakeSpectrum:
+    """A steady path and the bands of the shake around it."""
+
+    path: FloatArray
+    """(6,) of one frame period: rotation vector, radians, and translation, metres."""
+    bands: FloatArray
+    """(n, 4) from and to, cycles per frame period, and standard deviations about and along each axis, radians and
+    metres."""
+
+    @classmethod
+    def of(cls, record: Any, interval: float) -> ShakeSpectrum:
+        """From ``path``, degrees and metres, and ``bands`` with degrees and metres, as a card has them.
+
+        Args:
+            interval: frame periods between the control poses that are to carry it.
+
+        Raises:
+            ValueError: another key, no such numbers, or a band too fast for the interval.
+        """
+        if not isinstance(record, Mapping) or set(record) != {"path", "bands"}:
+            raise ValueError("spectrum must be a table with path and bands, and no other key")
+        path, bands = (arguments.real_array(f"spectrum.{key}", record[key]) for key in ("path", "bands"))
+        if path.shape != (6,) or not np.all(np.abs(path) < [180.0] * 3 + [_LARGEST_M] * 3):
+            raise ValueError("spectrum.path must be 6 finite numbers: degrees (3) and metres (3) per frame period")
+        if bands.ndim != 2 or bands.shape[1] != 4 or not 1 <= len(bands) <= _MOST_BANDS:
+            raise ValueError(f"spectrum.bands must be 1 to {_MOST_BANDS} rows of 4: from, to, degrees, metres")
+        most = _FASTEST / interval
+        for row in bands.tolist():
+            low, high, turn, shift = row
+            if not (0.0 <= low < high <= most and 0.0 <= turn <= _LARGEST_DEG and 0.0 <= shift <= _LARGEST_M):
+                raise ValueError(
+                    f"spectrum.bands: {row}: must rise from 0 or more to at most {most:g} cycles per frame period "
+                    f"(0.25 / interval), with standard deviations from 0 to {_LARGEST_DEG:g} deg and "
+                    f"{_LARGEST_M:g} m"
+                )
+        turned = np.concatenate([np.deg2rad(path[:3]), path[3:]])
+        return cls(turned, bands * [1.0, 1.0, np.pi / 180.0, 1.0])
+
+    def control(self, times: FloatArray, interval: float, rng: np.random.Generator) -> FloatArray:
+        """Control poses (n, 6), rotation vectors and translations, at times (n,) one interval apart.
+
+        The spline of them passes where the sines are at those times.
+        """
+        low, high, turn, shift = self.bands.T[..., None, None]
+        part, phase = np.moveaxis(rng.random((len(self.bands), 6, _SINES, 2)), -1, 0)
+        frequency = low + (high - low) * (np.arange(_SINES) + part) / _SINES
+        sigma = np.concatenate(
+            [np.broadcast_to(turn, (len(turn), 3, 1)), np.broadcast_to(shift, (len(turn), 3, 1))], 1
+        )
+        # A cubic B-spline of a sine's samples is smaller by this factor where its pieces meet.
+        kept = (2.0 + np.cos(2.0 * np.pi * frequency * interval)) / 3.0
+        size = sigma * np.sqrt(2.0 / _SINES) / kept
+        waves = np.sin(2.0 * np.pi * (frequency * times[:, None, None, None] + phase))
+        shake = np.sum(size * waves, axis=(1, 3))
+        steady = se3.log(Pose(so3.exp(self.path[:3]), self.path[3:]))
+        R, t = compose(se3.exp(shake), se3.exp(times[:, None] * steady))
+        return np.concatenate([so3.log(R), t], axis=1)
+
 
 LAST = 2.0
 """Rows of frame 1 are read until then, at the latest: how long a shake is that does not say."""
@@ -230,7 +311,7 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
         _only(parameters, "shake")
         return _interval(parameters), _twists(parameters["shake"], _interval(parameters), "shake")
     preset = parameters.get("preset", "handheld")
-    given.check_one_of("preset", preset, PRESETS)
+    arguments.check_one_of("preset", preset, PRESETS)
     if "interval" in parameters:
         raise ValueError("interval goes with shake or poses, or spectrum; a preset has its own")
     interval, rotation_deg, translation = PRESETS[preset]
@@ -242,7 +323,7 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
 def _generator(purpose: str, parameters: Mapping[str, Any]) -> np.random.Generator:
     """What is drawn with the seed of the parameters."""
     seed = parameters.get("seed", 0)
-    given.check_whole("seed", seed, 0, 1 << 256)
+    arguments.check_whole("seed", seed, 0, 1 << 256)
     digest = hashlib.sha256(f"{purpose}/{int(seed)}".encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:16], "little"))
 
@@ -306,8 +387,8 @@ def least_poses(interval: float, periods: float = LAST) -> int:
 
 
 def _twists(value: ArrayLike, interval: float, name: str) -> FloatArray:
-    rows = given.real_array(name, value)
-    if rows.ndim != 2 or rows.shape[1] != 6 or not np.all(np.abs(rows) <= given.LARGEST):
+    rows = arguments.real_array(name, value)
+    if rows.ndim != 2 or rows.shape[1] != 6 or not np.all(np.abs(rows) <= arguments.LARGEST):
         raise ValueError(f"{name} must be rows of 6 finite numbers: rotation vector and translation")
     if len(rows) < least_poses(interval):
         raise ValueError(f"{name} has {len(rows)} rows; an interval of {interval:g} needs {least_poses(interval)}")
@@ -334,3 +415,163 @@ def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:
         before = error
         xi = se3.log(compose(missing, se3.exp(xi)))
     raise ValueError("shake: too strong: no smooth path leads to w and d")
+
+
+LARGEST_TURN_DEG = 90.0
+"""Between two poses: beyond, nobody can tell how the rig got there."""
+_SAME = 1e-9
+"""Largest difference of w and d that are still those of given poses."""
+_UNIT = 1e-6
+"""Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
+
+
+@final
+@dataclass(frozen=True, eq=False, init=False)
+class TrajectoryMotion(Motion):
+    """Through poses of the body, seen from the body at time 0. Beyond the first and the last the speed stays."""
+
+    name: ClassVar[str] = "trajectory"
+    poses: FloatArray
+    """(n, 8) time in frame periods, position x, y, z in metres and quaternion x, y, z, w of the body in a frame
+    that stands still: world_from_body."""
+
+    def __init__(self, w: ArrayLike, d: ArrayLike, poses: ArrayLike) -> None:
+        """From poses whose ``endpoint`` is w and d.
+
+        Raises:
+            ValueError: not such rows, times that do not grow or do not reach from 0 to 1, a turn of more than
+                ``LARGEST_TURN_DEG`` from one pose to the next, or another w or d.
+        """
+        super().__init__(w, d)
+        rows = _checked(poses)
+        rows.setflags(write=False)
+        object.__setattr__(self, "poses", rows)
+        R, t = self.body_from_world(1.0)
+        if np.max(np.abs(np.concatenate([so3.log(R) - self.w, t - self.d]))) > _SAME:
+            raise ValueError("w and d of a trajectory are those of its poses, and were given otherwise")
+
+    @cached_property
+    def _path(self) -> _Path:
+        return _Path.through(self.poses)
+
+    @cached_property
+    def _start(self) -> Pose:
+        return self._path.at(0.0).world_from_body
+
+    def body_from_world(self, tau: ArrayLike) -> Pose:
+        return compose(inverse(self._path.at(tau).world_from_body), self._start)
+
+    def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        place, turn, speed, *_ = self._path.at(tau)
+        body = inverse(place)
+        t = compose(body, self._start).t
+        return -turn, -so3.cross(turn, t) - (body.R @ speed[..., None])[..., 0]
+
+    def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        place, turn, speed, turn_change, speed_change = self._path.at(tau)
+        body = inverse(place)
+        t, (_, t_rate) = compose(body, self._start).t, self.velocity(tau)
+        v, v_change = ((body.R @ each[..., None])[..., 0] for each in (speed, speed_change))
+        return -turn_change, so3.cross(turn, v) - v_change - so3.cross(turn_change, t) - so3.cross(turn, t_rate)
+
+    @property
+    def lasts(self) -> float:
+        return float(self.poses[-1, 0])
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        return {"poses": self.poses.tolist()}
+
+    @classmethod
+    def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+        if "poses" not in parameters:
+            raise ValueError("poses are required: (time, x, y, z, qx, qy, qz, qw) of the body")
+        path = _Path.through(_checked(parameters["poses"]))
+        R, t = compose(inverse(path.at(1.0).world_from_body), path.at(0.0).world_from_body)
+        return so3.log(R), t
+
+
+class Moving(NamedTuple):
+    """Where the body is and how it moves."""
+
+    world_from_body: Pose
+    turn: FloatArray
+    """(..., 3) rotation rate in the body's own axes, rad per unit of time."""
+    speed: FloatArray
+    """(..., 3) in the axes of the world, metres per unit of time."""
+    turn_change: FloatArray
+    """(..., 3) derivative of ``turn``."""
+    speed_change: FloatArray
+    """(..., 3) derivative of ``speed``."""
+
+
+class _Path(NamedTuple):
+    """The spline of positions and quaternions (7), from the first time to the last."""
+
+    spline: Any
+    first: float
+    last: float
+
+    @classmethod
+    def through(cls, poses: FloatArray) -> _Path:
+        from scipy.interpolate import CubicSpline
+
+        quaternions = _one_sign(poses[:, 4:] / np.linalg.norm(poses[:, 4:], axis=1, keepdims=True))
+        values = np.concatenate([poses[:, 1:4], quaternions], axis=1)
+        return cls(CubicSpline(poses[:, 0], values), float(poses[0, 0]), float(poses[-1, 0]))
+
+    def at(self, tau: ArrayLike) -> Moving:
+        """At times (...); before the first pose and after the last at the velocity that it has there."""
+        tau = np.asarray(tau, dtype=np.float64)
+        within = np.clip(tau, self.first, self.last)
+        beyond = (tau - within)[..., None]
+        still = (beyond == 0.0).astype(np.float64)
+        place, rate, change = self.spline(within), self.spline(within, 1), still * self.spline(within, 2)
+        x, y, z, w = np.moveaxis(place[..., 3:], -1, 0)
+        v, dv, dw = place[..., 3:6], rate[..., 3:6], rate[..., 6:]
+        square = np.sum(place[..., 3:] ** 2, axis=-1, keepdims=True)
+        # 2 q* q' of a quaternion q, whose length has no part in it.
+        turn = 2.0 * (w[..., None] * dv - dw * v - so3.cross(v, dv)) / square
+        ddv, ddw = change[..., 3:6], change[..., 6:]
+        growth = 2.0 * np.sum(place[..., 3:] * rate[..., 3:], axis=-1, keepdims=True) / square
+        turn_change = 2.0 * (w[..., None] * ddv - ddw * v - so3.cross(v, ddv)) / square - still * growth * turn
+        R = so3.from_quaternion(np.stack([w, x, y, z], axis=-1)) @ so3.exp(beyond * turn)
+        moved = Pose(R, place[..., :3] + beyond * rate[..., :3])
+        return Moving(moved, turn, rate[..., :3], turn_change, change[..., :3])
+
+
+def world_from_body(poses: ArrayLike, tau: ArrayLike) -> Pose:
+    """Pose (..., 3, 3), (..., 3) at times (...) of the spline through poses (n, 8) as ``TrajectoryMotion`` has.
+
+    Raises:
+        ValueError: rows that can be no path.
+    """
+    return _Path.through(_checked(poses, spans=False)).at(tau).world_from_body
+
+
+def turns_deg(quaternions: FloatArray) -> FloatArray:
+    """Angles (n - 1,) from one of unit quaternions (n, 4) to the next, degrees."""
+    cosine = np.abs(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
+    return np.asarray(np.rad2deg(2.0 * np.arccos(np.minimum(cosine, 1.0))))
+
+
+def _one_sign(quaternions: FloatArray) -> FloatArray:
+    """The same rotations, each quaternion on the side of the one before."""
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+    signs = np.concatenate([[1.0], np.where(flips, -1.0, 1.0)])
+    return np.asarray(quaternions * np.cumprod(signs)[:, None])
+
+
+def _checked(value: ArrayLike, spans: bool = True) -> FloatArray:
+    rows = arguments.real_array("poses", value)
+    if rows.ndim != 2 or rows.shape[1] != 8 or len(rows) < 2 or not np.all(np.abs(rows) <= arguments.LARGEST):
+        raise ValueError("poses must be two or more rows of 8 finite numbers: time, x, y, z, qx, qy, qz, qw")
+    if np.any(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > _UNIT):
+        raise ValueError("poses: a quaternion is not of length 1")
+    if np.any(np.diff(rows[:, 0]) <= 0.0):
+        raise ValueError("poses: each time must be later than the one before")
+    if spans and not rows[0, 0] <= 0.0 < 1.0 <= rows[-1, 0]:
+        raise ValueError(f"poses must reach from time 0 to 1, they are from {rows[0, 0]:g} to {rows[-1, 0]:g}")
+    if np.max(turns_deg(rows[:, 4:])) > LARGEST_TURN_DEG:
+        raise ValueError(f"poses: more than {LARGEST_TURN_DEG:g} degrees from one to the next")
+    return rows

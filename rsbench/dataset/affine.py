@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from rsbench.core.camera import inverse_2x2
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import inverse_2x2
 from rsbench.core.projection import pixel_moves, plane_basis
 from rsbench.core.rig import View
 from rsbench.core.se3 import inverse

@@ -14,7 +14,7 @@ from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_to
 from rsbench.components.imports import search
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import GivenGeometry
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
@@ -181,10 +181,10 @@ class DatasetCard(Scanning):
     def motion_of(self, sequence: SequenceCard) -> Motion:
         return self._motion_card(sequence).motion()
 
-    def geometry_of(self, sequence: SequenceCard) -> GivenGeometry:
+    def geometry_of(self, sequence: SequenceCard) -> FixedGeometry:
         rig, shutter = self.rig_of(sequence), self.shutter_for(sequence)
         things = tuple(each.thing for each in sequence.moving)
-        return GivenGeometry(rig, shutter, self.motion_of(sequence), self.frames, things)
+        return FixedGeometry(rig, shutter, self.motion_of(sequence), self.frames, things)
 
     def _motion_card(self, sequence: SequenceCard) -> MotionCard:
         card = sequence.motion or self.motion

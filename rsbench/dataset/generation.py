@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import load_card
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import Geometry
-from rsbench.core.moving_objects import poses_of
+from rsbench.core.geometry import Geometry, poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose

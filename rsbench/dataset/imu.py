@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
-from rsbench.core.imu_rates import STANDARD_GRAVITY, inertial
+from rsbench.core.imu import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import Motion
 from rsbench.core.rig import views_of
 from rsbench.core.shutter import RollingShutter

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.motion_models import motion_record, read_motion
-from rsbench.core.moving_objects import MovingObject
+from rsbench.core.geometry import MovingObject
 from rsbench.dataset.channels import CHANNELS, Channel
 from rsbench.dataset.motion_card import MotionCard
 from rsbench.scenes.object_meshes import MOST_MOVING, Body, MeshFile

@@ -16,8 +16,8 @@ from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import motion_record, read_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import MovingObject
 from rsbench.core.motion import LaterMotion, Motion
-from rsbench.core.moving_objects import MovingObject
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning

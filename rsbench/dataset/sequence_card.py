@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 from rsbench.components.cards import SHUTTER_KEY
-from rsbench.core.lens import Lens
+from rsbench.core.camera import Lens
 from rsbench.dataset.motion_card import MotionCard
 from rsbench.dataset.object_records import MovingCard
 from rsbench.renderers.electrons import Sensor

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsbench.core.geometry import GivenGeometry
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import VIEWS, views_of
 from rsbench.dataset.affine import make_affine, save_affine
 from rsbench.dataset.card import DatasetCard, SequenceCard
@@ -38,7 +38,7 @@ def write_sequence_channels(
 
     shutter, period, sensor = card.shutter_for(sequence), card.period_of(sequence), card.sensor_of(sequence)
     motion, seed = card.motion_of(sequence), f"{card.seed_of(sequence)}/{sequence.name}"
-    geometry = GivenGeometry(card.rig_of(sequence), shutter, motion, card.frames)
+    geometry = FixedGeometry(card.rig_of(sequence), shutter, motion, card.frames)
     if "timing" in card.channels:
         write_timing(folder, shutter, period, sensor, card.frames)
     if "instances" in card.channels:

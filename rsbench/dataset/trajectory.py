@@ -14,7 +14,7 @@ from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.core.trajectory_motion import LARGEST_TURN_DEG, turns_deg, world_from_body
+from rsbench.core.spline_motion import LARGEST_TURN_DEG, turns_deg, world_from_body
 from rsbench.scenes.model import Start
 from rsbench.storage.untrusted_files import check_amount, read_text
 

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rsbench.core.geometry import Geometry, GivenGeometry
-from rsbench.core.moving_objects import RelativeMotion
+from rsbench.core.geometry import FixedGeometry, Geometry, RelativeMotion
 from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
@@ -23,10 +22,10 @@ FAR = 1e7
 """Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
 
 
-def seen_from(geometry: Geometry, number: int) -> GivenGeometry:
+def seen_from(geometry: Geometry, number: int) -> FixedGeometry:
     """How the rig moves seen from an object, in whose frame the object's points stand still; 0: from the world."""
     motion = RelativeMotion(geometry.motion, geometry.objects[number - 1]) if number else geometry.motion
-    return GivenGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
+    return FixedGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
 
 
 class ImageView(NamedTuple):

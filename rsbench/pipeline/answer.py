@@ -11,17 +11,15 @@ from rsbench.capture.calibration import recalibrated
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, record_of, shutter_found
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, join_stereo
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.frame_motion import SHAKES, chosen_model, entry_of, or_spline, takes_models, widened
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.base import MotionEstimate, SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
 
 Answer = dict[str, Any]

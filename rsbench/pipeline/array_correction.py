@@ -9,17 +9,17 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.components import arguments
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import gyro_samples
+from rsbench.core.geometry import check_image, check_times, four_images
 from rsbench.core.rig import StereoRig
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import model_to_use
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.mono_sequence import correct_all
-from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.registry import entry_of
+from rsbench.solvers.engine.base import Solver, entry_of
 from rsbench.vision.closing import finished
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
@@ -64,9 +64,9 @@ def of_rig(
 
     ``close``: narrow holes too.
     """
-    given.check_type("rig", rig, StereoRig)
-    arguments.check_times(readout_ratio, options.target_row, rig)
-    views, known = arguments.four_images(images, rig), Given(gyro=arguments.gyro_samples(gyro))
+    arguments.check_type("rig", rig, StereoRig)
+    check_times(readout_ratio, options.target_row, rig)
+    views, known = four_images(images, rig), Given(gyro=gyro_samples(gyro))
     with Isolation() as isolation:
         found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=known)
     demand_corrected(found.frames, options.corrector.name)
@@ -87,13 +87,13 @@ def of_one_camera(
     """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
     known = StereoRig(camera=camera, baseline=1.0) if isinstance(camera, PinholeCamera) else None
     for number, image in enumerate(arguments.items("images", images)):
-        arguments.check_image(f"frame {number}", image, known)
+        check_image(f"frame {number}", image, known)
     if len(images) > 0:
-        given.check_number("target_row", target_row, 0.0, images[0].shape[0] - 1.0)
-    given.check_whole("seed", seed, 0)
+        arguments.check_number("target_row", target_row, 0.0, images[0].shape[0] - 1.0)
+    arguments.check_whole("seed", seed, 0)
     if readout_ratio is not None:
-        given.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
+        arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
     if camera is not None and not isinstance(camera, PinholeCamera):
-        given.check_number("camera", camera)  # degrees, whose range the card of a camera checks
-    samples = arguments.gyro_samples(gyro)
+        arguments.check_number("camera", camera)  # degrees, whose range the card of a camera checks
+    samples = gyro_samples(gyro)
     return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=samples)

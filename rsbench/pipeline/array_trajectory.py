@@ -11,8 +11,8 @@ import numpy as np
 from rsbench.capture.sequence_shutter import shutter_of_sequence
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, Trajectory, estimate_trajectory
-from rsbench.components import arguments
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.geometry import check_image, four_images
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -36,10 +36,10 @@ def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Cor
         if isinstance(both, Correspondences) or not isinstance(both, Collection) or len(both) != 2:
             raise ValueError(f"sequence[{number}]: must be Correspondences, as all others, or two images")
         for side, image in zip(("left", "right"), both, strict=True):
-            arguments.check_image(f"sequence[{number}], {side}", image, rig)
+            check_image(f"sequence[{number}], {side}", image, rig)
     if len(frames) < 2:
         raise ValueError(f"sequence: {len(frames)} times, at least 2 are needed")
-    return [find_matches(arguments.four_images([*a, *b]), options) for a, b in itertools.pairwise(frames)]
+    return [find_matches(four_images([*a, *b]), options) for a, b in itertools.pairwise(frames)]
 
 
 def trajectory_of(

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsbench.components.motion_models import make_motion
+from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -9,7 +9,7 @@ from typing import Any
 from rsbench.components.imports import component_key
 from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.corrector import CorrectorEntry, load_corrector
 from rsbench.vision.feature_matcher import FeatureEntry, load_features

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from rsbench.capture.calibration import CardSigma, of_offset
 from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.arguments import check_number
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.given import check_number
-from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
 from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes

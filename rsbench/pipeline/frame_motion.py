@@ -23,6 +23,7 @@ from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.two_frame_spline import log_odds_of_opposite, shaken_motion
+from rsbench.components.motion_models import load_kernel
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -34,11 +35,8 @@ from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import on_their_rows
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.kernel_type import load_kernel
-from rsbench.solvers.engine.registry import SolverEntry
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
-from rsbench.solvers.engine.robust_problem import MatchCount
+from rsbench.solvers.engine.base import MotionEstimate, SolverEntry
+from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 BACKWARDS = (

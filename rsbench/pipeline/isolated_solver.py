@@ -31,11 +31,16 @@ from rsbench.jobs.isolation import (
     use_one_thread,
 )
 from rsbench.pipeline.problem import EXAMPLE, read_problem
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
-from rsbench.solvers.engine.robust_problem import MatchCount
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.engine.base import (
+    MatchSet,
+    MotionEstimate,
+    Solver,
+    SolverEntry,
+    SolverSpec,
+    load_solver_entry,
+)
+from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.refined import warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

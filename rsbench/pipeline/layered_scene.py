@@ -15,8 +15,8 @@ from typing import final
 import numpy as np
 
 from rsbench.components.motion_models import make_motion
+from rsbench.core.arguments import check_whole
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.given import check_whole
 from rsbench.core.rig import FRAMES, SIDES, Side, View
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.two_frame_spline import way_of_two
+from rsbench.components.motion_models import InertialMotion
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import InertialMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

@@ -14,7 +14,7 @@ import scipy
 
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.gyro_motion import GyroMotion
+from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -22,7 +22,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.mono_correction import FoundOwnMotion, flow_matches
 from rsbench.pipeline.mono_law import error_px
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.gyro import GyroSolver
+from rsbench.solvers.gyro_and_gravity import GyroSolver
 from rsbench.vision.mono_fusion import Flows, OwnMotion
 
 NOT_COVERED = "the gyroscope's samples do not reach over these frames"

@@ -10,15 +10,15 @@ from rsbench.capture.calibration import NO_ERRORS
 from rsbench.capture.model_choice import motion_at
 from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
+from rsbench.components.motion_models import AcceleratedMotion, InertialMotion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.motion import AcceleratedMotion, InertialMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
-from rsbench.solvers.engine.robust_problem import MatchCount
+from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions
 from rsbench.solvers.refined import RefinedSolver
 
 _CLEARLY_LESS = 0.9

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.components.motion_models import AcceleratedMotion, InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import AcceleratedMotion, InertialMotion
 from rsbench.core.rig import FRAMES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

@@ -24,8 +24,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images, Pairs
 from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.robust_motion import RobustEstimate
-from rsbench.solvers.engine.robust_problem import MatchCount
+from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate
 
 BRIDGED = "few of the matches agree with the motion"
 TURNED = "; they turn as the gyroscope says, and stay where they are"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.gyro_motion import GyroMotion
+from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

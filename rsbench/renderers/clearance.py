@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.core.geometry import MovingObject, RelativeMotion
 from rsbench.core.motion import Motion
-from rsbench.core.moving_objects import MovingObject, RelativeMotion
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import inverse
 from rsbench.core.shutter import RollingShutter

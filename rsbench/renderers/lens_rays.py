@@ -3,7 +3,7 @@
 The pixel centres are solved on the host. What the samples of a pixel share - its centre and the inverse derivative
 there - is found once; from it a chord method, Newton's with that one derivative, goes the half pixel to each
 sample: no ray is interpolated. It takes the steps that the lens needs, which the host tries. NumPy:
-``rsbench.core.lens.Lens.undistort``.
+``rsbench.core.camera.Lens.undistort``.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens, inverse_2x2
+from rsbench.core.camera import Lens, PinholeCamera, inverse_2x2
 
 _EXACT_PX = 1e-8
 """How near to its sample a ray is, in double precision; rounding it to single errs a thousand times more."""

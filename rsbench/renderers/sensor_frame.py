@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.geometry import Geometry
-from rsbench.core.moving_objects import poses_of
+from rsbench.core.geometry import Geometry, poses_of
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.renderers.electrons import Sensor, expose

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
-from rsbench.core.moving_objects import MovingObject
+from rsbench.core.geometry import MovingObject
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.renderers.scene import MitsubaScene

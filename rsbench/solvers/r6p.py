@@ -1,26 +1,26 @@
 """Absolute pose of a rolling-shutter frame from six points, on the stereo depth of the frame before.
 
-C. Albl, Z. Kukelova, T. Pajdla, R6P: Rolling Shutter Absolute Camera Pose, CVPR 2015, let the camera turn and move
-at constant velocity while it reads. With s the time since the first row,
+C. Albl, Z. Kukelova, T. Pajdla, R6P: Rolling Shutter Absolute Camera Pose, CVPR 2015, let the camera turn and
+move at constant velocity while it reads. With s the time since the first row,
 
     lambda x = (I + s [w']x) R X + C + s t'      (single linearisation)
     lambda x = (I + s [w']x) (I + [v]x) X + C + s t'      (double linearisation, R near the identity).
 
 Six points give twelve equations. Z. Kukelova, C. Albl, A. Sugimoto, T. Pajdla, Linear Solution to the Minimal
-Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation with [w']x [v]x X frozen at the v
-of the step before: a few linear steps. Here these are Newton's, linear about the w' of the step before too: as
-dear, and of cameras that turn by 30 degrees within the frame they end at the solution in 9 of 10 samples, where
-frozen ones do in 6. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling Shutter Camera Absolute
-Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, whose v turns R after each. Algebraic solvers
-give all solutions; this gives one, next to the orientation of frame 0.
+Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation with [w']x [v]x X frozen at the
+v of the step before: a few linear steps. Here these are Newton's, linear about the w' of the step before too:
+as dear, and of cameras that turn by 30 degrees within the frame they end at the solution in 9 of 10 samples,
+where frozen ones do in 6. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling Shutter Camera
+Absolute Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, whose v turns R after each.
+Algebraic solvers give all solutions; this gives one, next to the orientation of frame 0.
 
 As published, P3P turns the points first, so that R is near the identity, and samples are judged by the
-reprojection errors of all twelve unknowns, not by the pose alone: of free velocities the pose of six points is far
-off where the whole of them fits.
+reprojection errors of all twelve unknowns, not by the pose alone: of free velocities the pose of six points is
+far off where the whole of them fits.
 
-Points of one plane leave one combination open to first order: facing it at Z and at rest, with s = a (y - y0), a
-pitch of 1, a rise of Z and a speed of -Z / a along the axis. Noise decides it (compare C. Albl, A. Sugimoto, T.
-Pajdla, Degeneracies in Rolling Shutter SfM, ECCV 2016).
+Points of one plane leave one combination open to first order: facing it at Z and at rest, with s = a (y - y0),
+a pitch of 1, a rise of Z and a speed of -Z / a along the axis. Noise decides it (compare C. Albl, A. Sugimoto,
+T. Pajdla, Degeneracies in Rolling Shutter SfM, ECCV 2016).
 
 The points are from the stereo pair of frame 0, whose rows move too: see ``R6pSolver.frame_0``. All lies in the
 body's axes, so that C is its translation.
@@ -34,14 +34,13 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import FRAME_1, Correspondences, stereo_points, with_depth
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.ransac import BoolArray, IntArray, RansacOptions, ransac
-from rsbench.solvers.engine.stereo_points import FRAME_1, stereo_points, with_depth
-from rsbench.solvers.p3p import P3pSolver
+from rsbench.solvers.poselib import P3pSolver
 
 _LEAST = 6
 _STEPS = 6

@@ -1,4 +1,5 @@
-"""The differential solvers of one rolling-shutter camera.
+"""The solvers of Zhuang et al.: differential ones of one rolling-shutter camera, and flow scaled to a global
+shutter.
 
 B. Zhuang, L.-F. Cheong, G. H. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017.
 
@@ -6,31 +7,45 @@ A camera whose points move by ``dX/dtau = w x X + v`` shows, to first order in t
 
     u = beta P(x) (w x x + v / Z),   P(x) = [I | -x] (2, 3),   x the ray of frame 0,
 
-of which ``v . (x x u) + beta x^T s x = 0`` with ``s = (v w^T + w v^T) / 2 - (v . w) I`` is free of the depth: the
-differential epipolar constraint (Y. Ma, J. Kosecka, S. Sastry, IJCV 2000), linear in v and s. beta is the time
-that the flow took, in frame periods: tau1 - tau0 at constant velocity, and at constant acceleration k
+of which ``v . (x x u) + beta x^T s x = 0`` with ``s = (v w^T + w v^T) / 2 - (v . w) I`` is free of the depth:
+the differential epipolar constraint (Y. Ma, J. Kosecka, S. Sastry, IJCV 2000), linear in v and s. beta is the
+time that the flow took, in frame periods: tau1 - tau0 at constant velocity, and at constant acceleration k
 
     beta = (alpha + k alpha_k) 2 / (2 + k),   alpha = tau1 - tau0,   alpha_k = (tau1^2 - tau0^2) / 2.
 
-Then Z(k) = Z0 + k Z1 annihilates (v (2 + k) / 2, s), so that k is a generalised eigenvalue of nine matches.
+Then Z(k) = Z0 + k Z1 annihilates (v (2 + k) / 2, s), so that k is a generalised eigenvalue of nine matches
+(``ZhuangSolver``).
+
+At constant velocity, a match that took ``a = 1 + h (y1 - y0)`` frame periods has moved a times as far as in
+one: scaling it by 1 / a makes any global-shutter solver one for a rolling shutter and a constant twist
+(``FlowScaledSolver``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 import scipy
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.rig import StereoRig
+from rsbench.core.correspondences import Correspondences, temporal_pairs, track_pairs, without_lens
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.linear_systems import ROUNDING, rotation_from_essential
+from rsbench.solvers.engine.base import (
+    MatchSet,
+    MotionEstimate,
+    Solver,
+    SolverEntry,
+    SolverSpec,
+    load_solver_entry,
+)
+from rsbench.solvers.linear import ROUNDING, rotation_from_essential
 
 _SLOWEST, _FASTEST = -0.49, 3.0
 """Accelerations k that are looked for: beyond the first the camera would turn back before the last row."""
@@ -313,3 +328,100 @@ class ZhuangSolver(Solver):
             reason="the length of d is not determined by one camera",
             motion_parameters={} if constant else {"acceleration": found.k},
         )
+
+
+_LEAST_DURATION = 0.05
+"""Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""
+
+
+def scale_flow(correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Correspondences:
+    """Matches, without a lens, whose frame-1 ends are moved to where they are after exactly one frame period."""
+    ideal = without_lens(correspondences, rig.camera)
+    halves = [
+        _scaled(track_pairs(correspondences.tracks, side), track_pairs(ideal.tracks, side), side, shutter)
+        for side in SIDES
+    ]
+    return Correspondences(
+        left=_scaled(correspondences.left, ideal.left, "left", shutter),
+        right=_scaled(correspondences.right, ideal.right, "right", shutter),
+        tracks=np.concatenate([ideal.tracks[:, :4], halves[0][:, 2:], halves[1][:, 2:]], axis=1),
+    )
+
+
+def _scaled(pixels: FloatArray, matches: FloatArray, side: Side, shutter: RollingShutter) -> FloatArray:
+    duration = shutter.pixel_time(pixels[:, 2:], 1, side) - shutter.pixel_time(pixels[:, :2], 0, side)
+    duration = np.maximum(duration, _LEAST_DURATION)[:, None]
+    return np.concatenate([matches[:, :2], matches[:, :2] + (matches[:, 2:] - matches[:, :2]) / duration], axis=1)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class FlowScaledSolver(Solver):
+    """A global-shutter solver on scaled matches; its motion is that of a constant twist to first order."""
+
+    solver: str
+    """Name or card of the global-shutter solver."""
+
+    def __post_init__(self) -> None:
+        if self._entry.solver.spec.shutter != "global":
+            raise RsbenchError(f"solver = {self.solver!r}: must be a global-shutter solver")
+        if "stereo" in self._entry.solver.spec.needs:
+            raise RsbenchError(
+                f"solver = {self.solver!r}: needs left-right matches, which take no time that could be scaled; "
+                "must be one of matches over time or tracks"
+            )
+
+    @cached_property
+    def _entry(self) -> SolverEntry:
+        try:
+            return load_solver_entry(self.solver)
+        except RecursionError:
+            raise RsbenchError(f"solver = {self.solver!r}: refers to this card itself") from None
+
+    @property
+    def inner(self) -> Solver:
+        """The global-shutter solver."""
+        return self._entry.solver
+
+    @property
+    def inner_keys(self) -> tuple[str, ...]:
+        return (self._entry.key,)
+
+    @property
+    def spec(self) -> SolverSpec:
+        """What the solver inside declares, on a rolling shutter."""
+        inner = self.inner.spec
+        return replace(
+            inner,
+            motion_model="twist",
+            shutter="rolling",
+            cameras="any" if inner.needs == {"left"} else "lens",
+            reference=f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}",
+            assumes=f"constant twist, small motion; {inner.assumes}",
+        )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        return self.inner.estimate(scale_flow(correspondences, rig, shutter), rig.ideal, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return self.inner.sample_sizes(correspondences)
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return self.inner.propose(scale_flow(sample, rig, shutter), rig.ideal, shutter)
+
+    def propose_all(
+        self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
+    ) -> Iterable[list[MotionEstimate]]:
+        return self.inner.propose_all([scale_flow(sample, rig, shutter) for sample in samples], rig.ideal, shutter)
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        return self.inner.improve(motion, scale_flow(correspondences, rig, shutter), rig.ideal, shutter, quick)

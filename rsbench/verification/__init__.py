@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rsbench.components.cards import card_path
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.storage.files import read_json
@@ -60,9 +60,9 @@ def verify_dataset(
         LostJobsError: the process of a sequence ended each time it was tried.
         RsbenchError: no dataset.json, or one that is not a JSON object; no card of a scene where one was named.
     """
-    given.check_whole("stride", stride, 1, given.LARGEST_SIZE)
-    given.check_one_of("rerender", rerender, ("no", "auto", "all"))
-    given.check_whole("workers", workers, 1)
+    arguments.check_whole("stride", stride, 1, arguments.LARGEST_SIZE)
+    arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
+    arguments.check_whole("workers", workers, 1)
     manifest = read_json(folder / manifest_checks.DATASET)
     step = progress or (lambda name: None)
     listing = manifest_checks.Listing.of(folder, manifest)

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
+from rsbench.core.camera import inverse_2x2
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import inverse_2x2
 from rsbench.core.projection import back_project
 from rsbench.core.rig import FRAMES
 from rsbench.core.so3 import FloatArray

@@ -17,7 +17,7 @@ import numpy as np
 
 from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
-from rsbench.core.moving_objects import poses_of
+from rsbench.core.geometry import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file

@@ -96,7 +96,7 @@ def across_lines(columns: bool, u: float, v: float) -> float:
 
 @compiled(error_model="numpy")
 def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """``rsbench.core.lens.Lens.distort`` of one ideal pixel, in pixels; NaN beyond the lens's reach."""
+    """``rsbench.core.camera.Lens.distort`` of one ideal pixel, in pixels; NaN beyond the lens's reach."""
     x, y = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
     s = x * x + y * y
     if not s < lens[4] * lens[4]:  # NaN included

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components import plugins
-from rsbench.components.arguments import check_plain
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core import projection
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import check_plain
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.se3 import Pose

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.arguments import check_ranges
+from rsbench.core.arguments import check_ranges
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.flow import flow_depth

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.arguments import check_ranges
+from rsbench.core.arguments import check_ranges
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, Side, StereoRig

@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.arguments import check_ranges
 from rsbench.components.compiled import compiled
+from rsbench.core.arguments import check_ranges
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS, StereoRig, View

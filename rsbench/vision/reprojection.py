@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
+from rsbench.components.motion_kernels import Vector, apply
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.vectors import Vector, apply
 from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
 
 F32 = NDArray[np.float32]

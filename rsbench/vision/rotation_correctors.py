@@ -9,8 +9,8 @@ from typing import final
 
 import numpy as np
 
-from rsbench.core.gyro_motion import GyroMotion
-from rsbench.core.motion import LinearMotion
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.imu import GyroMotion
 from rsbench.core.rig import View
 from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.arguments import check_ranges
+from rsbench.core.arguments import check_ranges
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.vision.disparity_refinement import refine_disparity
 from rsbench.vision.half_size import guided_upsample, halved

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components import plugins
-from rsbench.components.arguments import check_ideal, check_plain
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import check_ideal, check_plain
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter

@@ -24,9 +24,8 @@ from small_scenes import write_box_scene
 
 from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import card_path, list_cards
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens
 from rsbench.core.shutter import Scan, Scanning
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard

@@ -76,7 +76,7 @@ def _cards(inputs: Path, folder: Path) -> Iterator[Loader]:
     from rsbench.pipeline.footage import read_rig_card
     from rsbench.renderers.options import RendererOptions
     from rsbench.scenes.load import read_scene_card
-    from rsbench.solvers.engine.registry import load_solver_entry
+    from rsbench.solvers.engine.base import load_solver_entry
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.feature_matcher import load_features
     from rsbench.vision.stereo_matcher import load_matcher

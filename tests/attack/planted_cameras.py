@@ -37,7 +37,7 @@ from attack.planting import (
 )
 from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import load_card
-from rsbench.core.lens import Lens
+from rsbench.core.camera import Lens
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.core.shutter import RollingShutter

@@ -49,7 +49,7 @@ from attack.planting import (
 )
 from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import load_card
-from rsbench.core.motion import TwistMotion
+from rsbench.components.motion_models import TwistMotion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_sequence

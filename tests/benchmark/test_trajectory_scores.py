@@ -20,10 +20,11 @@ from rsbench.benchmark.trajectory_scores import (
     trajectory_scores,
     turn_errors,
 )
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core import se3, so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import Motion
 from rsbench.core.projection import project_at, rs_project
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.se3 import Pose, compose, inverse

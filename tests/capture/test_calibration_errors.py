@@ -9,11 +9,10 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import LENS, NO_ERRORS, OFFSET, ROWS, TERMS, in_words, ray_shifts, recalibrated
 from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.two_frame_estimate import conclude, examine
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion, TwistMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray

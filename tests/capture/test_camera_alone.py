@@ -17,8 +17,8 @@ from rsbench.capture.shutter_decision import (
     shutter_alone,
 )
 from rsbench.capture.two_frame_estimate import Capture
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

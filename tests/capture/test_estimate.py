@@ -24,10 +24,10 @@ from rsbench.capture.hypotheses import (
 )
 from rsbench.capture.hypothesis_ranking import Peak, find_lag, first_shutter
 from rsbench.capture.two_frame_estimate import Capture, _product, conclude, examine
-from rsbench.core.camera import PinholeCamera
+from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.lens import Lens
-from rsbench.core.motion import AcceleratedMotion, InertialMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray

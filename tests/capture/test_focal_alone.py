@@ -7,8 +7,8 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.self_calibration import PRIOR, PairFocal, conclude_focal, focal_of_pair
+from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import InertialMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.robust_motion import RobustOptions

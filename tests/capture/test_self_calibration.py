@@ -12,9 +12,8 @@ from rsbench.capture.calibration import FOCAL, LENS, NO_ERRORS, RADIAL, CardSigm
 from rsbench.capture.hypotheses import CALIBRATION, CaptureCost, Hypothesis, Known, Likelihood, Scans, TimedMatches
 from rsbench.capture.self_calibration import _mended, find_camera
 from rsbench.components.motion_models import make_motion
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 

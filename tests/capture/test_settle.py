@@ -27,9 +27,8 @@ from rsbench.capture.model_choice import AUTO, choose_model, motion_at
 from rsbench.capture.shutter_decision import NoMotionError, known_of, runs_backwards, shutter_found
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.components.motion_models import make_motion
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray

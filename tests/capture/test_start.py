@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from rsbench.capture.hypothesis_ranking import Lag, with_lag_taken
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
 
 

@@ -30,8 +30,8 @@ from rsbench.capture.trajectory_estimate import (
 from rsbench.capture.trajectory_fit import fit
 from rsbench.capture.trajectory_spline import ContinuousMotion, Prior
 from rsbench.capture.trajectory_tracks import Tails, pack_windows
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.so3 import FloatArray
 
 

@@ -8,10 +8,11 @@ import pytest
 from rsbench.capture.sequence_shutter import capture_along
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_spline import trajectory_alone, way_of_two
+from rsbench.components.motion_models import InertialMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import InertialMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter

@@ -27,9 +27,8 @@ from rsbench.capture.trajectory_spline import (
     whitening,
 )
 from rsbench.capture.trajectory_tracks import ENOUGH, Tails, pack_windows, telling
-from rsbench.components.motion_models import motion_record, read_motion
+from rsbench.components.motion_models import LinearMotion, motion_record, read_motion
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.so3 import FloatArray
 
 

@@ -24,7 +24,7 @@ BROKEN = {
 
 GOOD = """
 from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 
 EIGHT_POINT = load_solver("gs-8pt")
 

@@ -21,8 +21,8 @@ from rsbench.capture.calibration import of_offset
 from rsbench.capture.hypotheses import Known, Scans
 from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.cli.correct_said import readout_words, say_calibration
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset import corrected_frames

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 SLOW = """
 import os, time
 from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 
 EIGHT_POINT = load_solver("gs-8pt")
 

@@ -19,7 +19,7 @@ from rsbench.cli import console
 from rsbench.cli.main import app
 from rsbench.cli.names import COMPONENTS, kind_names, names_of, parameters_of
 from rsbench.components.cards import FORMER_NAMES, CardKind, list_cards, read_toml
-from rsbench.solvers.engine.registry import list_solvers, load_solver_entry
+from rsbench.solvers.engine.base import list_solvers, load_solver_entry
 
 
 def rsbench(*arguments: str, path: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -14,8 +14,8 @@ import pytest
 from commands import assert_refused, run_here
 
 import rsbench
+from rsbench.components.motion_models import TwistMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import TwistMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.problem import EXAMPLE, Problem, problem_record
@@ -23,7 +23,7 @@ from rsbench.pipeline.problem import EXAMPLE, Problem, problem_record
 PLUGIN = """
 import os, sys, time
 from dataclasses import dataclass
-from rsbench.solvers.eight_point import EightPointSolver
+from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.solvers.engine.base import MotionEstimate, Solver
 
 print("imported")
@@ -149,7 +149,7 @@ def test_a_problem_without_an_answer_is_exit_code_1(tmp_path: Path) -> None:
 def test_wrong_options_are_refused_in_one_line(
     tmp_path: Path, arguments: list[str], words: tuple[str, ...]
 ) -> None:
-    (tmp_path / "gs-8pt.toml").write_text("class = 'rsbench.solvers.eight_point:EightPointSolver'\n")
+    (tmp_path / "gs-8pt.toml").write_text("class = 'rsbench.solvers.essential_matrix:EightPointSolver'\n")
     result = solve(EXAMPLE, *(argument.format(folder=tmp_path) for argument in arguments))
     assert result.returncode == 2 and result.stdout == ""
     assert len(result.stderr.splitlines()) == 1 and result.stderr.startswith("rsbench: error: ")

@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsbench.components import compiled
+from rsbench.components import compiled, motion_kernels, motion_models
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine import five_point, kernels, minimal, motion_kernels, track_kernels, vectors
-from rsbench.solvers.engine.registry import list_solvers, load_solver
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers import refined
+from rsbench.solvers.engine import packed, residuals
+from rsbench.solvers.engine.base import list_solvers, load_solver
+from rsbench.solvers.refined import warm_up
 
 FOLDER = "from rsbench.components.compiled import cache_folder; import sys; sys.stdout.write(str(cache_folder()))"
 ADDS = """
@@ -141,13 +142,13 @@ def test_every_source_with_compiled_code_decides_the_version() -> None:
         if "import compiled\n" in path.read_text()
     }
     assert users <= marked
-    assert {"solvers/engine/kernels.py", "vision/resample.py"} <= users
+    assert {"solvers/engine/residuals.py", "vision/resample.py"} <= users
     assert not any("njit" in (package / name).read_text() for name in marked - {"components/compiled.py"})
 
 
 def signatures() -> set[tuple[str, str]]:
     found = set()
-    for module in (vectors, motion_kernels, kernels, track_kernels, minimal, five_point):
+    for module in (motion_kernels, motion_models, residuals, packed, refined):
         for name, function in vars(module).items():
             found |= {(name, str(signature)) for signature in getattr(function, "signatures", [])}
     return found
@@ -157,8 +158,8 @@ def signatures() -> set[tuple[str, str]]:
 @pytest.mark.parametrize("name", list_solvers())
 def test_a_warm_solver_compiles_nothing(name: str) -> None:
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-    from rsbench.solvers.engine.free_solver import FreeVelocitySolver
     from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+    from rsbench.solvers.free_velocities import FreeVelocitySolver
 
     solver = load_solver(name)
     warm_up([solver.spec.motion_model])

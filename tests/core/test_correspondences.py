@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences, lens_affine, without_lens
-from rsbench.core.lens import Lens
 
 COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core import epipolar, so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import Motion
 from rsbench.core.projection import ProjectionStatus, project_at, rs_project
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose, inverse, transform

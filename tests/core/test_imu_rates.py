@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
-from rsbench.core.imu_rates import STANDARD_GRAVITY, inertial
-from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.imu import STANDARD_GRAVITY, inertial
+from rsbench.core.motion import Motion
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.core.spline_motion import SplineMotion
-from rsbench.core.trajectory_motion import TrajectoryMotion
+from rsbench.core.spline_motion import SplineMotion, TrajectoryMotion
 
 W, D = np.array([0.08, -0.12, 0.05]), np.array([0.2, -0.1, 0.3])
 DOWN = np.array([0.0, STANDARD_GRAVITY, 0.0])

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
+from rsbench.core.camera import Lens, PinholeCamera
 
 PLAIN = PinholeCamera(width=640, height=480, fx=420.0, fy=430.0, cx=310.0, cy=250.0)
 PHONE = Lens(model="brown-conrady", k1=0.12, k2=-0.35, p1=0.0011, p2=-0.0007, k3=0.28)

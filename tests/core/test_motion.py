@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm, logm
 
+from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
-from rsbench.core.motion import AcceleratedMotion, InertialMotion, LaterMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import LaterMotion, Motion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import PRESETS, SplineMotion

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
-from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
-from rsbench.core.moving_objects import MovingObject, RelativeMotion, poses_of
+from rsbench.core.geometry import MovingObject, RelativeMotion, poses_of
+from rsbench.core.motion import Motion
 from rsbench.core.se3 import transform
 
 Triple = tuple[float, float, float]

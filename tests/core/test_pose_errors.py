@@ -8,8 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core import pose_errors
-from rsbench.core.motion import LinearMotion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.components.motion_models import LinearMotion, TwistMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.motion import Motion
 from rsbench.core.projection import (
     ROW_TOLERANCE_PX,
     ProjectionStatus,

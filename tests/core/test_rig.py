@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion, TwistMotion
 from rsbench.core.projection import project_at
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose, inverse

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from rsbench.core.correspondences import (
     JOIN_TOLERANCE_PX,
     Correspondences,
+    join_stereo,
     repeated,
     temporal_pairs,
     unlinked_pairs,
 )
-from rsbench.core.track_building import join_stereo
 
 
 def points(count: int, seed: int = 0) -> np.ndarray:

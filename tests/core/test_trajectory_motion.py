@@ -11,7 +11,7 @@ from rsbench.components.motion_models import make_motion, motion_record, read_mo
 from rsbench.core import so3
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.core.trajectory_motion import TrajectoryMotion, world_from_body
+from rsbench.core.spline_motion import TrajectoryMotion, world_from_body
 
 few = settings(max_examples=25)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import Geometry, GivenGeometry
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.components.motion_models import LinearMotion, TwistMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.geometry import FixedGeometry, Geometry
+from rsbench.core.motion import Motion
 from rsbench.core.projection import rs_project, rs_project_near
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.se3 import inverse, transform
@@ -30,9 +30,9 @@ MOTION = LinearMotion([0.03, -0.05, 0.06], [0.2, -0.1, 0.3])
 
 def geometry_of(
     lens: Lens | None = None, ratio: float = 0.9, motion: Motion = MOTION, **scanning: Any
-) -> GivenGeometry:
+) -> FixedGeometry:
     shutter = Scanning(**scanning).shutter_of(CAMERA.width, CAMERA.height, ratio)
-    return GivenGeometry(StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.3), shutter, motion)
+    return FixedGeometry(StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.3), shutter, motion)
 
 
 def points_on_planes(geometry: Geometry, rng: np.random.Generator, count: int) -> tuple[Tracks, Array]:
@@ -85,7 +85,7 @@ def differences(geometry: Geometry, tracks: Tracks, normals: Array, view: View, 
     ],
     ids=["plain", "barrel", "fisheye, columns, late", "opposite"],
 )
-def test_derivatives_are_those_of_traced_rays(geometry: GivenGeometry) -> None:
+def test_derivatives_are_those_of_traced_rays(geometry: FixedGeometry) -> None:
     """A step of 0.01 px errs by its square times third derivatives, and by 1e-9 px of rows over 0.02 px."""
     tracks, normals = points_on_planes(geometry, np.random.default_rng(7), 300)
     found = jacobians_of(geometry, tracks, normals)

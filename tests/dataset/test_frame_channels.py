@@ -14,8 +14,8 @@ from attack.planting import rehash
 from frame_faults import FAULTS
 from numpy.typing import NDArray
 
+from rsbench.components.motion_models import AcceleratedMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import AcceleratedMotion
 from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray

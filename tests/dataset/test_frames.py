@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import AcceleratedMotion, LaterMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import LaterMotion, Motion
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import FRAMES, SIDES, StereoRig, views_of
 from rsbench.core.se3 import compose, inverse, transform

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.components.cards import parse_card
+from rsbench.core.camera import Lens
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, View
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card

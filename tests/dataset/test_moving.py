@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from traced_truth import Array, rays
 
 from rsbench.components.cards import parse_card
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
-from rsbench.core.moving_objects import poses_of
+from rsbench.core.geometry import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard

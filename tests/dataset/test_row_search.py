@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.camera import PinholeCamera
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import GivenGeometry
-from rsbench.core.lens import Lens
-from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
+from rsbench.core.geometry import FixedGeometry
+from rsbench.core.motion import Motion
 from rsbench.core.projection import ProjectionStatus, back_project, project_at, rs_project
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import inverse
@@ -32,13 +32,13 @@ NEAR_PX = 5e-6
 1e-8 of a focal length, over a slope of the row equation above 0.2."""
 
 
-def _geometry(lens: Lens | None, motion: Motion, **scan: object) -> GivenGeometry:
+def _geometry(lens: Lens | None, motion: Motion, **scan: object) -> FixedGeometry:
     camera = PinholeCamera(width=64, height=48, fx=60.0, fy=62.0, cx=30.0, cy=25.0, lens=lens)
     shutter = RollingShutter(height=48, width=64, readout_ratio=0.9, **scan)  # pyrefly: ignore[bad-argument-type]
-    return GivenGeometry(StereoRig(camera=camera, baseline=0.3), shutter, motion)
+    return FixedGeometry(StereoRig(camera=camera, baseline=0.3), shutter, motion)
 
 
-def _points(geometry: GivenGeometry, source: ImageView, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def _points(geometry: FixedGeometry, source: ImageView, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """What pixels (4, 64) of the source see at random depths, and the lines where the search starts."""
     rows = np.sort(rng.choice(48, 4, replace=False))
     grid = geometry.rig.camera.pixel_grid()[rows]

@@ -16,7 +16,7 @@ from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.core.trajectory_motion import world_from_body
+from rsbench.core.spline_motion import world_from_body
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along, read_trajectory

@@ -13,7 +13,7 @@ from evo.tools import file_interface
 from exported_data import LENSES, MOTION, SAME_PX, dataset, exported, only, opencv_pixels, seen
 from scipy.spatial.transform import Rotation
 
-from rsbench.core.motion import LinearMotion, TwistMotion
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.rig import SIDES, views_of
 from rsbench.core.so3 import FloatArray
 from rsbench.storage.files import read_json, write_json

@@ -18,17 +18,16 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.jobs.isolation import IsolatedWorker, decode, encode
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.eight_point import EightPointSolver
-from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.essential_matrix import EightPointSolver
 
 PLUGIN = """
 import ctypes, dataclasses, os, signal, subprocess, sys, time
@@ -36,7 +35,7 @@ import ctypes, dataclasses, os, signal, subprocess, sys, time
 import numpy as np
 
 from rsbench.solvers.engine.base import MotionEstimate, Solver
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 
 
 EIGHT_POINT = load_solver("gs-8pt")
@@ -289,7 +288,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 
 rig = StereoRig(camera=PinholeCamera.centred(640, 480, 500.0), baseline=0.2)
 points = np.random.default_rng(0).uniform(0, 400, (20, 4))

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.baseline_motions import global_shutter_motion, monocular_motion, solved_alone
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

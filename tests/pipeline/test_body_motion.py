@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.pipeline.body_motion import body_motion
-from rsbench.solvers.eight_point import EightPointSolver
 from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

@@ -22,8 +22,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import motion_of, solve_frames
-from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import MotionEstimate, load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS, FeatureMatcher
 from rsbench.vision.features import SiftMatcher

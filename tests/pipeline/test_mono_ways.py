@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import InertialMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_ways

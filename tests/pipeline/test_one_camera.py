@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import TwistMotion
 from rsbench.components.plugins import wrap
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.geometry import GivenGeometry
-from rsbench.core.motion import TwistMotion
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -47,8 +47,8 @@ def left_over(part: float) -> float:
     assert isinstance(found, TwistMotion)
     about = RIG.about("left")
     estimated = monocular_depth(flow.astype(np.float32), about, SHUTTER, found, "left", 0)
-    expected = correction_flow(depth.astype(np.float32), GivenGeometry(RIG, SHUTTER, motion), ("left", 0))
-    got = correction_flow(estimated, GivenGeometry(about, SHUTTER, found), ("left", 0))
+    expected = correction_flow(depth.astype(np.float32), FixedGeometry(RIG, SHUTTER, motion), ("left", 0))
+    got = correction_flow(estimated, FixedGeometry(about, SHUTTER, found), ("left", 0))
     # Inside of the patches of equal depth, which the median filter of the depth map leaves as they are.
     inner = np.zeros((96, 96), dtype=np.bool_)
     inner[3::8, 3::8] = inner[4::8, 4::8] = True

@@ -16,16 +16,15 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.core.camera import PinholeCamera
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.answer import EXTRAS, Answer, solve_problem
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import EXAMPLE, Problem, parse_problem, read_problem, read_problems
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
@@ -334,7 +333,7 @@ def test_seconds_hold_no_compilation() -> None:
     """In a fresh process the first problem takes about as long as the second one, and not what loading takes."""
     code = (
         "from rsbench.pipeline.answer import *; from rsbench.pipeline.problem import *\n"
-        "from rsbench.solvers.engine.registry import load_solver_entry\n"
+        "from rsbench.solvers.engine.base import load_solver_entry\n"
         "problem, entry = read_problem(EXAMPLE), load_solver_entry('rs-stereo-refined')\n"
         "with SolverRunner() as runner:\n"
         "    print([solve_problem(problem, entry, RobustOptions(), runner)['seconds'] for _ in range(5)])"

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import row_poses as line_poses
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose

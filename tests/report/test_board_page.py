@@ -24,8 +24,8 @@ from rsbench.benchmark.leaderboard.board import ORACLES, add
 from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.report.board_figures import ErrorLine, curves, drawable

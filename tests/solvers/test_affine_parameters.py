@@ -11,21 +11,20 @@ import pytest
 from commands import run_here
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
-from rsbench.solvers.affine_parameters import AffineSolver, equations, jets
-from rsbench.solvers.engine.free_velocities import FreeMotion, Rows, constraint
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.free_velocities import AffineSolver, FreeMotion, Rows, constraint, equations, jets
 from rsbench.storage.files import load_matches
 
 CAMERA = PinholeCamera.centred(900, 900, 810.0)

@@ -16,7 +16,7 @@ from rsbench.benchmark.simulated.convention_errors import misreading
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.registry import SolverEntry, list_solvers, load_solver_entry
+from rsbench.solvers.engine.base import SolverEntry, list_solvers, load_solver_entry
 
 ALLOWED_WARNINGS = {
     # The published linearisation couples rotation and readout: the rotation is 1 % off, and d with it.

@@ -8,29 +8,32 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.solvers.dai import DaiSolver, extract, system
-from rsbench.solvers.engine.free_descent import refine
-from rsbench.solvers.engine.free_velocities import (
+from rsbench.solvers.free_velocities import (
+    DaiSolver,
     FreeMotion,
     Rows,
+    TwelveParameterSolver,
+    coefficients,
     errors,
+    extract,
     from_row,
     in_front_of_both,
+    refine,
     sampson,
     sampson_jacobian,
     signed,
+    system,
+    with_derivatives,
 )
-from rsbench.solvers.engine.generalised_essential import coefficients, with_derivatives
-from rsbench.solvers.engine.linear_systems import null_vector
-from rsbench.solvers.twelve_parameters import TwelveParameterSolver
+from rsbench.solvers.linear import null_vector
 
 CAMERA = PinholeCamera.centred(900, 900, 810.0)
 RIG = StereoRig(camera=CAMERA, baseline=0.6)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.registry import load_solver
-from rsbench.solvers.scaled import FlowScaledSolver, scale_flow
+from rsbench.solvers.engine.base import load_solver
+from rsbench.solvers.zhuang import FlowScaledSolver, scale_flow
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
@@ -145,10 +145,10 @@ def test_scaled_solver_declares_what_its_inner_one_does(tmp_path: Path) -> None:
     )
     for text, message in (("rs-stereo-linear", "must be a global-shutter solver"), ("gs-9pt", "gs-9pt")):
         card = tmp_path / "bad.toml"
-        card.write_text(f'class = "rsbench.solvers.scaled:FlowScaledSolver"\n[parameters]\nsolver = "{text}"\n')
+        card.write_text(f'class = "rsbench.solvers.zhuang:FlowScaledSolver"\n[parameters]\nsolver = "{text}"\n')
         with pytest.raises(RsbenchError, match=message):
             load_solver(card)
-    card.write_text(f'class = "rsbench.solvers.scaled:FlowScaledSolver"\n[parameters]\nsolver = "{card}"\n')
+    card.write_text(f'class = "rsbench.solvers.zhuang:FlowScaledSolver"\n[parameters]\nsolver = "{card}"\n')
     with pytest.raises(RsbenchError, match="refers to this card itself"):
         load_solver(card)
 

@@ -9,17 +9,17 @@ import pytest
 
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.gyro_motion import GyroMotion
-from rsbench.core.motion import AcceleratedMotion, LinearMotion
+from rsbench.core.imu import GyroMotion
 from rsbench.core.pose_errors import rotation_error, scale_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.gyro import GyroSolver
+from rsbench.solvers.gyro_and_gravity import GyroSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

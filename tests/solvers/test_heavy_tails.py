@@ -9,17 +9,15 @@ import pytest
 from scipy.stats import chi2, t
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.heavy_tails import HeavyTailed, _distribution, heavy_tailed
 from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
-from rsbench.solvers.engine.packed import Packed, pack
-from rsbench.solvers.engine.per_measurement import each_term
+from rsbench.solvers.engine.packed import HeavyTailed, Packed, _distribution, each_term, heavy_tailed, pack
 from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

@@ -11,19 +11,25 @@ from scipy.optimize import least_squares
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences, without_lens
-from rsbench.core.lens import Lens
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.line_errors import LineErrors, line_rays, stereo_ends, usable_lines
-from rsbench.solvers.engine.registry import load_solver, load_solver_entry
+from rsbench.solvers.engine.base import load_solver, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.line_triplets import Features, LineTripletSolver
-from rsbench.solvers.triplets import PATTERNS, newton
+from rsbench.solvers.triplets import (
+    PATTERNS,
+    Features,
+    LineErrors,
+    LineTripletSolver,
+    line_rays,
+    newton,
+    stereo_ends,
+    usable_lines,
+)
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)

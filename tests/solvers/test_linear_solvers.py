@@ -11,20 +11,28 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.solvers.eight_point import EightPointSolver, decompose_essential, eight_point
 from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.linear_systems import null_vector, rotation_from_essential, scaled_translation
 from rsbench.solvers.engine.packed import pack
-from rsbench.solvers.iterated import IteratedSolver, length_from_tracks, reduced_blocks
-from rsbench.solvers.linear import LinearSolver, far_apart, system_rows
+from rsbench.solvers.essential_matrix import EightPointSolver, decompose_essential, eight_point
+from rsbench.solvers.linear import (
+    IteratedSolver,
+    LinearSolver,
+    far_apart,
+    length_from_tracks,
+    null_vector,
+    reduced_blocks,
+    rotation_from_essential,
+    scaled_translation,
+    system_rows,
+)
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

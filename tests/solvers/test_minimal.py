@@ -13,8 +13,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
-from rsbench.solvers.engine.minimal import damped_step, solve_triples
-from rsbench.solvers.engine.packed import pack
+from rsbench.solvers.engine.packed import damped_step, pack, solve_triples
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

@@ -14,7 +14,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)

@@ -10,7 +10,16 @@ from numpy.typing import ArrayLike
 
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.components import motion_models
+from rsbench.components import motion_kernels, motion_models
+from rsbench.components.motion_kernels import MotionKernel, Moved, kernel_for, times
+from rsbench.components.motion_models import (
+    AnyLaw,
+    any_law,
+    linear_move,
+    linear_translation_jacobian,
+    load_kernel,
+    quick_law,
+)
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
@@ -23,13 +32,8 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.solvers.engine import kernel_type
-from rsbench.solvers.engine.any_law import AnyLaw, any_law, quick_law
-from rsbench.solvers.engine.kernel_type import MotionKernel, Moved, kernel_for, load_kernel
-from rsbench.solvers.engine.motion_kernels import linear_move, linear_translation_jacobian
 from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.engine.vectors import times
 from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera(width=900, height=700, fx=810.0, fy=760.0, cx=440.0, cy=355.0), baseline=0.5)
@@ -181,7 +185,7 @@ def test_a_kernel_that_breaks_the_contract_is_refused_when_it_is_made() -> None:
 
     with pytest.raises(TypeError, match=r"Renamed\.move must have the arguments self, theta, tau0, tau1, R, A"):
         kernel_for(DullMotion)(Renamed)
-    assert DullMotion not in kernel_type._KERNELS
+    assert DullMotion not in motion_kernels.KERNELS
 
 
 @pytest.mark.parametrize(

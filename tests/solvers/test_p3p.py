@@ -15,9 +15,9 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.p3p import P3pSolver
+from rsbench.solvers.poselib import P3pSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)

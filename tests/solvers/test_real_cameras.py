@@ -10,13 +10,11 @@ import pytest
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.components.cards import list_cards
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences, without_lens
-from rsbench.core.lens import Lens
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import SolverSpec
-from rsbench.solvers.engine.registry import load_solver, load_solver_entry
+from rsbench.solvers.engine.base import SolverSpec, load_solver, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 

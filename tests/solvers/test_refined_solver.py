@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
-from rsbench.components.motion_models import make_motion
+from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import rotation_error, scale_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter

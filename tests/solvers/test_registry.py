@@ -15,8 +15,15 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.registry import SOLVERS, list_solvers, load_solver, load_solver_entry
+from rsbench.solvers.engine.base import (
+    SOLVERS,
+    MotionEstimate,
+    Solver,
+    SolverSpec,
+    list_solvers,
+    load_solver,
+    load_solver_entry,
+)
 from rsbench.solvers.linear import LinearSolver
 
 SPEC = SolverSpec(
@@ -88,7 +95,7 @@ def test_parameters_come_from_the_card(tmp_path: Path) -> None:
             'class = "rsbench.solvers.linear:LinearSolver"\n[parameters]\nextraction = "best"',
             ["extraction = 'best'", "'full' or 'symmetric'"],
         ),
-        ('class = "rsbench.solvers.iterated:IteratedSolver"\n[parameters]\npasses = 0', ["passes", "from 1 to"]),
+        ('class = "rsbench.solvers.linear:IteratedSolver"\n[parameters]\npasses = 0', ["passes", "from 1 to"]),
     ],
 )
 def test_a_wrong_card_is_refused_in_one_line(tmp_path: Path, text: str, parts: list[str]) -> None:
@@ -149,7 +156,7 @@ def test_a_solver_must_say_what_it_is(tmp_path: Path) -> None:
 
 PLAIN = """
 from rsbench.solvers.engine.base import MotionEstimate, Solver
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 
 
 class Plain(Solver):
@@ -164,7 +171,7 @@ class Plain(Solver):
 
 
 def test_the_key_follows_class_parameters_source_and_what_is_inside(tmp_path: Path) -> None:
-    scaled = 'class = "rsbench.solvers.scaled:FlowScaledSolver"\n[parameters]\nsolver = "{}"'
+    scaled = 'class = "rsbench.solvers.zhuang:FlowScaledSolver"\n[parameters]\nsolver = "{}"'
     inner = tmp_path / "inner.toml"
     keys = set()
     for iterations in (20, 30):

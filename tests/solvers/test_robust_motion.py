@@ -17,18 +17,24 @@ from rsbench.benchmark.simulated.simulation import (
     random_motion,
     simulate,
 )
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import BESIDE, MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.registry import list_solvers, load_solver
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
-from rsbench.solvers.engine.robust_problem import _moment, _quantile
+from rsbench.solvers.engine.base import (
+    BESIDE,
+    MatchSet,
+    MotionEstimate,
+    Solver,
+    SolverSpec,
+    list_solvers,
+    load_solver,
+)
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, _moment, _quantile, estimate_motion
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)

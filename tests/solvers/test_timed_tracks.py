@@ -11,10 +11,9 @@ from scipy.optimize import least_squares
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -11,19 +11,19 @@ import pytest
 
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.upright import Uprights, UprightSolver
+from rsbench.solvers.gyro_and_gravity import Uprights, UprightSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)

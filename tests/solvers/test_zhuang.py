@@ -52,7 +52,7 @@ def test_instantaneous_flow_gives_the_exact_velocity(kind: str, how: str, count:
     found = solver.estimate(matches, LEFT, SHUTTER) if count else None
     candidates = [found] if found is not None else solver.propose(matches, LEFT, SHUTTER)
     w = min((each.w for each in candidates), key=lambda w: float(np.linalg.norm(w - W)))
-    # Eight matches amplify the rounding of 1e-16 by up to 1e6 (see ROUNDING in linear_systems).
+    # Eight matches amplify the rounding of 1e-16 by up to 1e6 (see ROUNDING in linear).
     np.testing.assert_allclose(w, W, atol=1e-8)
     if found is not None and kind == "constant":
         assert found.motion_parameters["acceleration"] == pytest.approx(k, abs=1e-6)

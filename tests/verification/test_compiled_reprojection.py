@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import GivenGeometry
-from rsbench.core.lens import Lens
-from rsbench.core.motion import AcceleratedMotion, LinearMotion, Motion, TwistMotion
-from rsbench.core.moving_objects import MovingObject
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.geometry import FixedGeometry, MovingObject
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
@@ -42,10 +41,10 @@ class Kinked(Motion):
         return LinearMotion(self.w, self.d).velocity(tau)
 
 
-def geometry_of(motion: Motion, lens: Lens | None = None, **shutter: Any) -> GivenGeometry:
+def geometry_of(motion: Motion, lens: Lens | None = None, **shutter: Any) -> FixedGeometry:
     rig = StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.3)
     whole: dict[str, Any] = {"height": 48, "width": 64, "readout_ratio": 0.9} | shutter
-    return GivenGeometry(rig, RollingShutter(**whole), motion, 2)
+    return FixedGeometry(rig, RollingShutter(**whole), motion, 2)
 
 
 def room(view: ImageView, camera: PinholeCamera) -> DepthMap:
@@ -92,7 +91,7 @@ def check_alike(found: Reprojection, exact: Reprojection) -> None:
         pytest.param(geometry_of(Kinked(W, D)), id="no table"),
     ],
 )
-def test_every_pixel_lands_where_the_row_equation_says(geometry: GivenGeometry) -> None:
+def test_every_pixel_lands_where_the_row_equation_says(geometry: FixedGeometry) -> None:
     camera = geometry.rig.camera
     for source, target in VIEW_PAIRS[:: 1 if geometry.motion.name == "linear" else 5]:
         check_alike(*both_ways(geometry, room(source, camera), room(target, camera), 2))

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from analytic_dataset import write_analytic_dataset
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import GivenGeometry
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -78,7 +77,7 @@ def test_planes_of_which_no_place_is_flat_are_spoilt(dataset: Path, monkeypatch:
 
 def test_maps_of_thin_things_are_compared_roughly() -> None:
     still = LinearMotion([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    sequence = GivenGeometry(RIG, SHUTTER, still)
+    sequence = FixedGeometry(RIG, SHUTTER, still)
     rng = np.random.default_rng(2)
     leaves = rng.uniform(2.0, 9.0, (48, 64)).astype(np.float32)  # another thing in every pixel
     seen = {view: DepthMap(view, leaves, RIG.camera) for view in IMAGE_VIEWS}

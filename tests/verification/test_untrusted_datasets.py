@@ -21,9 +21,9 @@ from analytic_dataset import write_analytic_dataset
 from commands import run_here
 from PIL import Image
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import read_dataset, read_dataset_manifest

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from analytic_dataset import write_analytic_dataset
 
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion, Motion, TwistMotion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import read_dataset

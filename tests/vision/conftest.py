@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses, rs_project
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose

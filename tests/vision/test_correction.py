@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.motion import LinearMotion, TwistMotion
+from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.projection import back_project, project_at, row_poses
 from rsbench.core.se3 import Pose
 from rsbench.vision.correction import LineView, WarpOptions, correct_frame, correction_flow, warp

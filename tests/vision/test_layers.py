@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS

@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.lens import Lens
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
 from rsbench.core.shutter import Scanning
 from rsbench.vision.compiled_camera import distort, optics_of

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.line_triplets import LineTripletSolver
+from rsbench.solvers.triplets import LineTripletSolver
 from rsbench.storage.files import load_matches, save_matches
 from rsbench.vision.feature_matcher import find_correspondences, load_features
 from rsbench.vision.lines import LineOptions, detect_lines, match_lines

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from rsbench.components.cards import list_cards
+from rsbench.components.motion_models import LinearMotion
 from rsbench.components.plugins import Entry, RunOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.feature_matcher import FeatureMatcher, find_correspondences, load_features

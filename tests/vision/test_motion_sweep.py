@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.core.motion import LinearMotion
+from rsbench.components.motion_models import LinearMotion
 from rsbench.vision.motion_sweep import census as census_of
 from rsbench.vision.motion_sweep import depth_from_motion, ones
 

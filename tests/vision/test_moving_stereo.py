@@ -10,9 +10,8 @@ import pytest
 from analytic_dataset import plane_colours, plane_depth
 from numpy.typing import NDArray
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose

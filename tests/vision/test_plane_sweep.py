@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.core.rig import VIEWS, View
 from rsbench.vision.plane_sweep import SweepMatcher, sweep_depths
 from rsbench.vision.stereo_matcher import load_matcher

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.lens import Lens
-from rsbench.core.motion import LinearMotion
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import back_project, row_poses, rs_project_near
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import Scanning

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import LinearMotion
 from rsbench.components.plugins import wrap
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import GivenGeometry
-from rsbench.core.motion import LinearMotion
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.imu import ImuSamples, gyro_samples, true_samples
 from rsbench.pipeline.chain import Given, correct_four
@@ -145,7 +145,7 @@ def test_one_image_with_lines_tells_how_its_rows_are_turned(
     motion = corrector.rotation(problem, view)
     assert not isinstance(motion, str), motion
     far = np.full((240, 240), np.inf, dtype=np.float32)
-    moving = [GivenGeometry(scene.rig, scene.shutter, each) for each in (scene.motion, motion)]
+    moving = [FixedGeometry(scene.rig, scene.shutter, each) for each in (scene.motion, motion)]
     flows = [correction_flow(far, each, view) for each in moving]
     distortion, left = (np.mean(np.linalg.norm(flow, axis=-1)) for flow in (flows[0], flows[1] - flows[0]))
     assert distortion > 4.0 and left < 0.3 * distortion

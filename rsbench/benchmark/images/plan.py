@@ -19,7 +19,7 @@ from rsbench.components.plugins import Entry, Kind
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.solvers.engine.registry import SOLVERS, SolverEntry, load_solver_entry
+from rsbench.solvers.engine.base import SOLVERS, SolverEntry, load_solver_entry
 from rsbench.storage.files import sha256
 from rsbench.storage.work_folder import listed
 from rsbench.vision.corrector import CORRECTORS, load_corrector

@@ -38,10 +38,9 @@ from rsbench.pipeline.frame_depth import (
 )
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.base import MotionEstimate
-from rsbench.solvers.engine.registry import SOLVERS, SolverEntry
+from rsbench.solvers.engine.base import SOLVERS, MotionEstimate, SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import (
     MATCH_SETS,
     load_arrays,

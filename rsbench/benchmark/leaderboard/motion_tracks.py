@@ -48,10 +48,11 @@ from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound
 from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.components.motion_models import TwistMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import Motion, TwistMotion
+from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
@@ -64,7 +65,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import COLUMNS, Problem
-from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.base import SolverEntry
 from rsbench.storage.files import read_table, write_bytes
 from rsbench.vision.undistortion import between_pixels
 

@@ -47,7 +47,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import write_bytes, write_json
 from rsbench.storage.untrusted_files import check_name, read_bytes
 from rsbench.storage.work_folder import remove

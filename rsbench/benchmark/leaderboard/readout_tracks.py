@@ -33,13 +33,12 @@ from rsbench.benchmark.leaderboard.track import (
 from rsbench.capture.hypotheses import MODELS, scans_of
 from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.two_frame_estimate import conclude, examine
-from rsbench.core.correspondences import Correspondences, temporal_pairs
+from rsbench.core.correspondences import Correspondences, join_stereo, temporal_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
-from rsbench.core.track_building import join_stereo
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.base import SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.storage.files import write_bytes

@@ -42,9 +42,9 @@ from rsbench.jobs.process_jobs import Workers, finished_jobs, run_jobs
 from rsbench.pipeline.answer import Extra, solve_problem
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import sha256, write_bytes, write_json
 from rsbench.storage.untrusted_files import check_name
 

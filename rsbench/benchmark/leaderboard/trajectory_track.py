@@ -50,7 +50,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.core.trajectory_motion import TrajectoryMotion
+from rsbench.core.spline_motion import TrajectoryMotion
 from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_dataset
@@ -58,7 +58,7 @@ from rsbench.jobs.isolation import use_one_thread
 from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.engine.warm_up import warm_up
+from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import sha256, write_bytes, write_json
 from rsbench.vision.feature_matcher import load_features
 

@@ -23,8 +23,7 @@ from rsbench.core.pose_errors import rotation_error, scale_error, translation_er
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import BESIDE, SENSORS, MotionEstimate
-from rsbench.solvers.engine.registry import SolverEntry
+from rsbench.solvers.engine.base import BESIDE, SENSORS, MotionEstimate, SolverEntry
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ROLLING = RollingShutter(height=900, readout_ratio=0.8)

@@ -18,8 +18,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, one_line
 from rsbench.pipeline.isolated_solver import checked_estimate
-from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.registry import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverEntry, SolverSpec, load_solver_entry
 
 
 class BrokenContractError(Exception):

@@ -14,9 +14,17 @@ from numpy.typing import NDArray
 
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
+from rsbench.core.arguments import (
+    LARGEST_M,
+    LARGEST_PX,
+    check_number,
+    check_one_of,
+    check_whole,
+    keep_plain,
+    shown,
+)
+from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.given import LARGEST_M, LARGEST_PX, check_number, check_one_of, check_whole, keep_plain, shown
-from rsbench.core.lens import inverse_2x2
 from rsbench.core.motion import Motion
 from rsbench.core.projection import (
     ROW_TOLERANCE_PX,

@@ -12,9 +12,9 @@ from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, Simula
 from rsbench.components.cards import card_path, load_card, parse_card
 from rsbench.components.imports import search
 from rsbench.components.motion_models import drawn_parameters, fixed_endpoint, make_motion
+from rsbench.core.arguments import check_whole
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.given import check_whole
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -16,7 +16,7 @@ from rsbench.benchmark.studies.layer_methods import asked_layers
 from rsbench.benchmark.studies.resumable_rows import Row
 from rsbench.benchmark.studies.rotation_methods import asked_rotation
 from rsbench.capture.shutter_decision import NoMotionError
-from rsbench.core.geometry import GivenGeometry
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence
@@ -27,7 +27,7 @@ from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
 from rsbench.pipeline.frame_matches import find_matches
 from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
 from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.vision.baseline_depths import plane_depth
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import load_corrector
@@ -122,7 +122,7 @@ class Bench:
         out = {}
         for (side, frame), fused in frames.items():
             depth = _DEPTHS.get(key, _as_it_is)(pairs[frame].depth[side])
-            flow = correction_flow(depth, GivenGeometry(self.rig, self.shutter, motion), (side, frame))
+            flow = correction_flow(depth, FixedGeometry(self.rig, self.shutter, motion), (side, frame))
             out[side, frame] = _attempt(fused, flow)
         return out
 
@@ -166,7 +166,7 @@ class Bench:
             motion = asked_rotation(key, self.sequence, self.images, view)
             if motion is not None:
                 frames, _ = self.corrected(self.sgm, motion, "rotation-only", (view,))
-                flow = correction_flow(far, GivenGeometry(self.rig, self.shutter, motion), view)
+                flow = correction_flow(far, FixedGeometry(self.rig, self.shutter, motion), view)
                 out[view] = _attempt(frames[view], flow)
         return out
 
@@ -187,7 +187,7 @@ class Bench:
         for view in VIEWS:
             geometry = self.rig.about(view[0]), self.shutter, motions[view[0]]
             frames = correct_frames(self.images, known_depth(self.images, depth), *geometry, options, (view,))
-            out[view] = _attempt(frames[view], correction_flow(depth[view], GivenGeometry(*geometry), view))
+            out[view] = _attempt(frames[view], correction_flow(depth[view], FixedGeometry(*geometry), view))
         return out
 
 

@@ -17,7 +17,7 @@ from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.studies.correction_bench import Bench
 from rsbench.benchmark.studies.correction_study import WORST
 from rsbench.capture.shutter_decision import NoMotionError
-from rsbench.core.geometry import GivenGeometry
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.sequence import Sequence
@@ -26,7 +26,7 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import Pairs, frame_pairs
 from rsbench.pipeline.frame_matches import find_matches
 from rsbench.pipeline.frame_motion import find_motion
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.vision.correction import correct_frame
 from rsbench.vision.corrector import load_corrector
@@ -144,7 +144,7 @@ def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused,
     error = np.where(depth > 0, error, np.float32(np.nan))
     here = fused.origin == Origin.HERE
     true = sequence.motion
-    truth_given = GivenGeometry(sequence.rig, sequence.shutter, true)
+    truth_given = FixedGeometry(sequence.rig, sequence.shutter, true)
     oracle = correct_frame(rolling, np.where(surface, true_depth, np.float32(np.inf)), truth_given, VIEW)
     numbers = {
         "seed": sequence.manifest["seed"],

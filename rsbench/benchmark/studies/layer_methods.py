@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.geometry import GivenGeometry
+from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import FRAMES, SIDES, View
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.layered_scene import LayersCorrector
@@ -50,7 +50,7 @@ def asked_layers(
         for frame in FRAMES:
             fused = corrector.rendered(problem, (side, frame), scene)
             rig, shutter, _, motion = scene.camera
-            flow = correction_flow(scene.depth(frame), GivenGeometry(rig, shutter, motion), (side, frame))
+            flow = correction_flow(scene.depth(frame), FixedGeometry(rig, shutter, motion), (side, frame))
             whole = inpaint(fused.image, fused.origin == Origin.NOBODY)
             found[side, frame] = replace(fused, image=whole), flow
     return found

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.gyro_motion import GyroMotion
+from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
 from rsbench.core.rig import View
 from rsbench.dataset.imu import gyro_samples

@@ -52,9 +52,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rsbench.components.cards import choices
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens
 from rsbench.core.rig import SIDES, Side, View
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter

@@ -21,9 +21,8 @@ import numpy as np
 
 from rsbench.components.cards import parse_card
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens import Lens
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter, Scanning

@@ -28,8 +28,8 @@ from typing import Any, BinaryIO, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.arguments import check_whole
 from rsbench.core.errors import RsbenchError
-from rsbench.core.given import check_whole
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.dataset.layout import SHUTTERS, picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest

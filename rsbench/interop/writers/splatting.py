@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.lens import Lens
+from rsbench.core.camera import Lens
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray

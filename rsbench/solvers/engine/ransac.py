@@ -1,7 +1,8 @@
-"""LO-RANSAC that knows no geometry: uniform minimal samples, MSAC score, local optimisation, exact stopping rule.
+"""LO-RANSAC that knows no geometry: uniform minimal samples, MSAC score, local optimisation, exact stopping
+rule.
 
-M. Fischler, R. Bolles, CACM 1981; P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler,
-Locally Optimized RANSAC, DAGM 2003.
+M. Fischler, R. Bolles, CACM 1981; P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J.
+Kittler, Locally Optimized RANSAC, DAGM 2003.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core import given
+from rsbench.core import arguments
 from rsbench.core.so3 import FloatArray
 
 Model = TypeVar("Model")
@@ -64,12 +65,12 @@ class RansacOptions:
     """Probability that a wrong datum is an inlier of a given model: a consensus must be beyond chance."""
 
     def __post_init__(self) -> None:
-        given.check_positive("threshold", self.threshold, given.LARGEST_PX, "pixels")
+        arguments.check_positive("threshold", self.threshold, arguments.LARGEST_PX, "pixels")
         for name in ("confidence", "chance"):
-            given.check_number(name, getattr(self, name), 0.0, 1.0)
+            arguments.check_number(name, getattr(self, name), 0.0, 1.0)
         for name in ("min_iterations", "max_iterations", "lo_steps", "final_steps"):
-            given.check_whole(name, getattr(self, name), 0, _MOST_STEPS)
-        given.keep_plain(self)
+            arguments.check_whole(name, getattr(self, name), 0, _MOST_STEPS)
+        arguments.keep_plain(self)
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")
         if not 0.0 < self.chance < 1.0:

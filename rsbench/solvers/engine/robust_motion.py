@@ -2,20 +2,288 @@
 
 from __future__ import annotations
 
+import functools
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 
-from rsbench.core.correspondences import BoolArray, Correspondences, without_lens
-from rsbench.core.rig import StereoRig
+from rsbench.components.motion_models import load_kernel
+from rsbench.core.correspondences import (
+    BoolArray,
+    Correspondences,
+    join_stereo,
+    repeated,
+    track_pairs,
+    unlinked_pairs,
+    without_lens,
+)
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.track_building import join_stereo
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver
-from rsbench.solvers.engine.ransac import RansacOptions, msac_score, ransac
-from rsbench.solvers.engine.robust_problem import MatchCount, RobustProblem
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.base import SENSORS, MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
+from rsbench.solvers.engine.ransac import IntArray, RansacOptions, msac_score, ransac
+
+SIGMAS = 2.5
+"""Standard deviations of the noise at which a match is an outlier."""
+_NEAR = 8.0
+"""Thresholds within which a solver that weighs matches itself is given them."""
+_TRACK_FREEDOM = 5
+_FIXED_POINT_STEPS = 8
+_GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchCount:
+    """How many matches there were for the solver, and how many of them its motion explains."""
+
+    inliers: int
+    matches: int
+
+
+class RobustProblem:
+    """The data are the left pairs, the right pairs, and the tracks that the solver uses as such.
+
+    Each measurement is in them once. To a solver that needs left-right matches, a track is a match over time with
+    a left-right match at both ends; it draws them together.
+    """
+
+    def __init__(
+        self,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        solver: Solver,
+        linked: bool = True,
+    ) -> None:
+        self.given, self.rig, self.shutter, self.solver = correspondences, rig, shutter, solver
+        self.spec = solver.spec
+        self._stereo = "stereo" in self.spec.needs
+        self.reasons: Counter[str] = Counter()
+        """Why the solver gave no motion of a sample, in its own words."""
+        self._sizes, self.linked = self._plan(linked)
+        self._affine = "affine" in self.spec.needs
+        self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
+        if self._affine:  # tracks have no affine frames: such a solver is given the left matches alone
+            self._unlinked["left"] = np.full(len(correspondences.left), len(correspondences.affine) > 0)
+        self.data = self._data()
+        self.packed = self._packed()
+
+    def _plan(self, linked: bool) -> tuple[tuple[int, int, int], bool]:
+        """How many data of each group a sample takes, and whether tracks are used as such."""
+        given = self.given
+        if not self._stereo:
+            pairs = Correspondences(left=given.left, right=given.right)
+            sizes = self.solver.sample_sizes(given if linked else pairs)
+            return (sizes.get("left", 0), sizes.get("right", 0), sizes.get("tracks", 0)), sizes.get(
+                "tracks", 0
+            ) > 0
+        sizes = self.solver.sample_sizes(self._handed(given.left, given.right, given.tracks))
+        temporal = {side: sizes.get(side, 0) for side in SIDES}
+        least = max(sizes.get("stereo", 0), sizes.get("tracks", 0))
+        if len(given.tracks) >= max(least, *temporal.values()):
+            return (0, 0, max(least, *temporal.values())), True
+        return (max(temporal["left"] - least, 0), max(temporal["right"] - least, 0), least), True
+
+    def _data(self) -> Correspondences:
+        """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
+        given = self.given
+        pairs = {}
+        for side in SIDES:
+            own = getattr(given, side)[self._unlinked[side]]
+            halves = track_pairs(given.tracks, side)[: 0 if self.linked or self._affine else None]
+            pairs[side] = np.concatenate([own, halves])
+            if side not in self.spec.needs:
+                pairs[side] = pairs[side][:0]
+        tracks = given.tracks if self.linked else given.tracks[:0]
+        affine = given.affine[: None if self._affine else 0]
+        return Correspondences(**pairs, tracks=tracks, affine=affine)
+
+    def _packed(self) -> Packed:
+        """The data under the shutter that the solver believes in, about the point whose motion it gives."""
+        data, rig, shutter = self.data, self.rig, self.shutter
+        model, own = self.spec.motion_model, self.spec.motion_parameters
+        if self.spec.shutter == "global":
+            shutter = shutter.at_once()
+        if self.spec.reference_point == "body":
+            return pack(data, rig, shutter, model, motion_parameters=own)
+        # The errors of tracks are about the body: the left camera's motion is judged by what that camera sees.
+        rig = rig.about("left")
+        alone = Correspondences(left=data.left, right=data.right)
+        packed = pack(alone, rig, shutter, model, motion_parameters=own)
+        halves = pack_pairs(track_pairs(data.tracks, "left"), "left", rig, shutter)
+        return replace(packed, pairs=np.concatenate([packed.pairs, halves]))
+
+    @property
+    def num_data(self) -> tuple[int, ...]:
+        return len(self.data.left), len(self.data.right), len(self.data.tracks)
+
+    @property
+    def sample_size(self) -> tuple[int, ...]:
+        return self._sizes
+
+    def generate(self, samples: IntArray) -> Iterator[list[MotionEstimate]]:
+        subsets = [self._subset(sample) for sample in samples]
+        for models in self.solver.propose_all(subsets, self.rig, self.shutter):
+            found = [model for model in models if model.success]
+            if not found:
+                self.reasons.update({model.reason for model in models})
+            yield found
+
+    def residuals(self, model: MotionEstimate) -> FloatArray:
+        packed = self.packed
+        if model.motion_parameters:
+            own = {**self.spec.motion_parameters, **model.motion_parameters}
+            packed = replace(packed, kernel=load_kernel(self.spec.motion_model, own))
+        theta = packed.theta(model.w, model.d)
+        squares = packed.track_squares(theta)
+        squares = np.where(squares >= 0.0, squares, np.inf)  # a point next to a camera's plane overflows
+        return np.concatenate([packed.pair_residuals(theta), np.sqrt(squares) * _track_scale()])
+
+    @property
+    def shortage(self) -> str:
+        """What is missing for a minimal sample; empty when nothing is."""
+        names = dict(zip(_GROUPS, ("left matches", "right matches", "tracks"), strict=True))
+        if self._affine:
+            names["left"] = "left matches with affine frames"
+        if self._stereo:
+            names["tracks"] = "matches over time with left-right matches at both ends"
+        groups = zip(_GROUPS, self.num_data, self.sample_size, strict=True)
+        short = [f"{count} {names[name]}, a sample needs {size}" for name, count, size in groups if count < size]
+        return "; ".join(short)
+
+    def failure(self, reason: str) -> str:
+        """Why there is no motion, with what the solver said of the samples most often."""
+        said = "".join(f"; the solver said most often: {text}" for text, _ in self.reasons.most_common(1))
+        return f"{self.shortage or reason}{said}"
+
+    def noise_threshold(self, model: MotionEstimate, threshold: float) -> float:
+        """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
+
+        A fixed point of: noise from the residuals below the threshold (a truncated distribution), threshold from
+        the noise. Outliers are spread too thinly to disturb it.
+        """
+        squares = self.residuals(model) ** 2
+        tracks = len(self.packed.tracks)
+        moments = np.repeat([_moment(1), _moment(_TRACK_FREEDOM)], [len(squares) - tracks, tracks])
+        for _ in range(_FIXED_POINT_STEPS):
+            below = squares <= threshold**2
+            if not np.any(below):
+                break
+            threshold = SIGMAS * float(np.sqrt(np.sum(squares[below]) / np.sum(moments[below])))
+        return threshold
+
+    def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
+        subset = self._subset(np.flatnonzero(inliers))
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter, quick=True)
+        return estimate if estimate.success else None
+
+    def weigh(self, model: MotionEstimate, threshold: float) -> MotionEstimate | None:
+        """What a solver that weighs matches itself makes of all of them near a model."""
+        near = np.flatnonzero(np.abs(self.residuals(model)) <= _NEAR * threshold)
+        found = self.solver.weigh(model, self._subset(near), self.rig, self.shutter, threshold / SIGMAS)
+        return found if found is not None and found.success else None
+
+    def conclude(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate:
+        """The solver on all inliers; the model itself when the solver fails there."""
+        subset = self._subset(np.flatnonzero(inliers))
+        estimate = self.solver.improve(model, subset, self.rig, self.shutter)
+        return estimate if estimate.success else model
+
+    def on_all(self) -> MotionEstimate:
+        """What the solver itself makes of all matches."""
+        data = self.data
+        everything = self._handed(data.left, data.right, data.tracks) if self._stereo else self.given
+        return self.solver.estimate(everything, self.rig, self.shutter)
+
+    def _subset(self, indices: IntArray) -> Correspondences:
+        left, right, _ = self.num_data
+        first = indices[indices < left]
+        return self._handed(
+            self.data.left[first],
+            self.data.right[indices[(indices >= left) & (indices < left + right)] - left],
+            self.data.tracks[indices[indices >= left + right] - left - right],
+            self.data.affine[first] if self._affine else None,
+        )
+
+    def _handed(
+        self, left: FloatArray, right: FloatArray, tracks: FloatArray, affine: FloatArray | None = None
+    ) -> Correspondences:
+        """Matches as the solver wants them: tracks as they are, or as matches that end in left-right matches."""
+        if not self._stereo:
+            frames = {} if affine is None else {"affine": affine}
+            return Correspondences(left=left, right=right, tracks=tracks, **frames, **self._sensed)
+        needs, halves = self.spec.needs, {side: track_pairs(tracks, side) for side in SIDES}
+        return Correspondences(
+            left=np.concatenate([halves["left"], left]) if "left" in needs else left,
+            right=np.concatenate([halves["right"], right]) if "right" in needs else right,
+            stereo_0=tracks[:, :4],
+            stereo_1=tracks[:, 4:],
+            tracks=tracks if "tracks" in needs else tracks[:0],
+            **self._sensed,
+        )
+
+    @property
+    def _sensed(self) -> dict[str, FloatArray]:
+        """What other sensors say, which is given whole."""
+        return {name: getattr(self.given, name) for name in SENSORS}
+
+    def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
+        """Inliers and matches of each group of data."""
+        parts = np.split(inliers, np.cumsum(self.num_data)[:-1])
+        return {
+            name: MatchCount(inliers=int(np.count_nonzero(part)), matches=len(part))
+            for name, part in zip(_GROUPS, parts, strict=True)
+        }
+
+    def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
+        """Inliers over the sets as they were given: what a track repeats is one as the track is."""
+        *pairs, tracks = np.split(inliers, np.cumsum(self.num_data)[:-1])
+        out: dict[MatchSet, BoolArray] = {}
+        as_pairs = np.ones(len(self.given.tracks), dtype=np.bool_)
+        for side, mask in zip(SIDES, pairs, strict=True):
+            own = self._unlinked[side]
+            out[side] = np.zeros(len(own), dtype=np.bool_)
+            halves = tracks
+            if side in self.spec.needs:
+                out[side][own] = mask[: np.count_nonzero(own)]
+                halves = tracks if self.linked else mask[np.count_nonzero(own) :]
+                if self._affine:
+                    halves = np.zeros(len(self.given.tracks), dtype=np.bool_)
+                as_pairs &= self.linked | halves
+            elif not self.linked:
+                continue
+            good = track_pairs(self.given.tracks[halves], side)
+            out[side][~own] = repeated(getattr(self.given, side)[~own], good)
+        out["tracks"] = tracks if self.linked else as_pairs & bool(self.spec.needs & set(SIDES))
+        return out
+
+
+@functools.cache
+def _quantile(freedom: int) -> float:
+    """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
+    return float(2.0 * scipy.special.gammaincinv(0.5 * freedom, float(scipy.special.chdtr(1, SIGMAS**2))))
+
+
+@functools.cache
+def _track_scale() -> float:
+    """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
+    return SIGMAS / float(np.sqrt(_quantile(_TRACK_FREEDOM)))
+
+
+@functools.cache
+def _moment(freedom: int) -> float:
+    """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
+    quantile = _quantile(freedom)
+    chdtr = scipy.special.chdtr
+    truncated = freedom * chdtr(freedom + 2, quantile) / chdtr(freedom, quantile)
+    return float(truncated) * SIGMAS**2 / quantile
+
 
 _SECOND_TRY = 3.0
 """Factor on the threshold when nothing was found."""

@@ -105,7 +105,7 @@ def card(path: Path, cls: str, **parameters: Any) -> Path:
 
 def test_a_changed_card_inside_a_scaled_solver_is_seen(smoke_dataset: Path, copy: Path, tmp_path: Path) -> None:
     inner = card(tmp_path / "inner.toml", "rsbench.solvers.refined:RefinedSolver", shutter="global")
-    outer = card(tmp_path / "outer.toml", "rsbench.solvers.scaled:FlowScaledSolver", solver=str(inner))
+    outer = card(tmp_path / "outer.toml", "rsbench.solvers.zhuang:FlowScaledSolver", solver=str(inner))
     evaluate(smoke_dataset, copy, solvers=(str(outer),))
     before = times(copy)
     evaluate(smoke_dataset, copy, solvers=(str(outer),))

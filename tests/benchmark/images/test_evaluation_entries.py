@@ -12,7 +12,7 @@ from evaluations import cell, evaluate, remade, times
 from rsbench.benchmark.images.evaluation import read_scores
 from rsbench.core.errors import RsbenchError
 from rsbench.report.evaluation_page import summary_tables
-from rsbench.solvers.eight_point import EightPointSolver
+from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.storage.files import read_png
 
 STRANGER = """

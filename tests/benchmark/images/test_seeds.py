@@ -15,7 +15,7 @@ from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_sequence
 from rsbench.report.evaluation_page import summary_tables
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.storage.files import load_matches, read_json
 

@@ -31,8 +31,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import Outcome
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.report.board_page import build_site
-from rsbench.solvers.engine.base import BESIDE
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import BESIDE, load_solver_entry
 from rsbench.storage.files import load_arrays
 
 ROOT = Path(__file__).parents[3]
@@ -276,7 +275,7 @@ def test_what_is_not_there_leaves_no_folder(tmp_path: Path) -> None:
 
 def test_cards_that_cannot_be_entries_are_refused_before_they_run(tmp_path: Path) -> None:
     card = tmp_path / "my card.toml"
-    card.write_text('class = "rsbench.solvers.eight_point:EightPointSolver"\n', "utf-8")
+    card.write_text('class = "rsbench.solvers.essential_matrix:EightPointSolver"\n', "utf-8")
     with pytest.raises(RsbenchError, match=r"solver 'my card': name = 'my card': must be a folder's name"):
         SPLIT.track.run([str(card)], SPLIT, tmp_path / "in", tmp_path / "work")
 

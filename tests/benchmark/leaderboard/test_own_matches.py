@@ -19,9 +19,9 @@ from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter

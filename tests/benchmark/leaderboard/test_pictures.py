@@ -23,8 +23,8 @@ from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.storage.files import read_depth, read_png, write_depth, write_png
 
 RIG, SHUTTER, MOTION = PLANES

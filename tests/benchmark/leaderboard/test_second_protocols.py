@@ -41,12 +41,12 @@ from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_name
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.cli.reproduce_leaderboard import entries_of_laws
+from rsbench.components.motion_models import TwistMotion
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import TwistMotion
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.dataset.card import load_dataset_card
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 
 ROOT = Path(__file__).parents[3]
 LAWS_FOLDER = ROOT / "results" / "laws"

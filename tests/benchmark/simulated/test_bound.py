@@ -7,10 +7,10 @@ import pytest
 
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound, root_information
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
-from rsbench.components.motion_models import make_motion
+from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import Side, StereoRig

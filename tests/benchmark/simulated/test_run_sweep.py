@@ -18,12 +18,12 @@ from rsbench.benchmark.simulated.run_sweep import geometry_of, read_bounds, read
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
 from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise_sweep
 from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.errors import RsbenchError
-from rsbench.core.motion import LinearMotion
 from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.eight_point import EightPointSolver
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
+from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.storage.work_folder import work_folder
 
@@ -160,7 +160,7 @@ def test_a_worker_killed_twice_is_one_line_that_names_its_trials(
 MISCHIEF = """
 import os, sys, time
 from rsbench.solvers.engine.base import Solver
-from rsbench.solvers.engine.registry import load_solver
+from rsbench.solvers.engine.base import load_solver
 
 EIGHT_POINT = load_solver("gs-8pt")
 

@@ -10,10 +10,10 @@ from scipy.stats import chi2
 
 from rsbench.benchmark.simulated import simulation
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
-from rsbench.components.motion_models import make_motion
+from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.motion import LinearMotion, Motion
+from rsbench.core.motion import Motion
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter

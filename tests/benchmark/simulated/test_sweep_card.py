@@ -10,7 +10,7 @@ import pytest
 from rsbench.benchmark.simulated.sweep_card import SweepCard, load_sweep, with_options
 from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
-from rsbench.solvers.engine.registry import list_solvers
+from rsbench.solvers.engine.base import list_solvers
 
 SETTING: dict[str, Any] = {
     "width": 900,

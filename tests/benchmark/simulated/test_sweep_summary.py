@@ -58,7 +58,7 @@ def test_failures_score_the_worst_value_and_are_counted() -> None:
 def test_a_solver_of_the_left_camera_is_scored_against_its_translation() -> None:
     content = arrays()
     rig = SETTING.rig()
-    from rsbench.core.motion import LinearMotion
+    from rsbench.components.motion_models import LinearMotion
 
     for k in range(N):
         motion = LinearMotion(content["w"][k], content["d"][k])

@@ -24,7 +24,7 @@ from rsbench.benchmark.studies.readings import (
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.solvers.engine.registry import load_solver_entry
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.linear import LinearSolver
 
 

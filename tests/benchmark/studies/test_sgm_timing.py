@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsbench.benchmark.studies.sgm_timing import TIMINGS, Timing, predicted_shift, right_row_poses
+from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.motion import LinearMotion
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter

@@ -1,12 +1,17 @@
-"""What a motion model brings to the compiled residuals: its kernel, as Numba sees it."""
+"""What compiled residuals need of a motion model: its kernel as Numba sees it, and vector algebra for kernels.
+
+Vectors are tuples, which need no memory; rotations are (3, 3) arrays. The readable NumPy forms of the vector
+functions are in ``rsbench.core.so3``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import inspect
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import FunctionType
 from typing import Any, TypeVar
 
@@ -25,11 +30,84 @@ from numba.extending import (
     unbox,
 )
 
-from rsbench.components.motion_models import make_motion, motion_model
-from rsbench.core.errors import RsbenchError
+from rsbench.components.compiled import compiled
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.vectors import Vector
+
+Vector = tuple[float, float, float]
+
+
+@compiled
+def cross(a: Vector, b: Vector) -> Vector:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@compiled
+def dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def plus(a: Vector, scale: float, b: Vector) -> Vector:
+    """a + scale b."""
+    return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
+
+
+@compiled
+def times(scale: float, a: Vector) -> Vector:
+    return (scale * a[0], scale * a[1], scale * a[2])
+
+
+@compiled
+def apply(R: FloatArray, a: Vector) -> Vector:
+    return (
+        R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
+        R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
+        R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@compiled
+def apply_transposed(R: FloatArray, a: Vector) -> Vector:
+    return (
+        R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
+        R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
+        R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@compiled
+def coefficients(s: float) -> tuple[float, float, float, float, float]:
+    """sin t/t, b = (1 - cos t)/t^2, c = (t - sin t)/t^3 of s = t^2, then b'/t and c'/t."""
+    if s < 1e-2:  # the closed forms cancel
+        a = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
+        b = 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90)))
+        c = 1 / 6 - s / 120 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110)))
+        db = -1 / 12 + s / 180 * (1 - s * 3 / 112 * (1 - s / 67.5))
+        dc = -1 / 60 + s / 1260 * (1 - s / 48 * (1 - s / 82.5))
+        return a, b, c, db, dc
+    t = math.sqrt(s)
+    a = math.sin(t) / t
+    b = 2 * math.sin(t / 2) ** 2 / s
+    c = (1 - a) / s
+    return a, b, c, (a - 2 * b) / s, (b - 3 * c) / s
+
+
+@compiled
+def fill_rotation(phi: Vector, identity: float, skew: float, outer: float, out: FloatArray) -> None:
+    """out = identity I + skew [phi]x + outer phi phi^T."""
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] = outer * phi[i] * phi[j]
+            out[j, i] = out[i, j]
+        out[i, i] += identity
+    out[0, 1] -= skew * phi[2]
+    out[1, 0] += skew * phi[2]
+    out[0, 2] += skew * phi[1]
+    out[2, 0] -= skew * phi[1]
+    out[1, 2] -= skew * phi[0]
+    out[2, 1] += skew * phi[0]
+
 
 Moved = tuple[Vector, Vector, Vector, Vector, Vector]
 """T, dT/dtau0, dT/dtau1, then s0 and s1 with dR/dtau0 = [s0]x R and dR/dtau1 = [s1]x R."""
@@ -79,7 +157,7 @@ class MotionKernel(ABC):
 
 
 Class = TypeVar("Class", bound=type)
-_KERNELS: dict[type[Motion], type[MotionKernel]] = {}
+KERNELS: dict[type[Motion], type[MotionKernel]] = {}
 
 
 def kernel_for(model: type[Motion]) -> Callable[[Class], Class]:
@@ -97,31 +175,10 @@ def kernel_for(model: type[Motion]) -> Callable[[Class], Class]:
             wanted = list(inspect.signature(getattr(MotionKernel, name)).parameters)
             if list(inspect.signature(getattr(kernel, name)).parameters) != wanted:
                 raise TypeError(f"{kernel.__qualname__}.{name} must have the arguments {', '.join(wanted)}")
-        _KERNELS[model] = kernel
+        KERNELS[model] = kernel
         return kernel
 
     return register
-
-
-def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -> MotionKernel:
-    """Kernel of a motion model with such parameters.
-
-    Raises:
-        RsbenchError: no such model, it cannot have such parameters, or it has no kernel: one line.
-    """
-    model = motion_model(motion_name)
-    if model not in _KERNELS:
-        known = ", ".join(sorted(other.name for other in _KERNELS))
-        raise RsbenchError(
-            f"motion model {motion_name!r} has no kernel, so no solver can assume it; these have: {known}"
-        )
-    motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), _KERNELS[model]
-    return kernel(**{field.name: float(getattr(motion, field.name)) for field in dataclasses.fields(kernel)})  # pyrefly: ignore[bad-argument-type]
-
-
-def has_kernel(motion_name: str) -> bool:
-    """Whether solvers can assume a motion model; RsbenchError when it does not exist."""
-    return motion_model(motion_name) in _KERNELS
 
 
 class KernelType(types.Type):
@@ -200,4 +257,6 @@ def _bare(function: Any) -> Any:
 
 
 overload_method(KernelType, "move")(_bare(_move))
+
+
 overload_method(KernelType, "translation_jacobian")(_bare(_translation_jacobian))

@@ -1,15 +1,18 @@
-"""What public constructors and functions are given, checked in one place: types, finite numbers, sizes.
+"""Checks of the arguments of public constructors and functions: types, finite numbers, sizes, names and paths.
 
-Every message is one line with the name, the value and what may be. Numbers are Python's or NumPy's own integers
-and floats: no truth values, no complex numbers, no text, no arrays of objects.
+Every message is one line with the name, the value and what is allowed. Numbers are Python's or NumPy's own
+integers and floats: no truth values, no complex numbers, no text, no arrays of objects. Checks of rigs and
+images are in ``rsbench.core.geometry``.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import reprlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -140,3 +143,52 @@ def _is_truth(value: object) -> bool:
 _WIDEST = 120
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
+_LONGEST_PATH = 4096
+
+
+def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raises ValueError unless the numbers of these names lie from the first to the second; None may be."""
+    for name, (least, most) in ranges.items():
+        value = getattr(component, name)
+        if value is not None and not least <= value <= most:
+            raise ValueError(f"{name} = {value!r}: must lie in [{least:g}, {most:g}]")
+
+
+def world_points(points: ArrayLike) -> FloatArray:
+    """Points (..., 3) as float64; raises ValueError on another shape, and on numbers that no scene has."""
+    array = real_array("points", points)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
+    far = np.abs(array) > LARGEST_M  # NaN is no point, and seen by nobody
+    if np.any(far):
+        raise ValueError(f"points: must lie within {LARGEST_M:g} m, got {array[far][0]:g}")
+    return array
+
+
+def items(name: str, value: Any) -> Any:
+    """What has a length and can be indexed; raises ValueError on anything else, a text included."""
+    listed = isinstance(value, Sequence) and not isinstance(value, str)
+    if not listed and not (isinstance(value, np.ndarray) and value.ndim > 0):
+        raise ValueError(f"{name}: must be a list, got {shown(value)}")
+    return value
+
+
+def path(name: str, value: Any) -> Path:
+    """A path; raises ValueError on what is none, or is longer than a system takes."""
+    return Path(name_or_path(name, value))
+
+
+def name_or_path(name: str, value: Any) -> str | Path:
+    """The name of a component or the path of its card; raises ValueError on what is neither."""
+    text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
+    if not isinstance(text, str) or "\0" in text or not 0 < len(text) <= _LONGEST_PATH:
+        raise ValueError(f"{name} = {shown(value)}: must be a name or a path")
+    return value if isinstance(value, str | Path) else text
+
+
+def names(name: str, value: Any) -> tuple[str, ...]:
+    """One name or many; raises ValueError on anything else."""
+    found = (value,) if isinstance(value, str) else value
+    if not isinstance(found, Iterable) or isinstance(found, Mapping):
+        raise ValueError(f"{name}: must be names, got {shown(value)}")
+    return tuple(str(name_or_path(name, each)) for each in found)

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 import rsbench
 from rsbench.benchmark.simulated.simulation import SimulationOptions
-from rsbench.core.lens import Lens
-from rsbench.core.motion import InertialMotion
+from rsbench.components.motion_models import InertialMotion
+from rsbench.core.camera import Lens
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 OPTIONS: Any = SimulationOptions

@@ -1,0 +1,781 @@
+"""Compiled inner loops: exact rolling-shutter residuals of pairs and tracks, and their normal equations.
+
+Parameters are ``theta = (w, v)``; the motion model is a ``MotionKernel``. The readable NumPy forms are in
+``rsbench.core.epipolar``, named in each function; the tests compare both.
+
+Pairs have a Sampson error. Its cost needs the derivative of its own weights, or it shrinks v towards the zero
+where every constraint vanishes. Taking the constraint's derivative at the corrected measurement gives just that
+gradient.
+
+Tracks whose rows both cameras read at the same time have the first-order form of a rolling-shutter bundle
+adjustment: a stereo pair is then an ordinary rectified pair. In the camera halfway between both, ``m = (x, y,
+disparity)`` with x = (xl + xr)/2, y = (yl + yr)/2 holds all that the pair measures of the point; its three
+parts have independent noise of variance (1/2, 1/2, 2). What is left, yl - yr, is independent of m and of the
+motion. The body's motion then predicts m of frame 1 from m of frame 0:
+
+    p = R ray(x0, y0) + rho0 T,   rho0 = disparity0 / (fx baseline) = 1 / z0
+    x1 = fx p_x / p_z + cx,  y1 = fy p_y / p_z + cy,  disparity1 = disparity0 / p_z
+
+Whitened with the noise of both frames (multi-constraint Sampson error), these three equations are the
+reprojection error of the best point, to first order. They stay regular without motion and for points at
+infinity.
+
+Timed tracks have four ends with times of their own: a lens bends rows, so that both cameras read a point at
+different times; so do other scans and a late right camera. Their error is the reprojection error of the best
+point: each track has a point of its own, (x, y, 1) / rho in the left camera at the time of its first end, which
+few Gauss-Newton steps find and the normal equations leave out (Schur complement; Triggs et al., Bundle
+Adjustment, 2000). A pixel that is shifted is also read at another time, which counts in the noise of an end.
+
+``add_pairs`` and ``add_tracks`` are the equations by the motion and by unknowns of the capture too: readout
+ratio, delay, lens and the like. Such an unknown changes where and when the ends of a match are, so ray and time
+of each end have a derivative by it, and one pass over the measurements gives the equations of all unknowns.
+Their errors have heavy tails (``packed.HeavyTailed``).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rsbench.components.compiled import compiled
+from rsbench.components.motion_kernels import (
+    MotionKernel,
+    Vector,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    plus,
+    times,
+)
+from rsbench.core.so3 import FloatArray
+
+Matrix = tuple[float, float, float, float]
+BEHIND = 1e12
+"""Squared error, px^2, of a track that the motion puts behind the camera; no descent step ever accepts it."""
+NEAREST = 1e-6
+"""Least ratio of a track's depths in frame 1 and frame 0."""
+
+
+@compiled
+def pair_terms(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    pairs: FloatArray,
+    focal: FloatArray,
+    h: float,
+    residuals: FloatArray,
+    H: FloatArray,
+    gradient: FloatArray,
+    want: bool,
+) -> None:
+    """Sampson residuals of left or right pairs, and the normal equations of half their sum of squares.
+
+    Args:
+        theta: (6,) w and v.
+        pairs: (n, 7) ray 0 (x, y), ray 1 (x, y), tau0, tau1, x of the camera's offset from the body in metres; or
+            (n, 17) with what ``at_pixels`` names, where the lens or the scan make it differ.
+        focal: (2,) fx, fy in pixels; h: frame periods per row, of pairs (n, 7).
+        residuals: (n,) filled, in pixels.
+        H, gradient: (6, 6), (6,), added to when ``want``.
+    """
+    R, A, T_w, T_v, J = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(6)
+    for m in range(len(pairs)):
+        x, y, offset = (pairs[m, 0], pairs[m, 1], 1.0), (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
+        tau0, tau1 = pairs[m, 4], pairs[m, 5]
+        T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
+        Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+        T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
+        rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
+        L0, L1, slope = at_pixels(pairs, m, h)
+        value, q = pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
+        qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+        residuals[m] = value / math.sqrt(qq) if qq > 0.0 else displacement(apply(R, x), y, focal)
+        if not want or qq <= 0.0:
+            continue
+        step = value / qq
+        x, y = shifted(x, L0, step * q[0], step * q[1], focal), shifted(y, L1, step * q[2], step * q[3], focal)
+        tau0 -= slope[1] * step * q[1] + slope[0] * step * q[0]
+        tau1 -= slope[1] * step * q[3] + slope[0] * step * q[2]
+        pair_jacobian(theta, kernel, x, y, tau0, tau1, offset, R, A, T_w, T_v, J)
+        for i in range(6):
+            gradient[i] += J[i] / math.sqrt(qq) * residuals[m]
+            for j in range(6):
+                H[i, j] += J[i] * J[j] / qq
+
+
+@compiled
+def at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tuple[float, float]]:
+    """Derivatives of both ideal pixels by the pixels (2 x 2, rows first), and of tau by the pixel."""
+    if pairs.shape[1] == 7:
+        return (1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), (0.0, h)
+    return (
+        (pairs[m, 7], pairs[m, 8], pairs[m, 9], pairs[m, 10]),
+        (pairs[m, 11], pairs[m, 12], pairs[m, 13], pairs[m, 14]),
+        (pairs[m, 15], pairs[m, 16]),
+    )
+
+
+@compiled
+def shifted(ray: Vector, L: Matrix, dx: float, dy: float, focal: FloatArray) -> Vector:
+    """The ray of a pixel that is (dx, dy) less."""
+    return (ray[0] - (L[0] * dx + L[1] * dy) / focal[0], ray[1] - (L[2] * dx + L[3] * dy) / focal[1], 1.0)
+
+
+@compiled
+def displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
+    """Error (px) of a pair where the camera only turns: its constraint vanishes, and would let anything pass."""
+    if p[2] <= 0.0:
+        return math.sqrt(BEHIND)
+    return math.hypot(focal[0] * (y[0] - p[0] / p[2]), focal[1] * (y[1] - p[1] / p[2])) / math.sqrt(2.0)
+
+
+@compiled
+def pair_gradient(
+    x: Vector,
+    y: Vector,
+    R: FloatArray,
+    T: Vector,
+    rate0: Vector,
+    rate1: Vector,
+    spin0: Vector,
+    spin1: Vector,
+    focal: FloatArray,
+    L0: Matrix,
+    L1: Matrix,
+    slope: tuple[float, float],
+) -> tuple[float, Matrix]:
+    """Value of y^T [T]x R x, and its derivative by the four pixel coordinates; NumPy: ``epipolar.rs_constraint``.
+
+    The paper's (7) before its linearisation: E = [T]x R of (6). The rates are T's by the two times, the spins R's.
+    """
+    p = apply(R, x)
+    n = cross(p, y)
+    line, back = cross(T, p), apply_transposed(R, cross(y, T))
+    turn0 = dot(spin0, y) * dot(T, p) - dot(spin0, T) * dot(y, p)
+    turn1 = dot(spin1, y) * dot(T, p) - dot(spin1, T) * dot(y, p)
+    time0, time1 = dot(rate0, n) + turn0, dot(rate1, n) + turn1
+    bx, by, lx, ly = back[0] / focal[0], back[1] / focal[1], line[0] / focal[0], line[1] / focal[1]
+    by_x0, by_y0 = L0[0] * bx + L0[2] * by + slope[0] * time0, L0[1] * bx + L0[3] * by + slope[1] * time0
+    by_x1, by_y1 = L1[0] * lx + L1[2] * ly + slope[0] * time1, L1[1] * lx + L1[3] * ly + slope[1] * time1
+    return dot(T, n), (by_x0, by_y0, by_x1, by_y1)
+
+
+@compiled
+def pair_jacobian(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    x: Vector,
+    y: Vector,
+    tau0: float,
+    tau1: float,
+    offset: float,
+    R: FloatArray,
+    A: FloatArray,
+    T_w: FloatArray,
+    T_v: FloatArray,
+    J: FloatArray,
+) -> None:
+    """Derivative (6,) of y^T [T]x R x by theta; R, A, T_w, T_v are work space."""
+    T, _, _, _, _ = kernel.move(theta, tau0, tau1, R, A)
+    kernel.translation_jacobian(theta, tau0, tau1, R, A, T_w, T_v)
+    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
+    p = apply(R, x)
+    n = cross(p, y)
+    turned = plus(plus(times(dot(T, p), y), -dot(y, p), T), -1.0, cross(Ro, n))
+    by_w = plus(apply_transposed(A, turned), 1.0, apply_transposed(T_w, n))
+    by_v = apply_transposed(T_v, n)
+    for j in range(3):
+        J[j], J[3 + j] = by_w[j], by_v[j]
+
+
+@compiled
+def count_in_front(theta: FloatArray, kernel: MotionKernel, pairs: FloatArray) -> int:
+    """How many pairs (n, 7 or 17) have both closest points in front of their cameras; parallel rays do not."""
+    R, A = np.zeros((3, 3)), np.zeros((3, 3))
+    count = 0
+    for m in range(len(pairs)):
+        y, offset = (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
+        T, _, _, _, _ = kernel.move(theta, pairs[m, 4], pairs[m, 5], R, A)
+        T = plus((T[0] + offset, T[1], T[2]), -offset, (R[0, 0], R[1, 0], R[2, 0]))
+        p = apply(R, (pairs[m, 0], pairs[m, 1], 1.0))
+        pp, yy, py, pT, yT = dot(p, p), dot(y, y), dot(p, y), dot(p, T), dot(y, T)
+        if pp * yy - py * py > 1e-15 * pp * yy and py * yT > yy * pT and pp * yT > py * pT:
+            count += 1
+    return count
+
+
+_POINT_STEPS = 2
+"""Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
+
+
+@compiled
+def timed_track_terms(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    tracks: FloatArray,
+    focal: FloatArray,
+    baseline: float,
+    squares: FloatArray,
+    H: FloatArray,
+    gradient: FloatArray,
+    want: bool,
+) -> None:
+    """Squared reprojection errors of the best points of tracks, and the normal equations of half their sum.
+
+    Args:
+        theta: (6,) w and v.
+        tracks: (n, 4, 9) ends left 0, right 0, left 1, right 1: ray (x, y), tau, derivative of the ideal pixel by
+            the pixel (2 x 2, rows first), derivative of tau by the pixel (2).
+        focal: (2,) fx, fy in pixels; baseline: metres.
+        squares: (n,) filled, px^2: chi-squared with 5 degrees of freedom at a noise of 1 px.
+        H, gradient: (6, 6), (6,), added to when ``want``.
+    """
+    e, D, W = np.zeros(8), np.zeros((8, 9)), np.zeros((4, 2, 2))
+    N, inverse, Q = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 3))
+    work = np.zeros((6, 3, 3))
+    for k in range(len(tracks)):
+        if not linearise_best(theta, kernel, tracks[k], focal, baseline, e, D, W, N, inverse, work):
+            squares[k] = BEHIND
+            continue
+        squares[k] = 0.0
+        for i in range(8):
+            squares[k] += e[i] * e[i]
+        if want:
+            _add_reduced(D, e, inverse, Q, H, gradient)
+
+
+@compiled
+def linearise_best(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    ends: FloatArray,
+    focal: FloatArray,
+    baseline: float,
+    e: FloatArray,
+    D: FloatArray,
+    W: FloatArray,
+    N: FloatArray,
+    inverse: FloatArray,
+    work: FloatArray,
+) -> bool:
+    """Errors and derivatives of one track at its best point; False when the ends determine none before a camera.
+
+    Args:
+        ends: (4, 9) of the track.
+        e, D, W: see ``_linearise``; N, inverse: (3, 3) normal matrix of the point, and its inverse.
+        work: (6, 3, 3); the last two hold the pixels' velocities, see ``_linearise``.
+    """
+    point = _first_point(theta, kernel, ends, baseline, work)
+    for step in range(_POINT_STEPS + 1):
+        if step > 0:
+            g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
+            point = plus(point, -1.0, apply(inverse, g))
+        # Weighed where it starts. A literal True would compile _linearise once more.
+        seen = _linearise(theta, kernel, ends, focal, baseline, point, e, D, W, work, step == 0)
+        if not (seen and _fill_inverse(D, N, inverse)):
+            return False
+    return True
+
+
+@compiled
+def _first_point(
+    theta: FloatArray, kernel: MotionKernel, ends: FloatArray, baseline: float, work: FloatArray
+) -> Vector:
+    """x, y and inverse depth of the point that the stereo pair of frame 0 shows; rho is NaN for none."""
+    R, A = work[0], work[1]
+    x, half = (ends[0, 0], ends[0, 1], 1.0), 0.5 * baseline
+    T, _, _, _, _ = kernel.move(theta, ends[0, 2], ends[1, 2], R, A)
+    a = apply(R, x)
+    b = plus((T[0] - half, T[1], T[2]), -half, (R[0, 0], R[1, 0], R[2, 0]))
+    above = below = 0.0
+    for i in range(2):
+        factor = b[i] - ends[1, i] * b[2]
+        above += factor * (ends[1, i] * a[2] - a[i])
+        below += factor * factor
+    return x[0], x[1], above / below if below > 0.0 else np.nan
+
+
+@compiled
+def _linearise(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    ends: FloatArray,
+    focal: FloatArray,
+    baseline: float,
+    point: Vector,
+    e: FloatArray,
+    D: FloatArray,
+    W: FloatArray,
+    work: FloatArray,
+    weigh: bool,
+) -> bool:
+    """Fill whitened errors e (8,) and their derivative D (8, 9) by the point and theta; False behind a camera.
+
+    ``weigh`` fills W (4, 2, 2) too, which takes errors in ideal pixels to pixels of unit noise. ``work[4:]`` gets
+    the derivatives of the predicted pixels of the right camera's frame 0 and of frame 1 (columns) by the time of
+    the first end (4) and by their own (5): x and y in the first two rows. That of the first end does not move.
+    """
+    R, A, T_w, T_v = work[0], work[1], work[2], work[3]
+    half, rho = 0.5 * baseline, point[2]
+    start = plus((point[0], point[1], 1.0), -rho, (half, 0.0, 0.0))
+    for i in range(4):
+        offset = half if i % 2 == 0 else -half
+        T, rate0, rate, spin0, spin = kernel.move(theta, ends[0, 2], ends[i, 2], R, A)
+        kernel.translation_jacobian(theta, ends[0, 2], ends[i, 2], R, A, T_w, T_v)
+        turned = apply(R, start)
+        p = plus(plus(turned, rho, T), rho, (offset, 0.0, 0.0))
+        if not p[2] > NEAREST:
+            return False
+        u, v = p[0] / p[2], p[1] / p[2]
+        moved = plus(times(rho, rate), 1.0, cross(spin, turned))
+        vx, vy = focal[0] * (moved[0] - u * moved[2]) / p[2], focal[1] * (moved[1] - v * moved[2]) / p[2]
+        if i > 0:
+            _fill_velocities(plus(times(rho, rate0), 1.0, cross(spin0, turned)), p, vx, vy, focal, work, i - 1)
+        if weigh:
+            _fill_weight(ends[i], vx, vy, W[i])
+        whiten(W[i], focal[0] * (ends[i, 0] - u), focal[1] * (ends[i, 1] - v), i, e)
+        by_rho = plus(plus(T, 1.0, (offset, 0.0, 0.0)), -half, (R[0, 0], R[1, 0], R[2, 0]))
+        for j in range(9):
+            if j < 2:
+                q = (R[0, j], R[1, j], R[2, j])
+            elif j == 2:
+                q = by_rho
+            elif j < 6:
+                q = plus(cross((A[0, j - 3], A[1, j - 3], A[2, j - 3]), turned), rho, _of(T_w, j - 3))
+            else:
+                q = times(rho, _of(T_v, j - 6))
+            gx, gy = -focal[0] * (q[0] - u * q[2]) / p[2], -focal[1] * (q[1] - v * q[2]) / p[2]
+            whiten(W[i], gx, gy, i, D[:, j])
+    return True
+
+
+@compiled
+def _fill_velocities(
+    first: Vector, p: Vector, vx: float, vy: float, focal: FloatArray, work: FloatArray, column: int
+) -> None:
+    """Of a predicted pixel by the time of the first end, whose point moves by ``first``, and by its own."""
+    work[4, 0, column] = focal[0] * (first[0] - p[0] / p[2] * first[2]) / p[2]
+    work[4, 1, column] = focal[1] * (first[1] - p[1] / p[2] * first[2]) / p[2]
+    work[5, 0, column], work[5, 1, column] = vx, vy
+
+
+@compiled
+def _of(M: FloatArray, j: int) -> Vector:
+    return (M[0, j], M[1, j], M[2, j])
+
+
+@compiled
+def _fill_weight(end: FloatArray, vx: float, vy: float, W: FloatArray) -> None:
+    """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s."""
+    a, b = end[3] - vx * end[7], end[4] - vx * end[8]
+    c, d = end[5] - vy * end[7], end[6] - vy * end[8]
+    det = a * d - b * c
+    W[0, 0], W[0, 1], W[1, 0], W[1, 1] = d / det, -b / det, -c / det, a / det
+
+
+@compiled
+def whiten(W: FloatArray, x: float, y: float, i: int, out: FloatArray) -> None:
+    out[2 * i], out[2 * i + 1] = W[0, 0] * x + W[0, 1] * y, W[1, 0] * x + W[1, 1] * y
+
+
+@compiled
+def _column(D: FloatArray, j: int, e: FloatArray) -> float:
+    total = 0.0
+    for i in range(8):
+        total += D[i, j] * e[i]
+    return total
+
+
+@compiled
+def _fill_inverse(D: FloatArray, N: FloatArray, out: FloatArray) -> bool:
+    """Inverse of the point's normal matrix; False when the ends do not determine the point."""
+    for i in range(3):
+        for j in range(3):
+            N[i, j] = 0.0
+            for n in range(8):
+                N[i, j] += D[n, i] * D[n, j]
+    first, second = (N[0, 0], N[1, 0], N[2, 0]), (N[0, 1], N[1, 1], N[2, 1])
+    third = (N[0, 2], N[1, 2], N[2, 2])
+    rows = (cross(second, third), cross(third, first), cross(first, second))
+    det = dot(first, rows[0])
+    if not det > 1e-14 * N[0, 0] * N[1, 1] * N[2, 2]:
+        return False
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = rows[i][j] / det
+    return True
+
+
+@compiled
+def _add_reduced(
+    D: FloatArray, e: FloatArray, inverse: FloatArray, Q: FloatArray, H: FloatArray, gradient: FloatArray
+) -> None:
+    """Normal equations (6) without the point: H += Dt^T Dt - Q N^-1 Q^T with Q = Dt^T Dp."""
+    g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
+    best = apply(inverse, g)
+    for i in range(6):
+        for j in range(3):
+            Q[i, j] = _column(D, 3 + i, D[:, j])
+    for i in range(6):
+        q = apply(inverse, (Q[i, 0], Q[i, 1], Q[i, 2]))
+        gradient[i] += _column(D, 3 + i, e) - dot((Q[i, 0], Q[i, 1], Q[i, 2]), best)
+        for j in range(6):
+            H[i, j] += _column(D, 3 + i, D[:, 3 + j]) - dot(q, (Q[j, 0], Q[j, 1], Q[j, 2]))
+
+
+_VARIANCE = (0.5, 0.5, 2.0)
+
+
+@compiled
+def _invert_symmetric(S: FloatArray, out: FloatArray) -> None:
+    """Inverse of a symmetric positive definite (3, 3) matrix by cofactors."""
+    c00 = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
+    c01 = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
+    c02 = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
+    det = S[0, 0] * c00 + S[0, 1] * c01 + S[0, 2] * c02
+    out[0, 0], out[0, 1], out[0, 2] = c00 / det, c01 / det, c02 / det
+    out[1, 1] = (S[0, 0] * S[2, 2] - S[0, 2] * S[0, 2]) / det
+    out[1, 2] = (S[0, 1] * S[0, 2] - S[0, 0] * S[1, 2]) / det
+    out[2, 2] = (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]) / det
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+
+
+@compiled
+def _predict(p: Vector, disparity: float, focal: FloatArray, by_p: FloatArray) -> Vector:
+    """Prediction, relative to the principal point; fills its derivative by_p (3, 3) by p."""
+    iz = 1.0 / p[2]
+    m = (focal[0] * p[0] * iz, focal[1] * p[1] * iz, disparity * iz)
+    by_p[0, 0], by_p[1, 1] = focal[0] * iz, focal[1] * iz
+    by_p[0, 2], by_p[1, 2], by_p[2, 2] = -m[0] * iz, -m[1] * iz, -m[2] * iz
+    return m
+
+
+@compiled
+def track_terms(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    tracks: FloatArray,
+    focal: FloatArray,
+    h: float,
+    baseline: float,
+    squares: FloatArray,
+    H: FloatArray,
+    gradient: FloatArray,
+    want: bool,
+) -> None:
+    """Squared whitened errors of tracks, and the normal equations of half their sum.
+
+    Tracks (n, 4, 9), whose four ends have times of their own, are those of ``timed_track_terms``.
+
+    Args:
+        theta: (6,) w and v.
+        tracks: (n, 8) ray 0 (x, y) and disparity 0; x, y relative to the principal point and disparity of
+            frame 1, px; tau0, tau1. All of the camera halfway between both.
+        focal: (2,) fx, fy in pixels; h: frame periods per row; baseline: metres.
+        squares: (n,) filled, px^2: chi-squared with 3 degrees of freedom at a noise of 1 px.
+        H, gradient: (6, 6), (6,), added to when ``want``.
+    """
+    if tracks.ndim == 3:  # known when compiled: only what is called is
+        timed_track_terms(theta, kernel, tracks, focal, baseline, squares, H, gradient, want)
+        return
+    R, A, by_p, S, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    D0, D1, T_w, T_v = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    C, WC = np.zeros((3, 6)), np.zeros((3, 6))
+    for k in range(len(tracks)):
+        x, disparity, tau0, tau1 = (tracks[k, 0], tracks[k, 1], 1.0), tracks[k, 2], tracks[k, 6], tracks[k, 7]
+        rho = disparity / (focal[0] * baseline)
+        T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
+        turned = apply(R, x)
+        p = plus(turned, rho, T)
+        if p[2] <= NEAREST:
+            squares[k] = BEHIND
+            continue
+        m = _predict(p, disparity, focal, by_p)
+        c = (tracks[k, 3] - m[0], tracks[k, 4] - m[1], tracks[k, 5] - m[2])
+        rate0 = plus(times(rho, rate0), 1.0, cross(spin0, turned))
+        rate1 = plus(times(rho, rate1), 1.0, cross(spin1, turned))
+        _track_gradients(R, T, rate0, rate1, p[2], by_p, focal, h, baseline, D0, D1)
+        _whitening(D0, D1, S, W)
+        lam = apply(W, c)
+        squares[k] = dot(c, lam)
+        if not want:
+            continue
+        step = apply_variance(apply_transposed(D0, lam))
+        x, disparity = (x[0] - step[0] / focal[0], x[1] - step[1] / focal[1], 1.0), disparity - step[2]
+        kernel.translation_jacobian(theta, tau0, tau1, R, A, T_w, T_v)
+        if _track_jacobian(x, disparity, R, A, T, T_w, T_v, focal, baseline, by_p, C):
+            _add_normal(C, WC, W, lam, H, gradient)
+
+
+@compiled
+def apply_variance(a: Vector) -> Vector:
+    return (_VARIANCE[0] * a[0], _VARIANCE[1] * a[1], _VARIANCE[2] * a[2])
+
+
+@compiled
+def _whitening(D0: FloatArray, D1: FloatArray, S: FloatArray, W: FloatArray) -> None:
+    """Fill the covariance S (3, 3) of the three equations and its inverse W."""
+    for i in range(3):
+        for j in range(i, 3):
+            S[i, j] = 0.0
+            for n in range(3):
+                S[i, j] += _VARIANCE[n] * (D0[i, n] * D0[j, n] + D1[i, n] * D1[j, n])
+            S[j, i] = S[i, j]
+    _invert_symmetric(S, W)
+
+
+@compiled
+def _track_gradients(
+    R: FloatArray,
+    T: Vector,
+    rate0: Vector,
+    rate1: Vector,
+    depth: float,
+    by_p: FloatArray,
+    focal: FloatArray,
+    h: float,
+    baseline: float,
+    D0: FloatArray,
+    D1: FloatArray,
+) -> None:
+    """Derivatives (3, 3) of the three equations by m of frame 0 and of frame 1; rates are p's by the times."""
+    by_x = (R[0, 0] / focal[0], R[1, 0] / focal[0], R[2, 0] / focal[0])
+    by_y = (
+        R[0, 1] / focal[1] + h * rate0[0],
+        R[1, 1] / focal[1] + h * rate0[1],
+        R[2, 1] / focal[1] + h * rate0[2],
+    )
+    columns = (apply(by_p, by_x), apply(by_p, by_y), apply(by_p, times(1.0 / (focal[0] * baseline), T)))
+    shift = apply(by_p, rate1)
+    for i in range(3):
+        for j in range(3):
+            D0[i, j] = -columns[j][i]
+            D1[i, j] = 0.0
+        D1[i, i] = 1.0
+    for i in range(3):
+        D1[i, 1] -= h * shift[i]
+    D0[2, 2] -= 1.0 / depth
+
+
+@compiled
+def _track_jacobian(
+    x: Vector,
+    disparity: float,
+    R: FloatArray,
+    A: FloatArray,
+    T: Vector,
+    T_w: FloatArray,
+    T_v: FloatArray,
+    focal: FloatArray,
+    baseline: float,
+    by_p: FloatArray,
+    C: FloatArray,
+) -> bool:
+    """Fill the derivative C (3, 6) of the three equations by theta; False when the point is behind the camera."""
+    rho = disparity / (focal[0] * baseline)
+    turned = apply(R, x)
+    p = plus(turned, rho, T)
+    if p[2] <= NEAREST:
+        return False
+    _predict(p, disparity, focal, by_p)
+    for j in range(3):
+        by_w = plus(cross((A[0, j], A[1, j], A[2, j]), turned), rho, (T_w[0, j], T_w[1, j], T_w[2, j]))
+        column_w = apply(by_p, by_w)
+        column_v = apply(by_p, (rho * T_v[0, j], rho * T_v[1, j], rho * T_v[2, j]))
+        for i in range(3):
+            C[i, j], C[i, 3 + j] = -column_w[i], -column_v[i]
+    return True
+
+
+@compiled
+def _add_normal(
+    C: FloatArray, WC: FloatArray, W: FloatArray, lam: Vector, H: FloatArray, gradient: FloatArray
+) -> None:
+    """H += C^T W C, gradient += C^T lam."""
+    for j in range(6):
+        column = (C[0, j], C[1, j], C[2, j])
+        gradient[j] += dot(column, lam)
+        whitened = apply(W, column)
+        WC[0, j], WC[1, j], WC[2, j] = whitened
+    for i in range(6):
+        for j in range(6):
+            H[i, j] += C[0, i] * WC[0, j] + C[1, i] * WC[1, j] + C[2, i] * WC[2, j]
+
+
+_LEAST_SLOPE = 0.1
+"""Of the weight: what a measurement far off counts in the Hessian, at least, as in ``packed.HeavyTailed``."""
+_MOTION = 6
+
+
+@compiled
+def add_tracks(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    tracks: FloatArray,
+    by: FloatArray,
+    focal: FloatArray,
+    baseline: float,
+    tails: FloatArray,
+    trust: FloatArray,
+    gradient: FloatArray,
+    H: FloatArray,
+) -> float:
+    """Negative log-likelihood of tracks times the squared scale, px^2; its gradient and Hessian are added to.
+
+    Args:
+        theta: (6,) of the motion.
+        tracks: (n, 4, 9), see ``timed_track_terms``.
+        by: (n, 4, k, 3) derivatives of the ends' rays (x, y) and times by k unknowns.
+        focal: (2,), px; baseline: metres.
+        tails: (2,) degrees of freedom and scale, px, of the errors' t distribution.
+        trust: (n,) factors on the log-likelihoods.
+        gradient, H: (6 + k,), (6 + k, 6 + k).
+    """
+    size = len(gradient)
+    e, D, W = np.zeros(8), np.zeros((8, 9)), np.zeros((4, 2, 2))
+    N, inverse, work = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 3, 3))
+    J, Q, half = np.zeros((8, size)), np.zeros((size, 3)), np.zeros((size, 3))
+    cost = 0.0
+    for n in range(len(tracks)):
+        if not linearise_best(theta, kernel, tracks[n], focal, baseline, e, D, W, N, inverse, work):
+            cost += _loss(BEHIND, 5.0, tails, trust[n])
+            continue
+        square = 0.0
+        for i in range(8):
+            square += e[i] * e[i]
+            for j in range(_MOTION):
+                J[i, j] = D[i, 3 + j]
+        for k in range(size - _MOTION):
+            _fill_unknown(by[n, :, k], focal, work, W, J[:, _MOTION + k])
+        cost += _loss(square, 5.0, tails, trust[n])
+        weight, slope = _weights(square, 5.0, tails, trust[n])
+        g = (_product(D[:, 0], e), _product(D[:, 1], e), _product(D[:, 2], e))
+        best = apply(inverse, g)
+        for i in range(size):
+            for j in range(3):
+                Q[i, j] = _product(J[:, i], D[:, j])
+            q = (Q[i, 0], Q[i, 1], Q[i, 2])
+            half[i, 0], half[i, 1], half[i, 2] = apply(inverse, q)
+            gradient[i] += weight * (_product(J[:, i], e) - dot(q, best))
+            for j in range(i + 1):
+                both = _product(J[:, i], J[:, j])
+                both -= half[i, 0] * Q[j, 0] + half[i, 1] * Q[j, 1] + half[i, 2] * Q[j, 2]
+                H[i, j] += slope * both
+                if j < i:
+                    H[j, i] += slope * both
+    return cost
+
+
+@compiled
+def _fill_unknown(by: FloatArray, focal: FloatArray, work: FloatArray, W: FloatArray, out: FloatArray) -> None:
+    """Derivative (8,) of a track's whitened errors by one unknown, of which the ends have ``by`` (4, 3)."""
+    for i in range(4):
+        x, y = focal[0] * by[i, 0], focal[1] * by[i, 1]
+        if i > 0:
+            x -= work[4, 0, i - 1] * by[0, 2] + work[5, 0, i - 1] * by[i, 2]
+            y -= work[4, 1, i - 1] * by[0, 2] + work[5, 1, i - 1] * by[i, 2]
+        whiten(W[i], x, y, i, out)
+
+
+@compiled
+def _product(a: FloatArray, b: FloatArray) -> float:
+    total = 0.0
+    for i in range(8):
+        total += a[i] * b[i]
+    return total
+
+
+@compiled
+def _loss(square: float, freedom: float, tails: FloatArray, trust: float) -> float:
+    variance = tails[1] * tails[1]
+    return 0.5 * variance * trust * (tails[0] + freedom) * math.log1p(square / (tails[0] * variance))
+
+
+@compiled
+def _weights(square: float, freedom: float, tails: FloatArray, trust: float) -> tuple[float, float]:
+    """Of a measurement in the gradient and in the Hessian: its second derivative, averaged over directions."""
+    variance = tails[1] * tails[1]
+    weight = trust * (tails[0] + freedom) / (tails[0] + square / variance)
+    bend = 2.0 * square / freedom / (tails[0] * variance + square)
+    return weight, weight * max(1.0 - bend, _LEAST_SLOPE)
+
+
+@compiled
+def add_pairs(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    pairs: FloatArray,
+    by: FloatArray,
+    focal: FloatArray,
+    tails: FloatArray,
+    trust: FloatArray,
+    gradient: FloatArray,
+    H: FloatArray,
+) -> float:
+    """What ``add_tracks`` is, of pairs (n, 17); ``by``: (n, 2, k, 3)."""
+    size = len(gradient)
+    J, work, ends = np.zeros(size), np.zeros((4, 3, 3)), np.zeros(6)
+    cost = 0.0
+    for n in range(len(pairs)):
+        residual, norm = linearise_pair(theta, kernel, pairs[n : n + 1], focal, work, J, ends)
+        square = residual * residual
+        cost += _loss(square, 1.0, tails, trust[n])
+        if norm <= 0.0:
+            continue
+        for k in range(size - _MOTION):
+            J[_MOTION + k] = 0.0
+            for i in range(6):
+                J[_MOTION + k] += ends[i] * by[n, i // 3, k, i % 3]
+        weight, slope = _weights(square, 1.0, tails, trust[n])
+        for i in range(size):
+            gradient[i] += weight * residual * J[i] / norm
+            for j in range(size):
+                H[i, j] += slope * J[i] * J[j] / (norm * norm)
+    return cost
+
+
+@compiled
+def linearise_pair(
+    theta: FloatArray,
+    kernel: MotionKernel,
+    pairs: FloatArray,
+    focal: FloatArray,
+    work: FloatArray,
+    J: FloatArray,
+    ends: FloatArray,
+) -> tuple[float, float]:
+    """Sampson residual, px, of one pair (1, 17), and the norm of its constraint's derivative by the pixels.
+
+    Fills J (6 and more,) with the derivative of the constraint by the motion, and ``ends`` (6,) with that by ray
+    and time of either end, both at the corrected pair, see ``kernels``.
+    """
+    R, A, T_w, T_v = work[0], work[1], work[2], work[3]
+    x, y, offset = (pairs[0, 0], pairs[0, 1], 1.0), (pairs[0, 2], pairs[0, 3], 1.0), pairs[0, 6]
+    tau0, tau1 = pairs[0, 4], pairs[0, 5]
+    T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
+    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
+    rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
+    L0, L1, slope = at_pixels(pairs, 0, 0.0)
+    value, q = pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
+    qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    if qq <= 0.0:
+        return displacement(apply(R, x), y, focal), 0.0
+    step = value / qq
+    x, y = shifted(x, L0, step * q[0], step * q[1], focal), shifted(y, L1, step * q[2], step * q[3], focal)
+    tau0 -= slope[1] * step * q[1] + slope[0] * step * q[0]
+    tau1 -= slope[1] * step * q[3] + slope[0] * step * q[2]
+    pair_jacobian(theta, kernel, x, y, tau0, tau1, offset, R, A, T_w, T_v, J)
+    T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
+    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
+    rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
+    p = apply(R, x)
+    n, line, back = cross(p, y), cross(T, p), apply_transposed(R, cross(y, T))
+    ends[0], ends[1], ends[3], ends[4] = back[0], back[1], line[0], line[1]
+    ends[2] = dot(rate0, n) + dot(spin0, y) * dot(T, p) - dot(spin0, T) * dot(y, p)
+    ends[5] = dot(rate1, n) + dot(spin1, y) * dot(T, p) - dot(spin1, T) * dot(y, p)
+    return value / math.sqrt(qq), math.sqrt(qq)

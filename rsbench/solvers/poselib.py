@@ -1,0 +1,366 @@
+"""Global-shutter solvers of PoseLib: five points of the left camera, all pairs of the rig, pose from points.
+
+V. Larsson et al., PoseLib. It minimises the Sampson or the reprojection error without robust loss here: the
+robust loop around a solver rejects outliers, the same loop for every solver. ``P3pSolver`` alone has PoseLib's
+own loop: the stereo pair of frame 0 gives the points, whose images in frame 1 give the pose by LO-RANSAC on
+those of the left camera (M. Persson, K. Nordberg, Lambda Twist P3P, ECCV 2018), then least squares of the
+reprojection errors of the inliers, of both cameras.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, final
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.arguments import check_number, check_whole
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import (
+    FRAME_1,
+    BoolArray,
+    Correspondences,
+    stereo_points,
+    temporal_pairs,
+    with_depth,
+)
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.essential_matrix import decompose_essential, eight_point
+
+_BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
+MISSING = "poselib is not installed: there is no wheel for this platform"
+_NOT_FINITE = "poselib returned no finite pose"
+
+
+class PoselibSolver(Solver):
+    """A solver whose final estimate is one of PoseLib's refinements."""
+
+    @abstractmethod
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
+        """The pose that PoseLib finds from a pose to start at; both are PoseLib's ``CameraPose``."""
+
+    def improve(
+        self,
+        motion: MotionEstimate,
+        correspondences: Correspondences,
+        rig: StereoRig,
+        shutter: RollingShutter,
+        quick: bool = False,
+    ) -> MotionEstimate:
+        poselib = poselib_module()
+        if poselib is None:
+            return MotionEstimate.failed(MISSING)
+        start = poselib_pose(poselib, so3.exp(motion.w), motion.d)
+        options = {**_BUNDLE, "max_iterations": 10} if quick else _BUNDLE
+        return estimate_of(self.refined(poselib, start, correspondences, rig, options), self.spec.metric)
+
+
+def poselib_module() -> Any:
+    """The module, or None where it has no wheel."""
+    try:
+        import poselib
+    except ImportError:
+        return None
+    return poselib
+
+
+def poselib_camera(camera: PinholeCamera) -> dict[str, Any]:
+    """As PoseLib names it; ValueError for a lens: it is given matches without one."""
+    if camera.lens is not None:
+        raise ValueError("PoseLib is given matches without a lens")
+    return {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
+
+
+def poselib_pose(poselib: Any, R: FloatArray, t: FloatArray) -> Any:
+    pose = poselib.CameraPose()
+    pose.R, pose.t = R, t
+    return pose
+
+
+def rig_extrinsics(poselib: Any, rig: StereoRig) -> list[Any]:
+    return [poselib_pose(poselib, np.eye(3), rig.offset(side)) for side in SIDES]
+
+
+def estimate_of(pose: Any, metric: bool) -> MotionEstimate:
+    R, t = np.array(pose.R), np.array(pose.t)
+    if not (np.all(np.isfinite(R)) and np.all(np.isfinite(t))):
+        return MotionEstimate.failed(_NOT_FINITE)
+    if not metric:
+        t = t / max(float(np.linalg.norm(t)), 1e-300)
+    reason = "" if metric else "the length of d is not determined by one camera"
+    return MotionEstimate(w=so3.log(R), d=t, success=True, metric=metric, reason=reason)
+
+
+def left_start(matches: FloatArray, rig: StereoRig) -> MotionEstimate:
+    """Motion of the left camera, with a unit d, by the eight-point algorithm on matches (n, 4), n >= 8."""
+    x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+    E = eight_point(x0, x1)
+    if E is None:
+        return MotionEstimate.failed("the matches fit more than one essential matrix: degenerate scene or motion")
+    pose, _ = decompose_essential(E, x0, x1)
+    return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True)
+
+
+def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
+    """Motions of the camera of matches (5, 4): PoseLib's five-point solver, points in front."""
+    poselib = poselib_module()
+    if poselib is None:
+        return [MotionEstimate.failed(MISSING)]
+    if len(matches) < 5:
+        return []
+    rays = [rig.camera.unproject(matches[:5, k : k + 2]) for k in (0, 2)]
+    unit = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
+    motions = [estimate_of(pose, metric=False) for pose in poselib.relpose_5pt(*unit)]
+    return [motion for motion in motions if motion.success]
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PoselibMonoSolver(PoselibSolver):
+    """Left camera only: five-point proposals, then the Sampson error of all matches."""
+
+    spec = SolverSpec(
+        needs=frozenset({"left"}),
+        minimum={"left": 8},
+        metric=False,
+        motion_model="linear",
+        shutter="global",
+        reference_point="left",
+        reference="PoseLib; Nister: An efficient solution to the five-point relative pose problem, PAMI 2004",
+        assumes="global shutter; translation",
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        matches = temporal_pairs(correspondences, "left")
+        short = self.spec.shortage({"left": len(matches)})
+        if short is not None:
+            return short
+        start = left_start(matches, rig)
+        return self.improve(start, correspondences, rig, shutter) if start.success else start
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"left": 5}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        return five_point_motions(temporal_pairs(sample, "left"), rig)
+
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
+        matches, camera = temporal_pairs(correspondences, "left"), poselib_camera(rig.camera)
+        pose, _ = poselib.refine_relative_pose(matches[:, :2], matches[:, 2:], start, camera, camera, options)
+        return pose
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PoselibStereoSolver(PoselibSolver):
+    """Left and right pairs of the rig as one generalised camera."""
+
+    spec = SolverSpec(
+        needs=frozenset({"left", "right"}),
+        minimum={"left": 8, "right": 8},
+        metric=True,
+        motion_model="linear",
+        shutter="global",
+        reference_point="body",
+        reference="PoseLib, generalised relative pose of left-left and right-right matches",
+        assumes="global shutter; translation; rotation that moves the baseline, for the scale",
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        short = self.spec.shortage({side: len(temporal_pairs(correspondences, side)) for side in SIDES})
+        if short is not None:
+            return short
+        start = left_start(temporal_pairs(correspondences, "left"), rig)
+        if not start.success:
+            return start
+        return self.improve(replace(start, d=0.5 * rig.baseline * start.d), correspondences, rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"left": 5}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        length = 0.5 * rig.baseline
+        return [
+            replace(motion, d=length * motion.d)
+            for motion in five_point_motions(temporal_pairs(sample, "left"), rig)
+        ]
+
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
+        pairs = []
+        for k, side in enumerate(SIDES):
+            matches = temporal_pairs(correspondences, side)
+            pair = poselib.PairwiseMatches()
+            pair.cam_id1, pair.cam_id2 = k, k
+            pair.x1, pair.x2 = matches[:, :2], matches[:, 2:]
+            pairs.append(pair)
+        extrinsics, cameras = rig_extrinsics(poselib, rig), [poselib_camera(rig.camera)] * 2
+        pose, _ = poselib.refine_generalized_relative_pose(
+            pairs, start, extrinsics, cameras, extrinsics, cameras, options
+        )
+        return pose
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class PoselibPnpSolver(PoselibSolver):
+    """Points from the disparities of frame 0, then the pose of frame 1's stereo pair from them."""
+
+    spec = SolverSpec(
+        needs=frozenset({"tracks"}),
+        minimum={"tracks": 4},
+        metric=True,
+        motion_model="linear",
+        shutter="global",
+        reference_point="body",
+        reference="PoseLib, generalised absolute pose; Persson, Nordberg: Lambda Twist, ECCV 2018",
+        assumes="global shutter; depth of frame 0 without noise",
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        usable = with_depth(correspondences.tracks)
+        if len(usable) < self.spec.minimum["tracks"]:
+            return MotionEstimate.failed(
+                f"{len(usable)} tracks with positive disparity, need {self.spec.minimum['tracks']}"
+            )
+        # A frame's motion is small: no motion at all is as good a start as a minimal solver's.
+        still = MotionEstimate(w=np.zeros(3), d=np.zeros(3), success=True)
+        return self.improve(still, correspondences, rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"tracks": 3}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        poselib, tracks = poselib_module(), with_depth(sample.tracks)
+        if poselib is None:
+            return [MotionEstimate.failed(MISSING)]
+        if len(tracks) < 3:
+            return []
+        rays = rig.camera.unproject(tracks[:3, 4:6])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        # Points in the body; the left camera of frame 1 sees them at R x + d + offset.
+        poses = poselib.p3p(rays, stereo_points(tracks[:3], rig))
+        return [_shifted(pose, rig.offset("left")) for pose in poses if np.all(np.isfinite(pose.t))]
+
+    def refined(
+        self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
+    ) -> Any:
+        tracks = with_depth(correspondences.tracks)
+        points = stereo_points(tracks, rig)
+        pose, _ = poselib.refine_generalized_absolute_pose(
+            [tracks[:, 4:6], tracks[:, 6:8]],
+            [points, points],
+            start,
+            rig_extrinsics(poselib, rig),
+            [poselib_camera(rig.camera)] * 2,
+            options,
+        )
+        return pose
+
+
+def _shifted(pose: Any, offset: FloatArray) -> MotionEstimate:
+    return MotionEstimate(w=so3.log(np.array(pose.R)), d=np.array(pose.t) - offset, success=True, metric=True)
+
+
+_LEAST = 10
+"""Samples, as in rsbench's own robust loop."""
+_BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class P3pSolver(Solver):
+    """PoseLib's robust absolute pose; a card of it says ``robust = "own"``."""
+
+    cameras_used: Literal["left", "both"] = "both"
+    """Whose pixels of frame 1 count in the end; the search is on the left camera's."""
+    threshold_px: float = 4.0
+    """Largest reprojection error of an inlier: beyond the noise of pixels and points, on a rolling shutter too."""
+    confidence: float = 0.999
+    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
+    max_iterations: int = 1000
+    """Samples that RANSAC draws, at most."""
+
+    def __post_init__(self) -> None:
+        check_number("threshold_px", self.threshold_px, 0.0)
+        check_number("confidence", self.confidence, 0.0, 1.0)
+        check_whole("max_iterations", self.max_iterations, 1)
+
+    spec = SolverSpec(
+        needs=frozenset({"tracks"}),
+        minimum={"tracks": 4},
+        metric=True,
+        motion_model="linear",
+        shutter="global",
+        reference_point="body",
+        reference="Persson, Nordberg: Lambda Twist, ECCV 2018; PoseLib, estimate_absolute_pose",
+        assumes="global shutter; depth of frame 0 without noise",
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        poselib, tracks = poselib_module(), with_depth(correspondences.tracks)
+        if poselib is None:
+            return MotionEstimate.failed(MISSING)
+        if len(tracks) < self.spec.minimum["tracks"]:
+            least = self.spec.minimum["tracks"]
+            return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {least}")
+        options = {
+            "max_reproj_error": self.threshold_px,
+            "success_prob": self.confidence,
+            "min_iterations": _LEAST,
+            "max_iterations": self.max_iterations,
+        }
+        offset = rig.offset("left")
+        points, camera = stereo_points(tracks, rig) + offset, poselib_camera(rig.camera)
+        pose, found = poselib.estimate_absolute_pose(tracks[:, 4:6], points, camera, options, _BUNDLE)
+        if found["num_inliers"] < self.spec.minimum["tracks"]:
+            return MotionEstimate.failed(f"no consensus: {found['num_inliers']} points fit one pose")
+        R = np.array(pose.R)
+        start = poselib_pose(poselib, R, np.array(pose.t) + R @ offset - offset)
+        return estimate_of(self._refined(poselib, start, tracks, rig), self.spec.metric)
+
+    def _refined(self, poselib: Any, start: Any, tracks: FloatArray, rig: StereoRig) -> Any:
+        """PoseLib's pose of the body, from the pixels near it."""
+        points, camera = stereo_points(tracks, rig), poselib_camera(rig.camera)
+        sides: tuple[Side, ...] = SIDES if self.cameras_used == "both" else ("left",)
+        near = [self._near(start, points, tracks[:, FRAME_1[side]], rig, side) for side in sides]
+        end, _ = poselib.refine_generalized_absolute_pose(
+            [tracks[mask, FRAME_1[side]] for side, mask in zip(sides, near, strict=True)],
+            [points[mask] for mask in near],
+            start,
+            [poselib_pose(poselib, np.eye(3), rig.offset(side)) for side in sides],
+            [camera] * len(sides),
+            _BUNDLE,
+        )
+        return end
+
+    def _near(self, pose: Any, points: FloatArray, pixels: FloatArray, rig: StereoRig, side: Side) -> BoolArray:
+        """Mask (n,) of the pixels of frame 1 near which a pose of the body shows its points."""
+        seen = points @ np.array(pose.R).T + np.array(pose.t) + rig.offset(side)
+        front = seen[:, 2] > 0.0
+        error = np.linalg.norm(rig.camera.project(np.where(front[:, None], seen, 1.0)) - pixels, axis=1)
+        return front & (error <= self.threshold_px)
