@@ -286,12 +286,6 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 # Packaging
 
 
-def test_no_two_modules_have_one_name() -> None:
-    """Whoever looks for a file by its name finds it."""
-    names = [path.name for path in (ROOT / "rsbench").rglob("*.py") if not path.name.startswith("__")]
-    assert sorted({name for name in names if names.count(name) > 1}) == []
-
-
 def test_the_changelog_knows_this_version() -> None:
     assert f"## [{rsbench.__version__}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
 
