@@ -13,7 +13,6 @@ from commands import run_here
 
 import rsbench
 from rsbench.benchmark.leaderboard.board import add, entries_of, splits_of
-from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.report.board_page import build_site
@@ -40,7 +39,7 @@ def test_a_dataset_is_read_and_has_no_fault(kept: Path) -> None:
 
 @pytest.mark.slow
 def test_a_board_is_read_scored_again_and_built(kept: Path) -> None:
-    board, split = kept / "board", points_split(TRACKS["points"])
+    board, split = kept / "board", TRACKS["points"].split(None)
     assert splits_of(board) == [("points-1", split.name)]
     (entry,) = entries_of(board, "points-1", split.name)
     assert entry.header.method == "kept-method" and entry.handed_in and entry.doubt == ""

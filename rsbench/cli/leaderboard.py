@@ -9,16 +9,6 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo
-from rsbench.cli.leaderboard_run import predict
-from rsbench.cli.leaderboard_tracks import (
-    Data,
-    Hidden,
-    Secret,
-    Track,
-    Workers,
-    split_of,
-    write_frames_of,
-)
 from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
@@ -54,6 +44,24 @@ _SHOWN = (
 
 board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
 
+Track = Annotated[
+    str,
+    typer.Argument(
+        help="A track or its protocol, such as points-2, pose (given matches) or pose-own (own matches)."
+    ),
+]
+Data = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points and points-2."),
+]
+Secret = Annotated[
+    Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")
+]
+Hidden = Annotated[
+    bool, typer.Option("--secret", help="The dataset's truth is not to be told: not exported, not used by check.")
+]
+
+Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
 _BoardOrUrl = Annotated[
     str, typer.Option(metavar="DIR", help="Folder of the board, or a URL such as s3://bucket/folder.")
@@ -61,6 +69,12 @@ _BoardOrUrl = Annotated[
 _File = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="Predictions: JSON lines; the folder 'pictures' beside it is read too."),
+]
+_Seed = Annotated[
+    Path, typer.Option("--seed-file", metavar="FILE", help="Secret text, 16 characters or more, drawn at random.")
+]
+_Card = Annotated[
+    str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
 ]
 
 
@@ -73,7 +87,7 @@ def export(
     secret: Hidden = False,
 ) -> None:
     """Write the inputs of a track for any language; of a public split the truth too."""
-    from rsbench.benchmark.leaderboard.inputs import check_place, write_inputs
+    from rsbench.benchmark.leaderboard.inputs import check_place, write_frames, write_inputs
     from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 
@@ -81,7 +95,7 @@ def export(
     check_place(split, out)
     with work_folder(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
         if data is not None and split.track.gives_images:
-            write_frames_of(split, data, out)
+            write_frames(split, data, out)
         write_inputs(split, _counted(split.track.problems(data, seed_file, len(split.truths)), advance), out)
     echo(f"{split.track.id}, split {split.name}, {len(split.truths)} problems: {out}")
     echo(f"fingerprint: {split.fingerprint}")
@@ -97,18 +111,20 @@ def template(
     """Print a file of predictions that is in order: fill in your own."""
     import tempfile
 
+    from rsbench.benchmark.leaderboard.submissions import write_template
+
     split = split_of(track, data, seed_file)
     if out is None:
         if split.track.pictures:
             raise RsbenchError(f"--out: the track {track!r} asks for pictures; name a new folder for the example")
         with tempfile.TemporaryDirectory() as folder:
-            split.track.write_template(split, path := Path(folder) / "predictions.jsonl")
+            write_template(split, path := Path(folder) / "predictions.jsonl")
             echo(path.read_text("utf-8"), nl=False)
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RsbenchError(f"--out {out}: is there already; choose a new folder")
     out.mkdir(parents=True, exist_ok=True)
-    split.track.write_template(split, path := out / "predictions.jsonl")
+    write_template(split, path := out / "predictions.jsonl")
     echo(str(path))
 
 
@@ -177,13 +193,25 @@ def run(
 ) -> None:
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
     from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
+    from rsbench.benchmark.leaderboard.inputs import prepare_inputs
+    from rsbench.benchmark.leaderboard.running import count_steps, load_cards, run_cards
     from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.benchmark.provenance import provenance
+    from rsbench.cli.console import progress_bar
+    from rsbench.storage.work_folder import work_folder
 
     processes, split = chosen_workers(workers, scheduler), split_of(track, data, seed_file, secret)
-    split.track.load(entry)  # before anything is written
+    load_cards(split.track, entry)  # before anything is written
+    limits = Limits(time_limit, memory)
     with results_at(board, scheduler) as place:
-        files = predict(entry, split, place, data, seed_file, processes, Limits(time_limit, memory))
+        with (
+            work_folder(place) as hidden,
+            progress_bar(f"running {split.name}", count_steps(split, entry, limits)) as advance,
+        ):
+            work = hidden / "runs" / split.track.id / split.name
+            work.mkdir(parents=True, exist_ok=True)
+            prepare_inputs(split, data, seed_file, work / "inputs")
+            files = run_cards(split, entry, work / "inputs", work, workers=processes, limits=limits, step=advance)
         with _scoring(split) as step:
             add_all(
                 place,
@@ -222,14 +250,15 @@ def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = 
     import tempfile
 
     from rsbench.benchmark.leaderboard.board import add_all
+    from rsbench.benchmark.leaderboard.submissions import write_oracles
     from rsbench.benchmark.provenance import provenance
 
     split = split_of(track, data, seed_file)
     if not split.public:
-        raise RsbenchError(f"split {split.name}: its truth is secret, and would be told as an entry of the board")
+        raise RsbenchError(f"split {split.name}: its truth is secret, and would be shown as an entry of the board")
     made = provenance("rsbench leaderboard oracles")
     with tempfile.TemporaryDirectory() as folder, _scoring(split) as step:
-        add_all(board, split.track.oracles(split, Path(folder)), split, made, step=step)
+        add_all(board, write_oracles(split, Path(folder)), split, made, step=step)
     _show(board, split.track.id, split.name, "truth")
 
 
@@ -286,6 +315,99 @@ def rescore(
         echo(f"{method}: other scores: {', '.join(columns)}")
     if changed:
         raise typer.Exit(1)
+
+
+# Of the keeper of a board
+
+
+@board_app.command()
+def publish(
+    track: Annotated[str, typer.Argument(help="A track of frames, such as pose or pose-own.")],
+    seed_file: _Seed,
+    keep: Annotated[
+        Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of what everybody may see.")],
+    card: _Card = "standard",
+    workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
+) -> None:
+    """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
+    from rsbench.benchmark.leaderboard import publishing
+    from rsbench.benchmark.leaderboard.tracks import track_of_name
+    from rsbench.cli.console import progress_bar
+    from rsbench.dataset.generation import steps_of
+    from rsbench.dataset.secret_split import read_secret, secret_card
+
+    of_frames, text = track_of_name(track), read_secret(seed_file)
+    if not of_frames.inputs.rendered:
+        raise RsbenchError(f"track {track!r}: has no frames; export and submit take --seed-file themselves")
+    for hidden in (keep, seed_file):
+        if hidden.resolve().is_relative_to(out.resolve()):
+            raise RsbenchError(f"{hidden}: lies in {out}, which everybody may see; take another place")
+    drawn = secret_card(card, text)
+    with progress_bar(f"rendering {drawn.name}", steps_of(drawn) * len(drawn.sequence)) as advance:
+        made = publishing.publish(of_frames, card, text, keep, out, workers=workers, progress=advance)
+    echo(f"{made.protocol}, split {made.split}, {len(drawn.sequence)} sequences: {out}")
+    for name in ("commitment", "fingerprint", "truth"):
+        echo(f"{name}: {getattr(made, name)}")
+
+
+@board_app.command()
+def score(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Predictions: JSON lines.")],
+    seed_file: _Seed,
+    published: Annotated[Path, typer.Option(metavar="DIR", help="Folder that publish wrote for everybody.")],
+    board: Annotated[Path, typer.Option(help="Folder of the board.")],
+    card: Annotated[str | None, typer.Option(metavar="CARD", help="Where its card is not rsbench's own.")] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="The keeper's folder, where the truth is depth or frames.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    workers: Workers = 1,
+) -> None:
+    """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
+    from rsbench.benchmark.leaderboard.board import add
+    from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
+    from rsbench.benchmark.leaderboard.submissions import check_submission
+    from rsbench.benchmark.leaderboard.tracks import track_of_id
+    from rsbench.benchmark.provenance import provenance
+    from rsbench.dataset.secret_split import read_secret
+
+    announced = read_announcement(published)
+    track, text = track_of_id(announced.protocol), read_secret(seed_file)
+    split = announced_split(announced, track, card or announced.card, text, keep)
+    for note in check_submission(file, split).notes:
+        echo(f"note: {note}", err=True)
+    made = provenance("rsbench leaderboard score")
+    scored = add(board, file, split, made, replace=replace, workers=workers)
+    echo(f"entry: {scored.folder}")
+    if scored.doubt:
+        echo(f"in doubt, and not ranked: {scored.doubt}")
+
+
+@board_app.command()
+def accept(
+    method: Annotated[str, typer.Argument(metavar="METHOD", help="Name of the entry.")],
+    board: Annotated[Path, typer.Option(help="Folder of the board.")],
+    protocol: Annotated[str, typer.Option(metavar="ID", help="Such as points-1.")],
+    split: Annotated[str, typer.Option(metavar="NAME", help="Such as dev-f88c896f.")],
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="Why it is believed; kept in its entry.json.")],
+) -> None:
+    """Rank an entry that is in doubt, its errors being below what its data allow."""
+    from rsbench.benchmark.leaderboard import board as boards
+
+    if not reason.strip():
+        raise RsbenchError("--reason '': must say why the entry is believed")
+    echo(f"{method}: ranked all the same: {boards.accept(board, protocol, split, method, reason)}")
+
+
+# Shared
+
+
+def split_of(track: str, data: Path | None, seed_file: Path | None, secret: bool = False) -> Split:
+    from rsbench.benchmark.leaderboard.tracks import track_of_name
+
+    return track_of_name(track).split(data, seed_file, secret)
 
 
 def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
@@ -359,13 +481,10 @@ def _number(value: float) -> str:
 
 
 def register(app: typer.Typer) -> None:
-    from rsbench.cli.leaderboard_secret import accept, publish, score
     from rsbench.cli.leaderboard_smoke import EPILOG as SMOKE
     from rsbench.cli.leaderboard_smoke import smoke
 
     board_app.command(epilog=SMOKE)(smoke)
-    for command in (publish, score, accept):
-        board_app.command()(command)
     app.add_typer(
         board_app,
         name="leaderboard",

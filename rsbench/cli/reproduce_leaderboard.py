@@ -12,6 +12,14 @@ from rsbench.cli.reproduce_correction import LAWS_FRAMES
 
 BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
 """Folders of the boards below ``--data``."""
+SAME_METHOD = {
+    "rs-r6p-single": "rs-r6p",
+    "rs-stereo-iterated": "rs-stereo-iterated-metric",
+    "rs-stereo-linear-symmetric": "rs-stereo-linear",
+    "rs-stereo-tracks": "rs-stereo-refined",
+}
+"""Cards that are left out, each with the entry that stands for its method: versions that answer alike cost all
+others power, because the comparison of every pair is corrected for their number."""
 _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
 """Correctors of one camera, and that of a rig for what a second one is worth."""
 
@@ -41,7 +49,7 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
     board, frames, folder, count = data / LAWS, data / LAWS_FRAMES, out / LAWS, workers or os.cpu_count() or 1
     generate("laws", str(frames), None, workers=count)
     for track, entries in entries_of_laws().items():
-        given = frames if track_of_id(track).rendered else None
+        given = frames if track_of_id(track).inputs.rendered else None
         run(track, entries, str(board), given, workers=count)
         oracles(track, board, given)
     publish(board, folder, "rsbench reproduce laws")
@@ -52,8 +60,7 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
 
 def entries_of_laws() -> dict[str, list[str]]:
     """By protocol, what comes with rsbench: one entry a method, and of solvers the one that chooses its law."""
-    from rsbench.benchmark.leaderboard.motion_tracks import SAME_METHOD
-    from rsbench.benchmark.leaderboard.running import CHOOSES
+    from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES
 
     first = entries_of_frames()
     solvers, readers = (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.board import Scored
-from rsbench.benchmark.leaderboard.pictures import FOLDER, TruePictures, read_answer_depth, read_answer_frame
+from rsbench.benchmark.leaderboard.pictures import PICTURES, TruePictures, read_answer_depth, read_answer_frame
 from rsbench.benchmark.leaderboard.track import Truth
 from rsbench.core.so3 import FloatArray
 from rsbench.report.pictures import Image, colour_map
@@ -26,8 +26,8 @@ Named = tuple[str, str, Image]
 
 
 def true_images(track: str, pictures: TruePictures) -> Iterator[Named]:
-    """The truth of all that is asked."""
-    for each in pictures.asked:
+    """The true pictures of a problem."""
+    for each in pictures.requested:
         if track == "depth":
             yield each.stem, "true depth", _depth_image(pictures.depth(), pictures.depth())
         else:
@@ -35,17 +35,17 @@ def true_images(track: str, pictures: TruePictures) -> Iterator[Named]:
 
 
 def answer_images(track: str, entry: Scored, truth: Truth) -> Iterator[Named]:
-    """What an entry handed in for a problem, and where that errs; nothing of a failure.
+    """The pictures that an entry submitted for a problem, and their errors; nothing of a failure.
 
     Raises:
         RsbenchError: a picture is missing, or damaged.
     """
-    pictures, method, folder = truth.pictures, entry.header.method, entry.folder / FOLDER
+    pictures, method, folder = truth.pictures, entry.header.method, entry.folder / PICTURES
     scores = entry.scores
     assert pictures is not None
     if not bool(scores.loc[scores["problem"] == truth.name, "success"].all()):
         return
-    for each in pictures.asked:
+    for each in pictures.requested:
         if track == "depth":
             depth = read_answer_depth(folder, pictures, entry.header.png_unit_m)
             yield each.stem, method, _depth_image(depth, pictures.depth())

@@ -74,7 +74,7 @@ class Album:
     def compared(self, problem: str) -> tuple[int, int]:
         """Which pictures stand at the divider first: the frame as it was and the best answer, or two frames."""
         truth = None if self._split is None else self._split.by_name[problem]
-        return (0, 1) if truth is None or truth.pictures is None else (1, 2 + len(truth.pictures.asked))
+        return (0, 1) if truth is None or truth.pictures is None else (1, 2 + len(truth.pictures.requested))
 
     def _groups(self, problem: str) -> Iterator[list[Named]]:
         """What stands or falls together: frames with the truth, then each entry, the best first."""

@@ -62,7 +62,7 @@ class Board:
     @property
     def pages(self) -> bool:
         """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
-        return self.problem_pages and self.track.rendered and not self.secret
+        return self.problem_pages and self.track.inputs.rendered and not self.secret
 
     def page_of(self, problem: str) -> str:
         """Where a problem is told, from the folder of the index."""

@@ -21,7 +21,7 @@ from browser import CHROMIUM, Browser, started
 from leaderboards import erring, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import ORACLES, add
-from rsbench.benchmark.leaderboard.splits import dataset_split
+from rsbench.benchmark.leaderboard.submissions import write_truth
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.motion_models import LinearMotion
@@ -307,7 +307,7 @@ def rendered_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     motion = LinearMotion(np.array([0.01, -0.02, 0.01]), np.array([0.1, 0.0, 0.2]))
     shutter = RollingShutter(height=72, readout_ratio=0.8)
     write_analytic_dataset(folder / "data", rig, shutter, motion, twins=(36,))
-    splits = {track: dataset_split(TRACKS[track], folder / "data") for track in ("pose", "depth", "correction")}
+    splits = {track: TRACKS[track].split(folder / "data") for track in ("pose", "depth", "correction")}
     add(
         folder / "board",
         write(folder / "x.jsonl", truth_lines(splits["pose"])),
@@ -315,7 +315,7 @@ def rendered_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"command": ORACLES},
     )
     for track in ("depth", "correction"):
-        path = splits[track].track.write_truth(splits[track], folder / track)
+        path = write_truth(splits[track], folder / track)
         lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
         for picture in (path.parent / "pictures" / "planes").iterdir():
             if track == "depth":

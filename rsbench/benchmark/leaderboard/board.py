@@ -30,7 +30,7 @@ from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
 from rsbench.benchmark.leaderboard.inputs import split_record
 from rsbench.benchmark.leaderboard.pictures import copy_files, file_bytes
 from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, read_submission
-from rsbench.benchmark.leaderboard.track import ORACLE, Header, Split, Step, Submission, mark_all
+from rsbench.benchmark.leaderboard.track import ORACLE, Header, Split, Step, Submission
 from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_id
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.components.cards import parse_card
@@ -88,7 +88,7 @@ class Scored:
     header: Header
     predictions_sha256: str
     scores: pd.DataFrame
-    """One row for each problem, see ``marking.mark``."""
+    """One row for each problem, see ``Track.mark``."""
     files: dict[str, str]
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
     doubt: str
@@ -279,7 +279,7 @@ def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> N
 def rescore(
     board: Path, split: Split, workers: Workers = 1, step: Step = lambda word: None
 ) -> dict[str, list[str]]:
-    """Score the stored predictions of a split again; no method runs. ``workers`` and ``step``: see ``mark_all``.
+    """Score the stored predictions of a split again; no method runs. ``workers`` and ``step``: see ``Track.mark``.
 
     Returns:
         For each entry whose scores were others, the columns that changed; all of them where there was no table.
@@ -292,7 +292,7 @@ def rescore(
     with work_folder(board):
         folders = list(_folders(place(board, split.track.id, split.name) / "entries"))
         stored = [_stored(folder, split) for folder in folders]
-        for folder, scores in zip(folders, mark_all(stored, split, workers, step), strict=True):
+        for folder, scores in zip(folders, split.track.mark(stored, split, workers, step), strict=True):
             if isinstance(scores, RsbenchError):
                 raise scores
             old = pd.DataFrame()
@@ -373,7 +373,7 @@ def add(
     Args:
         made: how it came about, for entry.json.
         replace: whether an entry of that name may be replaced.
-        workers, step: see ``mark_all``.
+        workers, step: see ``Track.mark``.
 
     Raises:
         RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
@@ -419,7 +419,7 @@ def add_all(
             taken.append(_Taken(dataclasses.replace(submission, folder=new), data, kept))
         write_split(board, split)
         kept = _kept(hidden, taken, split)
-        marked = mark_all([each.submission for each in taken], split, workers, step, kept)
+        marked = split.track.mark([each.submission for each in taken], split, workers, step, kept)
         for each, scores in zip(taken, marked, strict=True):
             if isinstance(scores, RsbenchError):
                 faults.append(scores)

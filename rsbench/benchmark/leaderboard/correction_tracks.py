@@ -1,4 +1,4 @@
-"""The track that asks for corrected frames: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
+"""Tracks of corrected frames: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
 
 What a method did not draw is black: nobody gains by leaving out what is difficult. Entries that the board makes
 itself close narrow holes, as the command does.
@@ -10,23 +10,22 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, product
+from itertools import product
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.predict import true_pairs
-from rsbench.benchmark.leaderboard.picture_track import CardChain, Making, PictureTrack
+from rsbench.benchmark.leaderboard.picture_track import CardChain, PictureTrack, SharedWork, drawn_oracle
 from rsbench.benchmark.leaderboard.pictures import (
-    FOLDER,
     PARTINGS,
+    PICTURES,
     VIEW,
-    Asked,
     Parts,
+    RequestedPicture,
     SquareErrors,
     TruePictures,
     frame_png,
@@ -35,20 +34,17 @@ from rsbench.benchmark.leaderboard.pictures import (
     texture,
 )
 from rsbench.benchmark.leaderboard.pictures import columns as parting_columns
-from rsbench.benchmark.leaderboard.splits import GYRO, bare_problems, with_gyro
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Truth
+from rsbench.benchmark.leaderboard.splits import Frames
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Track
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, VIEWS, View
-from rsbench.dataset.imu import MEASURED
 from rsbench.dataset.layout import exposed_file, picture_file
 from rsbench.dataset.sequence import Sequence as Rendered
-from rsbench.dataset.sequence import read_pairs
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four, correct_known_rows
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.mono_correction import find_own_motion, flow_matches, refusal
-from rsbench.pipeline.problem import Problem
 from rsbench.storage.files import write_bytes
 from rsbench.vision.closing import finished
 from rsbench.vision.corrector import CorrectorSpec, demand_corrected, load_corrector
@@ -113,7 +109,7 @@ _FRAMES = (
 
 def _uncorrected(pictures: TruePictures, place: Path) -> None:
     image = pictures.rolling()
-    for each in pictures.asked:
+    for each in pictures.requested:
         write_bytes(place / f"{each.stem}.png", frame_png(image, np.ones(image.shape[:2], dtype=np.bool_)))
 
 
@@ -122,74 +118,61 @@ def _best(pictures: TruePictures, place: Path) -> None:
     sequence = pictures.sequence
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     given = Given(motion=sequence.motion, pairs=true_pairs(sequence, images))
-    for each in pictures.asked:
+    for each in pictures.requested:
         options = CorrectionOptions(target_row=each.row)
         ratio = sequence.shutter.readout_ratio
         fused = correct_four(images, sequence.rig, ratio, options, given=given, views=(VIEW,)).frames[VIEW]
         write_bytes(place / f"{each.stem}.png", frame_png(fused.image, fused.origin != 0))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CorrectionTrack(PictureTrack):
     """Rolling-shutter frames as a global shutter would have taken them."""
 
-    name, id = "correction", "correction-1"
-    title = "Corrected frames"
-    asks_rows = True
-    rows: ClassVar[tuple[str, ...]] = ("first", "middle")
-    """At whose times frames are asked, where the dataset has the truth."""
-    flips: ClassVar[bool] = True
+    rows: tuple[str, ...] = ("first", "middle")
+    """Rows whose times frames may show, where the dataset has the truth."""
+    flips: bool = True
     """Whether FLIP is among the scores."""
-    scores = _FRAMES
-    error, error_title = "error", "1 - SSIM"
-    exact = MappingProxyType({"error": 1e-6, **dict.fromkeys(parting_columns("rms", PARTINGS[0]), 0.05)})
+    at_rows = True
     part_score, part_title = "rms", "RMS error of the common pixels, of 255"
-    others = (
-        ("uncorrected", "images", "The rolling-shutter frame as it is", _uncorrected),
-        ("fusion-true", ORACLE, "The corrector fusion with the true motion and depth", _best),
-    )
-    smoke = ("fusion", "zhuang", "uncorrected", "fusion-true", ORACLE)
-    # Without FLIP, whose package has no wheel for some systems.
-    smoke_metrics = (
-        *(f"ssim{part}" for part in ("", "_covered", "_all", "_deepunroll", "_uniform")),
-        *(f"psnr{part}" for part in ("", "_covered", "_all", "_first", "_middle")),
-        "coverage",
-        "epe_px",
-    )
 
-    def asked(self, sequence: Rendered) -> tuple[Asked, ...]:
+    def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
         """At the first row, and at others where the dataset has that truth."""
         side, frame = VIEW
         lines = sequence.shutter.lines(side)
         numbers = {"first": 0, "middle": lines // 2, "last": lines - 1}
         rows = {name: numbers[name] for name in self.rows if numbers[name] in (0, *sequence.twins)}
         return tuple(
-            Asked(f"{side}_{frame}_{name}", row, picture_file("gs", side, frame + sequence.first, row))
+            RequestedPicture(f"{side}_{frame}_{name}", row, picture_file("gs", side, frame + sequence.first, row))
             for name, row in rows.items()
         )
 
     def hints(
-        self, folder: Path, truth: Truth, png_unit_m: float | None, split: Split, wanted: bool
+        self, folder: Path, pictures: TruePictures, png_unit_m: float | None, split: Split, wanted: bool
     ) -> Iterable[str]:
-        assert truth.pictures is not None
         found: set[str] = set()
-        for each in truth.pictures.asked:
-            image, _ = read_answer_frame(folder, truth.pictures, each)
+        for each in pictures.requested:
+            image, _ = read_answer_frame(folder, pictures, each)
             if wanted and split.public:
-                others = {k.stem: truth.pictures.frame(k.row) for k in truth.pictures.asked if k != each}
-                found |= set(_readings(image, truth.pictures.frame(each.row), others))
+                others = {k.stem: pictures.frame(k.row) for k in pictures.requested if k != each}
+                found |= set(_mistakes(image, pictures.frame(each.row), others))
         return found
 
-    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
+    def scorer(self, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
         true = TrueFrame.all_of(pictures)
 
         def scores_of(submission: Submission, success: bool) -> Numbers:
-            folder = submission.folder / FOLDER
-            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.asked] if success else None
-            return frame_scores(true, drawn, self.rows, flips=self.flips)
+            folder = submission.folder / PICTURES
+            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.requested] if success else None
+            return self.scores_within(true, drawn)
 
         return scores_of
 
-    def draw_example(self, pictures: TruePictures, place: Path) -> None:
+    def scores_within(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
+        """Scores of the frames of a problem; None: a failure."""
+        return frame_scores(true, drawn, self.rows, flips=self.flips)
+
+    def draw(self, pictures: TruePictures, place: Path) -> None:
         _uncorrected(pictures, place)
 
     def chain(self, card: str) -> CardChain:
@@ -197,11 +180,11 @@ class CorrectionTrack(PictureTrack):
         chain, spec = CorrectionOptions(corrector=corrector), corrector.component.spec
         return CardChain(chain, corrector, chain.key, ("readout", "images", *sorted(spec.sees)), spec.reference)
 
-    def make(self, making: Making, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
+    def make(self, work: SharedWork, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
         drawn: dict[str, bytes] = {}
         try:
-            frames, seconds = self.corrected(making, chain)
-            for each, found in zip(making.asked, frames, strict=True):
+            frames, seconds = self.corrected(work, chain)
+            for each, found in zip(work.requested, frames, strict=True):
                 demand_corrected(found, chain.corrector.name)
                 fused = finished(found[VIEW])
                 drawn[each.stem] = frame_png(fused.image, fused.origin != Origin.NOBODY)
@@ -212,44 +195,44 @@ class CorrectionTrack(PictureTrack):
             write_bytes(place / f"{stem}.png", data)
         return {"seconds": round(seconds, 4)}
 
-    def corrected(self, making: Making, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
-        """The frame at the time of each row that is asked, and the seconds that this takes alone.
+    def corrected(self, work: SharedWork, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
+        """The frame at the time of each requested row, and the seconds that this takes alone.
 
         Raises:
             RsbenchError: it cannot be corrected.
         """
         needs = chain.corrector.component.spec.needs
-        rig, shutter = making.problem.rig, making.problem.shutter
-        if needs & {"motion", "matches"} and making.given.matches is None:
+        rig, shutter = work.problem.rig, work.problem.shutter
+        if needs & {"motion", "matches"} and work.known.matches is None:
             start = time.perf_counter()
-            matches = find_matches_of_rig(making.images, rig, shutter.scanning, chain)
-            making.given = replace(making.given, matches=matches)
-            making.spent["matching"] = time.perf_counter() - start
-        first, *others = (float(each.row) for each in making.asked)
+            matches = find_matches_of_rig(work.images, rig, shutter.scanning, chain)
+            work.known = replace(work.known, matches=matches)
+            work.spent["matching"] = time.perf_counter() - start
+        first, *others = (float(each.row) for each in work.requested)
         found = correct_four(
-            making.images,
+            work.images,
             rig,
             shutter.readout_ratio,
             replace(chain, target_row=first),
-            given=making.given,
+            given=work.known,
             views=(VIEW,),
             scanning=shutter.scanning,
             rows=others,
         )
-        _share(making, found)
+        _share(work, found)
         steps = {"matching": {"motion", "matches"}, "motion": {"motion"}, "depth": {"depth"}}
-        spent = sum(making.spent.get(step, 0.0) for step, of in steps.items() if needs & of)
+        spent = sum(work.spent.get(step, 0.0) for step, users in steps.items() if needs & users)
         return [found.frames, *found.at_rows], found.seconds["correction"] + spent
 
 
-def _share(making: Making, found: CorrectedFrames) -> None:
+def _share(work: SharedWork, found: CorrectedFrames) -> None:
     """What need not be found again, and how long it took."""
-    if making.given.motion is None and found.motion is not None:
-        making.spent["motion"] = found.seconds["motion"]
-    if making.given.pairs is None and found.pairs is not None:
-        making.spent["depth"] = found.seconds["depth"]
-    motion, pairs = found.motion or making.given.motion, found.pairs or making.given.pairs
-    making.given = replace(making.given, motion=motion, pairs=pairs)
+    if work.known.motion is None and found.motion is not None:
+        work.spent["motion"] = found.seconds["motion"]
+    if work.known.pairs is None and found.pairs is not None:
+        work.spent["depth"] = found.seconds["depth"]
+    motion, pairs = found.motion or work.known.motion, found.pairs or work.known.pairs
+    work.known = replace(work.known, motion=motion, pairs=pairs)
 
 
 # Marking
@@ -270,9 +253,9 @@ class TrueFrame:
 
     @classmethod
     def all_of(cls, pictures: TruePictures) -> list[TrueFrame]:
-        """Read those that are asked of a problem."""
+        """Read those of a problem."""
         found, commons = list[TrueFrame](), pictures.commons()
-        for each, common in zip(pictures.asked, commons, strict=True):
+        for each, common in zip(pictures.requested, commons, strict=True):
             image = pictures.frame(each.row)
             parts = parts_within(CorrectionTrack.part_score, image, each.row, common)
             name = each.stem.rpartition("_")[2]
@@ -283,13 +266,13 @@ class TrueFrame:
 def frame_scores(
     truths: Sequence[TrueFrame],
     frames: Sequence[Frame] | None,
-    rows: Sequence[str] = CorrectionTrack.rows,
+    rows: Sequence[str] = ("first", "middle"),
     *,
     flips: bool = True,
 ) -> Numbers:
-    """Of corrected frames, one for each that is asked; None: a failure. Means over these, of dB too.
+    """Scores of the requested corrected frames; None: a failure. Means over these, of dB too.
 
-    ``rows`` are those at whose times they may be asked; ``flips``: FLIP too, which takes most of the time.
+    ``rows`` are those whose times may be requested; ``flips``: FLIP too, which takes most of the time.
     """
     scores, squares = list[Numbers](), SquareErrors(CorrectionTrack.part_score)
     for number, true in enumerate(truths):
@@ -330,10 +313,10 @@ def _flips(image: NDArray[np.uint8], truth: NDArray[np.uint8], masks: dict[str, 
     }
 
 
-# What may be meant
+# Likely mistakes
 
 
-def _readings(
+def _mistakes(
     image: NDArray[np.uint8], truth: NDArray[np.uint8], others: dict[str, NDArray[np.uint8]]
 ) -> Iterator[str]:
     limit = _SMALLER * _squared(image, truth)
@@ -363,12 +346,12 @@ def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
     return float(np.mean(difference * difference)) if difference.size else np.inf
 
 
-# Corrected frames by where things stand in them: what filters can do to a picture moves nothing.
+# By where things are in corrected frames
 #
-# A frame's noise, blur and vignetting are no matter of the shutter, yet they are most of what SSIM counts on a
-# real sensor. So windows of the frame and of the truth, blurred alike, are laid over each other where they
-# correlate most, and what counts is by how far they stand off. Dense flow would not do: on a noisy frame it errs
-# by as much as a corrected frame is off; nor phase correlation, which undoes the blur.
+# A frame's noise, blur and vignetting have nothing to do with the shutter, yet they are most of what SSIM counts
+# on a real sensor. So windows of the frame and of the truth, blurred alike, are shifted against each other to
+# where they correlate most, and the length of that shift counts. Dense flow would not do: on a noisy frame it errs
+# by as much as a corrected frame is off; nor would phase correlation, which undoes the blur.
 
 LIMIT_PX = 2.0
 """A window that stands farther off has no part in the score."""
@@ -386,94 +369,44 @@ _LEAST = 0.25
 """Share of a window's pixels that must count."""
 
 
-class PlacedCorrection(CorrectionTrack):
-    """Rolling-shutter frames as a global shutter would have taken them, ranked by geometry."""
-
-    name, id = "correction-2", "correction-2"
-    title = "Corrected frames, by where things stand"
-    scores = (
-        Score(
-            key="placed",
-            title="placed",
-            hint="1 where textured common pixels stand right, 0 from 2 px on and where they are not drawn",
-            kind="share",
-            better="higher",
-        ),
-        *(score for score in CorrectionTrack.scores if not score.key.startswith("flip_")),
-    )
-    flips = False
-    error, error_title = "misplaced", "1 - placed"
-    smoke: ClassVar[tuple[str, ...]] = ()
+class PlacedTrack(CorrectionTrack):
+    """Frames as a global shutter would have taken them, ranked by geometry."""
 
     def chain(self, card: str) -> CardChain:
         return super().chain(card).choosing()
 
-    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
-        others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)
-
-        def scores_of(submission: Submission, success: bool) -> Numbers:
-            folder = submission.folder / FOLDER
-            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.asked] if success else None
-            share = 0.0 if drawn is None else placed(true, drawn)
-            return {**others(submission, success), "placed": share, "misplaced": 1.0 - share}
-
-        return scores_of
+    def scores_within(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
+        share = 0.0 if drawn is None else placed(true, drawn)
+        return {**super().scores_within(true, drawn), "placed": share, "misplaced": 1.0 - share}
 
 
-class SeenCorrection(PlacedCorrection):
-    """Rolling-shutter frames as a global shutter of the same sensor would have taken them."""
+class SensorTrack(PlacedTrack):
+    """Frames as a global shutter of the same sensor would have taken them."""
 
-    name, id = "correction-3", "correction-3"
-    title = "Corrected frames, by where things stand and how they look"
-    scores = (
-        Score(
-            key="corrected",
-            title="placed x picture",
-            hint="the product of the two: what stands in its place and looks like the scene there",
-            kind="share",
-            better="higher",
-        ),
-        *(score for score in PlacedCorrection.scores if score.key == "placed"),
-        Score(
-            key="picture",
-            title="picture",
-            hint="SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
-            kind="share",
-            better="higher",
-        ),
-        *(score for score in PlacedCorrection.scores if score.key != "placed"),
-    )
-    error, error_title = "uncorrected", "1 - placed x picture"
-    beside = ("placed", "picture", "failure")
-
-    def asked(self, sequence: Rendered) -> tuple[Asked, ...]:
+    def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
         """The truth is what the same sensor expects under a global shutter, without noise.
 
         Raises:
             RsbenchError: the dataset has a sensor and no such images.
         """
-        asked = super().asked(sequence)
+        requested = super().requested(sequence)
         if sequence.sensor is None:
-            return asked
+            return requested
         if not sequence.exposed_twins:
             raise RsbenchError(
                 f"{sequence.folder}: has no global-shutter images of its sensor, which {self.id} compares with; "
                 "render the dataset again with exposed_twins = true in its card"
             )
         side, frame = VIEW
-        return tuple(each._replace(file=exposed_file(side, frame + sequence.first, each.row)) for each in asked)
+        return tuple(
+            each._replace(file=exposed_file(side, frame + sequence.first, each.row)) for each in requested
+        )
 
-    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
-        others, true = super().scorer(truth, pictures), TrueFrame.all_of(pictures)
-
-        def scores_of(submission: Submission, success: bool) -> Numbers:
-            folder, found = submission.folder / FOLDER, others(submission, success)
-            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.asked] if success else None
-            looks = 0.0 if drawn is None else seen_alike(true, drawn)
-            both = found["placed"] * looks
-            return {**found, "picture": looks, "corrected": both, "uncorrected": 1.0 - both}
-
-        return scores_of
+    def scores_within(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
+        found = super().scores_within(true, drawn)
+        looks = 0.0 if drawn is None else seen_alike(true, drawn)
+        both = found["placed"] * looks
+        return {**found, "picture": looks, "corrected": both, "shortfall": 1.0 - both}
 
 
 def seen_alike(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
@@ -543,7 +476,7 @@ def _blurred(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float32)
 
 
-# The track of corrected frames for methods that see one camera, beside those of a rig on the same frames.
+# Of one camera
 #
 # What a corrector needs is found from the two frames of that camera alone, by dense flow: matches, and a motion
 # whose translation has no length. Correctors that need the depth of a rig run in the chain of ``correction``, and
@@ -553,78 +486,150 @@ _SIDE = VIEW[0]
 _LAST = {"key": "psnr_last", "title": "PSNR last", "hint": "of the last row's time, common pixels"}
 
 
-class MonoCorrectionTrack(CorrectionTrack):
-    """Rolling-shutter frames of one camera as a global shutter would have taken them."""
-
-    name, id = "correction-mono", "correction-mono-1"
-    title = "Corrected frames of one camera"
-    allowed = (*CorrectionTrack.allowed, "gyro")
-    given = "the four rolling-shutter frames; samples of a gyroscope where the dataset has the channel imu"
-    rows = ("first", "middle", "last")
-    scores = tuple(
-        each
-        for score in CorrectionTrack.scores
-        for each in ((score, replace(score, **_LAST)) if score.key == "psnr_middle" else (score,))
-    )
-    smoke = ("mono-fusion", "flow-scaled", "zhuang", "fusion", "uncorrected", "fusion-true", ORACLE)
-
-    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        assert data is not None
-        sequences = zip(bare_problems(data), read_pairs(data), strict=True)
-        return islice((with_gyro(problem, sequence) for problem, sequence in sequences), count)
-
-    def shown(self, sequence: Rendered) -> tuple[str, ...]:
-        return (MEASURED,) if GYRO in sequence.channels else ()
+class OneCameraTrack(CorrectionTrack):
+    """Frames of one camera as a global shutter would have taken them."""
 
     def chain(self, card: str) -> CardChain:
         made = super().chain(card)
         spec = made.options.corrector.component.spec
-        if _of_a_rig(spec):
+        if _needs_rig(spec):
             return made.choosing()
         others = [name for name, there in (("time", "time" in spec.sees), ("gyro", "gyro" in spec.needs)) if there]
         return made._replace(uses=("readout", "images", *others))
 
-    def corrected(self, making: Making, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
+    def corrected(self, work: SharedWork, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
         spec = chain.corrector.component.spec
-        if _of_a_rig(spec):
-            return super().corrected(making, chain)
-        problem, known = making.problem, Given()
-        images = {view: image for view, image in making.images.items() if view[0] == _SIDE}
+        if _needs_rig(spec):
+            return super().corrected(work, chain)
+        problem, known = work.problem, Given()
+        images = {view: image for view, image in work.images.items() if view[0] == _SIDE}
         if spec.needs & {"motion", "matches"}:
-            making.alone = making.alone or _alone(making, chain)
-            known = making.alone
+            work.left = work.left or _from_left(work, chain)
+            known = work.left
         gyro = problem.correspondences.gyro
         known = replace(known, gyro=gyro if len(gyro) > 0 else None)
         rig, rows, start = (
             problem.rig.about(_SIDE),
-            [float(each.row) for each in making.asked],
+            [float(each.row) for each in work.requested],
             time.perf_counter(),
         )
         frames = correct_known_rows(images, known, rig, problem.shutter, chain, (VIEW,), 0.0, rows)
-        spent = making.spent.get("alone", 0.0) if spec.needs & {"motion", "matches"} else 0.0
+        spent = work.spent.get("left", 0.0) if spec.needs & {"motion", "matches"} else 0.0
         return frames, time.perf_counter() - start + spent
 
 
-def _of_a_rig(spec: CorrectorSpec) -> bool:
+def _needs_rig(spec: CorrectorSpec) -> bool:
     """Whether a corrector asks for more than one camera: for depth, or by itself for frames of the other one."""
     return "depth" in spec.needs or ("stereo" in spec.sees and not spec.needs & {"motion", "matches"})
 
 
-def _alone(making: Making, chain: CorrectionOptions) -> Given:
-    """Matches of the asked camera over time, and its motion, whose translation has length 1.
+def _from_left(work: SharedWork, chain: CorrectionOptions) -> Given:
+    """Matches of the left camera over time, and its motion, whose translation has length 1.
 
     Raises:
         RsbenchError: its frames show none.
     """
     start = time.perf_counter()
-    frames = [making.images[_SIDE, frame] for frame in FRAMES]
+    frames = [work.images[_SIDE, frame] for frame in FRAMES]
     flows = find_flows(frames)
     if reason := refusal(frames, flows):
         raise RsbenchError(reason)
     matches = flow_matches(flows, np.random.default_rng(chain.seed))
-    rig, shutter = making.problem.rig, making.problem.shutter
+    rig, shutter = work.problem.rig, work.problem.shutter
     found = find_own_motion(flows, rig, shutter, _SIDE, chain.robust, chain.seed)
     if found.own.motion is None:
         raise RsbenchError(found.reason)
-    making.spent["alone"] = time.perf_counter() - start
+    work.spent["left"] = time.perf_counter() - start
     return Given(matches=Correspondences(left=matches), motion=found.own.motion)
+
+
+_RIG: dict[str, Any] = {
+    "allowed": ("readout", "images", "stereo", "time"),
+    "given": "the four rolling-shutter frames",
+    "inputs": Frames(),
+    "exact": {"error": 1e-6, **dict.fromkeys(parting_columns("rms", PARTINGS[0]), 0.05)},
+    "oracles": (
+        drawn_oracle("uncorrected", "images", "The rolling-shutter frame as it is", _uncorrected),
+        drawn_oracle("fusion-true", ORACLE, "The corrector fusion with the true motion and depth", _best),
+    ),
+    # Without FLIP, whose package has no wheel for some systems.
+    "smoke_metrics": (
+        *(f"ssim{part}" for part in ("", "_covered", "_all", "_deepunroll", "_uniform")),
+        *(f"psnr{part}" for part in ("", "_covered", "_all", "_first", "_middle")),
+        *("coverage", "epe_px"),
+    ),
+}
+_ONE_CAMERA: dict[str, Any] = _RIG | {
+    "allowed": (*_RIG["allowed"], "gyro"),
+    "given": "the four rolling-shutter frames; samples of a gyroscope where the dataset has the channel imu",
+}
+_SSIM: dict[str, Any] = {"error": "error", "error_title": "1 - SSIM"}
+_PLACED = Score(
+    key="placed",
+    title="placed",
+    hint="1 where textured common pixels stand right, 0 from 2 px on and where they are not drawn",
+    kind="share",
+    better="higher",
+)
+_WITHOUT_FLIP = tuple(score for score in _FRAMES if not score.key.startswith("flip_"))
+TRACKS: tuple[Track, ...] = (
+    SensorTrack(
+        **_RIG,
+        name="correction-3",
+        id="correction-3",
+        title="Corrected frames, by where things stand and how they look",
+        scores=(
+            Score(
+                key="corrected",
+                title="placed x picture",
+                hint="the product of the two: what stands in its place and looks like the scene there",
+                kind="share",
+                better="higher",
+            ),
+            _PLACED,
+            Score(
+                key="picture",
+                title="picture",
+                hint="SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
+                kind="share",
+                better="higher",
+            ),
+            *_WITHOUT_FLIP,
+        ),
+        flips=False,
+        error="shortfall",
+        error_title="1 - placed x picture",
+        beside=("placed", "picture", "failure"),
+    ),
+    PlacedTrack(
+        **_RIG,
+        name="correction-2",
+        id="correction-2",
+        title="Corrected frames, by where things stand",
+        scores=(_PLACED, *_WITHOUT_FLIP),
+        flips=False,
+        error="misplaced",
+        error_title="1 - placed",
+    ),
+    CorrectionTrack(
+        **_RIG | _SSIM,
+        name="correction",
+        id="correction-1",
+        title="Corrected frames",
+        scores=_FRAMES,
+        smoke=("fusion", "zhuang", "uncorrected", "fusion-true", ORACLE),
+    ),
+    OneCameraTrack(
+        **_ONE_CAMERA | _SSIM,
+        name="correction-mono",
+        id="correction-mono-1",
+        title="Corrected frames of one camera",
+        rows=("first", "middle", "last"),
+        scores=tuple(
+            each
+            for score in _FRAMES
+            for each in ((score, replace(score, **_LAST)) if score.key == "psnr_middle" else (score,))
+        ),
+        smoke=("mono-fusion", "flow-scaled", "zhuang", "fusion", "uncorrected", "fusion-true", ORACLE),
+    ),
+)

@@ -1,6 +1,6 @@
-"""The track that asks for depth maps: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
+"""The track of depth maps: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
 
-What is unknown in a depth map is wrong there: nobody gains by leaving out what is difficult.
+Where depth is unknown it counts as wrong: nobody gains by leaving out what is difficult.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.picture_track import CardChain, Making, PictureTrack
+from rsbench.benchmark.leaderboard.picture_track import CardChain, PictureTrack, SharedWork, drawn_oracle
 from rsbench.benchmark.leaderboard.pictures import (
     FARTHEST,
-    FOLDER,
+    PICTURES,
     VIEW,
-    Asked,
     Parts,
+    RequestedPicture,
     TruePictures,
     parts_within,
     read_answer_depth,
     shares,
 )
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Truth
+from rsbench.benchmark.leaderboard.splits import Frames
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Track
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
@@ -55,11 +55,11 @@ _WORST_PART: Numbers = {
 _NEAR = 0.1
 """Relative error of depth below which another reading is near to the truth."""
 _RIGHT = 0.01
-"""One that is so near as it stands needs no other reading."""
+"""Depth that is so near needs no other reading."""
 _SMALLER = 0.25
 """Another reading's error must be below this part of that of what stands there."""
 _FAR_M = 300.0
-"""Median depth that is hardly one in metres."""
+"""A larger median depth is hardly in metres."""
 _DEPTH = (
     Score(
         key="bad_1",
@@ -96,55 +96,40 @@ def _constant(pictures: TruePictures, place: Path) -> None:
 
 
 def _flat(pictures: TruePictures, place: Path, depth_m: float) -> None:
-    (each,) = pictures.asked
+    (each,) = pictures.requested
     write_depth(place / f"{each.stem}.exr", np.full(pictures.size[::-1], depth_m, dtype=np.float32))
 
 
 class DepthTrack(PictureTrack):
     """Depth of a rolling-shutter frame."""
 
-    name, id = "depth", "depth-1"
-    title = "Depth of rolling-shutter frames"
-    scores = _DEPTH
-    error, error_title = "bad_1", "bad@1"
-    exact = MappingProxyType(dict.fromkeys(("abs_rel", "abs_rel_visible", "abs_rel_occluded"), 1e-6))
     part_score, part_title = "bad_1", "bad@1"
-    others = (("constant", ORACLE, "The median true depth of each sequence, everywhere", _constant),)
-    smoke = ("sgm", "sweep", "sgm-plain", "constant", ORACLE)
-    smoke_metrics = (
-        *(f"bad_{part}" for part in ("1", "2", "3", "1_visible", "1_occluded")),
-        "coverage",
-        "on_sky",
-        "abs_rel",
-        "rmse_m",
-    )
 
-    def asked(self, sequence: Sequence) -> tuple[Asked, ...]:
+    def requested(self, sequence: Sequence) -> tuple[RequestedPicture, ...]:
         file = picture_file("rs", VIEW[0], VIEW[1] + sequence.first, depth=True)
-        return (Asked(f"{VIEW[0]}_{VIEW[1]}", 0, file, (".exr", ".png")),)
+        return (RequestedPicture(f"{VIEW[0]}_{VIEW[1]}", 0, file, (".exr", ".png")),)
 
     def hints(
-        self, folder: Path, truth: Truth, png_unit_m: float | None, split: Split, wanted: bool
+        self, folder: Path, pictures: TruePictures, png_unit_m: float | None, split: Split, wanted: bool
     ) -> Iterable[str]:
-        assert truth.pictures is not None
-        depth = read_answer_depth(folder, truth.pictures, png_unit_m)
+        depth = read_answer_depth(folder, pictures, png_unit_m)
         if not wanted:
             return ()
         if split.public:
-            return _readings(depth, truth)
+            return _mistakes(depth, pictures)
         far = np.any(depth > 0.0) and np.median(depth[depth > 0.0]) > _FAR_M
-        return (f"half of it is above {_FAR_M:g} m: metres are asked, not millimetres",) if far else ()
+        return (f"half of it is above {_FAR_M:g} m; depth is in metres, not millimetres",) if far else ()
 
-    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
+    def scorer(self, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
         true = TrueDepth.of(pictures)
 
         def scores_of(submission: Submission, success: bool) -> Numbers:
-            folder, unit = submission.folder / FOLDER, submission.header.png_unit_m
+            folder, unit = submission.folder / PICTURES, submission.header.png_unit_m
             return depth_scores(true, read_answer_depth(folder, pictures, unit) if success else None)
 
         return scores_of
 
-    def draw_example(self, pictures: TruePictures, place: Path) -> None:
+    def draw(self, pictures: TruePictures, place: Path) -> None:
         _flat(pictures, place, 10.0)
 
     def chain(self, card: str) -> CardChain:
@@ -152,47 +137,45 @@ class DepthTrack(PictureTrack):
         uses = self.allowed if needs_motion(matcher) else ("images", "stereo")
         return CardChain(CorrectionOptions(matcher=matcher), matcher, matcher.key, uses)
 
-    def make(self, making: Making, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
-        rig, (side, frame) = making.problem.rig, VIEW
+    def make(self, work: SharedWork, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
+        rig, (side, frame) = work.problem.rig, VIEW
         shared = 0.0
         try:
             if needs_motion(chain.matcher):
-                motion = _motion(making, chain)
-                shared, start = sum(making.spent.values()), time.perf_counter()
-                found = motion_disparities(
-                    chain.matcher, making.images, rig, making.problem.shutter, motion, (VIEW,)
-                )
+                motion = _motion(work, chain)
+                shared, start = sum(work.spent.values()), time.perf_counter()
+                found = motion_disparities(chain.matcher, work.images, rig, work.problem.shutter, motion, (VIEW,))
                 depth = metres(found[VIEW], rig)
             else:
                 start = time.perf_counter()
-                pair = [making.images[each, frame] for each in SIDES]
+                pair = [work.images[each, frame] for each in SIDES]
                 disparity = sensor_disparities(chain.matcher, pair[0], pair[1], rig)[SIDES.index(side)]
                 depth = np.nan_to_num(rig.depth(disparity), nan=0.0)
         except RsbenchError as error:
             return {"success": False, "reason": str(error)[:300]}
         seconds = shared + time.perf_counter() - start
         place.mkdir(parents=True)
-        (each,) = making.asked
+        (each,) = work.requested
         write_depth(place / f"{each.stem}.exr", np.where(depth > FARTHEST, 0.0, depth).astype(np.float32))
         return {"seconds": round(seconds, 4)}
 
 
-def _motion(making: Making, chain: CorrectionOptions) -> Motion:
-    """That the default solver estimates, the same for all matchers: of frames that are looked at first.
+def _motion(work: SharedWork, chain: CorrectionOptions) -> Motion:
+    """The motion that the default solver estimates, the same for all matchers.
 
     Raises:
         RsbenchError: see ``match_frames`` and ``solve_frames``.
     """
-    rig, shutter, start = making.problem.rig, making.problem.shutter, time.perf_counter()
-    if making.given.motion is None:
-        matches = match_frames(making.images, rig, chain, shutter.scanning)
+    rig, shutter, start = work.problem.rig, work.problem.shutter, time.perf_counter()
+    if work.known.motion is None:
+        matches = match_frames(work.images, rig, chain, shutter.scanning)
         matched = time.perf_counter()
         found = solve_frames(matches, rig, shutter.readout_ratio, chain, scanning=shutter.scanning).found
         assert found is not None
-        making.given = Given(motion=found.motion)
-        making.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
-    assert making.given.motion is not None
-    return making.given.motion
+        work.known = Given(motion=found.motion)
+        work.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
+    assert work.known.motion is not None
+    return work.known.motion
 
 
 # Marking
@@ -260,13 +243,12 @@ def part_scores(
     }
 
 
-# What may be meant
+# Likely mistakes
 
 
-def _readings(depth: NDArray[np.float32], truth: Truth) -> Iterator[str]:
-    assert truth.pictures is not None
-    sequence = truth.pictures.sequence
-    rig, true = sequence.rig, truth.pictures.depth()
+def _mistakes(depth: NDArray[np.float32], pictures: TruePictures) -> Iterator[str]:
+    sequence = pictures.sequence
+    rig, true = sequence.rig, pictures.depth()
     along = np.linalg.norm(rig.camera.unproject(rig.camera.pixel_grid()), axis=-1)
     both = (depth > 0.0) & (true > 0.0)
     if not np.any(both):
@@ -276,11 +258,11 @@ def _readings(depth: NDArray[np.float32], truth: Truth) -> Iterator[str]:
     if stands < _RIGHT:
         return
     readings: dict[str, Callable[[], FloatArray]] = {
-        "it is in millimetres; metres are asked": lambda: given / 1000.0,
-        "it is in centimetres; metres are asked": lambda: given / 100.0,
+        "it is in millimetres; depth is in metres": lambda: given / 1000.0,
+        "it is in centimetres; depth is in metres": lambda: given / 100.0,
         "it is disparity in px; depth is fx * baseline / disparity": lambda: product / given,
-        "it is inverse depth, 1 / m; depth is asked": lambda: 1.0 / given,
-        "it is the distance along the ray; z of the camera is asked": lambda: given / along[both],
+        "it is inverse depth, 1 / m, not depth": lambda: 1.0 / given,
+        "it is the distance along the ray; depth is z of the camera": lambda: given / along[both],
     }
     for words, reading in readings.items():
         if _error(reading(), z) < min(_NEAR, _SMALLER * stands):
@@ -289,11 +271,35 @@ def _readings(depth: NDArray[np.float32], truth: Truth) -> Iterator[str]:
     before = sequence.depth("rs", "left", 0)
     there = (depth > 0.0) & (before > 0.0)
     if _error(depth[there].astype(np.float64), before[there].astype(np.float64)) < _SMALLER * stands:
-        yield "it is that of frame 0; frame 1 is asked"
+        yield "it is that of frame 0, not of frame 1"
     elif _error(given * np.median(z / given), z) < min(_NEAR, _SMALLER * stands):
-        yield "it is right up to a factor; metres are asked"
+        yield "it is right up to a factor; depth is in metres"
 
 
 def _error(depth: FloatArray, truth: FloatArray) -> float:
     """Median relative error."""
     return float(np.median(np.abs(depth - truth) / truth)) if truth.size else np.inf
+
+
+TRACKS: tuple[Track, ...] = (
+    DepthTrack(
+        name="depth",
+        id="depth-1",
+        title="Depth of rolling-shutter frames",
+        allowed=("readout", "images", "stereo", "time"),
+        given="the four rolling-shutter frames",
+        inputs=Frames(),
+        scores=_DEPTH,
+        error="bad_1",
+        error_title="bad@1",
+        exact=dict.fromkeys(("abs_rel", "abs_rel_visible", "abs_rel_occluded"), 1e-6),
+        oracles=(
+            drawn_oracle("constant", ORACLE, "The median true depth of each sequence, everywhere", _constant),
+        ),
+        smoke=("sgm", "sweep", "sgm-plain", "constant", ORACLE),
+        smoke_metrics=(
+            *(f"bad_{part}" for part in ("1", "2", "3", "1_visible", "1_occluded")),
+            *("coverage", "on_sky", "abs_rel", "rmse_m"),
+        ),
+    ),
+)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import read_record
 from rsbench.benchmark.leaderboard.pictures import VIEW
+from rsbench.benchmark.leaderboard.submissions import write_truth
 from rsbench.benchmark.leaderboard.track import Split, Track
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
@@ -37,8 +38,8 @@ def check_place(split: Split, out: Path) -> None:
     """Raises RsbenchError when a folder holds anything but inputs of this split, or a truth that is secret now."""
     others = [path.name for path in out.iterdir() if path.name != HIDDEN] if out.is_dir() else []
     record = (read_record(out / "split.json") or {}) if others else split_record(split)
-    told = not split.public and "truth.jsonl" in others
-    if record.get("fingerprint") != split.fingerprint or told:
+    reveals = not split.public and "truth.jsonl" in others
+    if record.get("fingerprint") != split.fingerprint or reveals:
         raise RsbenchError(
             f"{out}: holds {named(sorted(others))}, not the inputs of {split.name} alone; choose another folder"
         )
@@ -58,10 +59,11 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     write_bytes(out / "problems.csv", _csv(("name", *columns), ((p.name, *_rig(p, columns)) for p in given)))
     write_matches(given, out)
     save_arrays(out / "problems.npz", _arrays(given, columns))
-    if split.track.asks_rows:
-        write_bytes(out / "pictures.csv", _csv(("name", "picture", "row", "time"), _asked(split)))
+    if split.track.at_rows:
+        rows = _requested_rows(split)
+        write_bytes(out / "pictures.csv", _csv(("name", "picture", "row", "time"), rows))
     if split.public:
-        split.track.write_truth(split, out, "truth.jsonl")
+        write_truth(split, out, "truth.jsonl")
     write_json(out / "split.json", split_record(split))
 
 
@@ -79,7 +81,7 @@ def write_matches(problems: Sequence[Problem], out: Path) -> None:
 
 
 def split_record(split: Split) -> dict[str, Any]:
-    """What is told of a split before anything is scored."""
+    """What is published of a split before anything is scored."""
     return {
         "protocol": split.track.id,
         "split": split.name,
@@ -108,10 +110,10 @@ def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:
     return (*values, problem.rig.baseline, problem.shutter.readout_ratio)[: len(columns)]
 
 
-def _asked(split: Split) -> Iterator[tuple[str, str, int, float]]:
-    """Each picture that is asked, with the row at whose time, and that time."""
+def _requested_rows(split: Split) -> Iterator[tuple[str, str, int, float]]:
+    """Each corrected frame of an answer, with the row whose time it shows, and that time."""
     for truth in split.truths:
-        for each in truth.pictures.asked if truth.pictures else ():
+        for each in truth.pictures.requested if truth.pictures else ():
             yield truth.name, each.stem, each.row, float(truth.shutter.time_after(each.row, VIEW[1], VIEW[0]))
 
 
@@ -140,12 +142,15 @@ def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArra
 # Tracks of rendered frames: what is given of them, matches or the frames themselves.
 
 
-def write_frames(data: Path, out: Path) -> None:
+def write_frames(split: Split, data: Path, out: Path) -> None:
     """Copy the rolling-shutter frames, as ``frames/<problem>/left_0.png`` to ``right_1.png``.
 
     Raises:
-        RsbenchError: a frame is missing or is no image of the camera's size, or cannot be written.
+        RsbenchError: a frame is missing, is not that of the split, or cannot be written.
     """
+    for truth in split.truths:
+        if truth.pictures is not None:
+            truth.pictures.check()
     for sequence in read_pairs(data):
         folder = out / "frames" / sequence.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -166,28 +171,23 @@ def read_frames(inputs: Path, problem: Problem) -> Images:
     return {view: read_png(folder / f"{view[0]}_{view[1]}.png", size) for view in VIEWS}
 
 
-# Running cards: predictions first, each kept as soon as it is made; scores come after, and run no method.
-#
-# A method sees what is exported, and nothing else. Each answer of a card is a file whose identity says from which
-# method, inputs, options and code it came: what is current is kept, so a killed run goes on where it was. Cards of
-# other packages run in processes of their own with a limit of time; what they do wrong is a failure with the
-# reason.
+def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, folder: Path) -> None:
+    """Export a split into a folder without its truth, unless the folder holds the split already.
 
+    Args:
+        split: which problems.
+        data, seed_file: as of ``Track.split``.
+        folder: made if missing.
 
-def prepare_inputs(
-    split: Split,
-    problems: Callable[[], Iterator[Problem]],
-    folder: Path,
-    frames: Callable[[Path], None] = lambda folder: None,
-) -> None:
-    """Export a split into a folder, unless it holds that already; the truth stays out of it.
-
-    ``frames`` writes those into a folder.
+    Raises:
+        RsbenchError: as ``write_frames`` and ``write_inputs``.
     """
     stored = read_record(folder / "split.json")
     if stored is None or stored.get("fingerprint") != split.fingerprint:
-        frames(folder)
-        write_inputs(replace(split, public=False), problems(), folder)
+        if data is not None and split.track.gives_images:
+            write_frames(split, data, folder)
+        problems = split.track.problems(data, seed_file, len(split.truths))
+        write_inputs(replace(split, public=False), problems, folder)
 
 
 def read_inputs(inputs: Path, track: Track) -> list[Problem]:

@@ -1,53 +1,58 @@
-"""Tracks that ask for motions: from simulated matches, given matches, and matches of the method's own."""
+"""Tracks of motions: from simulated matches, from given matches of frames, and from frames alone.
+
+Where methods find matches themselves, they may submit these too, as ``matches/left.csv`` and the like beside the
+file of answers, with the columns of the given matches that ``export pose`` writes. The true place of a match is
+where the other frame sees the surface at its first end, by the true depth, which between pixels is that of one
+plane, and the true motion, each end at its own row's time.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
+from abc import abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.inputs import read_frames, read_inputs, write_inputs, write_matches
+from rsbench.benchmark.leaderboard.inputs import read_frames, read_inputs, write_inputs
 from rsbench.benchmark.leaderboard.pictures import check_own
-from rsbench.benchmark.leaderboard.running import Choosing, SolverTrack, answer_problem, run_cards
-from rsbench.benchmark.leaderboard.splits import (
-    POINTS_1,
-    POINTS_2,
-    Draws,
-    FrameTrack,
-    exact_problem,
-    points_split,
-    seed_of,
-    simulated_problem,
-)
-from rsbench.benchmark.leaderboard.submissions import submission_text
+from rsbench.benchmark.leaderboard.splits import POINTS_1, POINTS_2, Draws, Frames, SimulatedPoints, exact_problem
+from rsbench.benchmark.leaderboard.submissions import method_header, submission_text
 from rsbench.benchmark.leaderboard.track import (
+    CHUNK,
     FAILED,
+    LARGEST,
+    LEAST_D,
     ORACLE,
     SECONDS,
     Answer,
+    Job,
     Limits,
     Row,
+    Runnable,
     Score,
+    Solve,
     Split,
     Step,
     Submission,
+    Track,
     Truth,
-    last,
-    named,
+    score_row,
 )
 from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound
 from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.benchmark.simulated.trials import Information, enter
+from rsbench.capture.model_choice import AUTO
 from rsbench.components.motion_models import TwistMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
@@ -61,14 +66,21 @@ from rsbench.dataset.match_truth import arranged, looks, seen_near
 from rsbench.dataset.matches import MATCHED
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.views import FAR
+from rsbench.jobs.process_jobs import Workers
+from rsbench.pipeline.answer import Extra, solve_problem
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.isolated_solver import SolverRunner
 from rsbench.pipeline.problem import COLUMNS, Problem
-from rsbench.solvers.engine.base import SolverEntry
+from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.storage.files import read_table, write_bytes
+from rsbench.storage.untrusted_files import read_bytes
+from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.undistortion import between_pixels
 
+CHOOSES = "rs-stereo-auto"
+"""Entry of the recommended solver under the motion model that the matches prefer: what ``rsbench solve`` does."""
 AUC_DEG = (1, 5, 10)
 """Thresholds of the areas under the curve of max(e_R, e_T)."""
 FLIP_DEG = 90.0
@@ -77,9 +89,35 @@ SUCCESS_DEG = (1.0, 5.0)
 """A success errs by less in rotation and direction, as in the sweeps of simulated points."""
 BOUND = "cramer-rao"
 """Name of the entry whose errors are drawn from the bound."""
+OPEN_DEG = 10.0
+"""Where the median error of the direction at the bound is larger, the rotation alone counts."""
+MATCHES = "matches"
+"""Folder of a method's own matches, beside the file of answers."""
+_EXTRAS: tuple[Extra, ...] = ("covariance",)
+_USES: dict[Information, tuple[str, ...]] = {
+    "left pairs": ("left",),
+    "left and right pairs": ("left", "right"),
+    "linked pairs": ("left", "right", "links"),
+    "tracks": ("left", "right", "links"),
+}
+_ANSWER_KEYS = (
+    *("name", "success", "reason", "w", "d", "metric", "reference_point", "direction_known", "covariance"),
+    "seconds",
+)
+"""What is kept of an answer of ``solve_problem``."""
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
-MOTION = (
+_DECADES = 2.0
+_AREAS_DEG = (0.1, 1.0)
+"""Limits of e_R and of e_T in pose-2: a rotation is known ten times as well."""
+_DRAWS = 4000
+"""Of errors at a bound: their median is known to 3 %."""
+_RIGHT_PX = 1.0
+"""A right match ends so near to the truth."""
+_MATCH_FILES = tuple(f"{key}.csv" for key in COLUMNS)
+_LARGEST_PX = 1e6
+"""No image is so large."""
+_MOTION = (
     *(
         Score(
             key=f"auc_{limit}",
@@ -102,7 +140,7 @@ MOTION = (
     Score(key="metres", title="metres", hint="median distance of d from the truth, where claimed", kind="median"),
     SECONDS,
 )
-MATCHES = (
+_OWN_MATCHES = (
     Score(key="matches", title="matches", hint="median number of own matches", kind="median", better="higher"),
     Score(
         key="matches_1px",
@@ -114,9 +152,136 @@ MATCHES = (
 )
 
 
+# Solvers as entries
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SolverTrack(Track):
+    """A track whose cards are solvers, and whose answers are lines of numbers."""
+
+    choosing: bool = False
+    """Whether the entry ``CHOOSES`` exists, and headers name every motion model."""
+    more_columns: Callable[[list[Row], Submission, Split], None] | None = None
+    """Adds columns to the rows of a submission."""
+    also_uses: ClassVar[tuple[str, ...]] = ()
+    """What every entry uses beside what its solver does."""
+
+    @abstractmethod
+    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+        """What a solver answers to a problem, as a line of a submission."""
+
+    @abstractmethod
+    def row(self, truth: Truth, answer: Answer | None) -> Row:
+        """Scores of an answer to one problem."""
+
+    def chunk(self, limits: Limits) -> int:
+        return CHUNK if limits == Limits() else 1
+
+    def entry_of(self, card: str) -> SolverEntry:
+        """Raises RsbenchError: no such solver."""
+        if card != CHOOSES or not self.choosing:
+            return load_solver_entry(card)
+        entry = load_solver_entry("rs-stereo-refined")
+        words = "The recommended solver under the motion model that the matches of the problem prefer"
+        return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}")
+
+    def check_entry(self, entry: SolverEntry) -> None:
+        """Raises RsbenchError when a solver does not fit the track."""
+        try:
+            self.check_uses(uses_of(entry, self.gives_readout))
+        except ValueError as error:
+            raise RsbenchError(f"solver {entry.name!r}: {error}") from error
+
+    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
+        entries = {card: self.entry_of(card) for card in cards}
+        for entry in entries.values():
+            self.check_entry(entry)
+        return {card: self._runnable(entry) for card, entry in entries.items()}
+
+    def _runnable(self, entry: SolverEntry) -> Runnable:
+        spec = entry.solver.spec
+        model = spec.motion_model if spec.motion_model in ("linear", "twist") else "linear"
+        if self.choosing:
+            model = "none" if spec.shutter == "global" else spec.motion_model
+        header = {
+            "uses": (*uses_of(entry, self.gives_readout), *self.also_uses),
+            "description": entry.description,
+            "paper": spec.reference,
+            "motion_model": "chosen" if entry.name == CHOOSES and self.choosing else model,
+        }
+        key = [entry.key, entry.options.deciding, asdict(RobustOptions())]
+        return Runnable(entry.name, entry.built_in, key, header, spec.motion_model)
+
+    def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
+        runner = SolverRunner(time_limit_s=limits.seconds, single_thread=True, memory_mb=limits.memory_mb)
+        problems = {problem.name: problem for problem in read_inputs(inputs, self)}
+
+        def solve(job: Job) -> Iterator[list[dict[str, Any]]]:
+            for target in job.targets:
+                entry = self.entry_of(target.card)
+                yield [self.answer(problems[name], entry, runner) for name in job.problems]
+
+        return solve
+
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        """Scores of each problem."""
+        rows = [self.row(truth, submission.answers.get(truth.name)) for truth in split.truths]
+        if self.more_columns is not None:
+            self.more_columns(rows, submission, split)
+        return rows
+
+    def mark(
+        self,
+        submissions: Sequence[Submission],
+        split: Split,
+        workers: Workers = 1,
+        step: Step = lambda word: None,
+        kept: Path | None = None,
+    ) -> list[pd.DataFrame | RsbenchError]:
+        return [pd.DataFrame(self.rows(submission, split)) for submission in submissions]
+
+
+def uses_of(entry: SolverEntry, readout: bool = True) -> tuple[str, ...]:
+    """What a solver uses, as it declares, on a track that gives the ``readout`` ratio or not."""
+    rolling = entry.solver.spec.shutter == "rolling" and readout
+    return _USES[enter(entry).information] + (("readout",) if rolling else ())
+
+
+def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
+    """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
+    text = f"leaderboard {problem.name} {entry.name}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+
+
+def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
+    """The motion that a solver finds, as a line of a submission."""
+    seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
+    found = solve_problem(problem, entry, RobustOptions(), runner, seed, _EXTRAS, model)
+    kept = {key: found[key] for key in _ANSWER_KEYS}
+    if found["success"]:
+        length = math.hypot(*found["d"])
+        if max(length, *map(abs, found["w"])) > LARGEST:
+            return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}
+        if length < LEAST_D:
+            kept["d"] = [0.0, 0.0, 0.0]  # the rig stands still
+    return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}
+
+
+def rounded(answer: dict[str, Any]) -> dict[str, Any]:
+    """With w and d to twelve digits, and a covariance to six: stored predictions are half as large."""
+    for name, digits in (("w", 12), ("d", 12), ("covariance", 6)):
+        if answer.get(name) is not None:
+            found = np.asarray(answer[name])
+            answer[name] = np.array([float(f"{x:.{digits}g}") for x in found.flat]).reshape(found.shape).tolist()
+    return answer
+
+
+# Motions
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Motion(Answer):
-    """An answer where a motion is asked."""
+    """An answer that is a motion."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,21 +290,19 @@ class _Motion(Answer):
                 raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class MotionTrack(SolverTrack):
     """The motion of a rig over one frame period."""
 
-    scores = MOTION
-    error, error_title = "error_deg", "max(e_R, e_T) in degrees"
-    exact = MappingProxyType({"e_R_deg": 1e-5, "e_T_deg": 1e-5, "e_s": 1e-7, "metres": 1e-7})
+    rounds: bool = False
+    """Whether answers of rsbench's entries are rounded, so that stored predictions are half as large."""
     answers = _Motion
-    smoke = ("rs-stereo-refined", "gs-stereo-tracks-scaled", ORACLE)
-    smoke_metrics = ("e_R_deg", "e_T_deg", "e_s", "metres", "e_row_deg", "nees")
-    example = MappingProxyType(
-        {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False, "reference_point": "left"}
-    )
 
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:
         return {"w": truth.motion.w.tolist(), "d": truth.motion.d.tolist(), "metric": True}
+
+    def example(self, split: Split) -> Mapping[str, Any]:
+        return {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False, "reference_point": "left"}
 
     def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
         if mistaken := _mistaken(answers, split):
@@ -147,52 +310,18 @@ class MotionTrack(SolverTrack):
             yield f"{count} of {len(answers)} motions are near to another reading of the truth: {words}"
 
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        return answer_problem(problem, entry, runner)
+        found = answer_problem(problem, entry, runner)
+        return rounded(found) if self.rounds else found
 
-    def rows(self, submission: Submission, split: Split) -> list[Row]:
-        return [motion_row(truth, submission.answers.get(truth.name)) for truth in split.truths]
-
-
-class PointsTrack(MotionTrack):
-    """Of simulated matches."""
-
-    name, id = "points", "points-1"
-    title = "Motion from simulated matches"
-    allowed = ("left", "right", "links", "readout")
-    given = "tracks of random points, with noise and outliers"
-    draws: ClassVar[Draws] = POINTS_1
-
-    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
-        if data is not None:
-            raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
-        if secret and seed_file is None:
-            raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
-        return points_split(self, seed_file, self.draws)
-
-    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        seed = seed_of(seed_file)
-        return (simulated_problem(seed, number, self.draws) for number in range(count))
+    def row(self, truth: Truth, answer: Answer | None) -> Row:
+        return motion_row(truth, answer)
 
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
+        if not isinstance(self.inputs, SimulatedPoints):
+            return {}
         pairs = "both" if {"left", "right"} <= set(uses) else "left"
         seen = "links" if "links" in uses else pairs
-        return bound_medians(self.draws, split.seed, len(split.truths), seen)
-
-    def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
-        yield from super().oracles(split, folder)
-        path = folder / BOUND / "predictions.jsonl"
-        path.parent.mkdir(parents=True)
-        write_bytes(path, bound_text(split, split.seed, self.draws).encode())
-        yield path
-
-
-class PoseTrack(FrameTrack, MotionTrack):
-    """Of rendered frames, with matches that are given."""
-
-    name, id = "pose", "pose-1"
-    title = "Motion from given matches of rendered frames"
-    allowed = ("left", "right", "links", "readout")
-    given = "matches of the frames by rsbench's SIFT"
+        return bound_medians(self.inputs.draws, split.seed, len(split.truths), seen)
 
 
 def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:
@@ -226,8 +355,7 @@ def motion_row(truth: Truth, answer: Answer | None) -> Row:
     )
     found = {name: float(value) for name, value in errors.items()}
     worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
-    return {
-        **named(truth, success),
+    scores = {
         **found,
         "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
         "e_row_deg": _row_angle(w, truth) if success else 180.0,
@@ -236,8 +364,8 @@ def motion_row(truth: Truth, answer: Answer | None) -> Row:
         "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
         "flip": float(success and found["e_T_deg"] > FLIP_DEG),
         "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
-        **last(success, answer),
     }
+    return score_row(truth, answer, success, scores)
 
 
 def _vectors(answer: Answer | None) -> tuple[FloatArray, FloatArray]:
@@ -306,23 +434,35 @@ def smooth(motion: Motion) -> Motion:
     return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion) else motion
 
 
-def bound_text(split: Split, seed: int, draws: Draws = POINTS_1) -> str:
-    """Motions that err as little as the data allow, as a submission; ``seed`` is that of the split.
+def medians_of(bounds: Sequence[Bound]) -> Mapping[str, FloatArray]:
+    """Medians (n,) of e_R_deg and e_T_deg of Gaussian errors at bounds; infinite where the data say nothing."""
+    draws = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
+    return {
+        "e_R_deg": np.array([_median(bound.rotation_axes, draws) for bound in bounds]),
+        "e_T_deg": np.array([_median(bound.direction_axes, draws) for bound in bounds]),
+    }
+
+
+def _median(axes: FloatArray, draws: FloatArray) -> float:
+    if not np.all(np.isfinite(axes)):
+        return np.inf
+    lengths = np.sqrt(np.sum((axes * draws[:, : len(axes)]) ** 2, axis=1))
+    return float(np.rad2deg(np.median(lengths)))
+
+
+def bound_text(split: Split, folder: Path) -> str:
+    """Motions that err as little as the data allow, as a submission.
 
     Errors are drawn from the Cramer-Rao bound of the matches without the outliers: what an unbiased method that
     knows them, and uses all their links, could at best do.
     """
-    header = {
-        "protocol": split.track.id,
-        "split": split.name,
-        "method": BOUND,
-        "uses": [ORACLE],
-        "description": "The true motion with errors drawn from the Cramer-Rao bound of all that is no outlier",
-    }
-    return submission_text(header, _at_the_bound(split, seed, draws))
+    words = "The true motion with errors drawn from the Cramer-Rao bound of all that is no outlier"
+    return submission_text(method_header(split, BOUND, [ORACLE], words), _at_the_bound(split))
 
 
-def _at_the_bound(split: Split, seed: int, draws: Draws) -> Iterator[dict[str, Any]]:
+def _at_the_bound(split: Split) -> Iterator[dict[str, Any]]:
+    assert isinstance(split.track.inputs, SimulatedPoints)
+    draws, seed = split.track.inputs.draws, split.seed
     for number, truth in enumerate(split.truths):
         exact, noise_px = exact_problem(seed, number, draws)
         bound = motion_bound(exact.correspondences, truth.rig, truth.shutter, smooth(truth.motion), noise_px)
@@ -340,23 +480,7 @@ def _at_the_bound(split: Split, seed: int, draws: Draws) -> Iterator[dict[str, A
         }
 
 
-# Second protocols: several laws of motion, scores that separate, ratios that nobody guesses, one entry each.
-
-SAME_METHOD: Mapping[str, str] = {
-    "rs-r6p-single": "rs-r6p",
-    "rs-stereo-iterated": "rs-stereo-iterated-metric",
-    "rs-stereo-linear-symmetric": "rs-stereo-linear",
-    "rs-stereo-tracks": "rs-stereo-refined",
-}
-"""Cards of ours that are left out, each with the entry that stands for its method: versions that answer alike cost
-all others power, for the comparison of every pair is corrected for their number."""
-OPEN_DEG = 10.0
-"""Where the median error of the direction at the bound is larger, the rotation alone counts."""
-_DECADES = 2.0
-_AUC_DEG = (0.1, 1.0)
-"""Of e_R and of e_T: a rotation is known ten times as well."""
-_KEPT = ("within", "flip", "failure", "e_R_deg", "e_T_deg", "e_s", "seconds")
-"""Scores of points-1 that are shown too."""
+# Columns of the second protocols
 
 
 def nearness(over: FloatArray) -> FloatArray:
@@ -365,111 +489,78 @@ def nearness(over: FloatArray) -> FloatArray:
         return np.clip(1.0 - np.log10(over) / _DECADES, 0.0, 1.0)
 
 
-class SeveralLaws(Choosing):
-    """A track whose rigs move by several laws."""
-
-    parting = "motion"
-
-
-def rounded(answer: dict[str, Any]) -> dict[str, Any]:
-    """With w and d to twelve digits, and a covariance to six: stored predictions are half as large."""
-    for name, digits in (("w", 12), ("d", 12), ("covariance", 6)):
-        if answer.get(name) is not None:
-            found = np.asarray(answer[name])
-            answer[name] = np.array([float(f"{x:.{digits}g}") for x in found.flat]).reshape(found.shape).tolist()
-    return answer
-
-
-class LawsOfPoints(SeveralLaws, PointsTrack):
-    """Of simulated matches, of four kinds of rigs that move by five laws."""
-
-    name, id = "points-2", "points-2"
-    title = "Motion from simulated matches, under several laws of motion"
-    draws = POINTS_2
-    smoke: ClassVar[tuple[str, ...]] = ()
-    scores = (
-        Score(
-            key="near_bound",
-            title="near bound",
-            hint="1 where e_R and e_T are at the Cramer-Rao bound, 0 from 100 times that on; mean of both",
-            kind="share",
-            better="higher",
-        ),
-        Score(key="near_R", title="near in R", hint="the same of e_R alone", kind="share", better="higher"),
-        Score(key="near_T", title="near in T", hint="the same of e_T alone", kind="share", better="higher"),
-        Score(key="over_R", title="e_R / bound", hint="median of e_R over its median at the bound", kind="median"),
-        Score(key="over_T", title="e_T / bound", hint="median of e_T over its median at the bound", kind="median"),
-        *(score for score in MotionTrack.scores if score.key in _KEPT),
-    )
-    error, error_title = "over_bound", "error over its median at the bound"
-
-    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        return rounded(answer_problem(problem, entry, runner))
-
-    def rows(self, submission: Submission, split: Split) -> list[Row]:
-        numbers = [int(truth.name[1:]) for truth in split.truths]
-        bounds = bound_medians(self.draws, split.seed, max(numbers) + 1, "links")
-        at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
-        rows = super().rows(submission, split)
-        for row, truth, R, T in zip(rows, split.truths, at_R, at_T, strict=True):
-            over_R, over_T = row["e_R_deg"] / R, row["e_T_deg"] / T
-            over = over_R, over_T if T <= OPEN_DEG else over_R
-            near = nearness(np.array(over)) if row["success"] else np.zeros(2)
-            row |= dict(
-                zip(("near_bound", "near_R", "near_T"), [float(np.mean(near)), *near.tolist()], strict=True)
-            )
-            row |= {"over_bound": math.sqrt(over[0] * over[1]), "over_R": over_R, "over_T": over_T}
-            row |= {"motion": truth.facts["motion"]}
-        return rows
+def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) -> None:
+    """points-2: errors over their medians at the Cramer-Rao bound."""
+    assert isinstance(split.track.inputs, SimulatedPoints)
+    numbers = [int(truth.name[1:]) for truth in split.truths]
+    bounds = bound_medians(split.track.inputs.draws, split.seed, max(numbers) + 1, "links")
+    at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
+    for row, truth, R, T in zip(rows, split.truths, at_R, at_T, strict=True):
+        over_R, over_T = row["e_R_deg"] / R, row["e_T_deg"] / T
+        over = over_R, over_T if T <= OPEN_DEG else over_R
+        near = nearness(np.array(over)) if row["success"] else np.zeros(2)
+        row |= {"near_bound": float(np.mean(near)), "near_R": float(near[0]), "near_T": float(near[1])}
+        row |= {"over_bound": math.sqrt(over[0] * over[1]), "over_R": over_R, "over_T": over_T}
+        row |= {"motion": truth.facts["motion"]}
 
 
-class LawsOfPoses(SeveralLaws, PoseTrack):
-    """Of rendered frames of a dataset whose motions follow several laws, with matches that are given."""
-
-    name, id = "pose-2", "pose-2"
-    title = "Motion from given matches of rendered frames, under several laws of motion"
-    smoke: ClassVar[tuple[str, ...]] = ()
-    scores = (
-        Score(
-            key="auc_apart",
-            title="AUC apart",
-            hint="mean of AUC of e_R to 0.1 deg and of e_T to 1 deg",
-            kind="share",
-            better="higher",
-        ),
-        *(
-            Score(key=key, title=title, hint=f"area under the curve of {title[4:]}", kind="share", better="higher")
-            for key, title in (("auc_R", "AUC e_R to 0.1 deg"), ("auc_T", "AUC e_T to 1 deg"))
-        ),
-        *(score for score in MotionTrack.scores if score.key in _KEPT),
-    )
-
-    def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        return rounded(answer_problem(problem, entry, runner))
-
-    def rows(self, submission: Submission, split: Split) -> list[Row]:
-        rows = super().rows(submission, split)
-        for row, truth in zip(rows, split.truths, strict=True):
-            R = max(0.0, 1.0 - row["e_R_deg"] / _AUC_DEG[0])
-            T = R if math.isnan(row["e_T_deg"]) else max(0.0, 1.0 - row["e_T_deg"] / _AUC_DEG[1])
-            row |= {"motion": truth.motion.name, "auc_apart": 0.5 * (R + T), "auc_R": R, "auc_T": T}
-        return rows
+def _add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:
+    """pose-2: areas under the curves of the rotation and of the direction, apart."""
+    for row, truth in zip(rows, split.truths, strict=True):
+        R = max(0.0, 1.0 - row["e_R_deg"] / _AREAS_DEG[0])
+        T = R if math.isnan(row["e_T_deg"]) else max(0.0, 1.0 - row["e_T_deg"] / _AREAS_DEG[1])
+        row |= {"motion": truth.motion.name, "auc_apart": 0.5 * (R + T), "auc_R": R, "auc_T": T}
 
 
-# Matches that a method found itself, handed in beside its motions: how many there are, and how many are right.
-#
-# They lie in ``matches/left.csv`` and the like beside the file of answers, with the columns of the given matches
-# that ``export pose`` writes. The true place of a match is where the other frame sees the surface at its first
-# end, by the true depth, which between pixels is that of one plane, and the true motion, each end at its own row's
-# time.
+def _add_match_columns(rows: list[Row], submission: Submission, split: Split) -> None:
+    """pose-own: how many own matches there are, and how many are right."""
+    own = read_own_matches(submission.folder, split.by_name)
+    for row, truth in zip(rows, split.truths, strict=True):
+        assert truth.sequence is not None
+        row |= match_scores(truth.sequence, None if own is None else own[truth.name])
 
-FOLDER = "matches"
-"""Beside the file of answers."""
-RIGHT_PX = 1.0
-"""A right match ends so near to the truth."""
-FILES = tuple(f"{key}.csv" for key in COLUMNS)
-_LARGEST = 1e6
-"""px: no image is so large."""
+
+# Motions from frames, with matches of the method's own
+
+
+class OwnMatchesTrack(MotionTrack):
+    """Of rendered frames; a method's own matches may be submitted."""
+
+    own_matches = True
+    also_uses = ("images",)
+
+    def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
+        """Solvers get the matches that ``rsbench correct`` finds by default, or those of ``features``."""
+        options = CorrectionOptions(features=load_features(features)) if features else CorrectionOptions()
+        found = list[Problem]()
+        for problem in read_inputs(inputs, self):
+            images, scanning = read_frames(inputs, problem), problem.shutter.scanning
+            try:
+                matches = find_matches_of_rig(images, problem.rig, scanning, options)
+            except RsbenchError:  # frames without texture: every solver fails such a problem, and says why
+                matches = problem.correspondences
+            found.append(replace(problem, correspondences=matches))
+            step(problem.name)
+        write_inputs(replace(split, public=False), found, work / "matched")
+        return work / "matched"
+
+    def copy_files(self, inputs: Path, folder: Path) -> None:
+        (folder / MATCHES).mkdir(parents=True, exist_ok=True)
+        for name in _MATCH_FILES:
+            if (inputs / name).is_file():
+                write_bytes(folder / MATCHES / name, read_bytes(inputs / name))
+
+    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
+        return [f"{MATCHES}/{name}" for name in match_files(submission.folder)]
+
+    def check_files(
+        self, submission: Submission, split: Split, most: int, hints: bool
+    ) -> tuple[list[str], list[str]]:
+        try:
+            read_own_matches(submission.folder, split.by_name)
+        except RsbenchError as error:
+            return [str(error)], []
+        return [], []
 
 
 def match_files(beside: Path) -> list[str]:
@@ -478,16 +569,16 @@ def match_files(beside: Path) -> list[str]:
     Raises:
         RsbenchError: something else lies in the folder ``matches``, or a link.
     """
-    folder = beside / FOLDER
+    folder = beside / MATCHES
     if not os.path.lexists(folder):
         return []
     found = sorted(os.listdir(folder)) if folder.is_dir() else []
     for name in found:
-        if name not in FILES:
-            raise RsbenchError(f"{folder / name}: is not asked; there are: {', '.join(FILES)}")
-        check_own(beside, f"{FOLDER}/{name}")
+        if name not in _MATCH_FILES:
+            raise RsbenchError(f"{folder / name}: does not belong here; there are: {', '.join(_MATCH_FILES)}")
+        check_own(beside, f"{MATCHES}/{name}")
     if not found:
-        raise RsbenchError(f"{folder}: must be a folder with some of {', '.join(FILES)}, no link")
+        raise RsbenchError(f"{folder}: must be a folder with some of {', '.join(_MATCH_FILES)}, no link")
     return found
 
 
@@ -499,7 +590,7 @@ def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, C
             than its images have pixels.
     """
     names = match_files(beside)
-    tables = {name.removesuffix(".csv"): _table(beside / FOLDER / name, problems) for name in names}
+    tables = {name.removesuffix(".csv"): _table(beside / MATCHES / name, problems) for name in names}
     if not tables:
         return None
     found: dict[str, dict[str, FloatArray]] = {problem: {} for problem in problems}
@@ -508,7 +599,7 @@ def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, C
             camera = problems[str(problem)].rig.camera
             if len(rows) > (most := camera.width * camera.height):
                 raise RsbenchError(
-                    f"{beside / FOLDER / key}.csv: {len(rows)} matches of {problem}: more than pixels, {most}"
+                    f"{beside / MATCHES / key}.csv: {len(rows)} matches of {problem}: more than pixels, {most}"
                 )
             found[str(problem)][key] = rows[COLUMNS[key].split(", ")].to_numpy(dtype=np.float64)
     return {problem: Correspondences(**sets) for problem, sets in found.items()}
@@ -519,14 +610,14 @@ def _table(path: Path, problems: Mapping[str, Truth]) -> pd.DataFrame:
     table = read_table(path, ("name",), columns, dtype={"name": str}, keep_default_na=False, na_values=["nan"])
     if others := sorted({*map(str, table.columns)} - {"name", *columns}):
         raise RsbenchError(
-            f"{path}: the column {others[0][:100]!r} is not asked; there are: name, {', '.join(columns)}"
+            f"{path}: the column {others[0][:100]!r} does not belong here; there are: name, {', '.join(columns)}"
         )
     for name in table["name"].unique():
         if name not in problems:
             raise RsbenchError(f"{path}: name = {str(name)[:100]!r}: is no problem of the split")
-    wrong = ~np.all(np.abs(table[columns].to_numpy(dtype=np.float64)) < _LARGEST, axis=1)
+    wrong = ~np.all(np.abs(table[columns].to_numpy(dtype=np.float64)) < _LARGEST_PX, axis=1)
     if np.any(wrong):
-        raise RsbenchError(f"{path}:{int(np.argmax(wrong)) + 2}: must hold finite pixels below {_LARGEST:g}")
+        raise RsbenchError(f"{path}:{int(np.argmax(wrong)) + 2}: must hold finite pixels below {_LARGEST_PX:g}")
     return table
 
 
@@ -542,7 +633,7 @@ def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[st
         match_errors(sequence, views, np.unique(found.pixels[found.sets == number].reshape(-1, 4), axis=0))
         for number, views in enumerate(MATCHED.values())
     ]
-    right = np.concatenate(errors) <= RIGHT_PX
+    right = np.concatenate(errors) <= _RIGHT_PX
     return {"matches": float(len(right)), "matches_1px": float(np.mean(right)) if len(right) else 0.0}
 
 
@@ -564,94 +655,115 @@ def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray)
 # The track of motions from frames alone: a method finds its own matches, and may hand them in.
 
 
-class OwnPoseTrack(Choosing, FrameTrack, MotionTrack):
-    """Of rendered frames; matches of the method's own may be handed in."""
-
-    name, id = "pose-own", "pose-own-1"
-    title = "Motion from rendered frames"
-    allowed = ("left", "right", "links", "readout", "images")
-    given = "the four rolling-shutter frames"
-    own_matches = True
-    scores = MOTION + MATCHES
-    smoke_metrics = (*MotionTrack.smoke_metrics, "matches", "matches_1px")
-    also_uses = ("images",)
-
-    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
-        return super().steps(cards, split, limits) + len(split.truths)
-
-    def run(
-        self,
-        cards: Sequence[str],
-        split: Split,
-        inputs: Path,
-        work: Path,
-        *,
-        step: Step = lambda word: None,
-        **options: Any,
-    ) -> list[Path]:
-        """Solvers get the matches that ``rsbench correct`` finds by default, and hand them in."""
-        found, matched = list[Problem](), work / "matched"
-        for problem in with_matches(read_inputs(inputs, self), inputs, CorrectionOptions()):
-            found.append(problem)
-            step(problem.name)
-        write_inputs(replace(split, public=False), found, matched)
-        files = run_cards(self, cards, split, matched, work, step=step, **options)
-        for file in files:
-            write_matches(found, file.parent / FOLDER)
-        return files
-
-    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
-        return [f"{FOLDER}/{name}" for name in match_files(submission.folder)]
-
-    def check_beside(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
-        try:
-            read_own_matches(submission.folder, split.by_name)
-        except RsbenchError as error:
-            return [str(error)], []
-        return [], []
-
-    def rows(self, submission: Submission, split: Split) -> list[Row]:
-        rows, own = super().rows(submission, split), read_own_matches(submission.folder, split.by_name)
-        for row, truth in zip(rows, split.truths, strict=True):
-            assert truth.sequence is not None
-            row |= match_scores(truth.sequence, None if own is None else own[truth.name])
-        return rows
-
-
-def with_matches(problems: Iterable[Problem], inputs: Path, options: CorrectionOptions) -> Iterator[Problem]:
-    """Problems with what the features of the options find in their frames; nothing where these show no texture."""
-    for problem in problems:
-        images, scanning = read_frames(inputs, problem), problem.shutter.scanning
-        try:
-            matches = find_matches_of_rig(images, problem.rig, scanning, options)
-        except RsbenchError:  # every solver fails such a problem, and says why
-            matches = problem.correspondences
-        yield replace(problem, correspondences=matches)
-
-
-# Entries nearer to the truth than their data allow are marked, and have no rank until the board's keeper says so.
-#
-# Two signs: an error that is exact in a tenth of the problems, and errors below what the Cramer-Rao bound of the
-# data that a method names allows. An unbiased method errs by less than the median at the bound in at most half of
-# the problems. Each error of a track is judged by itself. Where no bound is known, as for rendered frames, the
-# truth with a small error shows neither sign: a keeper who wants to be sure runs the method.
-_DRAWS = 4000
-"""Of errors at a bound: their median is known to 3 %."""
-
-
-def medians_of(bounds: Sequence[Bound]) -> Mapping[str, FloatArray]:
-    """Medians (n,) of e_R_deg and e_T_deg of Gaussian errors at bounds; infinite where the data say nothing."""
-    draws = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
-    return {
-        "e_R_deg": np.array([_median(bound.rotation_axes, draws) for bound in bounds]),
-        "e_T_deg": np.array([_median(bound.direction_axes, draws) for bound in bounds]),
-    }
-
-
-def _median(axes: FloatArray, draws: FloatArray) -> float:
-    if not np.all(np.isfinite(axes)):
-        return np.inf
-    lengths = np.sqrt(np.sum((axes * draws[:, : len(axes)]) ** 2, axis=1))
-    return float(np.rad2deg(np.median(lengths)))
+_SHOWN_TOO = tuple(
+    score
+    for score in _MOTION
+    if score.key in ("within", "flip", "failure", "e_R_deg", "e_T_deg", "e_s", "seconds")
+)
+"""Scores of the first protocols that the second ones show too."""
+_SHARED: dict[str, Any] = {
+    "error": "error_deg",
+    "error_title": "max(e_R, e_T) in degrees",
+    "exact": {"e_R_deg": 1e-5, "e_T_deg": 1e-5, "e_s": 1e-7, "metres": 1e-7},
+    "smoke_metrics": ("e_R_deg", "e_T_deg", "e_s", "metres", "e_row_deg", "nees"),
+}
+_SMOKE = ("rs-stereo-refined", "gs-stereo-tracks-scaled", ORACLE)
+_POINTS: dict[str, Any] = {
+    "allowed": ("left", "right", "links", "readout"),
+    "given": "tracks of random points, with noise and outliers",
+    "oracles": ((BOUND, bound_text),),
+}
+_POSES: dict[str, Any] = {
+    "allowed": ("left", "right", "links", "readout"),
+    "given": "matches of the frames by rsbench's SIFT",
+    "inputs": Frames(),
+}
+_SEVERAL_MODELS: dict[str, Any] = {"parting": "motion", "choosing": True, "rounds": True}
+TRACKS: tuple[Track, ...] = (
+    MotionTrack(
+        **_SHARED
+        | _POINTS
+        | _SEVERAL_MODELS
+        | {"error": "over_bound", "error_title": "error over its median at the bound"},
+        name="points-2",
+        id="points-2",
+        title="Motion from simulated matches, under several laws of motion",
+        inputs=SimulatedPoints(POINTS_2),
+        scores=(
+            Score(
+                key="near_bound",
+                title="near bound",
+                hint="1 where e_R and e_T are at the Cramer-Rao bound, 0 from 100 times that on; mean of both",
+                kind="share",
+                better="higher",
+            ),
+            Score(key="near_R", title="near in R", hint="the same of e_R alone", kind="share", better="higher"),
+            Score(key="near_T", title="near in T", hint="the same of e_T alone", kind="share", better="higher"),
+            Score(
+                key="over_R", title="e_R / bound", hint="median of e_R over its median at the bound", kind="median"
+            ),
+            Score(
+                key="over_T", title="e_T / bound", hint="median of e_T over its median at the bound", kind="median"
+            ),
+            *_SHOWN_TOO,
+        ),
+        more_columns=_add_bound_columns,
+    ),
+    MotionTrack(
+        **_SHARED | _POINTS,
+        name="points",
+        id="points-1",
+        title="Motion from simulated matches",
+        inputs=SimulatedPoints(POINTS_1),
+        scores=_MOTION,
+        smoke=_SMOKE,
+    ),
+    MotionTrack(
+        **_SHARED | _POSES | _SEVERAL_MODELS,
+        name="pose-2",
+        id="pose-2",
+        title="Motion from given matches of rendered frames, under several laws of motion",
+        scores=(
+            Score(
+                key="auc_apart",
+                title="AUC apart",
+                hint="mean of AUC of e_R to 0.1 deg and of e_T to 1 deg",
+                kind="share",
+                better="higher",
+            ),
+            *(
+                Score(
+                    key=key,
+                    title=title,
+                    hint=f"area under the curve of {title[4:]}",
+                    kind="share",
+                    better="higher",
+                )
+                for key, title in (("auc_R", "AUC e_R to 0.1 deg"), ("auc_T", "AUC e_T to 1 deg"))
+            ),
+            *_SHOWN_TOO,
+        ),
+        more_columns=_add_area_columns,
+    ),
+    MotionTrack(
+        **_SHARED | _POSES,
+        name="pose",
+        id="pose-1",
+        title="Motion from given matches of rendered frames",
+        scores=_MOTION,
+        smoke=_SMOKE,
+    ),
+    OwnMatchesTrack(
+        **_SHARED | {"smoke_metrics": (*_SHARED["smoke_metrics"], "matches", "matches_1px")},
+        name="pose-own",
+        id="pose-own-1",
+        title="Motion from rendered frames",
+        allowed=("left", "right", "links", "readout", "images"),
+        given="the four rolling-shutter frames",
+        inputs=Frames(),
+        scores=_MOTION + _OWN_MATCHES,
+        smoke=_SMOKE,
+        choosing=True,
+        more_columns=_add_match_columns,
+    ),
+)

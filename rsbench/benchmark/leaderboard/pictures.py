@@ -1,7 +1,8 @@
-"""What pictures of a sequence are asked, and the truth that they are compared with.
+"""Pictures of a submission: which are requested, the truth they are compared with, and reading them safely.
 
-Asked is frame 1 of the left camera, the later one, for which a method may look at the frame before. Pictures of a
-split are what its fingerprint is of: a file that has changed since then is refused by name.
+They show frame 1 of the left camera, the later one, so that a method may use the frame before. They lie beside the
+file of answers as ``pictures/PROBLEM/NAME.png``. Names are looked up, never taken from a submission, and no link
+is followed. The size of an image is read from its header before anything is decoded.
 """
 
 from __future__ import annotations
@@ -34,30 +35,30 @@ from rsbench.storage.untrusted_files import NAME, inside, read_bytes
 from rsbench.vision.stereo_depth import seen_by_other
 
 VIEW: View = ("left", 1)
-"""Whose depth and corrected frames are asked."""
+"""Whose depth and corrected frames are requested."""
 
 
-class Asked(NamedTuple):
-    """A picture that an answer holds."""
+class RequestedPicture(NamedTuple):
+    """A picture that an answer must have."""
 
     stem: str
-    """Of its file, such as ``left_1_middle``."""
+    """Name of its file without suffix, such as ``left_1_middle``."""
     row: int
-    """At whose time, counted as rows are read; of depth, 0: each pixel is of its own row's time."""
+    """Row whose time it shows, counted as rows are read; 0 of depth, where each pixel has its own row's time."""
     file: str
-    """Of the true picture, below the folder of the sequence."""
+    """Path of the true picture below the folder of the sequence."""
     suffixes: tuple[str, ...] = (".png",)
-    """Of kinds of files that it may be."""
+    """Of the file formats that it may have."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TruePictures:
-    """A sequence whose files are those of a split."""
+    """The sequence of a problem, whose files are covered by the fingerprint of the split."""
 
     sequence: Sequence
-    asked: tuple[Asked, ...]
+    requested: tuple[RequestedPicture, ...]
     files: Mapping[str, str]
-    """SHA-256 by the path below the sequence's folder: of all that methods see, and that scores are of."""
+    """SHA-256 by path below the sequence's folder: what methods see, and what scores are computed from."""
 
     def check(self) -> None:
         """Raises RsbenchError when a file is not the one of the split."""
@@ -71,7 +72,7 @@ class TruePictures:
         """Width and height."""
         return self.sequence.rig.camera.width, self.sequence.rig.camera.height
 
-    def path(self, each: Asked) -> Path:
+    def path(self, each: RequestedPicture) -> Path:
         """File of the true picture."""
         return inside(self.sequence.folder, each.file)
 
@@ -80,8 +81,8 @@ class TruePictures:
         return self.sequence.depth("rs", *VIEW)
 
     def frame(self, row: int) -> NDArray[np.uint8]:
-        """(H, W, 3) what a global shutter sees from the pose of a row that is asked for."""
-        (file,) = (each.file for each in self.asked if each.row == row)
+        """(H, W, 3) what a global shutter sees from the pose of a requested row."""
+        (file,) = (each.file for each in self.requested if each.row == row)
         return read_png(inside(self.sequence.folder, file), self.size)
 
     def rolling(self) -> NDArray[np.uint8]:
@@ -89,29 +90,26 @@ class TruePictures:
         return self.sequence.image("rs", *VIEW)
 
     def seen_by_both(self, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(H, W) pixels of the frame, of that true ``depth`` (H, W), whose point the right camera sees too."""
+        """(H, W) pixels of the frame, of true ``depth`` (H, W), whose point the right camera sees too."""
         return seen_by_other(depth, self.sequence.depth("rs", "right", 1), self.sequence.rig, "left")
 
     def commons(self) -> list[NDArray[np.bool_]]:
-        """(H, W) pixels of each corrected frame whose place the rolling-shutter frame saw, the same for all."""
+        """(H, W) pixels of each corrected frame whose scene point the rolling-shutter frame shows."""
         images = {view: self.sequence.image("rs", *view) for view in VIEWS}
         pairs = true_pairs(self.sequence, images)
-        return [visible_pixels(self.sequence, pairs, (VIEW,), each.row)[VIEW] for each in self.asked]
+        return [visible_pixels(self.sequence, pairs, (VIEW,), each.row)[VIEW] for each in self.requested]
 
 
-# Pictures that anybody hands in: beside a file of answers, ``pictures/PROBLEM/NAME.png``.
-#
-# Names are looked up, never taken from what was handed in, and no link is followed. The size of an image is known
-# from its header, before anything is decoded.
+# Files of answers
 
-FOLDER = "pictures"
-"""Beside the file of answers."""
+PICTURES = "pictures"
+"""Folder of pictures, beside the file of answers."""
 FARTHEST = 1e9
 """m: no surface is farther."""
 _FILE = re.compile(
     rf"pictures/{NAME.pattern}/left_1(_first|_middle|_last)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
 )
-"""Paths of what answers hold, below an entry: nothing else is taken from a board of somebody else."""
+"""Paths of pictures and matches below an entry: nothing else is copied from other boards."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COLOURS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 """Colour types of a PNG header."""
@@ -120,18 +118,18 @@ _BYTES = 1 << 16
 """A file has at most so many, and so many for each pixel."""
 
 
-def find_picture(folder: Path, problem: str, asked: Asked) -> Path:
+def find_picture(folder: Path, problem: str, picture: RequestedPicture) -> Path:
     """The file of a picture below ``pictures``.
 
     Raises:
         RsbenchError: there is none, two of different kinds, or something that is no file of its own.
     """
-    paths = [folder / problem / f"{asked.stem}{suffix}" for suffix in asked.suffixes]
+    paths = [folder / problem / f"{picture.stem}{suffix}" for suffix in picture.suffixes]
     found = [path for path in paths if os.path.lexists(path)]
     if len(found) != 1:
         names = " and ".join(path.name for path in paths)
         problem_is = f"{len(found)} of {names} are there; keep one" if found else "is missing"
-        raise RsbenchError(f"{paths[0]}: {problem_is}; a problem without an answer says success = false")
+        raise RsbenchError(f"{paths[0]}: {problem_is}; a problem without an answer has success = false")
     check_own(folder.parent, found[0].relative_to(folder.parent).as_posix())
     return found[0]
 
@@ -220,16 +218,16 @@ def read_frame(path: Path, size: tuple[int, int]) -> tuple[NDArray[np.uint8], ND
 
 
 def read_answer_frame(
-    folder: Path, pictures: TruePictures, asked: Asked
+    folder: Path, pictures: TruePictures, picture: RequestedPicture
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """``read_frame`` of a problem; errors as ``find_picture`` too."""
-    return read_frame(find_picture(folder, pictures.sequence.name, asked), pictures.size)
+    return read_frame(find_picture(folder, pictures.sequence.name, picture), pictures.size)
 
 
 def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | None) -> NDArray[np.float32]:
     """``read_depth_map`` of a problem; errors as ``find_picture`` too."""
-    (asked,) = pictures.asked
-    return read_depth_map(find_picture(folder, pictures.sequence.name, asked), pictures.size, png_unit_m)
+    (picture,) = pictures.requested
+    return read_depth_map(find_picture(folder, pictures.sequence.name, picture), pictures.size, png_unit_m)
 
 
 def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:

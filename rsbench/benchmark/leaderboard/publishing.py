@@ -66,7 +66,7 @@ def drawn_split(track: Track, card: str, text: Secret) -> Split:
     Raises:
         RsbenchError: as ``secret_card``; or the track asks for what only rendering tells.
     """
-    if track.pictures or track.whole:
+    if track.pictures or track.inputs.whole:
         raise RsbenchError(f"track {track.name!r}: its truth is rendered; name the keeper's folder with --keep")
     drawn = secret_card(card, secret_of(track, text))
     pairs = [pair for each in _sequences(drawn) for pair in each.pairs()]
@@ -120,7 +120,7 @@ def publish(
     check_place(split, out)
     with work_folder(out):
         if track.gives_images:
-            write_frames(data, out)
+            write_frames(split, data, out)
         write_inputs(split, track.problems(data, None, len(split.truths)), out)
         names = [name for name in files_below(out) if name != ANNOUNCEMENT and not name.startswith(HIDDEN)]
         made = replace(made, files={name: sha256(out / name) for name in sorted(names)})

@@ -14,28 +14,21 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from rsbench.benchmark.images.store import read_record
-from rsbench.benchmark.leaderboard.inputs import prepare_inputs, read_inputs, write_frames, write_matches
-from rsbench.benchmark.leaderboard.motion_tracks import FOLDER as MATCHES
-from rsbench.benchmark.leaderboard.motion_tracks import PoseTrack, with_matches
-from rsbench.benchmark.leaderboard.running import answer_problem, header_of, load_entries
-from rsbench.benchmark.leaderboard.splits import FEATURES, FrameTrack
-from rsbench.benchmark.leaderboard.submissions import read_submission, submission_text
-from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.inputs import prepare_inputs
+from rsbench.benchmark.leaderboard.running import run_cards
+from rsbench.benchmark.leaderboard.splits import FEATURES
+from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
+from rsbench.benchmark.leaderboard.track import ORACLE, Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.storage.files import read_table, write_bytes
-from rsbench.vision.feature_matcher import load_features
+from rsbench.storage.files import read_table
 
 CARD = "leaderboard-smoke"
 """The dataset's, for the tracks of frames."""
-ORACLES = ("truth", "constant", "uncorrected", "fusion-true")
-"""Entries that are no cards."""
-ENTRIES = {track.name: track.smoke for track in TRACKS.values() if isinstance(track, FrameTrack) and track.smoke}
+ENTRIES = {track.name: track.smoke for track in TRACKS.values() if track.inputs.rendered and track.smoke}
 """By track of frames."""
 PROBLEMS = 6
 """Of points; a minute for all solvers of ours."""
@@ -125,13 +118,13 @@ def _serve(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]
 def _serve_child(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]]:
     run = _serve(data, problems)
 
-    def told(job: Job) -> list[Row]:
+    def run_or_fail(job: Job) -> list[Row]:
         try:
             return run(job)
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
 
-    return told
+    return run_or_fail
 
 
 def track_scores(track: str, data: Path | None, entries: Sequence[str], problems: int | None) -> pd.DataFrame:
@@ -148,12 +141,7 @@ def track_scores(track: str, data: Path | None, entries: Sequence[str], problems
     split = replace(split, truths=split.truths[:problems])
     with tempfile.TemporaryDirectory() as folder:
         inputs = Path(folder) / "inputs"
-        prepare_inputs(
-            split,
-            lambda: split.track.problems(data, None, len(split.truths)),
-            inputs,
-            lambda place: write_frames(data, place) if data is not None and split.track.gives_images else None,
-        )
+        prepare_inputs(split, data, None, inputs)
         for name, path in _answers(split, entries, inputs, Path(folder)):
             scores = mark(read_submission(path, split), split).assign(method=name)
             tables.append(scores[[*_NAMES, *split.track.smoke_metrics]])
@@ -162,26 +150,13 @@ def track_scores(track: str, data: Path | None, entries: Sequence[str], problems
 
 def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> Iterator[tuple[str, Path]]:
     """Entries with their files of answers; cards run in this process."""
-    cards = [name for name in entries if name not in ORACLES]
-    if split.track.own_matches:
-        yield from zip(cards, _with_own_matches(cards, split, inputs, work), strict=True)
-    elif cards:
-        yield from zip(cards, split.track.run(cards, split, inputs, work, workers=0), strict=True)
+    oracles = {ORACLE, *(name for name, _ in split.track.oracles)}
+    cards = [name for name in entries if name not in oracles]
+    if cards:
+        yield from zip(cards, run_cards(split, cards, inputs, work, workers=0, features=FEATURES), strict=True)
     if len(cards) < len(entries):
-        oracles = split.track.oracles(split, work / "oracles")
-        yield from ((path.parent.name, path) for path in oracles if path.parent.name in entries)
-
-
-def _with_own_matches(cards: Sequence[str], split: Split, inputs: Path, work: Path) -> Iterator[Path]:
-    """Solvers on matches of the frames, which are handed in too."""
-    options, runner = CorrectionOptions(features=load_features(FEATURES)), SolverRunner(single_thread=True)
-    given = list(with_matches(read_inputs(inputs, split.track), inputs, options))
-    for entry in load_entries(cards, PoseTrack()).values():
-        path = work / entry.name / "predictions.jsonl"
-        write_matches(given, path.parent / MATCHES)
-        answers = (answer_problem(each, entry, runner) for each in given)
-        write_bytes(path, submission_text(header_of(entry, split), answers).encode())
-        yield path
+        paths = write_oracles(split, work / "oracles")
+        yield from ((path.parent.name, path) for path in paths if path.parent.name in entries)
 
 
 def hashes_of_frames(data: Path) -> dict[str, str]:

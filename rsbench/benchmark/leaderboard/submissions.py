@@ -7,16 +7,17 @@ those of the split and are never paths, and numbers are finite. docs/how-to/subm
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rsbench.benchmark.leaderboard.track import Answer, Header, Split, Submission, Vector
+from rsbench.benchmark.leaderboard.track import ORACLE, Answer, Header, Split, Submission, Vector
 from rsbench.components.cards import choices, parse_card
 from rsbench.core.errors import RsbenchError
+from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
@@ -86,7 +87,7 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
     if header is None or faults:
         return Findings(submission=None, faults=tuple(faults), notes=())
     submission = Submission(header=header, answers=answers, folder=path.parent)
-    beside, notes = split.track.check_beside(submission, split, _MOST_FAULTS, hints)
+    beside, notes = split.track.check_files(submission, split, _MOST_FAULTS, hints)
     if beside:
         return Findings(submission=None, faults=tuple(beside), notes=())
     if hints:
@@ -180,9 +181,20 @@ def _of(vector: Vector | None) -> np.ndarray:
 # Writing
 
 
-def submission_text(header: Mapping[str, Any], answers: Iterator[Mapping[str, Any]]) -> str:
+def submission_text(header: Mapping[str, Any], answers: Iterable[Mapping[str, Any]]) -> str:
     """JSON lines that ``check_submission`` reads."""
     return "".join(json.dumps(line, allow_nan=False) + "\n" for line in (header, *answers))
+
+
+def method_header(split: Split, method: str, uses: Sequence[str], description: str) -> dict[str, Any]:
+    """The first line of predictions that rsbench makes."""
+    return {
+        "protocol": split.track.id,
+        "split": split.name,
+        "method": method,
+        "uses": uses,
+        "description": description[:300],
+    }
 
 
 def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
@@ -191,26 +203,39 @@ def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
         "protocol": split.track.id,
         "split": split.name,
         "method": method,
-        "uses": ["left"],
+        "uses": ["images" if split.track.pictures else "left"],
         **{key: "" for key in ("version", "authors", "paper", "code", "licence", "hardware", "tuned_on")},
     }
 
 
-def template_text(split: Split, answer: Mapping[str, Any]) -> str:
-    """An example without a fault: one answer, and a failure for every other problem."""
+def write_template(split: Split, path: Path) -> None:
+    """Write an example without a fault: an answer to the first problem, and a failure for every other."""
     first, *rest = (truth.name for truth in split.truths)
     failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
-    return submission_text(template_header(split), iter([{"name": first, **answer}, *failures]))
+    split.track.draw_example(split, path.parent)
+    answers = [{"name": first, **split.track.example(split)}, *failures]
+    write_bytes(path, submission_text(template_header(split), answers).encode())
+
+
+def write_truth(split: Split, folder: Path, file: str = "predictions.jsonl") -> Path:
+    """Write the truth as a submission, which scores the best value of everything; returns its file of answers."""
+    folder.mkdir(parents=True, exist_ok=True)
+    split.track.draw_truth(split, folder)
+    write_bytes(folder / file, truth_text(split).encode())
+    return folder / file
 
 
 def truth_text(split: Split) -> str:
-    """The truth as a submission, but for its pictures: it scores the best value of everything."""
-    header = {
-        "protocol": split.track.id,
-        "split": split.name,
-        "method": "truth",
-        "uses": ["truth"],
-        "description": "The truth itself",
-    }
+    """The truth as a file of answers."""
     answers = ({"name": truth.name, **split.track.true_answer(truth)} for truth in split.truths)
-    return submission_text(header, answers)
+    return submission_text(method_header(split, ORACLE, [ORACLE], "The truth itself"), answers)
+
+
+def write_oracles(split: Split, folder: Path) -> Iterator[Path]:
+    """Write the truth, and others that show how much there is to gain; yields their files of answers."""
+    yield write_truth(split, folder / ORACLE)
+    for name, make in split.track.oracles:
+        path = folder / name / "predictions.jsonl"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, make(split, path.parent).encode())
+        yield path

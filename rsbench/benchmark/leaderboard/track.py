@@ -1,7 +1,7 @@
-"""What a track is: its question, what is given, what an answer is, how it is scored, run, and shown on a board.
+"""Tracks as data, and the records they exchange: problems with their truth, answers, submissions, scores.
 
-Each track is one class below ``Track``; ``track_list`` has all. Its protocol, ``id``, never changes: what would
-change scores is a protocol with another number.
+A track is an object of a class below ``Track``; each module of tracks ends with its list ``TRACKS``. Its protocol,
+``id``, never changes: what would change scores is a new protocol with the next number.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.pictures import Asked, TruePictures
+from rsbench.benchmark.leaderboard.pictures import RequestedPicture, TruePictures
 from rsbench.components.cards import choices
 from rsbench.components.motion_models import motion_record
 from rsbench.core.correspondences import Correspondences
@@ -49,10 +49,30 @@ KNOWLEDGE = {
 """What methods use, in the order of tables."""
 ORACLE = "truth"
 CHUNK = 10
-"""Problems of one job."""
+"""Problems of one job of a solver."""
+PUBLIC_SEED = 1
+"""Of the split ``dev``: its truth is public."""
+LARGEST = 1e9
+"""Limit of the numbers in w and d: larger ones are no motions, and their squares overflow."""
+LEAST_D = 1e-9
+"""Shortest length of ``d``, in metres or the method's own unit, unless it is exactly zero."""
+_TEXT_CHARACTERS = 300
+_ANNOUNCED = {
+    "b7eafa489ffbd9d816c2edd44f5842bdf01306f286ab36dd2c0ef72aee05523b": "f88c896f00000000",
+    "57af81babdeeb5d96992052241698c127f8a4e7fd716fc28f146bf858b8edb40": "7a998de400000000",
+    "881e9e954f8a3cc3c1bd3d11fcca7277b3af27da058d3a2340487ac84d1e7c89": "292f151500000000",
+    "792e3e2e7ccfbdaefda940050f3d95c9e814a517eb48c4e618b200bb37b608ee": "ba1e206a00000000",
+    "ee83b3153351ba62775f40dedeba0d2bfeb9c8c036fe6eefa6332c92b9e48b29": (
+        "382c1320481b8b75aae3ba87190f80b7d671d73c323961e95e6bee131c507e77"
+    ),
+}
+"""Announced fingerprints, of the public points and of the motions of ``laws``, by the hash of the truth rounded to
+nine digits, which is equal on all processors."""
 Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
+Numbers = dict[str, float]
 Step = Callable[[str], None]
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,13 +84,13 @@ class Score:
     hint: str
     """What it is, in a line."""
     kind: Kind
-    """How problems are summed up: a ``share`` lies in [0, 1], a ``mean`` anywhere; both are means over scenes with
-    an interval. A ``median`` is one over problems."""
+    """How problems are summarised: a ``share`` lies in [0, 1], a ``mean`` anywhere; both are means over scenes
+    with an interval. A ``median`` is taken over problems."""
     better: Literal["lower", "higher"] = "lower"
 
     @property
     def sign(self) -> float:
-        """What makes more of it better."""
+        """Factor that makes larger values better."""
         return 1.0 if self.better == "higher" else -1.0
 
 
@@ -84,188 +104,8 @@ class Limits(NamedTuple):
     seconds: float | None = None
     memory_mb: float | None = None
 
-    @property
-    def chunk(self) -> int:
-        """Problems of one job: a job that takes too much is the failure of one problem."""
-        return CHUNK if self == Limits() else 1
 
-
-class Track(ABC):
-    """One way of asking for motions, readout ratios or pictures."""
-
-    name: ClassVar[str]
-    """On the command line."""
-    id: ClassVar[str]
-    """Of its protocol; what submissions name."""
-    title: ClassVar[str]
-    allowed: ClassVar[tuple[str, ...]]
-    """What of ``KNOWLEDGE`` it gives."""
-    given: ClassVar[str]
-    """The inputs, in words."""
-    scores: ClassVar[tuple[Score, ...]]
-    """Of its tables; methods are ranked by the first."""
-    error: ClassVar[str]
-    """The column of scores.csv that decides about the primary score."""
-    error_title: ClassVar[str]
-    """What figures call it."""
-    exact: ClassVar[Mapping[str, float]]
-    """Errors of scores.csv, each with the value below which the truth itself was submitted: no method is so near.
-    Each is judged alone, so that a false part of an answer does not hide a true one."""
-    answers: ClassVar[type[Answer]]
-    """What a line of a file of predictions must hold."""
-    pictures: ClassVar[bool] = False
-    """Whether an answer is made of pictures beside the file of answers."""
-    asks_rows: ClassVar[bool] = False
-    """Whether pictures are of the times of rows."""
-    own_matches: ClassVar[bool] = False
-    """Whether matches may be handed in with motions."""
-    rendered: ClassVar[bool] = False
-    """Whether problems are rendered frames."""
-    whole: ClassVar[bool] = False
-    """Whether a problem is a whole sequence, of whose true depth scores are made."""
-    beside: ClassVar[tuple[str, ...]] = ("failure",)
-    """Shares and means that short tables show beside the primary score."""
-    unknowns: ClassVar[int] = 6
-    """Degrees of freedom of the column ``nees``, where answers state deviations."""
-    parting: ClassVar[str] = ""
-    """A column of scores.csv by whose values tables divide the primary score; empty: by none."""
-    smoke: ClassVar[tuple[str, ...]] = ()
-    """Entries of a smoke run: what rsbench has by default, the strongest that cost little, and oracles."""
-    smoke_metrics: ClassVar[tuple[str, ...]]
-    """Columns of scores that a smoke run compares."""
-
-    # Inputs
-
-    @abstractmethod
-    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
-        """The problems with their truth, of a dataset or a seed.
-
-        Raises:
-            RsbenchError: an option that the track does not take, or misses; the dataset or the seed is at fault.
-        """
-
-    @abstractmethod
-    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        """What a method is given of the first ``count``, without images."""
-
-    @property
-    def gives_images(self) -> bool:
-        """Whether the frames are given."""
-        return "images" in self.allowed
-
-    @property
-    def gives_readout(self) -> bool:
-        """Whether the readout ratio is given."""
-        return "readout" in self.allowed
-
-    # Predictions
-
-    @abstractmethod
-    def true_answer(self, truth: Truth) -> Mapping[str, Any]:
-        """The truth as an answer, but for its name and its pictures."""
-
-    @abstractmethod
-    def write_truth(self, split: Split, folder: Path, file: str = "predictions.jsonl") -> Path:
-        """Write the truth as a submission; returns its file of answers."""
-
-    @abstractmethod
-    def write_template(self, split: Split, path: Path) -> None:
-        """Write an example without a fault: an answer to the first problem, and a failure for every other."""
-
-    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
-        """Paths of all that the answers hold beside their file."""
-        return ()
-
-    def check_beside(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
-        """Faults of what lies beside a file, ``most`` at most, and with ``hints`` what may be meant."""
-        return [], []
-
-    def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
-        """What may be meant by the answers of a public split."""
-        yield from ()
-
-    @abstractmethod
-    def load(self, cards: Sequence[str]) -> None:
-        """Raises RsbenchError when a card is wrong, or is none of the track's kind."""
-
-    @abstractmethod
-    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
-        """How often ``run`` reports progress."""
-
-    @abstractmethod
-    def run(self, cards: Sequence[str], split: Split, inputs: Path, work: Path, **options: Any) -> list[Path]:
-        """Run cards on exported inputs; returns for each a file of predictions in ``work``, ready to be submitted.
-
-        ``options`` are ``workers``, ``limits`` and ``step``, as of ``running.run_cards``.
-        """
-
-    # Marking
-
-    def asked(self, sequence: Rendered) -> tuple[Asked, ...]:
-        """The pictures of an answer."""
-        return ()
-
-    def shown(self, sequence: Rendered) -> tuple[str, ...]:
-        """Files of a sequence that methods see beside its frames."""
-        return ()
-
-    def scorer(self, truth: Truth, pictures: TruePictures) -> Callable[[Submission, bool], dict[str, float]]:
-        """Scores of the pictures of submissions to one problem, by whether it is none that failed."""
-        raise NotImplementedError(f"track {self.name!r} asks for no pictures")
-
-    @abstractmethod
-    def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
-    ) -> list[pd.DataFrame | RsbenchError]:
-        """See ``marking.mark_all``."""
-
-    # The board
-
-    @property
-    def primary(self) -> Score:
-        """By which methods are ranked."""
-        return self.scores[0]
-
-    @abstractmethod
-    def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
-        """Files of predictions, below ``folder``, that show how much there is to gain: the truth, and others."""
-
-    def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
-        """By column of scores.csv, the median (problems,) of errors at the Cramer-Rao bound of what a method uses.
-
-        Infinite where its data say nothing; no columns where no bound is known.
-        """
-        return {}
-
-    def of_kind(self, *kinds: Kind) -> tuple[str, ...]:
-        """Keys of the scores of these kinds."""
-        return tuple(score.key for score in self.scores if score.kind in kinds)
-
-    def check_uses(self, uses: Collection[str]) -> None:
-        """Raises ValueError when a method uses what does not exist, or what this protocol does not give."""
-        for name in uses:
-            if name not in KNOWLEDGE:
-                raise ValueError(f"uses: {name!r} is unknown{choices(name, KNOWLEDGE)}")
-            if name not in (*self.allowed, ORACLE):
-                raise ValueError(
-                    f"uses: {name!r} is not given by {self.id}, which gives {', '.join(self.allowed)}"
-                )
-        if not uses:
-            raise ValueError(f"uses: must name what the method works on, of {', '.join(self.allowed)}")
-        if len(set(uses)) < len(uses):
-            raise ValueError("uses: names something twice; once is enough")
-
-
-# What stands in a file of predictions: the header, and what answers of all tracks have in common.
-
-LARGEST = 1e9
-"""Number of w and d: larger ones are no motions, and their squares overflow."""
-LEAST_D = 1e-9
-"""Length of ``d`` in metres or units of the method's own; a shorter one is no direction, but for zero."""
-_TEXT_CHARACTERS = 300
-Vector = tuple[float, float, float]
+# What a file of predictions holds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,7 +211,13 @@ class Answer:
         ):
             raise ValueError("covariance: must be 6 x 6 numbers, of w and d")
         if self.covariance is not None and not _symmetric(np.array(self.covariance)):
-            raise ValueError("covariance: must be symmetric: both halves of it are asked")
+            raise ValueError("covariance: must be symmetric: give both halves of it")
+
+    def refuse_numbers(self, instead: str) -> None:
+        """Raises ValueError where an answer made of something else has a motion, a ratio or a covariance."""
+        for name in ("w", "d", "readout_ratio", "covariance"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name}: does not belong here; {instead}")
 
 
 def _symmetric(covariance: FloatArray) -> bool:
@@ -381,87 +227,23 @@ def _symmetric(covariance: FloatArray) -> bool:
         return bool(np.all(np.abs(covariance - covariance.T) <= 1e-3 * np.outer(sizes, sizes)))
 
 
-# Scores of submissions, a row for each problem: by the one scorer of their track, and by nothing else.
-#
-# A problem without an answer is a failure, and a failure scores the worst value of everything. Pictures take
-# longest: they are scored problem by problem, for what is found of the truth serves all entries, each problem in
-# one process of one thread. A score does not depend on which process it comes from, or on the other entries: none
-# draws at random, or adds in an order of its own.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Submission:
+    """A file of predictions without faults."""
 
-Numbers = dict[str, float]
-
-
-def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
-    """One row for each problem, in the order of the split; the columns are those of docs/how-to/submit.md.
-
-    Args:
-        submission: what was answered.
-        split: the truth.
-        workers: processes, which score pictures; the rest takes no time.
-
-    Raises:
-        RsbenchError: a picture is at fault, or the truth has changed since the split was read.
-    """
-    (found,) = mark_all([submission], split, workers)
-    if isinstance(found, RsbenchError):
-        raise found
-    return found
+    header: Header
+    answers: Mapping[str, Answer]
+    """By the name of the problem."""
+    folder: Path
+    """Of the file; pictures and matches of its answers lie there."""
 
 
-def mark_all(
-    submissions: Sequence[Submission],
-    split: Split,
-    workers: Workers = 1,
-    step: Step = lambda word: None,
-    kept: Path | None = None,
-) -> list[pd.DataFrame | RsbenchError]:
-    """``mark`` of several submissions, which share what is found of the truth; an error is that of one of them.
-
-    Args:
-        submissions, split, workers: as of ``mark``.
-        step: called with the name of each problem whose pictures are scored.
-        kept: folder for what is done of them, so that a run that is cut off goes on there.
-
-    Raises:
-        RsbenchError: the truth has changed since the split was read.
-    """
-    return split.track.mark(submissions, split, workers, step, kept)
-
-
-def named(truth: Truth, success: bool) -> Row:
-    """The first columns."""
-    return {"problem": truth.name, "scene": truth.scene, "success": success}
-
-
-def last(success: bool, answer: Answer | None) -> Row:
-    """The last columns."""
-    seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
-    return {"failure": float(not success), "seconds": seconds}
-
-
-# The problems of a split with their truth: drawn from a seed, or those of a rendered dataset.
-#
-# A split is known by its name and a fingerprint of its truth. The fingerprint can be announced before a
-# competition: whoever is told the seed or is given the dataset afterwards finds the same one.
-
-PUBLIC_SEED = 1
-"""Of the split ``dev``: its truth is known to everybody."""
-_ANNOUNCED = {
-    "b7eafa489ffbd9d816c2edd44f5842bdf01306f286ab36dd2c0ef72aee05523b": "f88c896f00000000",
-    "57af81babdeeb5d96992052241698c127f8a4e7fd716fc28f146bf858b8edb40": "7a998de400000000",
-    "881e9e954f8a3cc3c1bd3d11fcca7277b3af27da058d3a2340487ac84d1e7c89": "292f151500000000",
-    "792e3e2e7ccfbdaefda940050f3d95c9e814a517eb48c4e618b200bb37b608ee": "ba1e206a00000000",
-    "ee83b3153351ba62775f40dedeba0d2bfeb9c8c036fe6eefa6332c92b9e48b29": (
-        "382c1320481b8b75aae3ba87190f80b7d671d73c323961e95e6bee131c507e77"
-    ),
-}
-"""By the hash of the truth to nine digits, equal on all processors, the fingerprint that was announced: of the
-public points, and of the motions of ``laws``."""
+# Problems with their truth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """The true motion of one problem, and what is known of it."""
+    """One problem: its true motion, and what is known of it."""
 
     name: str
     rig: StereoRig
@@ -472,33 +254,36 @@ class Truth:
     facts: dict[str, float | str]
     """What scores may be drawn against."""
     sequence: Rendered | None = None
-    """Of rendered frames: where their truth lies."""
+    """Where the truth of rendered frames lies."""
     pictures: TruePictures | None = None
-    """Where pictures are asked."""
+    """On tracks whose answers are pictures."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Split:
-    """The truth of all problems of a track."""
+    """All problems of a track with their truth."""
 
     track: Track
     label: str
     """``dev``, ``test``, or the name of the dataset."""
     public: bool
-    """Whether the truth may be told."""
+    """Whether the truth may be published."""
     truths: tuple[Truth, ...]
     seed: int = PUBLIC_SEED
-    """Of problems that are simulated."""
+    """Of simulated problems."""
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the protocol, the rigs, the true motions, and what is seen where pictures are asked."""
+        """SHA-256 of the protocol, the rigs, the true motions, and the files that pictures are compared with.
+
+        It can be announced before a competition: whoever gets the seed or the dataset afterwards finds the same.
+        """
         content = [self.track.id, *(_identity(truth) for truth in self.truths)]
-        return _ANNOUNCED.get(hash_of(_rounded(content))) or hash_of(content)
+        return _ANNOUNCED.get(_hash_of(_rounded(content))) or _hash_of(content)
 
     @property
     def name(self) -> str:
-        """The label, and enough of the fingerprint that no two splits are taken for one."""
+        """The label, and enough of the fingerprint that no two splits are confused."""
         return f"{self.label}-{self.fingerprint[:8]}"
 
     @cached_property
@@ -506,12 +291,12 @@ class Split:
         return {truth.name: truth for truth in self.truths}
 
 
-def hash_of(content: object) -> str:
+def _hash_of(content: object) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _rounded(content: Any) -> Any:
-    """With numbers to nine digits: exp and sin differ in the last bit between processors."""
+    """Numbers to nine digits: exp and sin differ in the last bit between processors."""
     if isinstance(content, float):
         return f"{content:.9g}"
     if isinstance(content, dict):
@@ -523,29 +308,279 @@ def _identity(truth: Truth) -> dict[str, Any]:
     problem = Problem(
         name=truth.name, correspondences=Correspondences(), rig=truth.rig, known_shutter=truth.shutter
     )
-    seen = {} if truth.pictures is None else {"files": truth.pictures.files}
-    return {**problem_record(problem), "motion": _motion_identity(truth.motion), **seen}
+    motion = truth.motion
+    if isinstance(motion, LaterMotion):  # two frames of a longer sequence: its whole motion, and where they begin
+        moved = {"later": motion_record(motion.motion), "start": motion.start}
+    else:
+        moved = motion_record(motion)
+    files = {} if truth.pictures is None else {"files": truth.pictures.files}
+    return {**problem_record(problem), "motion": moved, **files}
 
 
-def _motion_identity(motion: Motion) -> dict[str, Any]:
-    """Of a pair of frames in a longer way: the whole way, and where it begins."""
-    if isinstance(motion, LaterMotion):
-        return {"later": motion_record(motion.motion), "start": motion.start}
-    return motion_record(motion)
+# Tracks
 
 
-# Predictions that anybody hands in: JSON lines, a header and an answer for each problem. A fault is a line.
-#
-# Nothing that stands there is believed: sizes are limited before anything is decoded, names are looked up among
-# those of the split and are never paths, and numbers are finite. docs/how-to/submit.md is the format.
+class Inputs(ABC):
+    """Where the problems of a track come from."""
+
+    rendered: ClassVar[bool] = True
+    """Whether they are rendered frames."""
+    whole: ClassVar[bool] = False
+    """Whether a problem is a whole sequence."""
+
+    @abstractmethod
+    def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
+        """See ``Track.split``."""
+
+    @abstractmethod
+    def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        """See ``Track.problems``."""
+
+
+class Runnable(NamedTuple):
+    """A card that a track can run."""
+
+    name: str
+    """Of its entry."""
+    built_in: bool
+    key: object
+    """JSON-ready: what decides its answers beside the inputs."""
+    header: Mapping[str, Any]
+    """What the first line of its predictions says of the method."""
+    model: str = "linear"
+    """Motion model whose code is compiled before it runs."""
+
+
+class Target(NamedTuple):
+    """A card of a job."""
+
+    card: str
+    folder: Path
+    """Of its predictions."""
+    identity: str
+    """Of these answers."""
+
+
+class Job(NamedTuple):
+    """Problems that one process solves by one card, or by several that share what they find."""
+
+    problems: tuple[str, ...]
+    targets: tuple[Target, ...]
+    requested: tuple[RequestedPicture, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{', '.join(target.folder.name for target in self.targets)}: problem {', '.join(self.problems)}"
+
+
+Solve = Callable[[Job], Iterator[list[dict[str, Any]]]]
+"""Yields the answers of each target of a job."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Submission:
-    """A file without faults."""
+class Track(ABC):
+    """A question with its inputs, its answers, their scores, and its columns on a board.
 
-    header: Header
-    answers: Mapping[str, Answer]
-    """By the name of the problem."""
-    folder: Path
-    """Of the file; what answers hold beside it lies there."""
+    The fields are its data; a subclass is what several tracks with one type of answer have in common.
+    """
+
+    name: str
+    """On the command line."""
+    id: str
+    """Of its protocol, which submissions name."""
+    title: str
+    allowed: tuple[str, ...]
+    """What of ``KNOWLEDGE`` it gives."""
+    given: str
+    """The inputs, in words."""
+    inputs: Inputs
+    scores: tuple[Score, ...]
+    """Columns of its tables; methods are ranked by the first."""
+    error: str
+    """The column of scores.csv that decides about the primary score."""
+    error_title: str
+    """Its name in figures."""
+    exact: Mapping[str, float]
+    """Error columns, each with the value below which the truth itself was submitted: no method is so near. Each is
+    judged alone, so that a wrong part of an answer does not hide an exact one."""
+    beside: tuple[str, ...] = ("failure",)
+    """Shares and means that short tables show beside the primary score."""
+    parting: str = ""
+    """A column of scores.csv by whose values tables divide the primary score; empty: none."""
+    unknowns: int = 6
+    """Degrees of freedom of the column ``nees``, where answers state deviations."""
+    oracles: tuple[tuple[str, Callable[[Split, Path], str]], ...] = ()
+    """Entries that know the truth, beside the truth itself: name, and what draws their pictures into a folder, if
+    any, and returns their file of answers."""
+    smoke: tuple[str, ...] = ()
+    """Entries of a smoke run: rsbench's defaults, the strongest that cost little, and oracles."""
+    smoke_metrics: tuple[str, ...] = ()
+    """Columns of scores that a smoke run compares."""
+    answers: ClassVar[type[Answer]] = Answer
+    """What a line of a file of predictions must hold."""
+    pictures: ClassVar[bool] = False
+    """Whether an answer is pictures beside the file of answers."""
+    own_matches: ClassVar[bool] = False
+    """Whether methods find matches themselves, and may submit them with motions."""
+    at_rows: ClassVar[bool] = False
+    """Whether each picture shows the time of one row."""
+    shares_work: ClassVar[bool] = False
+    """Whether cards share what they find of a problem, so that one job runs them all."""
+
+    # Inputs
+
+    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
+        """The problems with their truth, of a dataset or a seed.
+
+        Raises:
+            RsbenchError: an option that the track does not take, or misses; the dataset or the seed is at fault.
+        """
+        return self.inputs.split(self, data, seed_file, secret)
+
+    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        """What a method gets of the first ``count``, without images."""
+        return self.inputs.problems(self, data, seed_file, count)
+
+    @property
+    def gives_images(self) -> bool:
+        """Whether the frames are given."""
+        return "images" in self.allowed
+
+    @property
+    def gives_readout(self) -> bool:
+        """Whether the readout ratio is given."""
+        return "readout" in self.allowed
+
+    def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
+        """The pictures of an answer."""
+        return ()
+
+    # Predictions
+
+    @abstractmethod
+    def true_answer(self, truth: Truth) -> Mapping[str, Any]:
+        """The truth as an answer, without its name and its pictures."""
+
+    @abstractmethod
+    def example(self, split: Split) -> Mapping[str, Any]:
+        """An answer to the first problem for a template, without its name and its pictures."""
+
+    def draw_truth(self, split: Split, folder: Path) -> None:  # noqa: B027  most tracks have none
+        """Write the pictures of the truth, if any."""
+
+    def draw_example(self, split: Split, folder: Path) -> None:  # noqa: B027
+        """Write the pictures of ``example``, if any."""
+
+    def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
+        """Paths, below the folder of the file of answers, of the pictures and matches of a submission."""
+        return ()
+
+    def check_files(
+        self, submission: Submission, split: Split, most: int, hints: bool
+    ) -> tuple[list[str], list[str]]:
+        """Faults of answers and their files, ``most`` at most, and with ``hints`` likely mistakes."""
+        return [], []
+
+    def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
+        """Likely mistakes in answers with motions to a public split."""
+        yield from ()
+
+    # Running
+
+    @abstractmethod
+    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
+        """Runnables by their cards.
+
+        Raises:
+            RsbenchError: a card is wrong, or does not fit the track.
+        """
+
+    def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
+        """The folder of the inputs that cards get: made in ``work`` where they need more than was exported."""
+        return inputs
+
+    def copy_files(self, inputs: Path, folder: Path) -> None:  # noqa: B027
+        """Copy what a submission has beside its answers from those inputs, if anything."""
+
+    @abstractmethod
+    def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
+        """In the process of a job: what solves jobs on exported inputs."""
+
+    def chunk(self, limits: Limits) -> int:
+        """Problems of one job. With limits one, so that a job that takes too much fails one problem."""
+        return 1
+
+    # Scores
+
+    @abstractmethod
+    def mark(
+        self,
+        submissions: Sequence[Submission],
+        split: Split,
+        workers: Workers = 1,
+        step: Step = lambda word: None,
+        kept: Path | None = None,
+    ) -> list[pd.DataFrame | RsbenchError]:
+        """Scores of submissions, which share what is found of the truth; an error is that of one submission.
+
+        A table has one row for each problem, in the order of the split; docs/how-to/submit.md names the columns. A
+        problem without an answer is a failure, and a failure scores the worst value of everything.
+
+        Args:
+            submissions: what was answered.
+            split: the truth.
+            workers: processes that score pictures; the rest takes no time.
+            step: called with the name of each problem whose pictures are scored.
+            kept: folder where an interrupted run keeps the scores of pictures, and finds them again.
+
+        Raises:
+            RsbenchError: the truth has changed since the split was read.
+        """
+
+    def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
+        """By column of scores.csv, the median (problems,) of errors at the Cramer-Rao bound of what a method uses.
+
+        Infinite where its data determine nothing; no columns where no bound is known.
+        """
+        return {}
+
+    @property
+    def primary(self) -> Score:
+        """The score by which methods are ranked."""
+        return self.scores[0]
+
+    def of_kind(self, *kinds: Kind) -> tuple[str, ...]:
+        """Keys of the scores of these kinds."""
+        return tuple(score.key for score in self.scores if score.kind in kinds)
+
+    def check_uses(self, uses: Collection[str]) -> None:
+        """Raises ValueError when a method uses what does not exist, or what this protocol does not give."""
+        for name in uses:
+            if name not in KNOWLEDGE:
+                raise ValueError(f"uses: {name!r} is unknown{choices(name, KNOWLEDGE)}")
+            if name not in (*self.allowed, ORACLE):
+                raise ValueError(
+                    f"uses: {name!r} is not given by {self.id}, which gives {', '.join(self.allowed)}"
+                )
+        if not uses:
+            raise ValueError(f"uses: must name what the method works on, of {', '.join(self.allowed)}")
+        if len(set(uses)) < len(uses):
+            raise ValueError("uses: names something twice; once is enough")
+
+
+def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
+    """``Track.mark`` of one submission.
+
+    Raises:
+        RsbenchError: a picture is at fault, or the truth has changed since the split was read.
+    """
+    (found,) = split.track.mark([submission], split, workers)
+    if isinstance(found, RsbenchError):
+        raise found
+    return found
+
+
+def score_row(truth: Truth, answer: Answer | None, success: bool, scores: Mapping[str, object]) -> Row:
+    """A row of scores.csv: which problem, the scores of its answer, and whether and how fast it was solved."""
+    seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
+    row = {"problem": truth.name, "scene": truth.scene, "success": success, **scores}
+    return {**row, "failure": float(not success), "seconds": seconds}

@@ -1,47 +1,22 @@
-"""The list of tracks, by name and by protocol: a track is one class and one line here."""
+"""All tracks, by name and by protocol; each module of tracks has its own list."""
 
 from __future__ import annotations
 
-from rsbench.benchmark.leaderboard.correction_tracks import (
-    CorrectionTrack,
-    MonoCorrectionTrack,
-    PlacedCorrection,
-    SeenCorrection,
+from rsbench.benchmark.leaderboard import (
+    correction_tracks,
+    depth_track,
+    motion_tracks,
+    readout_tracks,
+    trajectory_track,
 )
-from rsbench.benchmark.leaderboard.depth_track import DepthTrack
-from rsbench.benchmark.leaderboard.motion_tracks import (
-    LawsOfPoints,
-    LawsOfPoses,
-    OwnPoseTrack,
-    PointsTrack,
-    PoseTrack,
-)
-from rsbench.benchmark.leaderboard.readout_tracks import DrawnReadout, ReadoutTrack, SkilledReadout
 from rsbench.benchmark.leaderboard.track import Track
-from rsbench.benchmark.leaderboard.trajectory_track import TrajectoryTrack
 from rsbench.components.cards import choices
 from rsbench.core.errors import RsbenchError
 
-TRACKS: dict[str, Track] = {
-    track.name: track
-    for track in (
-        LawsOfPoints(),
-        PointsTrack(),
-        LawsOfPoses(),
-        PoseTrack(),
-        OwnPoseTrack(),
-        SkilledReadout(),
-        DrawnReadout(),
-        ReadoutTrack(),
-        DepthTrack(),
-        SeenCorrection(),
-        PlacedCorrection(),
-        CorrectionTrack(),
-        MonoCorrectionTrack(),
-        TrajectoryTrack(),
-    )
-}
+_MODULES = (motion_tracks, readout_tracks, depth_track, correction_tracks, trajectory_track)
+TRACKS: dict[str, Track] = {track.name: track for module in _MODULES for track in module.TRACKS}
 """By name, in the order of tables."""
+_BY_PROTOCOL = {track.id: track for track in TRACKS.values()}
 
 
 def track_of_name(name: str) -> Track:
@@ -50,17 +25,14 @@ def track_of_name(name: str) -> Track:
     Raises:
         RsbenchError: there is no such track.
     """
-    by_id = {track.id: track for track in TRACKS.values()}
-    if name in by_id:
-        return by_id[name]
-    if name not in TRACKS:
+    found = _BY_PROTOCOL.get(name) or TRACKS.get(name)
+    if found is None:
         raise RsbenchError(f"track {name!r} does not exist{choices(name, TRACKS)}")
-    return TRACKS[name]
+    return found
 
 
 def track_of_id(protocol: str) -> Track:
     """Raises RsbenchError: there is no such protocol."""
-    known = {track.id: track for track in TRACKS.values()}
-    if protocol not in known:
-        raise RsbenchError(f"protocol = {protocol!r}: does not exist{choices(protocol, known)}")
-    return known[protocol]
+    if protocol not in _BY_PROTOCOL:
+        raise RsbenchError(f"protocol = {protocol!r}: does not exist{choices(protocol, _BY_PROTOCOL)}")
+    return _BY_PROTOCOL[protocol]

@@ -1,4 +1,4 @@
-"""The track that asks for the trajectory of a whole sequence, from the matches of each two of its frames.
+"""The track of trajectories of whole sequences, from the matches of each two successive frames.
 
 An answer is poses at times of its own choice; a cubic spline goes through them. Rotations are scored at lines of
 all frames, drift at the starts of the frames, and what a viewer would see of it by true points.
@@ -8,40 +8,36 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.leaderboard.inputs import read_inputs
-from rsbench.benchmark.leaderboard.running import jobs_done
-from rsbench.benchmark.leaderboard.splits import FEATURES, FrameTrack, label_of, matched, truth_of
-from rsbench.benchmark.leaderboard.submissions import submission_text, template_text, truth_text
+from rsbench.benchmark.leaderboard.splits import WholeSequences
 from rsbench.benchmark.leaderboard.track import (
     FAILED,
     LARGEST,
-    ORACLE,
     SECONDS,
     Answer,
+    Job,
     Limits,
     Row,
+    Runnable,
     Score,
+    Solve,
     Split,
     Step,
     Submission,
     Track,
     Truth,
-    last,
-    named,
+    score_row,
 )
-from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Given, along
 from rsbench.benchmark.trajectory_scores import AUC_DEG, LINES, TrueTrajectory, scored_times, trajectory_scores
 from rsbench.components.cards import choices
@@ -51,18 +47,14 @@ from rsbench.core.se3 import compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import TrajectoryMotion
-from rsbench.dataset.imu import gyro_samples
-from rsbench.dataset.sequence import Sequence as Rendered
-from rsbench.dataset.sequence import read_dataset
-from rsbench.jobs.isolation import use_one_thread
 from rsbench.jobs.process_jobs import Workers
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.refined import warm_up
-from rsbench.storage.files import sha256, write_bytes, write_json
-from rsbench.vision.feature_matcher import load_features
 
-FEWEST_FRAMES, MOST_FRAMES = 4, 250
+_MOST_POSES = 500
+"""Of an answer: a line of a file of answers has limited length."""
+APART = 1e-5
+"""Frame periods, at least, between two poses of an answer: rows are farther apart, and a spline through nearer
+ones may go anywhere."""
 _UNIT = 1e-3
 _REACH = 1e-6
 """Frame periods by which the first and the last pose may miss the starts of the first and the last frame."""
@@ -123,9 +115,7 @@ class TrajectoryAnswer(Answer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("w", "d", "readout_ratio", "covariance"):
-            if getattr(self, name) is not None:
-                raise ValueError(f"{name}: is not asked; an answer is poses")
+        self.refuse_numbers("an answer is poses")
         if not self.success:
             return
         if self.poses is None or len(self.poses) < 2:
@@ -150,61 +140,15 @@ class TrajectoryAnswer(Answer):
         """Through the poses, of a success. Raises ValueError where they lead nowhere."""
         rows = self.rows
         rows[:, 4:] /= np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
-        given = {"poses": rows}
-        w, d = TrajectoryMotion.endpoint(given) or (np.zeros(3), np.zeros(3))
-        return TrajectoryMotion(w, d, **given)
+        poses = {"poses": rows}
+        w, d = TrajectoryMotion.endpoint(poses) or (np.zeros(3), np.zeros(3))
+        return TrajectoryMotion(w, d, **poses)
 
 
-class TrajectoryTrack(FrameTrack):
+class TrajectoryTrack(Track):
     """Whole sequences of rendered frames."""
 
-    name, id = "trajectory", "trajectory-1"
-    title = "Trajectory of whole sequences from given matches"
-    allowed = ("left", "right", "links", "readout", "gyro")
-    given = (
-        "matches of each two successive frames by rsbench's SIFT; samples of a gyroscope where the dataset has "
-        "the channel imu"
-    )
-    scores = _SCORES
-    error, error_title = "error", "1 - AUC way"
-    exact = MappingProxyType(
-        {
-            **dict.fromkeys(("way_median_deg", "way_95_deg", "rows_median_deg", "rows_95_deg", "rpe_deg"), 1e-6),
-            **dict.fromkeys(("ate_mm", "rpe_mm"), 1e-5),
-        }
-    )
     answers = TrajectoryAnswer
-    whole = True
-    smoke: ClassVar[tuple[str, ...]] = ()
-    smoke_metrics = ("auc_way", "auc_rows", "way_median_deg", "rows_median_deg", "ate_mm", "rpe_mm", "rpe_deg")
-
-    # Inputs
-
-    def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
-        data = self.source(data, seed_file)
-        truths = list[Truth]()
-        for sequence in read_dataset(data):
-            if not FEWEST_FRAMES <= sequence.frames <= MOST_FRAMES:
-                raise RsbenchError(
-                    f"{data}: {sequence.name} has {sequence.frames} frames: the track {self.name!r} takes "
-                    f"sequences of {FEWEST_FRAMES} to {MOST_FRAMES}, such as those of the card handheld"
-                )
-            truth = truth_of(sequence)
-            truths.append(replace(truth, facts={**truth.facts, **_facts(sequence)}))
-        return Split(track=self, label=label_of(data), public=not secret, truths=tuple(truths))
-
-    def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        """The windows of the first so many sequences; the gyroscope's samples are those of the first window."""
-        assert data is not None
-        options = CorrectionOptions(features=load_features(FEATURES))
-        for sequence in read_dataset(data)[:count]:
-            for number, pair in enumerate(sequence.pairs()):
-                problem = matched(pair, options)
-                if number == 0 and "imu" in sequence.channels:
-                    gyro = gyro_samples(sequence.inertial(), sequence.frame_period_s)
-                    matches = replace(problem.correspondences, gyro=gyro)
-                    problem = replace(problem, correspondences=matches)
-                yield problem
 
     # Predictions
 
@@ -213,21 +157,16 @@ class TrajectoryTrack(FrameTrack):
         frames = truth.sequence.frames
         return answer_of(along(truth.motion, frames - 1), truth.shutter, frames)
 
-    def write_truth(self, split: Split, folder: Path, file: str = "predictions.jsonl") -> Path:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_bytes(folder / file, truth_text(split).encode())
-        return folder / file
-
-    def write_template(self, split: Split, path: Path) -> None:
+    def example(self, split: Split) -> Mapping[str, Any]:
         sequence = split.truths[0].sequence
         assert sequence is not None
         still = [[float(frame), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] for frame in range(sequence.frames)]
-        write_bytes(path, template_text(split, {"poses": still, "metric": False}).encode())
+        return {"poses": still, "metric": False}
 
-    def check_beside(
+    def check_files(
         self, submission: Submission, split: Split, most: int, hints: bool
     ) -> tuple[list[str], list[str]]:
-        """What poses must reach over is told by the split."""
+        """Poses must cover the sequence, whose length the split knows."""
         faults, answered = list[str](), list[tuple[TrajectoryAnswer, Truth]]()
         for answer in submission.answers.values():
             truth = split.by_name[answer.name]
@@ -252,21 +191,41 @@ class TrajectoryTrack(FrameTrack):
 
     # Running
 
-    def load(self, cards: Sequence[str]) -> None:
+    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
+        found = dict[str, Runnable]()
         for card in cards:
             if card not in METHODS:
                 raise RsbenchError(f"--entry {card}: no method of the track {self.name!r}{choices(card, METHODS)}")
+            method = METHODS[card]
+            header = {"uses": method.uses, "description": method.description, "motion_model": method.motion_model}
+            found[card] = Runnable(card, True, card, header)
+        return found
 
-    def steps(self, cards: Sequence[str], split: Split, limits: Limits) -> int:
-        return len(cards) * len(split.truths)
+    def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
+        windows = read_inputs(inputs, self)
+        sequences = {
+            name: list(each) for name, each in groupby(windows, lambda window: window.name.rpartition(".")[0])
+        }
 
-    def run(self, cards: Sequence[str], split: Split, inputs: Path, work: Path, **options: Any) -> list[Path]:
-        return run_methods(self, cards, split, inputs, work, **options)
+        def solve(job: Job) -> Iterator[list[dict[str, Any]]]:
+            (name,), (target,) = job.problems, job.targets
+            try:
+                answer = _solve(target.card, name, sequences[name])
+            except (RsbenchError, ValueError, ArithmeticError) as error:  # such as matches that determine nothing
+                answer = {"success": False, "reason": " ".join(str(error).split())[:300]}
+            yield [{"name": name, **answer}]
 
-    # Marking
+        return solve
+
+    # Scores
 
     def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+        self,
+        submissions: Sequence[Submission],
+        split: Split,
+        workers: Workers = 1,
+        step: Step = lambda word: None,
+        kept: Path | None = None,
     ) -> list[pd.DataFrame | RsbenchError]:
         rows: list[list[Row]] = [[] for _ in submissions]
         for truth in split.truths:
@@ -276,9 +235,6 @@ class TrajectoryTrack(FrameTrack):
                 mine.append(_row(truth, true, submission.answers.get(truth.name)))
             step(truth.name)
         return [pd.DataFrame(each) for each in rows]
-
-    def oracles(self, split: Split, folder: Path) -> Iterator[Path]:
-        yield self.write_truth(split, folder / ORACLE)
 
 
 def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
@@ -290,13 +246,6 @@ def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
     return bool(_INVERTED * turned < as_is)
 
 
-def _facts(sequence: Rendered) -> dict[str, float | str]:
-    """Root mean square of how fast the rig turns, and how many frames there are."""
-    rates, _ = sequence.motion.velocity(np.linspace(0.0, sequence.frames - 1.0, 20 * sequence.frames))
-    turn = float(np.rad2deg(np.sqrt(np.mean(np.sum(rates**2, axis=1)))))
-    return {"turn_deg": turn, "frames": float(sequence.frames)}
-
-
 def _row(truth: Truth, true: TrueTrajectory, answer: Answer | None) -> Row:
     """Scores of an answer to one problem."""
     success = isinstance(answer, TrajectoryAnswer) and answer.success
@@ -306,25 +255,7 @@ def _row(truth: Truth, true: TrueTrajectory, answer: Answer | None) -> Row:
         estimate = along(answer.motion, truth.sequence.frames - 1, positions=answer.metric)
         found = trajectory_scores(true, estimate)
         del found["failed"]
-    return {**named(truth, success), **found, "error": 1.0 - found["auc_way"], **last(success, answer)}
-
-
-# Running the methods of the track ``trajectory`` on exported inputs: each sequence is a job, kept when done.
-
-_MOST_POSES = 500
-"""Of an answer: a line of a file of answers has its length."""
-APART = 1e-5
-"""Frame periods, at least, between two poses of an answer: rows are farther apart, and a spline through nearer
-ones may go anywhere."""
-
-
-class _Job(NamedTuple):
-    method: str
-    name: str
-    path: Path
-
-    def __str__(self) -> str:
-        return f"{self.method}, {self.name}"
+    return score_row(truth, answer, success, {**found, "error": 1.0 - found["auc_way"]})
 
 
 def answer_of(estimate: Estimate, shutter: RollingShutter, frames: int) -> dict[str, Any]:
@@ -346,85 +277,11 @@ def answer_of(estimate: Estimate, shutter: RollingShutter, frames: int) -> dict[
     return {"poses": np.round(found, 10).tolist(), "metric": estimate.positions}
 
 
-def run_methods(
-    track: Track,
-    names: Sequence[str],
-    split: Split,
-    inputs: Path,
-    work: Path,
-    *,
-    workers: Workers = 1,
-    limits: Limits = Limits(),  # noqa: B008  it is a constant
-    step: Callable[[str], None] = lambda word: None,
-) -> list[Path]:
-    """Run methods of ours on exported inputs; returns for each a file of predictions in ``work``.
-
-    Raises:
-        RsbenchError: no such method; processes died each time over the same problem: what is done is kept.
-    """
-    track.load(names)
-    data, jobs, paths = sha256(inputs / "problems.jsonl"), list[_Job](), dict[str, list[Path]]()
-    for name in names:
-        identity = identity_of(
-            source=numeric_version(), method=name, protocol=track.id, data=data, limits=list(limits)
-        )
-        paths[name] = [work / name / f"{identity[:16]}-{truth.name}.json" for truth in split.truths]
-        for truth, path in zip(split.truths, paths[name], strict=True):
-            if read_record(path) is None:
-                jobs.append(_Job(name, truth.name, path))
-            else:
-                step(name)
-
-    def fail(job: _Job, reason: str) -> None:
-        job.path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(job.path, {"name": job.name, "success": False, "reason": reason})
-
-    for job in jobs_done(partial(_serve, track), jobs, workers, inputs, limits, fail):
-        step(job.method)
-    return [_joined(name, split, work, paths[name]) for name in names]
-
-
-def _joined(name: str, split: Split, work: Path, paths: Sequence[Path]) -> Path:
-    method = METHODS[name]
-    header = {
-        "protocol": split.track.id,
-        "split": split.name,
-        "method": name,
-        "uses": method.uses,
-        "description": method.description,
-        "code": "rsbench",
-        "hardware": f"{processor()}, 1 thread"[:300],
-        "motion_model": method.motion_model,
-    }
-    answers = (read_record(path) or {} for path in paths)
-    write_bytes(work / name / "predictions.jsonl", submission_text(header, answers).encode())
-    return work / name / "predictions.jsonl"
-
-
-def _serve(track: Track, inputs: Path, limits: Limits) -> Callable[[_Job], None]:
-    use_one_thread()
-    warm_up()
-    windows = read_inputs(inputs, track)
-    sequences = {
-        name: list(each) for name, each in groupby(windows, lambda window: window.name.rpartition(".")[0])
-    }
-
-    def run(job: _Job) -> None:
-        try:
-            answer = _solve(job, sequences[job.name])
-        except (RsbenchError, ValueError, ArithmeticError) as error:  # such as matches that determine nothing
-            answer = {"success": False, "reason": " ".join(str(error).split())[:300]}
-        job.path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(job.path, {"name": job.name, **answer})
-
-    return run
-
-
-def _solve(job: _Job, windows: Sequence[Problem]) -> dict[str, Any]:
+def _solve(method: str, name: str, windows: Sequence[Problem]) -> dict[str, Any]:
     first = windows[0]
     gyro = first.correspondences.gyro
-    seed = int.from_bytes(hashlib.sha256(f"leaderboard {job.name} {job.method}".encode()).digest()[:4], "big")
-    given = Given(
+    seed = int.from_bytes(hashlib.sha256(f"leaderboard {name} {method}".encode()).digest()[:4], "big")
+    known = Given(
         rig=first.rig,
         shutter=first.shutter,
         matches=[replace(each.correspondences, gyro=np.zeros((0, 4))) for each in windows],
@@ -432,8 +289,29 @@ def _solve(job: _Job, windows: Sequence[Problem]) -> dict[str, Any]:
         seed=seed,
     )
     began = time.perf_counter()
-    estimate = METHODS[job.method].solve(given)
+    estimate = METHODS[method].solve(known)
     seconds = round(time.perf_counter() - began, 4)
     if estimate is None:
         return {"success": False, "reason": "the dataset has no gyroscope (channel imu)", "seconds": seconds}
     return {**answer_of(estimate, first.shutter, len(windows) + 1), "seconds": seconds}
+
+
+TRACKS: tuple[Track, ...] = (
+    TrajectoryTrack(
+        name="trajectory",
+        id="trajectory-1",
+        title="Trajectory of whole sequences from given matches",
+        allowed=("left", "right", "links", "readout", "gyro"),
+        given="matches of each two successive frames by rsbench's SIFT; samples of a gyroscope where the dataset "
+        "has the channel imu",
+        inputs=WholeSequences(),
+        scores=_SCORES,
+        error="error",
+        error_title="1 - AUC way",
+        exact={
+            **dict.fromkeys(("way_median_deg", "way_95_deg", "rows_median_deg", "rows_95_deg", "rpe_deg"), 1e-6),
+            **dict.fromkeys(("ate_mm", "rpe_mm"), 1e-5),
+        },
+        smoke_metrics=("auc_way", "auc_rows", "way_median_deg", "rows_median_deg", "ate_mm", "rpe_mm", "rpe_deg"),
+    ),
+)

@@ -8,7 +8,6 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 from leaderboards import ASK_PICTURES, PLANES
 
-from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 
@@ -23,4 +22,4 @@ def planes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def splits(planes: Path) -> dict[str, Split]:
-    return {track: dataset_split(TRACKS[track], planes) for track in ASK_PICTURES}
+    return {track: TRACKS[track].split(planes) for track in ASK_PICTURES}

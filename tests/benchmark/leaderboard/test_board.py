@@ -19,10 +19,9 @@ from leaderboards import Line, erring, named, small_split, truth_lines, write
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore, splits_of
 from rsbench.benchmark.leaderboard.inputs import write_inputs
-from rsbench.benchmark.leaderboard.motion_tracks import AUC_DEG
-from rsbench.benchmark.leaderboard.readout_tracks import ReadoutTrack
-from rsbench.benchmark.leaderboard.running import uses_of
-from rsbench.benchmark.leaderboard.splits import dataset_split, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.motion_tracks import AUC_DEG, uses_of
+from rsbench.benchmark.leaderboard.running import run_cards
+from rsbench.benchmark.leaderboard.splits import simulated_problem
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Limits, Split, mark
@@ -178,7 +177,7 @@ def test_scores_that_were_changed_are_named(tmp_path: Path) -> None:
 def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ratio is not told, one that is off by 0.03 scores 0.7, and small frames are failures by value."""
     monkeypatch.setattr(running, "finished_jobs", _here)
-    split = dataset_split(TRACKS["readout"], smoke_dataset)
+    split = TRACKS["readout"].split(smoke_dataset)
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
     assert run_here("leaderboard", "export", "readout", *where[:2], "--out", tmp_path / "in").returncode == 0
     assert "0.8" not in (tmp_path / "in" / "problems.csv").read_text("utf-8")
@@ -205,13 +204,13 @@ def test_readout_ratios_are_asked(smoke_dataset: Path, tmp_path: Path, monkeypat
 
 def test_our_solver_finds_the_ratio_that_it_is_not_told() -> None:
     """Of the public problems the two with the fastest turn whose noise is below 0.2 px."""
-    clear = [t for t in points_split(TRACKS["points"]).truths if float(t.facts["noise_px"]) < 0.2]
+    clear = [t for t in TRACKS["points"].split(None).truths if float(t.facts["noise_px"]) < 0.2]
     entry = load_solver_entry("rs-stereo-refined")
     for truth in sorted(clear, key=lambda t: -float(t.facts["rotation_deg"]))[:2]:
         problem = simulated_problem(1, int(truth.name[1:]))
         blind = replace(problem, known_shutter=problem.shutter.with_ratio(0.0))
         with SolverRunner() as runner:
-            answer = ReadoutTrack().answer(blind, entry, runner)
+            answer = TRACKS["readout"].answer(blind, entry, runner)
         assert abs(answer["readout_ratio"] - truth.shutter.readout_ratio) < 0.05
 
 
@@ -276,8 +275,8 @@ def test_what_is_not_there_leaves_no_folder(tmp_path: Path) -> None:
 def test_cards_that_cannot_be_entries_are_refused_before_they_run(tmp_path: Path) -> None:
     card = tmp_path / "my card.toml"
     card.write_text('class = "rsbench.solvers.essential_matrix:EightPointSolver"\n', "utf-8")
-    with pytest.raises(RsbenchError, match=r"solver 'my card': name = 'my card': must be a folder's name"):
-        SPLIT.track.run([str(card)], SPLIT, tmp_path / "in", tmp_path / "work")
+    with pytest.raises(RsbenchError, match=r"entry .*my card.toml: name = 'my card': must be a folder's name"):
+        run_cards(SPLIT, [str(card)], tmp_path / "in", tmp_path / "work")
 
 
 @pytest.mark.slow
@@ -286,14 +285,14 @@ def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pyt
     write_inputs(SPLIT, (simulated_problem(1, number) for number in range(12)), tmp_path / "in")
     steps: list[str] = []
     work = tmp_path / "work"
-    (path,) = SPLIT.track.run(["gs-8pt"], SPLIT, tmp_path / "in", work, workers=2, step=steps.append)
+    (path,) = run_cards(SPLIT, ["gs-8pt"], tmp_path / "in", work, workers=2, step=steps.append)
     first = [{**json.loads(line), "seconds": 0} for line in path.read_text("utf-8").splitlines()]
-    chunks = sorted(work.glob("gs-8pt/*.json"))
+    chunks = sorted(work.glob("gs-8pt/answers/*.json"))
     assert len(steps) == len(chunks) == 2
     kept = chunks[0].read_bytes()
     chunks[1].unlink()
     monkeypatch.setattr(running, "finished_jobs", _here)
-    SPLIT.track.run(["gs-8pt"], SPLIT, tmp_path / "in", work)
+    run_cards(SPLIT, ["gs-8pt"], tmp_path / "in", work)
     again = [{**json.loads(line), "seconds": 0} for line in path.read_text("utf-8").splitlines()]
     assert again == first and chunks[0].read_bytes() == kept
     scores = mark(read_submission(path, SPLIT), SPLIT)
@@ -317,15 +316,15 @@ def test_a_problem_that_takes_too_much_is_a_failure(tmp_path: Path, monkeypatch:
     ) -> Any:
         run = serve(*arguments)
         for job in jobs:
-            assert seconds_of(job) == 5.0 and memory_mb is None and job.problems == 1
-            late = job.first == 1
+            assert seconds_of(job) == 5.0 and memory_mb is None and len(job.problems) == 1
+            late = job.problems == ("p001",)
             value = None if late else run(job)
             yield job, Outcome(value=value, reason="took longer than 5 s" if late else "", output="")
 
     monkeypatch.setattr(running, "finished_jobs", _here)
     monkeypatch.setattr(running, "run_jobs", one_too_long)
     for chosen in (Limits(), limits):
-        (path,) = split.track.run(["gs-8pt"], split, tmp_path / "in", tmp_path / "work", limits=chosen)
+        (path,) = run_cards(split, ["gs-8pt"], tmp_path / "in", tmp_path / "work", limits=chosen)
         answers = [json.loads(line) for line in path.read_text("utf-8").splitlines()[1:]]
         assert [answer["name"] for answer in answers] == ["p000", "p001", "p002"]
         assert ("took longer" in answers[1].get("reason", "")) == (chosen == limits)
@@ -338,7 +337,7 @@ def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypa
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
     ran = run_here("leaderboard", "run", "pose", *where, "--entry", "rs-stereo-refined", "--entry", "gs-8pt")
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(TRACKS["pose"], smoke_dataset)
+    split = TRACKS["pose"].split(smoke_dataset)
     assert {truth.scene for truth in split.truths} == {"castle", "room"}
     assert run_here("leaderboard", "oracles", "pose", *where).returncode == 0
     found = {each.header.method: each.scores for each in entries_of(tmp_path / "board", "pose-1", split.name)}
@@ -376,7 +375,7 @@ def test_the_documented_script_needs_no_rsbench(smoke_dataset: Path, tmp_path: P
     assert checked.returncode == 0, checked.stderr
     shown = run_here("leaderboard", "submit", tmp_path / "mine.jsonl", "--board", tmp_path / "board", *data)
     assert "opencv-sift-5pt" in shown.stdout
-    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
+    split = TRACKS["pose-own"].split(smoke_dataset)
     (entry,) = entries_of(tmp_path / "board", "pose-own-1", split.name)
     # A solver for global shutters, on small frames, but nearer to the truth than "no motion": in our conventions.
     still = [truth.facts["rotation_deg"] for truth in split.truths]

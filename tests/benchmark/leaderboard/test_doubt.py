@@ -12,7 +12,6 @@ from leaderboards import Line, named, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, add, entries_of, merge, rescore
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
-from rsbench.benchmark.leaderboard.splits import points_split
 from rsbench.benchmark.leaderboard.standings import standings, table
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
@@ -25,7 +24,7 @@ SPLIT, SMALL = small_split(60), small_split()
 @pytest.fixture(scope="module")
 def at_bound() -> list[Line]:
     """Motions that err as the bound of all links allows."""
-    return [json.loads(line) for line in bound_text(SPLIT, SPLIT.seed).splitlines()]
+    return [json.loads(line) for line in bound_text(SPLIT, Path()).splitlines()]
 
 
 def handed(lines: list[Line], method: str, *uses: str) -> list[Line]:
@@ -172,7 +171,7 @@ def test_links_alone_are_not_all_that_a_method_uses(tmp_path: Path) -> None:
 
 
 def test_the_commands_say_it(tmp_path: Path) -> None:
-    file = write(tmp_path / "a.jsonl", named(truth_lines(points_split(TRACKS["points"])), "mine"))
+    file = write(tmp_path / "a.jsonl", named(truth_lines(TRACKS["points"].split(None)), "mine"))
     text = file.read_text("utf-8").replace('"truth"', '"left"', 1)
     file.write_text(text, "utf-8")
     board = tmp_path / "board"
@@ -187,7 +186,7 @@ def test_the_commands_say_it(tmp_path: Path) -> None:
         "--protocol",
         "points-1",
         "--split",
-        points_split(TRACKS["points"]).name,
+        TRACKS["points"].split(None).name,
     ]
     assert_refused(run_here(*words, "--reason", " "), "--reason")
     ran = run_here(*words, "--reason", "a test of ours")

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from leaderboards import Line, erring, files_below, lines_of, named, truth_lines, write
 
-from rsbench.benchmark.leaderboard.splits import points_split
+from rsbench.benchmark.leaderboard.submissions import write_truth
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 
@@ -100,7 +100,7 @@ def hand_in(tmp_path: Path, branch: str, change: Callable[[Path], object]) -> No
 
 
 def answers(method: str) -> Callable[[Path], object]:
-    lines: list[Line] = named(truth_lines(points_split(TRACKS["points"])), method)
+    lines: list[Line] = named(truth_lines(TRACKS["points"].split(None)), method)
     rough = [lines[0], *erring(lines[1:], 0.05, 0.05)]  # errors beyond those of any doubt
 
     def change(clone: Path) -> None:
@@ -409,7 +409,7 @@ def test_what_rsbench_finds_is_one_plain_line(board: Path, tmp_path: Path) -> No
 def test_pictures_that_a_track_asks_for_are_scored(
     board: Path, planes: Path, splits: dict[str, Split], tmp_path: Path
 ) -> None:
-    path = splits["depth"].track.write_truth(splits["depth"], tmp_path / "in")
+    path = write_truth(splits["depth"], tmp_path / "in")
     write(path, named(lines_of(path), "mine", ("images",)))
     below = files_below(tmp_path / "in")
     change: Files = {

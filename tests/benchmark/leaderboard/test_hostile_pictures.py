@@ -15,7 +15,7 @@ import pytest
 from leaderboards import Line, files_below, lines_of, pictures_of, write
 
 from rsbench.benchmark.leaderboard.board import add
-from rsbench.benchmark.leaderboard.submissions import check_submission
+from rsbench.benchmark.leaderboard.submissions import check_submission, write_truth
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import write_depth, write_exr, write_png
@@ -96,10 +96,10 @@ DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda p: p.with_suffix(".png").write_bytes(p.read_bytes()),
         "2 of left_1.exr and left_1.png are there",
     ),
-    "another name": (lambda p: p.rename(p.with_name("left_0.exr")), "left_0.exr: is not asked"),
+    "another name": (lambda p: p.rename(p.with_name("left_0.exr")), "left_0.exr: does not belong here"),
     "another problem": (lambda p: p.parent.rename(p.parent.with_name("castle")), "castle: is no problem of"),
-    "a file too many": (lambda p: p.with_name("evil.sh").write_text("x"), "evil.sh: is not asked"),
-    "a hidden file": (lambda p: p.with_name(".x").write_text("x"), ".x: is not asked"),
+    "a file too many": (lambda p: p.with_name("evil.sh").write_text("x"), "evil.sh: does not belong here"),
+    "a hidden file": (lambda p: p.with_name(".x").write_text("x"), ".x: does not belong here"),
     "a file among folders": (lambda p: (p.parents[1] / "planes.1x").write_text("x"), "planes.1x: is no problem"),
     "a link": (_link, "left_1.exr: must be a file of its own, no link"),
     "a linked folder": (_linked_folder, "planes.0: must be a folder of its own, no link"),
@@ -184,7 +184,7 @@ FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
 ANSWER_FAULTS: dict[str, tuple[Callable[[list[Line]], list[Line]], str]] = {
     "no line": (lambda lines: lines[:-1], "planes.1: has pictures, but no line"),
     "a failure with pictures": (lambda lines: [*lines[:-1], {**lines[-1], "success": False}], "has pictures, but"),
-    "a motion": (lambda lines: [*lines[:-1], {**lines[-1], "w": [0, 0, 0]}], "w: is not asked"),
+    "a motion": (lambda lines: [*lines[:-1], {**lines[-1], "w": [0, 0, 0]}], "w: does not belong here"),
     "path for a problem": (lambda lines: [*lines, {"name": "../truth"}], "is no problem of"),
     "a unit of kilometres": (
         lambda lines: [{**lines[0], "png_unit_m": 1000.0}, *lines[1:]],
@@ -200,7 +200,7 @@ def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split
     split, faults = (splits["depth"], DEPTH_FAULTS) if name == case else (splits["correction"], FRAME_FAULTS)
     damage, words = faults[name]
     (tmp_path / "in").mkdir()
-    path = split.track.write_truth(split, tmp_path / "in")
+    path = write_truth(split, tmp_path / "in")
     damage(pictures_of(path)[0])
     before = files_below(tmp_path)
     told = check_submission(path, split).faults
@@ -214,6 +214,6 @@ def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split
 @pytest.mark.parametrize("case", ANSWER_FAULTS)
 def test_faults_of_answers_are_lines(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
     change, words = ANSWER_FAULTS[case]
-    path = splits["depth"].track.write_truth(splits["depth"], tmp_path)
+    path = write_truth(splits["depth"], tmp_path)
     (fault,) = check_submission(write(path, change(lines_of(path))), splits["depth"]).faults
     assert words in fault

@@ -14,8 +14,8 @@ from leaderboards import PLANES, lines_of
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.picture_track import Making
-from rsbench.benchmark.leaderboard.splits import dataset_split, with_gyro
+from rsbench.benchmark.leaderboard.picture_track import SharedWork
+from rsbench.benchmark.leaderboard.splits import with_gyro
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
@@ -75,7 +75,7 @@ def test_methods_are_ranked_by_the_cameras_that_they_see(
     ran = run_here("leaderboard", "run", TRACK.name, *where, *cards)
     assert ran.returncode == 0, ran.stderr
     assert run_here("leaderboard", "oracles", TRACK.name, *where).returncode == 0
-    split = dataset_split(TRACK, rendered)
+    split = TRACK.split(rendered)
     found = {e.header.method: e for e in entries_of(tmp_path / "board", TRACK.id, split.name)}
     uses = {name: found[name].header.uses[2:] for name in names}
     assert uses == {
@@ -100,14 +100,14 @@ def test_methods_are_ranked_by_the_cameras_that_they_see(
 def test_a_gyroscope_is_given_where_there_is_one(rendered: Path, tmp_path: Path) -> None:
     assert run_here("leaderboard", "export", TRACK.name, "--data", rendered, "--out", tmp_path).returncode == 0
     (problem,) = lines_of(tmp_path / "problems.jsonl")
-    truth = dataset_split(TRACK, rendered).truths[0]
+    truth = TRACK.split(rendered).truths[0]
     tau, w = np.split(np.array(problem["gyro"]), [1], axis=1)
     assert tau.min() < 0.0 and tau.max() > 1.8
     # The motion turns evenly; 0.02 rad/s of bias on each axis, at 20 frames a second.
     np.testing.assert_allclose(np.mean(w, axis=0), truth.motion.w, atol=4.0 * 0.02 * 0.05)
     assert truth.pictures is not None and "imu/measured.csv" in truth.pictures.files
     # The tracks that do not give it are as they were.
-    other = dataset_split(TRACKS["correction"], rendered).truths[0].pictures
+    other = TRACKS["correction"].split(rendered).truths[0].pictures
     assert other is not None and "imu/measured.csv" not in other.files
 
 
@@ -128,14 +128,14 @@ def test_samples_of_a_pair_of_many_frames_have_its_own_times(rendered: Path) -> 
 @pytest.mark.parametrize("name", ["mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers"])
 def test_nobody_looks_to_the_right(name: str, rendered: Path) -> None:
     """Black images of the right camera give the same frames."""
-    split = dataset_split(TRACK, rendered)
+    split = TRACK.split(rendered)
     (problem,) = TRACK.problems(rendered, None, 1)
     pictures, made = split.truths[0].pictures, list[np.ndarray]()
     assert pictures is not None
     images = {view: pictures.sequence.image("rs", *view) for view in VIEWS}
     for seen in (images, {view: image * (view[0] == "left") for view, image in images.items()}):
         frames, seconds = TRACK.corrected(  # pyrefly: ignore[missing-attribute]
-            Making(problem, seen, pictures.asked),
+            SharedWork(problem, seen, pictures.requested),
             TRACK.chain(name).options,  # pyrefly: ignore[missing-attribute]
         )
         assert len(frames) == 3 and seconds > 0.0
@@ -148,5 +148,5 @@ def test_rows_are_asked_where_their_truth_is(tmp_path: Path) -> None:
         folder = tmp_path / str(len(twins))
         write_analytic_dataset(folder, *PLANES, twins=twins)
         for track, most in (("correction-mono", 3), ("correction", 2)):
-            pictures = dataset_split(TRACKS[track], folder).truths[0].pictures
-            assert pictures is not None and [each.row for each in pictures.asked] == rows[:most]
+            pictures = TRACKS[track].split(folder).truths[0].pictures
+            assert pictures is not None and [each.row for each in pictures.requested] == rows[:most]

@@ -15,7 +15,6 @@ from leaderboards import truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore
 from rsbench.benchmark.leaderboard.motion_tracks import match_scores
-from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
@@ -36,7 +35,7 @@ MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]
 def split(tmp_path_factory: pytest.TempPathFactory) -> Split:
     folder = tmp_path_factory.mktemp("planes")
     write_analytic_dataset(folder, RIG, SHUTTER, MOTION)
-    return dataset_split(TRACKS["pose-own"], folder)
+    return TRACKS["pose-own"].split(folder)
 
 
 def _tracks() -> np.ndarray:
@@ -113,7 +112,7 @@ def test_what_comes_with_rsbench_finds_its_own_matches(smoke_dataset: Path, tmp_
     entries = ["--entry", "rs-stereo-auto", "--entry", "gs-8pt"]
     ran = run_here("leaderboard", "run", "pose-own", *entries, *board)
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
+    split = TRACKS["pose-own"].split(smoke_dataset)
     baseline, ours = entries_of(tmp_path / "board", "pose-own-1", split.name)
     assert (ours.header.method, baseline.header.method) == ("rs-stereo-auto", "gs-8pt")
     assert "images" in ours.header.uses and "matches/tracks.csv" in ours.files
@@ -122,7 +121,10 @@ def test_what_comes_with_rsbench_finds_its_own_matches(smoke_dataset: Path, tmp_
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "another file": (lambda p: (p / "evil.csv").write_text("x"), "evil.csv: is not asked; there are: left.csv"),
+    "another file": (
+        lambda p: (p / "evil.csv").write_text("x"),
+        "evil.csv: does not belong here; there are: left.csv",
+    ),
     "a link": (lambda p: (p / "right.csv").symlink_to(p / "left.csv"), "right.csv: must be a file of its own"),
     "nothing": (lambda p: (p / "left.csv").unlink(), "matches: must be a folder with some of"),
     "no columns": (lambda p: (p / "left.csv").write_text("name,x\nplanes,1\n"), "lacks the column 'x0'"),
@@ -140,7 +142,10 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,True,False,True,True\n"),
         "must hold numbers",
     ),
-    "a column twice": (lambda p: (p / "left.csv").write_text("name,x0,x0,y0,x1,y1\n"), "'x0.1' is not asked"),
+    "a column twice": (
+        lambda p: (p / "left.csv").write_text("name,x0,x0,y0,x1,y1\n"),
+        "'x0.1' does not belong here",
+    ),
     "an open quote": (lambda p: (p / "left.csv").write_text('name,x0,y0,x1,y1\n"planes'), "not a table"),
     "rows that are too long": (
         lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,4,5,6\n"),
@@ -165,7 +170,7 @@ def test_faults_are_lines(case: str, split: Split, tmp_path: Path) -> None:
 
 def test_given_matches_are_in_the_form_of_own_ones(smoke_dataset: Path, tmp_path: Path) -> None:
     """What ``export pose`` writes may be handed in as it is: most of rsbench's matches are right."""
-    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
+    split = TRACKS["pose-own"].split(smoke_dataset)
     out = tmp_path / "inputs"
     assert run_here("leaderboard", "export", "pose", "--data", smoke_dataset, "--out", out).returncode == 0
     (tmp_path / "matches").mkdir()

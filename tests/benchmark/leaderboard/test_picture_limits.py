@@ -12,7 +12,6 @@ from leaderboards import ASK_PICTURES, lines_of
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.jobs.isolation import Outcome
 
@@ -88,7 +87,7 @@ def test_a_method_that_takes_too_much_fails_alone(
     where = ("--data", planes, "--board", tmp_path / "board")
     ran = run_here("leaderboard", "run", track, *where, "--entry", card, *limit)
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(TRACKS[track], planes)
+    split = TRACKS[track].split(planes)
     (found,) = entries_of(tmp_path / "board", split.track.id, split.name)
     first, second = lines_of(found.folder / "predictions.jsonl")[1:]
     assert words in str(first["reason"]) and mood in str(first["reason"])

@@ -14,7 +14,7 @@ from leaderboards import ASK_PICTURES, PLANES, lines_of, named, pictures_of, wri
 from rsbench.benchmark.leaderboard.board import add, place
 from rsbench.benchmark.leaderboard.picture_track import PictureTrack
 from rsbench.benchmark.leaderboard.pictures import PARTINGS, WINDOW, columns, texture
-from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.submissions import read_submission, write_truth
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.report.board_entry import entry_context
 from rsbench.report.board_pictures import albums
@@ -51,7 +51,7 @@ def _by_hand(values: np.ndarray, of: np.ndarray, image: np.ndarray, row: int) ->
 def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
     """Off by 1.5 px below the middle row, and unknown in a column: of rows the first parts are right."""
     split = splits["depth"]
-    path, product = split.track.write_truth(split, tmp_path), RIG.camera.fx * RIG.baseline
+    path, product = write_truth(split, tmp_path), RIG.camera.fx * RIG.baseline
     for picture in pictures_of(path):
         z = read_depth(picture).astype(np.float64)
         z[40:] = product / (product / z[40:] + 1.5)
@@ -73,7 +73,7 @@ def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path
 def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
     """Each pixel of both frames off by a level of its own; a part holds what either frame has of it."""
     split = splits["correction"]
-    path, off = split.track.write_truth(split, tmp_path), np.random.default_rng(1).integers(0, 3, (80, 96, 3))
+    path, off = write_truth(split, tmp_path), np.random.default_rng(1).integers(0, 3, (80, 96, 3))
     off[50:] *= 9
     for picture in pictures_of(path):
         write_png(picture, ((read_png(picture) + off) % 256).astype(np.uint8))
@@ -81,7 +81,7 @@ def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path:
     for number, truth in enumerate(split.truths):
         assert truth.pictures is not None
         parts = dict[str, list[float]]()
-        for each, common in zip(truth.pictures.asked, truth.pictures.commons(), strict=True):
+        for each, common in zip(truth.pictures.requested, truth.pictures.commons(), strict=True):
             frame = truth.pictures.frame(each.row)
             squares = np.mean(((frame + off) % 256 - frame.astype(np.float64)) ** 2, axis=-1)
             for name, values in _by_hand(squares, common, frame, each.row).items():
@@ -102,7 +102,7 @@ def test_a_failure_is_the_worst_in_the_same_parts(
     track: str, worst: float, splits: dict[str, Split], tmp_path: Path
 ) -> None:
     split = splits[track]
-    path = split.track.write_truth(split, tmp_path)
+    path = write_truth(split, tmp_path)
     right = mark(read_submission(path, split), split)
     failed = mark(read_submission(write(_folder(tmp_path / "none") / "x.jsonl", lines_of(path)[:1]), split), split)
     for parting in PARTINGS:
@@ -116,7 +116,7 @@ def test_a_failure_is_the_worst_in_the_same_parts(
 def test_the_page_of_an_entry_draws_them(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """Medians of the problems, as stored; none of a secret split, and none of scores that were stored before."""
     split = splits[track]
-    lines = lines_of(split.track.write_truth(split, tmp_path / "in"))
+    lines = lines_of(write_truth(split, tmp_path / "in"))
     failed = [{"name": line["name"], "success": False} for line in lines[1:]]
     path = write(_folder(tmp_path / "none") / "x.jsonl", named([lines[0], *failed], "none", ("images",)))
     scored = add(tmp_path / "board", path, split, {})

@@ -11,8 +11,7 @@ from leaderboards import ASK_PICTURES, PLANES, files_below, jobs_here, lines_of,
 
 from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.board import entries_of
-from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.benchmark.leaderboard.submissions import check_submission
+from rsbench.benchmark.leaderboard.submissions import check_submission, write_truth
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.storage.files import read_depth
 
@@ -34,7 +33,7 @@ def test_cards_run_and_go_on(
     ran = run_here("leaderboard", "run", track, *where, *cards)
     assert ran.returncode == 0, ran.stderr
     assert run_here("leaderboard", "oracles", track, *where).returncode == 0
-    split = dataset_split(TRACKS[track], smoke_dataset)
+    split = TRACKS[track].split(smoke_dataset)
     found = {e.header.method: e for e in entries_of(tmp_path / "board", split.track.id, split.name)}
     assert {*entries, "truth"} < set(found)
     made = tmp_path / "board" / ".rsbench" / "runs" / split.track.id / split.name / entries[0]
@@ -83,7 +82,7 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
     cards = [word for name in ("level", "odd") for word in ("--entry", tmp_path / f"{name}.toml")]
     ran = run_here("leaderboard", "run", "depth", *where, *cards)
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(TRACKS["depth"], planes)
+    split = TRACKS["depth"].split(planes)
     found = {e.header.method: e for e in entries_of(tmp_path / "board", "depth-1", split.name)}
     depth = read_depth(found["level"].folder / "pictures" / "planes.0" / "left_1.exr")
     np.testing.assert_allclose(depth, RIG.camera.fx * RIG.baseline / 5.0, rtol=1e-6)
@@ -92,7 +91,7 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
     answers = lines_of(found["odd"].folder / "predictions.jsonl")[1:]
     assert all("not today" in str(answer["reason"]) for answer in answers)
     # A damaged picture is one line on the command line too, and the board stays as it is.
-    path = split.track.write_truth(split, tmp_path / "mine")
+    path = write_truth(split, tmp_path / "mine")
     pictures_of(path)[0].write_bytes(b"no picture")
     before = files_below(tmp_path / "board")
     assert_refused(run_here("leaderboard", "submit", path, *where), "left_1.exr: damaged or not an EXR file")
@@ -106,11 +105,11 @@ def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None
     """Of a public split the truth, which is in order as it stands; of a secret one none of its files."""
     export = ("leaderboard", "export", track, "--data", planes, "--out")
     assert run_here(*export, tmp_path / "open").returncode == 0
-    split = dataset_split(TRACKS[track], planes)
+    split = TRACKS[track].split(planes)
     assert check_submission(tmp_path / "open" / "truth.jsonl", split).faults == ()
     assert run_here(*export, tmp_path / "closed", "--secret").returncode == 0
     told = set(files_below(tmp_path / "closed").values())
     for truth in split.truths:
         assert truth.pictures is not None
-        assert not told & {truth.pictures.path(each).read_bytes() for each in truth.pictures.asked}
+        assert not told & {truth.pictures.path(each).read_bytes() for each in truth.pictures.requested}
     assert (planes / "planes" / "rs" / "left_2.png").read_bytes() in told

@@ -18,9 +18,14 @@ from analytic_dataset import write_analytic_dataset
 from leaderboards import ASK_PICTURES, PLANES, lines_of, pictures_of, write
 
 from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
-from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.standings import standings
-from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
+from rsbench.benchmark.leaderboard.submissions import (
+    check_submission,
+    read_submission,
+    write_oracles,
+    write_template,
+    write_truth,
+)
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.motion_models import LinearMotion
@@ -53,7 +58,7 @@ def _each_frame(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
 def test_the_truth_is_best_and_nothing_is_worst(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """No score of any other lies outside; the order of answers does not matter."""
     split = splits[track]
-    two = islice(split.track.oracles(split, tmp_path), 2)  # the third takes seconds, and is scored below
+    two = islice(write_oracles(split, tmp_path), 2)  # the third takes seconds, and is scored below
     found = {path.parent.name: _scores(path, split) for path in two}
     path = tmp_path / "truth" / "predictions.jsonl"
     head, *answers = lines_of(path)
@@ -79,7 +84,7 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
     """Pixel by pixel, of a map that is off by known disparities and does not know a part."""
     split = splits["depth"]
     rng = np.random.default_rng(0)
-    path = split.track.write_truth(split, tmp_path)
+    path = write_truth(split, tmp_path)
     off = rng.choice([0.0, 0.6, 1.4, -2.5, 5.0], (80, 96))
     known = rng.random((80, 96)) > 0.2
     product = RIG.camera.fx * RIG.baseline
@@ -110,17 +115,15 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
 def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: Path) -> None:
     """Ten steps of grey everywhere, a picture that is moved by two pixels, and one that is half drawn."""
     split = splits["correction"]
-    brighter = _scores(
-        _each_frame(split.track.write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10)), split
-    )
+    brighter = _scores(_each_frame(write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10)), split)
     for name in ("psnr", "psnr_all", "psnr_covered", "psnr_first", "psnr_middle"):
         np.testing.assert_allclose(brighter[name], 20.0 * np.log10(25.5), rtol=1e-9)
     moved = _scores(
-        _each_frame(split.track.write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1)), split
+        _each_frame(write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1)), split
     )
     assert np.all(np.abs(moved["epe_px"] - 2.0) < 0.3)  # dense flow is some tenths of a pixel wrong
     assert np.all(moved["ssim"] < brighter["ssim"])
-    path = split.track.write_truth(split, tmp_path / "c")
+    path = write_truth(split, tmp_path / "c")
     for picture in pictures_of(path):
         image = read_png(picture)
         alpha = np.zeros(image.shape[:2], np.uint8)
@@ -141,7 +144,7 @@ def test_the_common_pixels_are_those_that_the_frame_saw(splits: dict[str, Split]
 
     truth = splits["correction"].truths[1]
     assert truth.pictures is not None
-    for each, common in zip(truth.pictures.asked, truth.pictures.commons(), strict=True):
+    for each, common in zip(truth.pictures.requested, truth.pictures.commons(), strict=True):
         sequence = truth.pictures.sequence
         pose = RIG.cam_from_world(truth.motion, truth.shutter.time_after(each.row, 1, "left"), "left")
         z = sequence.depth("gs", "left", 1, each.row)[..., None]
@@ -175,7 +178,7 @@ FRAME_SLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def test_slips_are_told(words: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """And of a secret truth only what needs no truth."""
     split = splits["depth" if words in DEPTH_SLIPS else "correction"]
-    path = split.track.write_truth(split, tmp_path)
+    path = write_truth(split, tmp_path)
     if words in DEPTH_SLIPS:
         _each_depth(path, DEPTH_SLIPS[words])
     else:
@@ -190,19 +193,19 @@ def test_what_is_nearly_right_is_not_called_a_slip(splits: dict[str, Split], tmp
     """Noise of 3 %, a map that is 2 % too large, and frames with noise."""
     rng = np.random.default_rng(0)
     path = _each_depth(
-        splits["depth"].track.write_truth(splits["depth"], tmp_path / "a"),
+        write_truth(splits["depth"], tmp_path / "a"),
         lambda z: 1.02 * z * np.exp(0.03 * rng.standard_normal(z.shape)),
     )
     assert check_submission(path, splits["depth"]).notes == ()
     path = _each_frame(
-        splits["correction"].track.write_truth(splits["correction"], tmp_path / "b"),
+        write_truth(splits["correction"], tmp_path / "b"),
         lambda image: np.clip(image + rng.normal(0.0, 12.0, image.shape), 0, 255).astype(np.uint8),
     )
     assert check_submission(path, splits["correction"]).notes == ()
 
 
 def test_exchanged_rows_are_told(splits: dict[str, Split], tmp_path: Path) -> None:
-    path = splits["correction"].track.write_truth(splits["correction"], tmp_path)
+    path = write_truth(splits["correction"], tmp_path)
     for folder in (tmp_path / "pictures").iterdir():
         (folder / "left_1_first.png").rename(folder / "x")
         (folder / "left_1_middle.png").rename(folder / "left_1_first.png")
@@ -213,14 +216,14 @@ def test_exchanged_rows_are_told(splits: dict[str, Split], tmp_path: Path) -> No
 
 @pytest.mark.parametrize("track", ASK_PICTURES)
 def test_the_template_is_in_order(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
-    splits[track].track.write_template(splits[track], path := tmp_path / "predictions.jsonl")
+    write_template(splits[track], path := tmp_path / "predictions.jsonl")
     assert check_submission(path, splits[track]).faults == ()
 
 
 def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path) -> None:
     """The lines of the document: half a step of rounding is all that is lost."""
     split = splits["depth"]
-    path = split.track.write_truth(split, tmp_path)
+    path = write_truth(split, tmp_path)
     for picture in pictures_of(path):
         depth = read_depth(picture)
         picture.unlink()
@@ -237,7 +240,7 @@ def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path)
 
 
 def _submitted(board: Path, split: Split, folder: Path, method: str, factor: float = 1.0) -> None:
-    path = _each_depth(split.track.write_truth(split, folder / method), lambda z: factor * z)
+    path = _each_depth(write_truth(split, folder / method), lambda z: factor * z)
     head, *answers = lines_of(path)
     add(board, write(path, [{**head, "method": method, "uses": ["images"]}, *answers]), split, {})
 
@@ -296,10 +299,10 @@ def test_another_dataset_is_another_split(planes: Path, splits: dict[str, Split]
         twins=(40,),
         true_motion=LinearMotion(MOTION.w, -MOTION.d),
     )
-    assert dataset_split(TRACKS["pose"], tmp_path).name == dataset_split(TRACKS["pose"], planes).name
-    split = dataset_split(TRACKS["depth"], tmp_path)
+    assert TRACKS["pose"].split(tmp_path).name == TRACKS["pose"].split(planes).name
+    split = TRACKS["depth"].split(tmp_path)
     assert split.name != splits["depth"].name
-    path = split.track.write_truth(split, tmp_path / "truth")
+    path = write_truth(split, tmp_path / "truth")
     true = tmp_path / "planes" / "rs_depth" / "left_2.exr"
     write_depth(true, 1.01 * read_depth(true))
     with pytest.raises(RsbenchError, match=r"left_2\.exr: is not the file that dataset\.json names"):
@@ -311,4 +314,4 @@ def test_cameras_of_other_kinds_are_refused(planes: Path, tmp_path: Path) -> Non
     path = tmp_path / "copy" / "planes" / "sequence.json"
     path.write_text(json.dumps({**json.loads(path.read_text("utf-8")), "scan": "bottom"}), "utf-8")
     with pytest.raises(RsbenchError, match="is of cameras without a lens that read rows together"):
-        dataset_split(TRACKS["depth"], tmp_path / "copy")
+        TRACKS["depth"].split(tmp_path / "copy")

@@ -13,8 +13,7 @@ from leaderboards import lines_of
 
 from rsbench.benchmark.leaderboard.correction_tracks import TrueFrame, placed, seen_alike
 from rsbench.benchmark.leaderboard.pictures import parts_within
-from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
 from rsbench.benchmark.leaderboard.track import mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.pipeline.correction_options import CorrectionOptions
@@ -96,10 +95,9 @@ def test_filters_gain_nothing(shear: float) -> None:
 
 
 def test_oracles_have_their_places(planes: Path, tmp_path: Path) -> None:
-    split = dataset_split(TRACKS["correction-2"], planes)
+    split = TRACKS["correction-2"].split(planes)
     found = {
-        path.parent.name: mark(read_submission(path, split), split)
-        for path in split.track.oracles(split, tmp_path)
+        path.parent.name: mark(read_submission(path, split), split) for path in write_oracles(split, tmp_path)
     }
     # A picture on itself: the top of an uneven correlation is no more than 0.01 px from the middle.
     assert np.all(found["truth"]["placed"] > 0.995) and np.all(found["truth"]["misplaced"] < 0.005)
@@ -165,13 +163,12 @@ def test_filters_gain_next_to_nothing_in_looks() -> None:
 
 
 def test_the_score_is_the_product_and_the_truth_has_it_all(planes: Path, tmp_path: Path) -> None:
-    split = dataset_split(TRACKS["correction-3"], planes)
+    split = TRACKS["correction-3"].split(planes)
     found = {
-        path.parent.name: mark(read_submission(path, split), split)
-        for path in split.track.oracles(split, tmp_path)
+        path.parent.name: mark(read_submission(path, split), split) for path in write_oracles(split, tmp_path)
     }
     for scores in found.values():
         np.testing.assert_allclose(scores["corrected"], scores["placed"] * scores["picture"], rtol=1e-12)
-        np.testing.assert_allclose(scores["uncorrected"], 1.0 - scores["corrected"], atol=1e-12)
+        np.testing.assert_allclose(scores["shortfall"], 1.0 - scores["corrected"], atol=1e-12)
     assert np.all(found["truth"]["picture"] > 1.0 - 1e-9)
     assert np.all(found["fusion-true"]["corrected"] > found["uncorrected"]["corrected"])

@@ -10,9 +10,8 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 from leaderboards import PLANES, jobs_here
 
-from rsbench.benchmark.leaderboard import running
+from rsbench.benchmark.leaderboard import motion_tracks, running
 from rsbench.benchmark.leaderboard.board import entries_of, restore, splits_of
-from rsbench.benchmark.leaderboard.splits import dataset_split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.cli import generate, reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
@@ -53,7 +52,7 @@ def test_one_command_makes_all_boards_and_goes_on(tmp_path: Path, monkeypatch: p
     page = (folder / "site" / "index.html").read_text("utf-8")
     assert all(f"{protocol}--{split}" in page for protocol, split in splits.items())
     # What is stored of frames scores as it did; a second run answers nothing again.
-    split = dataset_split(TRACKS["pose-2"], frames)
+    split = TRACKS["pose-2"].split(frames)
     restore(folder / "predictions" / "pose-2", split, tmp_path / "again")
     first, again = (
         {
@@ -73,6 +72,6 @@ def test_entries_of_laws_answer_what_is_asked() -> None:
     for protocol, names in entries.items():
         TRACKS[protocol].load(names)
         assert len(set(names)) == len(names)
-    choosers = {protocol for protocol, names in entries.items() if running.CHOOSES in names}
+    choosers = {protocol for protocol, names in entries.items() if motion_tracks.CHOOSES in names}
     assert choosers == {"points-2", "pose-2", "readout-3"} and entries["points-2"] == entries["pose-2"]
     assert "gyro" not in entries["correction-3"]

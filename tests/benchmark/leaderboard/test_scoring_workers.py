@@ -11,9 +11,9 @@ import pytest
 from leaderboards import lines_of, named, pictures_of, write
 
 from rsbench.benchmark.leaderboard.board import FILES, ORACLES, add, add_all, entries_of, rescore
-from rsbench.benchmark.leaderboard.picture_track import _serve_scores
-from rsbench.benchmark.leaderboard.submissions import read_submission
-from rsbench.benchmark.leaderboard.track import Split, mark_all
+from rsbench.benchmark.leaderboard.picture_track import _serve_rows
+from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles, write_truth
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import EntryFailure, decode, encode
 from rsbench.storage.files import read_png, write_depth, write_png
@@ -22,7 +22,7 @@ from rsbench.storage.files import read_png, write_depth, write_png
 def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path: Path) -> None:
     """Of frames that are moved and noisy, so that no score is a round number; and scored again by one."""
     split, rng = splits["correction"], np.random.default_rng(0)
-    path = split.track.write_truth(split, tmp_path)
+    path = write_truth(split, tmp_path)
     for picture in pictures_of(path):
         image = np.roll(read_png(picture), 1, axis=1) + rng.normal(0.0, 9.0, (80, 96, 3))
         write_png(picture, np.clip(image, 0, 255).astype(np.uint8))
@@ -46,7 +46,7 @@ def test_entries_that_are_scored_together_score_as_alone(
 ) -> None:
     """The truth, which the board has alone too, beside two that know less; and each process shares it anew."""
     split = splits[track]
-    paths = list(split.track.oracles(split, tmp_path / "oracles"))
+    paths = list(write_oracles(split, tmp_path / "oracles"))
     for path in paths:
         add(tmp_path / "alone", path, split, {"command": ORACLES})
     for workers in (1, 2):
@@ -61,7 +61,7 @@ def test_entries_that_are_scored_together_score_as_alone(
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
-    split, path = splits["depth"], splits["depth"].track.write_truth(splits["depth"], tmp_path)
+    split, path = splits["depth"], write_truth(splits["depth"], tmp_path)
     scored = list[str]()
 
     def stop(name: str) -> None:
@@ -83,18 +83,16 @@ def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], 
 def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
     """A picture that went after the file was read: the other entry is scored."""
     split = splits["depth"]
-    broken, whole = (
-        read_submission(split.track.write_truth(split, tmp_path / name), split) for name in ("broken", "whole")
-    )
+    broken, whole = (read_submission(write_truth(split, tmp_path / name), split) for name in ("broken", "whole"))
     pictures_of(broken.folder / "predictions.jsonl")[0].unlink()
-    fault, table = mark_all([broken, whole], split, workers)
+    fault, table = split.track.mark([broken, whole], split, workers)
     assert isinstance(fault, RsbenchError) and "left_1.exr: is missing" in str(fault)
     assert isinstance(table, pd.DataFrame) and np.all(table["bad_1"] == 0.0)
 
 
 def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Split], tmp_path: Path) -> None:
     split = splits["depth"]
-    paths = list(split.track.oracles(split, tmp_path / "oracles"))
+    paths = list(write_oracles(split, tmp_path / "oracles"))
     write_depth(pictures_of(paths[0])[0], np.full((80, 96), -1.0, dtype=np.float32))
     with pytest.raises(RsbenchError, match=r"left_1\.exr: 7680 pixels are negative"):
         add_all(tmp_path / "board", paths, split, {"command": ORACLES})
@@ -109,7 +107,7 @@ def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_p
     assert first.pictures is not None
     changed = replace(first.pictures, files=dict.fromkeys(first.pictures.files, "0" * 64))
     broken = replace(split, truths=(replace(first, pictures=changed), second))
-    run = _serve_scores([read_submission(split.track.write_truth(split, tmp_path), split)], broken)
+    run = _serve_rows([read_submission(write_truth(split, tmp_path), split)], broken)
     with pytest.raises(EntryFailure, match=r"is not the file that dataset\.json names"):
         run(first.name)
     (row,) = run(second.name)

@@ -14,8 +14,7 @@ from leaderboards import lines_of, named, truth_lines, write
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.publishing import drawn_split
 from rsbench.benchmark.leaderboard.readout_tracks import best_constant
-from rsbench.benchmark.leaderboard.splits import dataset_split
-from rsbench.benchmark.leaderboard.submissions import read_submission
+from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core import so3
@@ -55,7 +54,7 @@ def test_ranges_of_ratios_that_are_none_are_refused(limits: str, tmp_path: Path)
 
 def test_no_constant_wins_the_ratio(readouts: Split, tmp_path: Path) -> None:
     """The best of all constants, found by trying a thousand, has what the oracle has, and that is little."""
-    paths = {path.parent.name: path for path in readouts.track.oracles(readouts, tmp_path)}
+    paths = {path.parent.name: path for path in write_oracles(readouts, tmp_path)}
     assert list(paths) == ["truth", "constant"]
     scores = {name: mark(read_submission(path, readouts), readouts)["auc_r10"] for name, path in paths.items()}
     ratios = np.array([truth.shutter.readout_ratio for truth in readouts.truths])
@@ -68,7 +67,7 @@ def test_no_constant_wins_the_ratio(readouts: Split, tmp_path: Path) -> None:
 
 
 def test_ratios_that_repeat_are_refused(smoke_dataset: Path, tmp_path: Path) -> None:
-    counts = Counter(truth.shutter.readout_ratio for truth in dataset_split(TRACKS["pose"], smoke_dataset).truths)
+    counts = Counter(truth.shutter.readout_ratio for truth in TRACKS["pose"].split(smoke_dataset).truths)
     assert max(counts.values()) > 1
     ran = run_here("leaderboard", "template", "readout-2", "--data", smoke_dataset)
     assert_refused(ran, "sequences have the readout ratio")
@@ -92,7 +91,7 @@ def test_who_chooses_a_law_runs_on_frames(smoke_dataset: Path, tmp_path: Path) -
     board = ("--board", tmp_path / "board", "--data", smoke_dataset)
     ran = run_here("leaderboard", "run", "pose-2", "--entry", "rs-stereo-auto", *board)
     assert ran.returncode == 0, ran.stderr
-    split = dataset_split(TRACKS["pose-2"], smoke_dataset)
+    split = TRACKS["pose-2"].split(smoke_dataset)
     (entry,) = entries_of(tmp_path / "board", "pose-2", split.name)
     assert entry.header.motion_model == "chosen" and entry.scores["success"].all()
     assert np.all(entry.scores["e_R_deg"] < [float(truth.facts["rotation_deg"]) for truth in split.truths])

@@ -14,7 +14,7 @@ from leaderboards import small_split
 
 from rsbench.benchmark.leaderboard.inputs import check_place, write_inputs
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
-from rsbench.benchmark.leaderboard.splits import dataset_split, exact_problem, points_split, simulated_problem
+from rsbench.benchmark.leaderboard.splits import exact_problem, simulated_problem
 from rsbench.benchmark.leaderboard.submissions import read_submission
 from rsbench.benchmark.leaderboard.track import mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
@@ -26,7 +26,7 @@ from rsbench.storage.files import load_arrays
 
 def test_problems_are_of_their_truth() -> None:
     """Without noise and outliers each track is a point: its four pixels are those that the true motion shows."""
-    truth = next(t for t in points_split(TRACKS["points"]).truths if t.facts["outliers"] == 0.0)
+    truth = next(t for t in TRACKS["points"].split(None).truths if t.facts["outliers"] == 0.0)
     tracks = simulated_problem(1, int(truth.name[1:])).correspondences.tracks
     assert len(tracks) == truth.facts["points"]
     noise = float(truth.facts["noise_px"])
@@ -43,17 +43,17 @@ def test_problems_are_of_their_truth() -> None:
 def test_secrets_make_splits_of_their_own(tmp_path: Path) -> None:
     protocol = TRACKS["points"]
     (tmp_path / "seed").write_text("a text that nobody can guess\n", "utf-8")
-    secret, again = (points_split(protocol, tmp_path / "seed") for _ in range(2))
-    assert secret.fingerprint == again.fingerprint != points_split(protocol).fingerprint
+    secret, again = (protocol.split(None, tmp_path / "seed") for _ in range(2))
+    assert secret.fingerprint == again.fingerprint != protocol.split(None).fingerprint
     assert secret.name.startswith("test-") and not secret.public
     (tmp_path / "seed").write_text("12345", "utf-8")
     with pytest.raises(RsbenchError, match="seed: holds 5 characters"):
-        points_split(protocol, tmp_path / "seed")
+        protocol.split(None, tmp_path / "seed")
 
 
 def test_the_public_split_stays_as_it_was_announced() -> None:
     """Predictions of others are of these problems: what changes them is another protocol."""
-    assert points_split(TRACKS["points"]).name == "dev-f88c896f"
+    assert TRACKS["points"].split(None).name == "dev-f88c896f"
 
 
 def test_all_inputs_are_the_same_numbers(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_all_inputs_are_the_same_numbers(tmp_path: Path) -> None:
 
 def test_a_secret_split_is_exported_without_its_truth(tmp_path: Path) -> None:
     (tmp_path / "seed").write_text("a text that nobody can guess", "utf-8")
-    split = points_split(TRACKS["points"], tmp_path / "seed")
+    split = TRACKS["points"].split(None, tmp_path / "seed")
     write_inputs(split, iter([simulated_problem(3, 0)]), tmp_path / "out")
     told = b"".join(path.read_bytes() for path in (tmp_path / "out").iterdir() if path.suffix != ".npz")
     assert not (tmp_path / "out" / "truth.jsonl").exists()
@@ -91,7 +91,7 @@ def test_motions_at_the_bound_err_as_it_says(tmp_path: Path) -> None:
     """Their squared errors over the bound's covariance are chi-squared with six degrees of freedom: mean 6."""
     split = small_split(40)
     path = tmp_path / "x.jsonl"
-    path.write_text(bound_text(split, 1), "utf-8")
+    path.write_text(bound_text(split, tmp_path), "utf-8")
     scores = mark(read_submission(path, split), split)
     assert scores["success"].all()
     assert abs(scores["nees"].mean() - 6.0) < 3.0 * np.sqrt(12.0 / 40)  # its variance is 12
@@ -108,7 +108,7 @@ def test_motions_at_the_bound_err_as_it_says(tmp_path: Path) -> None:
 def test_a_secret_dataset_is_exported_without_its_truth(smoke_dataset: Path, tmp_path: Path) -> None:
     where = ("--data", smoke_dataset, "--out", tmp_path / "out", "--secret")
     assert run_here("leaderboard", "export", "pose-own", *where).returncode == 0
-    split = dataset_split(TRACKS["pose-own"], smoke_dataset)
+    split = TRACKS["pose-own"].split(smoke_dataset)
     files = [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".csv", ".json", ".jsonl")]
     told = b"".join(path.read_bytes() for path in files)
     assert len(files) == 3 and split.fingerprint.encode() in told

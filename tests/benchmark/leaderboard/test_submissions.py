@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from leaderboards import Line, named, small_split, truth_lines, write
 
-from rsbench.benchmark.leaderboard.motion_tracks import PointsTrack, motion_row
-from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, template_text
+from rsbench.benchmark.leaderboard.motion_tracks import motion_row
+from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_template
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
@@ -165,7 +165,7 @@ def test_every_fault_is_told(tmp_path: Path) -> None:
 
 def test_the_template_and_the_truth_are_in_order(tmp_path: Path) -> None:
     path = tmp_path / "template.jsonl"
-    path.write_text(template_text(SPLIT, PointsTrack.example), "utf-8")
+    write_template(SPLIT, path)
     for file in (path, write(tmp_path / "truth.jsonl", TRUTH)):
         found = check_submission(file, SPLIT)
         assert (found.faults, found.notes) == ((), ()) and found.submission is not None

@@ -13,7 +13,7 @@ from leaderboards import Line, lines_of, named, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.publishing import drawn_split
-from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
+from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_truth
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.benchmark.trajectory_methods import METHODS
@@ -67,7 +67,7 @@ def _scored(split: Split, folder: Path, **answer: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("ratio", [0.0, 0.6, 1.0])
 def test_the_truth_has_the_best_of_everything(tmp_path: Path, ratio: float) -> None:
     split = TRACK.split(_dataset(tmp_path / "data", ratio=ratio))
-    row = mark(read_submission(TRACK.write_truth(split, tmp_path), split), split).iloc[0]
+    row = mark(read_submission(write_truth(split, tmp_path), split), split).iloc[0]
     assert row["auc_way"] > 1.0 - 1e-6 and row["auc_rows"] > 1.0 - 1e-6 and row["failure"] == 0.0
     assert row["way_95_deg"] < 1e-6 and row["ate_mm"] < 1e-4 and row["rpe_mm"] < 1e-4
     # Of points between the lines that are told: a spline through them.
@@ -116,7 +116,7 @@ GOOD = _poses(np.arange(float(FRAMES)))
         ({"poses": [GOOD[0], [1e-30, *GOOD[1][1:]], *GOOD[1:]]}, "1e-30 frame periods apart"),
         ({"poses": GOOD[:-1]}, "must reach from 0 to 4"),
         ({"poses": [[row[0] + 0.1, *row[1:]] for row in GOOD]}, "0.1|time 0"),
-        ({"poses": GOOD, "w": [0.0, 0.0, 0.0]}, "w: is not asked"),
+        ({"poses": GOOD, "w": [0.0, 0.0, 0.0]}, "w: does not belong here"),
     ],
 )
 def test_what_is_no_trajectory_is_a_fault(
