@@ -454,7 +454,7 @@ def _true_pictures(folder: Path, sequences: Iterable[Sequence], track: Track) ->
                 f"{folder}: {sequence.name}: {track.id} is of cameras without a lens that read rows together "
                 "from the top, and of scenes that stand still; choose another dataset"
             )
-        requested, files = track.requested(sequence), {}
+        requested, files = track.requested(sequence), dict[str, str]()
         views = [(side, frame + sequence.first) for side, frame in VIEWS]
         names = [picture_file("rs", *view, depth=depth) for depth in (False, True) for view in views]
         names += [each.file for each in requested]

@@ -210,7 +210,7 @@ def test_our_solver_finds_the_ratio_that_it_is_not_told() -> None:
         problem = simulated_problem(1, int(truth.name[1:]))
         blind = replace(problem, known_shutter=problem.shutter.with_ratio(0.0))
         with SolverRunner() as runner:
-            answer = TRACKS["readout"].answer(blind, entry, runner)
+            answer = TRACKS["readout"].answer(blind, entry, runner)  # pyrefly: ignore[missing-attribute]
         assert abs(answer["readout_ratio"] - truth.shutter.readout_ratio) < 0.05
 
 
