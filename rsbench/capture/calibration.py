@@ -43,30 +43,14 @@ TERMS = (
 """px by which disparities are too large, as a function 1, x, y, xx, xy, yy of the ray; row differences, px, as one
 of 1, x, y, xy (to first order errors of the relative rotation and focal lengths); k1, p2, p1 of both lenses; the
 share by which both focal lengths are too short."""
-
-
 OFFSET = 0
-
-
 BENDS, ROWS, LENS, FOCAL = slice(1, 6), slice(6, 10), slice(10, 13), 13
-
-
 RADIAL = LENS.start
-
-
 STRETCHING = (RADIAL, FOCAL)
 """Those that change how many pixels an error of a ray is by more than a hundredth."""
-
-
 _STEP = 1e-5
-
-
 _STEPS = _STEP * np.eye(2)
-
-
 NO_ERRORS = (0.0,) * len(TERMS)
-
-
 _HALF: dict[Side, float] = {"left": 0.5, "right": -0.5}
 
 
@@ -186,27 +170,15 @@ def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[floa
 
 _FEWEST = 30
 """Left-right matches below which nothing is said of the rig."""
-
-
 _FAR_OFF_PX, _ROUNDS, _SIGMAS, _LEAST_PX = 10.0, 8, 3.0, 0.05
-
-
 _SAME_ROW = 0.68
 """Share of matches on the same row: at least 0.80 in real rectified pairs, at most 0.56 in those of two times."""
-
-
 _OPPOSITE = 0.5
 """Share of negative disparities: at most 0.03 in real pairs in order, at least 0.86 in exchanged ones."""
-
-
 _BACK_PX = 1.0
 """Disparities above this have a sign: it is beyond noise and the errors of most calibrations."""
-
-
 _DISTORTED = 0.1
 """Coefficient of radial distortion of no rectified pair: at most 0.03 in real ones, -1/3 in f-theta lenses."""
-
-
 _CLEARLY = 5.0
 
 

@@ -26,18 +26,10 @@ from rsbench.solvers.engine.residuals import add_pairs, add_tracks
 
 Start = Literal["global", "top", "bottom", "left", "right"]
 """The side of the image at which a camera begins to read, or ``global`` for all lines at once."""
-
-
 _FRAMES = np.array([0.0, 1.0])
-
-
 _RATIO, _DELAY, _ACCELERATION, _FIRST_ERROR = range(4)
 """Places of the unknowns; after the first error of the calibration come the others."""
-
-
 STARTS: tuple[Start, ...] = get_args(Start)
-
-
 _FRAMES_OF_TRACKS, _LATE_OF_TRACKS = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0])
 """Of the ends of a track: the frame, and 1 of those of the right camera."""
 
@@ -73,8 +65,6 @@ class Scans:
 
 
 GLOBAL = Scans("global", "global")
-
-
 ALL_SCANS = tuple(Scans(*starts) for starts in product(STARTS, STARTS))
 """All 25."""
 
@@ -306,27 +296,15 @@ def _late(rig: StereoRig, scan: Scan) -> RollingShutter:
 
 RATIO, DELAY, ACCELERATION = range(3)
 """Places of the first unknowns: readout ratio, delay of the right camera (frame periods), k."""
-
-
 CALIBRATION = slice(3, 3 + len(TERMS))
 """Places of what the calibration is wrong by, see ``calibration.TERMS``."""
-
-
 UNKNOWNS = CALIBRATION.stop
-
-
 LEAST_RATIO = 0.05
 """Readout ratios below this are taken for a global shutter's."""
-
-
 MODELS = ("linear", "twist", "inertial", "accelerated")
 """Motion models that are tried."""
-
-
 DELAY_SIGMA = 0.3
 """Frame periods by which a right camera that is late or early is so: what is expected before matches are seen."""
-
-
 ACCELERATION_SIGMA = 0.2
 """Standard deviation of k that is expected of motions that accelerate."""
 
@@ -393,37 +371,17 @@ class Known:
 
 BEYOND_RATIO = 1.2
 """No ratio is beyond 1, but the top of what noise makes of one near 1 may be."""
-
-
 _MAX_TRANSLATION_M = 50.0
-
-
 _LEAST = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], *3 * [-2.0], -0.4])
-
-
 _MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0], 0.4])
-
-
 _LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2], 0.1])
-
-
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e6
 """A motion makes up for most of a wrong ratio: more damping than this would hold the ratio where it is."""
-
-
 _MOTION = 6
-
-
 _STRETCHING = tuple(CALIBRATION.start + term for term in STRETCHING)
-
-
 _STEP = 1e-7
-
-
 _OVER = 5.0
 """Times Newton's prediction that a cost may fall, at most."""
-
-
 _MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
 """Median of squared normal errors, one or five together; and what exact matches are taken for."""
 

@@ -52,22 +52,12 @@ COARSE: tuple[tuple[Scan, float], ...] = (
     ("right", 0.5),
 )
 """Shutters of cameras that read together, under which a motion is looked for: between them points err little."""
-
-
 _LAG_SAMPLES, _LAG_ROUNDS = 400, 6
-
-
 _NOISE_PX, _TIME_SIGMA = 0.5, 0.5
 """Expected noise of a row difference, and expected size of a difference of times, frame periods."""
-
-
 _LEAST_PX = 0.1
-
-
 _LONGEST_LEAP = 0.75
 """Of the image's width or height, over a frame period: far from the reciprocal of the largest ratio, 1 / 1.2."""
-
-
 _BEND, _FAR = 0.1, 40.0
 """Error of a lag, frame periods, and squared deviations beyond which scans disagree with it."""
 
@@ -214,50 +204,26 @@ def _columns_of_lag(scans: Scans) -> FloatArray:
 
 _SCREENED = 160
 """Measurements by which most scans are put aside."""
-
-
 _CLOSE = 30.0
 """Differences of the logarithm of the likelihood beyond which a hypothesis is put aside after that."""
-
-
 _LIKELY = 12.0
 """The same, beyond which one is left out in the end: of matches whose errors are independent."""
-
-
 _MOST_SCALE, _FIRST_NU = 10.0, 4.0
 """Scale of the errors, px, at most, and their tails, before their distribution is found."""
-
-
 _FALLS, _STEADY = 10, 0.9
-
-
 _UNSETTLED = 5.0
 """Times as far off as that a hypothesis may be before it is fitted at the scale of the best one."""
-
-
 _ROUGHLY = 1e-2
 """Of the squared scale: a decrease of the cost at which the screening stops."""
-
-
 _REACH = 10.0
 """As in ``heavy_tails``."""
-
-
 _TILES = (6, 4)
 """Columns and rows of tiles in which matches may err together."""
-
-
 _FIRST_REACH, _MOST_REACH, _LEAST_REACH = 0.02, 0.05, 0.001
 """Differences of the ratio by which the sharpness of a maximum is measured: about two deviations."""
-
-
 _SLOPE_ROUNDS = 5
-
-
 _SMALL_RATIO, _FAR_BETTER = 0.3, 0.5
 """Readout ratio that is nearly none, and errors over those of another fit that are far smaller."""
-
-
 _WIDE = 1.0
 """Standard deviation of a ratio of which the matches say nothing."""
 

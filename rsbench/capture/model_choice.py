@@ -16,8 +16,6 @@ from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
 
 AUTO = "auto"
-
-
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Differences of motions that say nothing, as between all models under a global shutter."""
 

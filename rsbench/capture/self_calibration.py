@@ -29,38 +29,22 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 
 _TELLING = 0.5
 """Standard deviation over the prior's, at most, of what is told."""
-
-
 _LEAST_TURN = np.deg2rad(0.25)
 """Per frame period: where a rig turns less, errors of the calibration say more of a focal length than the motion
 does, and it is not asked. From a straight drive (KITTI) it came out 6 % too long, at a stated deviation of 2 %."""
-
-
 _FEWEST_TURNS = 3
 """Windows of a rig whose rows show that its calibration errs: by their scatter alone is it known how much of that
 they take for a focal length (KITTI: single windows are off by up to eleven deviations)."""
-
-
 _LEFT_OVER = 0.03
 """Share of a focal length by which it is off, about, where the calibration errs in more than its terms hold: found
 4 % too short from a KITTI excerpt that turns, at a deviation of 1 % by the scatter of its windows."""
-
-
 _TOGETHER = np.array([2e-4, 2e-4])
 """Share of a focal length, and k1, by which the errors that matches of pictures share put them off: without it
 deviations of 21 pairs of traced frames were too small by a half (``benchmarks/wrong_cards.py``)."""
-
-
 _MOST_ROUNDS, _SETTLED = 4, 0.1
 """Behind a lens the error is linear only nearby: again from what was found, until it moves by few deviations."""
-
-
 _TERMS = [FOCAL, RADIAL]
-
-
 _LATER = "is found with the errors of the calibration that rows show"
-
-
 _OPEN = "as the card has it: the matches cannot tell; turn the rig, or give more frames"
 
 
@@ -196,40 +180,22 @@ def _turn(window: Window) -> float:
 PRIOR = 0.35
 """Standard deviation of the logarithm of a focal length over the width of the image, about 0: lenses from a half
 to two widths, of 90 to 28 degrees, are within two of them."""
-
-
 _MATCHES, _SAMPLES = 400, 100
 """Of a pair, and of samples of them: neighbours in dense flow err alike."""
-
-
 _MODELS = ("inertial", "accelerated")
-
-
 _NEARBY, _PAIR_ROUNDS = 0.3, 4
 """Share of a focal length that is found at once; one that is off by more is looked for again from there."""
-
-
 _LEAST_PAIR_TURN, _LEAST_PAIR_MOVED = np.deg2rad(1.0), 0.01
 """Per frame period, and the widths by which that moves the image: what turns less shows more of the errors of the
 flow than of a focal length, and a focal length that is far too short makes turns look large."""
-
-
 _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
 """Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
-
-
 _SHARED = 0.05
 """By which the pairs of a video err alike."""
-
-
 _LEAST_TURNING = 0.5
 """Share of the pairs: where few seem to turn, they seem so by what they err."""
-
-
 _BROKEN, _LEAST_GOOD = 3.0, 0.75
 """Prior deviations beyond which a pair shows its shaking alone, and the share that must not be so."""
-
-
 _TELLING_PAIRS = 0.65
 """Standard deviation over the prior's, at most, of what is told."""
 

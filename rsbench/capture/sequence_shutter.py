@@ -36,41 +36,23 @@ from rsbench.core.so3 import FloatArray
 
 _FIRST, _COARSE, _LEAST = 0.6, 0.15, 0.02
 """Where the search starts, its stride, and the least ratio that counts as one."""
-
-
 _KNOTS = 0.25
 """Frame periods between control poses to begin with: fine ones, for at a wrong ratio the way is rough."""
-
-
 _WIDE = Tails(3.0, 0.3)
 """Errors, px, of the search for the right stride: under those that refined matches have, a ratio that is far off
 is a fit of something else."""
-
-
 _FEWEST, _SOME, _TRACKS = 15, 60, 150
 """Tracks of a window, about: below which nothing is told, to tell the scanning, and the ratio."""
-
-
 _SHARES_ALONE = 0.5, 0.15
 """What a match of one camera's dense flow counts, to tell the scanning, and the ratio: neighbours err alike.
 Counted for one each, ratios of ten pieces of rendered video were off by 2.6 of their deviations (root of the mean
 square)."""
-
-
 _LEAST_SHARE = 0.2
 """Of the tracks must be right."""
-
-
 _PRECISION = 1e12
-
-
 _STEP, _STEPS, _ROUGH_STEPS = 0.05, 6, 2
-
-
 _NODES = np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
 """Deviations from the peak at which the evidence is summed."""
-
-
 _NOTHING = -1e12
 """Logarithm of evidence where there is no fit."""
 
@@ -265,8 +247,6 @@ def _smooth(x: FloatArray, y: FloatArray, at: FloatArray) -> FloatArray:
 
 LONGEST = 12
 """Successive windows that are looked at, at most: what is left open then is less than what noise leaves."""
-
-
 _TOGETHER = tuple(Scanning(scan=scan) for scan in ("top", "bottom", "left", "right"))
 
 
@@ -363,12 +343,8 @@ def _candidate(found: SequenceRatio, rig: StereoRig) -> Candidate:
 
 SUCCESSIVE = 6
 """Windows that are looked at."""
-
-
 _CHECKED_TRACKS = 200
 """Of each window, at most."""
-
-
 _FAR_BETTER = 0.8
 """Scale of the errors about a trajectory over that about motion models, below which these are wrong."""
 

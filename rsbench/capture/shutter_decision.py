@@ -41,31 +41,19 @@ from rsbench.solvers.refined import RefinedSolver
 OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 """Standard deviation of a ratio that frames are corrected with, at most; more where it moves no pixel by this."""
-
-
 _PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
 """Standard deviation of each error of a calibration over the size of the row differences, px: rows show some,
 and the others come from the same calibration. From 0.1 px on there are any to find, of as many left-right matches:
 rendered pairs show 0.02 px at most, two excerpts of KITTI odometry 1.1 px."""
-
-
 _LEAST_SIZE = 1e-3
 """px that 1 of a term moves a pixel by, at least: of an image of a narrow field there is little of the others."""
-
-
 _FROM_GLOBAL = 3.0
 """Deviations from 0 of a ratio, at least, of lines that are said to be read one after the other: a pair of KITTI,
 whose calibration errs, gave 0.25 +- 0.09 from the left, at a probability of 0.98."""
-
-
 _CLEARLY, LEAST_BACKWARDS, _NEAR = 0.999, 0.25, 0.2
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
-
-
 _FEW = 600
 """Tracks, or matches of one camera, that tell of most frames that time runs forward."""
-
-
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
 

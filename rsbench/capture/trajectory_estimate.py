@@ -57,16 +57,10 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 _ONE_SIGMA = 0.8413447460685429
-
-
 _JUDGED = 8
 """First windows, from which knots and prior are chosen."""
-
-
 _FEWEST, _LEAST_SHARE = 15, 0.2
 """Right tracks, and their share, from which on a window is supported by its own matches."""
-
-
 MOST_NOISE_PX = 10.0
 """Beyond which errors are no noise: random tracks leave some 20 px, and by that scale most of them are right."""
 
@@ -282,11 +276,7 @@ def trajectory_bound(
 
 _ADVANCE, _LAG = 6, 5
 """Windows that leave together, and those behind them that they wait for."""
-
-
 _FAR = 1_000_000
-
-
 _JUDGED_BY = 250
 """Tracks of a window, about, by which knots and prior are chosen."""
 

@@ -71,37 +71,19 @@ from rsbench.solvers.refined import RefinedSolver
 
 NORMAL = 1e9
 """Degrees of freedom of tails that are none."""
-
-
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
-
-
 _FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
-
-
 _FLAT_COST, _NEAR = 1e-3, 1.0
-
-
 _MANY = 300
 """Tracks from which on it pays to share them."""
-
-
 _LEAST_WIDTH = 5
 """Control poses that the prior ties, and a moment of a gyroscope."""
-
-
 ANCHORED = 1e4
 """Precision of the pose at time 0, in those of the most certain control pose."""
-
-
 _TELLING = 2.0
 """Accelerations that tracks must determine, at least, to say how strong they are."""
-
-
 _STRENGTHS = (1e-10, 1e2)
 """Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
-
-
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
 
 
@@ -434,8 +416,6 @@ def _strengths(
 
 _SOME = 250
 """Tracks of a window, about: enough to begin with."""
-
-
 _SUSPECT = 4.0
 """Times the error of a window whose motion is made of its neighbours', from which on its own is wrong."""
 
@@ -529,11 +509,7 @@ def _chained(rates: FloatArray, span: tuple[float, float], interval: float) -> C
 
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Frame periods."""
-
-
 _PRECISION = 1e12
-
-
 _WORTH = 1.0
 """Logarithm of evidence that another choice must gain."""
 

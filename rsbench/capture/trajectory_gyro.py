@@ -29,40 +29,22 @@ from rsbench.core.so3 import FloatArray
 _APART = 1 / 16
 """Frame periods: samples that are closer are taken together. A filter in the sensor makes their noise alike, and
 the mean over an eighth of a period blunts what a hand shakes."""
-
-
 _MOMENT = 1e-3
 """Half of the time over which the spline's turn is taken for its rate: far above rounding, far below a knot."""
-
-
 _BIAS = 1e-2
 """Standard deviation of the bias, rad per frame period, before anything is seen: 0.3 rad/s at 30 Hz."""
-
-
 _SHIFT, FARTHEST = 0.2, 0.5
 """Standard deviation of the shift of its clock, frame periods, before anything is seen, and the largest that is
 looked for: a quarter of the period of the fastest shakes of a hand."""
-
-
 _CROOKED, _MOST_CROOKED = 0.02, 0.3
 """Standard deviation of axes and scales before anything is seen, rad and relative, and the largest errors of them
 that are believed."""
-
-
 ERRORS = 13
-
-
 _EXPECTED = np.array([_BIAS] * 3 + [_SHIFT] + [_CROOKED] * 9)
-
-
 _LEAST_VARIANCE = 1e-12
 """rad^2 per frame period: far below that of any gyroscope, and above rounding."""
-
-
 _TELLING = 2.0
 """Errors beside those that the spline follows, at least, to say how large they are."""
-
-
 _UNLIKE, _NOISY = 0.3, 3.0
 """Root mean square of a gyroscope's errors, over that of how its rates vary and over that of its own noise, from
 which on both it contradicts the matches."""

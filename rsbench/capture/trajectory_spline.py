@@ -106,8 +106,6 @@ def band_inverse(lower: FloatArray) -> FloatArray:
 
 _ORDER = 4
 """Control poses that a time feels."""
-
-
 _SAME = 1e-9
 
 

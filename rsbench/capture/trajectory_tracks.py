@@ -29,24 +29,14 @@ from rsbench.core.so3 import FloatArray
 
 BEHIND = 1e12
 """Squared error, px^2, of a track whose point lies behind a camera."""
-
-
 _NEAREST = 1e-3
 """Least ratio of depths at two ends."""
-
-
 _POINT_STEPS = 2
 """Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
-
-
 _ROUGH_RHO = 3.0
 """1/m: deviation of inverse depths about 0 that is expected where a track does not show its own."""
-
-
 _UNCERTAIN = 0.3
 """px: what an expected inverse depth counts as much as."""
-
-
 END = 10
 """Numbers of an end."""
 
@@ -364,12 +354,8 @@ def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, 
 
 _TAILS = (3.0, 5.0, 10.0, 30.0)
 """Degrees of freedom to choose from, as in ``heavy_tails``."""
-
-
 REACH = 10.0
 """Errors, in scales, beyond which a track is wrong."""
-
-
 LEAST_SCALE_PX = 1e-3
 
 
@@ -410,12 +396,8 @@ def _likelihood(q: FloatArray, p: FloatArray, tails: Tails) -> float:
 
 
 IntArray = NDArray[np.int64]
-
-
 ENOUGH = 400
 """Tracks of a window from which on its pairs say little more, and take longer than all else."""
-
-
 LONGEST = 5
 """Frames of a track: more would couple more control poses for little."""
 

@@ -34,39 +34,21 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CERTAIN = 0.95
 """Probability of what is told."""
-
-
 MAX_SIGMA = 0.015
 """Standard deviation, at most, of a readout ratio that is told: 0.03 is then two of them."""
-
-
 FEWEST = 30
 """Matches between two times."""
-
-
 _LEAST_SHARE = 0.3
 """Of the matches, that must agree with what is told."""
-
-
 _NEARLY, _SMALL = 0.06, 0.15
 """Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
 the ratios that the matches then allow."""
-
-
 _STILL_PX = 1.0
-
-
 _UNLIKELY = 0.01
-
-
 _EXPECTED = {"top": 0.5, "global": 0.25, "bottom": 0.1, "left": 0.04, "right": 0.04}
 """Probability, before matches are seen, of cameras that read alike, by where they begin."""
-
-
 _APART, _ONE_GLOBAL = 0.06, 0.01
 """Probability of cameras that roll in different ways, and of one camera that rolls beside one that does not."""
-
-
 _LATE = 0.2
 """Probability, before matches are seen, that the right camera is late."""
 

@@ -37,20 +37,12 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 _NO_PRIOR = Prior(1.0, 1, np.inf, np.inf)
-
-
 _OF_A_LAW = 6.0
 """Parameters of a law, at least."""
-
-
 _FEWEST = 30
 """Tracks, from which on a spline is tried."""
-
-
 _KNOTS = 0.25
 """Frame periods between control poses."""
-
-
 _SHARE = 0.15
 """What a track counts beside the prior, and in the covariance. What rows of both frames shake alike hardly shows:
 tracks that err together by a tenth of a pixel, counted for more, turned it by degrees."""
@@ -161,27 +153,17 @@ def log_odds_of_opposite(
 
 _PRIOR = Prior(memory=0.25, smooth=1, rotation=1e-4, position=1e-2)
 """To begin with; its strength follows the matches."""
-
-
 _SHARE_OF_VIDEO = 0.5
 """What a track counts beside the prior, see ``TrajectoryOptions``: of many frames, and of two, where tracks that
 err together turn what hardly anything else holds."""
-
-
 _GAINED = 0.3
 """Logarithm of the likelihood that a match of two frames must gain, in the mean, for a way in place of a law.
 Neighbours err alike in dense flow, so that many of them count for one; of rendered motions by laws of constant
 speed it was 0.1 at most."""
-
-
 _OPEN_PX = 0.15
 """Deviation, root mean square, of where turns of the rows of a frame put what is far: above, two frames leave open
 how they shook."""
-
-
 _ROWS = 24
-
-
 _JUDGED_BY = 150
 """Matches of a window, about, by which the prior is found, and which of the others are right."""
 
