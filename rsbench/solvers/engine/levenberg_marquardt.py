@@ -1,14 +1,15 @@
-"""Levenberg-Marquardt on six parameters (w, v)."""
+"""Levenberg-Marquardt: on six parameters (w, v), and on any problem that makes its own damped steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from rsbench.core.so3 import FloatArray
 
+Place = TypeVar("Place")
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
 _LARGEST_DAMPING = 1e10
 _FLAT = 1e-10
@@ -110,3 +111,43 @@ def _clamped(theta: FloatArray, limit: float) -> FloatArray:
     if not length > limit:
         return theta
     return np.concatenate([theta[:3], theta[3:] * (limit / length)])
+
+
+class Problem(Protocol[Place]):
+    """A cost whose minimum is sought; a place holds parameters, and the cost and its derivatives there."""
+
+    def stepped(self, here: Place, damping: float, /) -> Place | None:
+        """Where a damped step leads; None where that is no better."""
+
+    def settled(self, before: Place, after: Place, /) -> bool:
+        """Whether a step was so small that it is the last."""
+
+
+class Damping(NamedTuple):
+    """How damping grows where a step is no better, and shrinks after one that is: tenfold, within limits."""
+
+    least: float
+    first: float
+    """The least one after a step that is no better."""
+    largest: float
+    """The descent ends where no step below it is better."""
+    dropped: float = 0.0
+    """Up to here damping shrinks to ``least`` at once."""
+
+
+def descend(problem: Problem[Place], here: Place, steps: int, damping: Damping) -> Place:
+    """At most so many damped steps from a place, each to a better one."""
+    now = damping.least
+    for _ in range(steps):
+        there = None
+        while there is None and now < damping.largest:
+            there = problem.stepped(here, now)
+            if there is None:
+                now = max(10.0 * now, damping.first)
+        if there is None:
+            break
+        before, here = here, there
+        now = max(0.1 * now, damping.least) if now > damping.dropped else damping.least
+        if problem.settled(before, here):
+            break
+    return here
