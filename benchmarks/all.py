@@ -28,6 +28,7 @@ import pandas as pd
 
 from rsbench.benchmark.images.plan import EvaluationOptions
 from rsbench.benchmark.provenance import provenance
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import VIEWS
 from rsbench.storage.files import write_bytes, write_json, write_table
@@ -170,7 +171,9 @@ def asked_over_matched(data: Path) -> tuple[Work, Work]:
 
     def inspect() -> None:
         matches = match()
-        conclude([examine(matches, sequence.rig, known_of(matches, sequence.rig, None, None), options.robust, 0)])
+        conclude(
+            [examine(matches, sequence.rig, known_of(matches, sequence.rig, KnownInputs()), options.robust, 0)]
+        )
 
     inspect()
     return inspect, match

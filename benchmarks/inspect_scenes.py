@@ -129,9 +129,9 @@ def row(name: str, case: Case, ratio: float) -> tuple[str, str, float]:
     matches = find_matches_of_rig(case.images, case.rig, Scanning(scan="left"), options)
     found = conclude([examine(matches, case.rig)])
     best, true = found.likeliest, ratio if case.scans.rolls else 0.0
-    error = abs(best.ratio - true) if found.told and best is not None else float("nan")
+    error = abs(best.ratio - true) if found.determined and best is not None else float("nan")
     said = f"{best.scans.left}, {best.scans.right}" if best is not None and found.named else "cannot tell"
-    value = "-" if best is None else f"{best.ratio:.3f} +- {best.sigma:.3f}{'' if found.told else ' (not told)'}"
+    value = "-" if best is None else f"{best.ratio:.3f} +- {best.sigma:.3f}{'' if found.determined else ' (open)'}"
     right = best is not None and best.scans == case.scans
     verdict = ("right" if right else "WRONG") if found.named else "cannot tell"
     truth = f"{case.scans.left}, {case.scans.right}"

@@ -18,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 from score_kitti import read_rig, step
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.core.errors import RsbenchError
@@ -38,7 +39,7 @@ def stated(folder: Path, names: tuple[str, str], every: int) -> Iterator[tuple[i
         if number % every:
             continue
         matches = match_unknown(images, rig, options)[0]
-        known = known_of(matches, rig, None, None)
+        known = known_of(matches, rig, KnownInputs())
         found = conclude([examine(matches, rig, known, options.robust, 0)])
         capture = as_global(found, [matches], rig, known)
         best = capture.likeliest

@@ -23,6 +23,7 @@ from rsbench.capture.hypotheses import (
     UNKNOWNS,
     CaptureCost,
     Hypothesis,
+    KnownInputs,
     Likelihood,
     Scans,
     TimedMatches,
@@ -44,7 +45,8 @@ NOISE_PX, NORMAL = 0.3, 1e6
 
 def found_in(matches: Correspondences, rig: StereoRig, seed: int = 0) -> Capture:
     """With the scan known."""
-    return conclude([examine(matches, rig, known_of(matches, rig, None, Scanning(), NO_ERRORS), seed=seed)])
+    given = KnownInputs(scanning=Scanning(), calibration=NO_ERRORS)
+    return conclude([examine(matches, rig, known_of(matches, rig, given), seed=seed)])
 
 
 def bound(data: Simulation, model: str, ratio: float) -> float:

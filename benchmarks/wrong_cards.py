@@ -62,7 +62,7 @@ def main() -> None:
             camera, lens = found.rig.camera, found.rig.camera.lens
             focal = camera.fx - rig.camera.fx
             k1 = (lens.k1 if lens else 0.0) - (rig.camera.lens.k1 if rig.camera.lens else 0.0)
-            off = np.where(found.told, (focal / found.sigma.focal, k1 / found.sigma.k1), math.nan)
+            off = np.where(found.determined, (focal / found.sigma.focal, k1 / found.sigma.k1), math.nan)
             deviations.append(off)
             percent = 100.0 * focal / rig.camera.fx
             write(f"{row}-{seed:<12} {percent:+18.2f} {off[0]:+12.1f} {k1:+13.4f} {off[1]:+11.1f}\n")

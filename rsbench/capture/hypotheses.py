@@ -1,8 +1,8 @@
 """Hypotheses on how the cameras read their lines and how the rig moves, and the best fit of one of them.
 
-A hypothesis names the scan of each camera, the motion model, and whether the right camera may be late. Its six motion
-parameters and its unknowns (readout ratio, delay, acceleration, errors of the calibration) are fitted together by a
-damped Newton method on compiled equations, under heavy-tailed errors.
+A hypothesis names the scan of each camera, the motion model, and whether the right camera may be late. Its six
+motion parameters and its unknowns (readout ratio, delay, acceleration, errors of the calibration) are fitted
+together by a damped Newton method on compiled equations, under heavy-tailed errors.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from rsbench.capture.hypotheses import (
     ACCELERATION,
@@ -51,7 +50,7 @@ COARSE: tuple[tuple[Scan, float], ...] = (
     ("left", 0.5),
     ("right", 0.5),
 )
-"""Shutters of cameras that read together, under which a motion is looked for: between them points err little."""
+"""Shutters of cameras that read together, for the search for a motion: errors between them are small."""
 _LAG_SAMPLES, _LAG_ROUNDS = 400, 6
 _NOISE_PX, _TIME_SIGMA = 0.5, 0.5
 """Expected noise of a row difference, and expected size of a difference of times, frame periods."""
@@ -110,7 +109,7 @@ def _columns(pixels: FloatArray, rig: StereoRig) -> FloatArray:
     return np.column_stack([np.ones(len(pixels)), pixels / size])
 
 
-def with_lag_taken(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspondences:
+def without_lag(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspondences:
     """The ideal matches as the right camera would have had them at the left one's times, to first order.
 
     In ideal pixels, for a lens shows no ray at some of the pixels that a lag may lead to.
@@ -129,8 +128,8 @@ def with_lag_taken(matches: Correspondences, lag: Lag, rig: StereoRig) -> Corres
 def without_leaps(matches: Correspondences, rig: StereoRig) -> Correspondences:
     """The matches but for pairs that leap over most of the image, which are wrong.
 
-    The ends of a pair that lie a share 1 / ratio of the image apart are read at one time: between them is no
-    motion, and no error, whatever was matched. One such pair held a ratio of 0.8 at 1.17.
+    Ends of a pair that lie a share 1 / ratio of the image apart are read at one time: between them is no
+    motion, and no error, whatever was matched. One such pair kept the estimate of a ratio of 0.8 at 1.17.
     """
     longest = _LONGEST_LEAP * np.array([rig.camera.width, rig.camera.height])
     left, right = (
@@ -145,10 +144,10 @@ def find_start(
 ) -> tuple[RobustEstimate | None, Lag]:
     """The motion that explains most matches, of those under ``COARSE``; None when there is none.
 
-    A lens is taken from the matches beforehand: their times are then a little off, as they are under any of these.
+    Matches are undistorted beforehand: their times are then slightly wrong, as they are under any of these.
     """
     lag = find_lag(matches.tracks, rig)
-    taken = with_lag_taken(matches, lag, rig)
+    taken = without_lag(matches, lag, rig)
     rig, camera, found = rig.ideal, rig.camera, list[RobustEstimate]()
     for scan, ratio in _coarse(known):
         shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
@@ -161,17 +160,16 @@ def find_start(
 
 
 def _coarse(known: Known) -> list[tuple[Scan, float]]:
-    """Those of ``COARSE`` that are possible; where cameras read apart, all."""
+    """Possible ones of ``COARSE``; all of them where the cameras may read differently."""
     starts = {scans.left for scans in known.scans}
     possible = [(scan, ratio) for scan, ratio in COARSE if ("global" if ratio == 0.0 else scan) in starts]
     if not all(scans.together for scans in known.scans) or not possible:
         possible = list(COARSE)
-    known_ratio = known.ratio
-    return possible if known_ratio is None else [(s, known_ratio if r else 0.0) for s, r in possible]
+    return possible if known.ratio is None else [(s, known.ratio if r else 0.0) for s, r in possible]
 
 
 def first_shutter(scans: Scans, lag: Lag) -> FloatArray:
-    """Ratio and delay (2,) of a scans that fit a lag best; a ratio of 0.5 where the cameras read alike."""
+    """Ratio and delay (2,) of scans that fit a lag best; a ratio of 0.5 where the cameras read alike."""
     if scans.together:
         return np.array([0.5 if scans.rolls else 0.0, -lag.line[0]])
     A = np.column_stack([_columns_of_lag(scans), [-1.0, 0.0, 0.0]])
@@ -203,29 +201,29 @@ def _columns_of_lag(scans: Scans) -> FloatArray:
 
 
 _SCREENED = 160
-"""Measurements by which most scans are put aside."""
+"""Measurements by which most scans are excluded."""
 _CLOSE = 30.0
-"""Differences of the logarithm of the likelihood beyond which a hypothesis is put aside after that."""
+"""Differences of the log-likelihood beyond which a hypothesis is excluded after that."""
 _LIKELY = 12.0
-"""The same, beyond which one is left out in the end: of matches whose errors are independent."""
+"""The same at the end, for matches with independent errors."""
 _MOST_SCALE, _FIRST_NU = 10.0, 4.0
-"""Scale of the errors, px, at most, and their tails, before their distribution is found."""
+"""Largest scale of the errors, px, and their tails, before their distribution is estimated."""
 _FALLS, _STEADY = 10, 0.9
 _UNSETTLED = 5.0
-"""Times as far off as that a hypothesis may be before it is fitted at the scale of the best one."""
+"""Factor on that difference before a hypothesis is fitted at the scale of the best one."""
 _ROUGHLY = 1e-2
-"""Of the squared scale: a decrease of the cost at which the screening stops."""
+"""Decrease of the cost, over the squared scale, at which the screening stops."""
 _REACH = 10.0
-"""As in ``heavy_tails``."""
+"""As in ``packed.HeavyTailed``."""
 _TILES = (6, 4)
-"""Columns and rows of tiles in which matches may err together."""
+"""Columns and rows of tiles in which matches may have common errors."""
 _FIRST_REACH, _MOST_REACH, _LEAST_REACH = 0.02, 0.05, 0.001
-"""Differences of the ratio by which the sharpness of a maximum is measured: about two deviations."""
+"""Differences of the ratio by which the sharpness of a maximum is measured: about two standard deviations."""
 _SLOPE_ROUNDS = 5
 _SMALL_RATIO, _FAR_BETTER = 0.3, 0.5
 """Readout ratio that is nearly none, and errors over those of another fit that are far smaller."""
 _WIDE = 1.0
-"""Standard deviation of a ratio of which the matches say nothing."""
+"""Prior standard deviation of a ratio."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -234,9 +232,9 @@ class Peak:
 
     value: float
     at: float
-    """Where the parabola has its top, which may lie outside of what is possible."""
+    """Where the parabola has its top, which may be an impossible ratio."""
     information: float
-    """0 of a ratio that is known, as of global shutters."""
+    """0 for a known ratio, as of global shutters."""
     fit: CaptureFit
     """At the best ratio; its deviations are those at that ratio."""
     trade: FloatArray
@@ -249,7 +247,7 @@ class Peak:
 
     @property
     def log_evidence(self) -> float:
-        """Integral over ratios from ``LEAST_RATIO`` to 1, uniform before; the value where the ratio is known."""
+        """Log-likelihood integrated over a uniform prior of ratios, ``LEAST_RATIO`` to 1; ``value`` if known."""
         if self.information == 0.0:
             return self.value
         ends = (np.array([LEAST_RATIO, 1.0]) - self.at) / self.sigma
@@ -263,46 +261,39 @@ class Peak:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WindowEvidence:
-    """What the matches of two times say of the hypotheses; those that are not here are out of the question."""
+    """Evidence of the hypotheses in the matches of two times; excluded hypotheses are left out."""
 
     peaks: Mapping[Hypothesis, Peak]
     lost: float
-    """Log-likelihood, below the best one's, of those."""
+    """Log-likelihood of the excluded ones below the best one's, at least."""
     used: int
     """Measurements that count: not so far off that they must be wrong."""
     of: int
     noise_px: float
     dispersion: float
-    """Factor on all variances, for matches of one part of the image that err together."""
+    """Factor on all variances, for matches of one part of the image that have common errors."""
 
 
 def window_evidence(
-    matches: Correspondences,
-    rig: StereoRig,
-    known: Known,
-    motion: tuple[FloatArray, FloatArray],
-    lag: Lag,
+    matches: Correspondences, rig: StereoRig, known: Known, motion: tuple[FloatArray, FloatArray], lag: Lag
 ) -> WindowEvidence | None:
     """All hypotheses, on matches with outliers, from a motion near the right one.
 
-    Most scans are put aside by some of the matches, under the first motion model. None for too few matches.
+    Most scans are excluded by some of the matches, under the first motion model. None for too few matches.
     """
     first = TimedMatches(matches, rig, known.models[0])
-    timed = {model: first.under(model) for model in known.models}
-    screened = (_of_models if known.shutter_known else _screened)(timed, known, motion, lag)
-    if screened is None:
-        return None
-    fits, likelihood = screened
-    sharpened = _sharpened(timed, known, fits, likelihood.scale)
+    comparison = _Comparison({model: first.under(model) for model in known.models}, known)
+    fits = comparison.of_known_shutter(motion) if known.shutter_known else comparison.screened(motion, lag)
+    screened = comparison.of_each_model(fits)
+    sharpened = None if screened is None else comparison.sharpened(*screened)
     if sharpened is None:
         return None
     full, near = sharpened
-    sharp = _Slope(_cost(timed, full, known, near[0].hypothesis), near[0])
+    sharp = _Slope(comparison.cost(full, near[0].hypothesis), near[0])
     dispersion = _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else 1.0
     near = _near(near, full.scale, _LIKELY * dispersion)
-    slopes = [sharp, *(_Slope(_cost(timed, full, known, fit.hypothesis), fit) for fit in near[1:])]
-    sharp = min(slopes, key=lambda slope: slope.best.cost)
-    reference, unit = sharp.best.cost, full.scale**2 * dispersion
+    slopes = [sharp, *(_Slope(comparison.cost(full, fit.hypothesis), fit) for fit in near[1:])]
+    reference, unit = min(slope.best.cost for slope in slopes), full.scale**2 * dispersion
     return WindowEvidence(
         peaks={slope.best.hypothesis: slope.peak(reference, unit) for slope in slopes},
         lost=_LIKELY,
@@ -313,89 +304,158 @@ def window_evidence(
     )
 
 
-def _screened(
-    timed: Mapping[str, TimedMatches], known: Known, motion: tuple[FloatArray, FloatArray], lag: Lag
-) -> tuple[list[CaptureFit], Likelihood] | None:
-    """What some of the matches allow, and the distribution of their errors: first scans, then motion models."""
-    first = timed[known.models[0]]
-    some = _some(first.count, _SCREENED)
-    theta = first.packed(GLOBAL, known.start(Hypothesis(scans=GLOBAL, motion_model=""), 0.0, 0.0)).theta(*motion)
-    found = dict[Scans, tuple[CaptureFit, float]]()
-    for scans in sorted(known.scans, key=lambda each: (each != GLOBAL, not each.together)):
-        if _is_excluded(scans, lag, found):
-            continue
-        hypothesis = Hypothesis(scans=scans, motion_model=known.models[0], delayed=known.delays[-1])
-        starts = [(theta, known.start(hypothesis, *first_shutter(scans, lag)))]
-        if GLOBAL in found:  # which any scans with a small ratio nearly are
-            still = found[GLOBAL][0]
-            starts.append((still.theta, known.start(hypothesis, LEAST_RATIO, float(still.unknowns[DELAY]))))
-        fits = (_settled(first, some, hypothesis, known, start) for start in starts)
-        found[scans] = min(fits, key=lambda each: each[1])
-    scale = min(each for _, each in found.values())
-    best = min((fit for fit, each in found.values() if each == scale), key=lambda fit: fit.cost)
-    likelihood = _distribution(first, some, best, scale)
-    if likelihood is None:
-        return None
-    judged = [_judged(timed, likelihood, known, fit) for fit, _ in found.values()]
-    near = _near(judged, likelihood.scale, _UNSETTLED * _CLOSE)
-    return _of_each_model(timed, some, known, near)
+@dataclass(frozen=True)
+class _Comparison:
+    """The matches of a window under each motion model, and what is known of their capture."""
 
+    timed: Mapping[str, TimedMatches]
+    known: Known
 
-def _of_models(
-    timed: Mapping[str, TimedMatches], known: Known, motion: tuple[FloatArray, FloatArray], lag: Lag
-) -> tuple[list[CaptureFit], Likelihood] | None:
-    """What ``_screened`` is where the shutter is known and motion models alone compete."""
-    first, scans = timed[known.models[0]], known.scans[0]
-    hypothesis = Hypothesis(scans=scans, motion_model=known.models[0])
-    start = known.start(hypothesis, 0.0, 0.0)
-    theta, some = first.packed(scans, start).theta(*motion), _some(first.count, _SCREENED)
-    wide = Likelihood(nu=_FIRST_NU, scale=_MOST_SCALE, chosen=some)
-    cost = CaptureCost(first, hypothesis, wide, known.prior(hypothesis))
-    return _of_each_model(timed, some, known, [fit_capture(cost, theta, start, iterations=1)])
+    @property
+    def first(self) -> TimedMatches:
+        """Under the first motion model."""
+        return self.timed[self.known.models[0]]
 
+    @property
+    def some(self) -> BoolArray:
+        """About ``_SCREENED`` of the measurements, evenly chosen."""
+        count = self.first.count
+        return np.asarray(np.arange(count) % max(count // _SCREENED, 1) == 0)
 
-def _of_each_model(
-    timed: Mapping[str, TimedMatches], some: BoolArray, known: Known, fits: Sequence[CaptureFit]
-) -> tuple[list[CaptureFit], Likelihood] | None:
-    """The fits of the first motion model, and those of the others on the same scans; and the errors of the best.
+    def cost(self, likelihood: Likelihood, hypothesis: Hypothesis) -> CaptureCost:
+        return CaptureCost(
+            self.timed[hypothesis.motion_model], hypothesis, likelihood, self.known.prior(hypothesis)
+        )
 
-    Each is fitted at the scale of its own errors: at the scale of another model's, far smaller, it would not move.
-    """
-    found = list[tuple[CaptureFit, float]]()
-    for fit, model in product(fits, known.models):
-        hypothesis = replace(fit.hypothesis, motion_model=model)
-        starts = (_start_from(timed, known, fit, hypothesis, k) for k in hypothesis.accelerations)
-        settled = (_settled(timed[model], some, hypothesis, known, start) for start in starts)
-        found.append(min(settled, key=lambda each: (each[1], each[0].cost)))
-    best, scale = min(found, key=lambda each: (each[1], each[0].cost))
-    likelihood = _distribution(timed[best.hypothesis.motion_model], some, best, scale)
-    if likelihood is None:
-        return None
-    judged = [_judged(timed, likelihood, known, fit) for fit, _ in found]
-    return _near(judged, likelihood.scale, _UNSETTLED * _CLOSE), likelihood
+    def rough_cost(self, hypothesis: Hypothesis, scale: float) -> CaptureCost:
+        """Of some measurements, before the distribution of their errors is estimated."""
+        return self.cost(Likelihood(nu=_FIRST_NU, scale=scale, chosen=self.some), hypothesis)
 
+    def screened(self, motion: tuple[FloatArray, FloatArray], lag: Lag) -> list[CaptureFit]:
+        """Fits of the scans that some of the matches allow, under the first motion model."""
+        known, model = self.known, self.known.models[0]
+        start = known.start(Hypothesis(scans=GLOBAL, motion_model=""), 0.0, 0.0)
+        theta, found = self.first.packed(GLOBAL, start).theta(*motion), dict[Scans, tuple[CaptureFit, float]]()
+        for scans in sorted(known.scans, key=lambda each: (each != GLOBAL, not each.together)):
+            if _is_excluded(scans, lag, found):
+                continue
+            hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=known.delays[-1])
+            starts = [(theta, known.start(hypothesis, *first_shutter(scans, lag)))]
+            if GLOBAL in found:  # which any scans with a small ratio nearly are
+                still = found[GLOBAL][0]
+                starts.append((still.theta, known.start(hypothesis, LEAST_RATIO, float(still.unknowns[DELAY]))))
+            fits = (self.settled(hypothesis, start) for start in starts)
+            found[scans] = min(fits, key=lambda each: each[1])
+        return self.judged(list(found.values()))[0]
 
-def _start_from(
-    timed: Mapping[str, TimedMatches], known: Known, fit: CaptureFit, hypothesis: Hypothesis, k: float = 0.0
-) -> tuple[FloatArray, FloatArray]:
-    """Where the fit of a hypothesis starts: at another one's of the same scans; ``k``: of another model's."""
-    model = hypothesis.motion_model
-    unknowns = known.start(hypothesis, *fit.unknowns[[RATIO, DELAY]])
-    unknowns[CALIBRATION] = fit.unknowns[CALIBRATION]
-    unknowns[ACCELERATION] = fit.unknowns[ACCELERATION] if model == fit.hypothesis.motion_model else k
-    motion = timed[fit.hypothesis.motion_model].kernel(fit.unknowns).motion(fit.theta)
-    return timed[model].kernel(unknowns).theta(*motion), unknowns
+    def of_known_shutter(self, motion: tuple[FloatArray, FloatArray]) -> list[CaptureFit]:
+        """The one fit in place of ``screened`` where the shutter is known and motion models alone compete."""
+        scans = self.known.scans[0]
+        hypothesis = Hypothesis(scans=scans, motion_model=self.known.models[0])
+        start = self.known.start(hypothesis, 0.0, 0.0)
+        theta = self.first.packed(scans, start).theta(*motion)
+        return [fit_capture(self.rough_cost(hypothesis, _MOST_SCALE), theta, start, iterations=1)]
 
+    def of_each_model(self, fits: Sequence[CaptureFit]) -> tuple[list[CaptureFit], Likelihood] | None:
+        """Fits of every motion model, on the scans of fits of the first one; and the errors of the best.
 
-def _some(count: int, wanted: int) -> BoolArray:
-    """About as many, evenly chosen."""
-    return np.asarray(np.arange(count) % max(count // wanted, 1) == 0)
+        Each is fitted at the scale of its own errors: at another model's far smaller scale it would not move.
+        """
+        found = list[tuple[CaptureFit, float]]()
+        for fit, model in product(fits, self.known.models):
+            hypothesis = replace(fit.hypothesis, motion_model=model)
+            starts = (self.start_from(fit, hypothesis, k) for k in hypothesis.accelerations)
+            settled = (self.settled(hypothesis, start) for start in starts)
+            found.append(min(settled, key=lambda each: (each[1], each[0].cost)))
+        fits, likelihood = self.judged(found)
+        return None if likelihood is None else (fits, likelihood)
+
+    def judged(self, found: Sequence[tuple[CaptureFit, float]]) -> tuple[list[CaptureFit], Likelihood | None]:
+        """Fits with their scales, px: those near the best one under the distribution of its errors; and this."""
+        best, scale = min(found, key=lambda each: (each[1], each[0].cost), default=(None, 0.0))
+        likelihood = None if best is None else self.distribution(self.some, best, scale)
+        if likelihood is None:
+            return [], None
+        costs = [self.cost(likelihood, fit.hypothesis)(fit.theta, fit.unknowns) for fit, _ in found]
+        fits = [replace(fit, cost=cost) for (fit, _), cost in zip(found, costs, strict=True)]
+        return _near(fits, likelihood.scale, _UNSETTLED * _CLOSE), likelihood
+
+    def start_from(self, fit: CaptureFit, hypothesis: Hypothesis, k: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Start of a hypothesis at the fit of another one of the same scans; ``k`` where models differ."""
+        model, own = hypothesis.motion_model, fit.hypothesis.motion_model
+        unknowns = self.known.start(hypothesis, *fit.unknowns[[RATIO, DELAY]])
+        unknowns[CALIBRATION] = fit.unknowns[CALIBRATION]
+        unknowns[ACCELERATION] = fit.unknowns[ACCELERATION] if model == own else k
+        motion = self.timed[own].kernel(fit.unknowns).motion(fit.theta)
+        return self.timed[model].kernel(unknowns).theta(*motion), unknowns
+
+    def settled(self, hypothesis: Hypothesis, start: tuple[FloatArray, FloatArray]) -> tuple[CaptureFit, float]:
+        """A hypothesis at the scale of its own errors, which falls as the fit improves; and that scale, px.
+
+        At a scale far below the errors that a wrong ratio leaves, informative matches would count least.
+        """
+        scale, fit = min(self.rough_cost(hypothesis, _MOST_SCALE).typical_error(*start), _MOST_SCALE), None
+        for _ in range(_FALLS):
+            cost = self.rough_cost(hypothesis, scale)
+            fit = fit_capture(cost, *start, iterations=6, still=_ROUGHLY)
+            start = (fit.theta, fit.unknowns)
+            last, scale = scale, min(scale, cost.typical_error(*start))
+            if scale > _STEADY * last:
+                break
+        assert fit is not None
+        return fit, scale
+
+    def fitted(self, likelihood: Likelihood, fits: Sequence[CaptureFit]) -> list[CaptureFit]:
+        """The fits again, with and without a late right camera, from the nearest fit; the best of them first.
+
+        The fit of a hypothesis that cannot come near the best one ends early.
+        """
+        out, fits = list[CaptureFit](), sorted(fits, key=lambda fit: fit.cost)
+        pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
+        for (scans, model), delayed in product(pairs, self.known.delays):
+            hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
+            of_pair = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
+            start = self.start_from(of_pair[0], hypothesis)
+            far = min((fit.cost for fit in out), default=np.inf) + _CLOSE * likelihood.scale**2
+            cost = self.cost(likelihood, hypothesis)
+            out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY, hopeless=far))
+        return out
+
+    def sharpened(
+        self, fits: list[CaptureFit], likelihood: Likelihood
+    ) -> tuple[Likelihood, list[CaptureFit]] | None:
+        """The fits on all matches, the best first, under the distribution of the best one's errors.
+
+        Its scale falls as the best one is fitted better, or another one becomes the best; none is excluded before.
+        """
+        scale, everything = likelihood.scale, np.ones(self.first.count, dtype=np.bool_)
+        for _ in range(_FALLS):
+            full = self.distribution(everything, min(fits, key=lambda fit: fit.cost), scale)
+            if full is None:
+                return None
+            fits = self.fitted(full, fits)
+            if full.scale > _STEADY * scale:
+                break
+            scale = full.scale
+        return full, _near(fits, full.scale)
+
+    def distribution(self, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:
+        """Of the errors under one fit, of the chosen matches that are not wrong."""
+        read = self.timed[fit.hypothesis.motion_model].read(fit.hypothesis.scans, among)
+        packed = read.packed(fit.unknowns)
+        found = heavy_tailed(packed, fit.theta, scale)
+        if found is None:
+            return None
+        freedom = np.repeat([1.0, 5.0], [len(packed.pairs), len(packed.tracks)])
+        chosen = among.copy()
+        chosen[among] = each_term(packed, fit.theta).squares / freedom <= (_REACH * found.scale) ** 2
+        return Likelihood(nu=found.nu, scale=max(found.scale, LEAST_SCALE_PX), chosen=chosen, trust=found.trust)
 
 
 def _is_excluded(scans: Scans, lag: Lag, found: Mapping[Scans, tuple[CaptureFit, float]]) -> bool:
-    """Whether the rows of left-right matches exclude scans, at all or but for ratios that are nearly none.
+    """Whether the rows of left-right matches exclude scans, at all or except for ratios that are nearly none.
 
-    Those are excluded with the global shutter, where cameras that read alike fit far better.
+    The latter are excluded with the global shutter, where cameras that read alike fit far better.
     """
     most = largest_ratio(scans, lag)
     if most <= 0.0 or most > _SMALL_RATIO or GLOBAL not in found:
@@ -403,104 +463,10 @@ def _is_excluded(scans: Scans, lag: Lag, found: Mapping[Scans, tuple[CaptureFit,
     return min(each for _, each in found.values()) < _FAR_BETTER * found[GLOBAL][1]
 
 
-def _settled(
-    timed: TimedMatches,
-    some: BoolArray,
-    hypothesis: Hypothesis,
-    known: Known,
-    start: tuple[FloatArray, FloatArray],
-) -> tuple[CaptureFit, float]:
-    """A hypothesis at the scale of its own errors, which falls as it is fitted better; and that scale, px.
-
-    At a scale far below the errors that a wrong ratio leaves, matches would count the less the more they tell.
-    """
-    prior = known.prior(hypothesis)
-    cost = CaptureCost(timed, hypothesis, Likelihood(nu=_FIRST_NU, scale=_MOST_SCALE, chosen=some), prior)
-    scale = min(cost.typical_error(*start), _MOST_SCALE)
-    fit = None
-    for _ in range(_FALLS):
-        cost = CaptureCost(timed, hypothesis, Likelihood(nu=_FIRST_NU, scale=scale, chosen=some), prior)
-        fit = fit_capture(cost, *start, iterations=6, still=_ROUGHLY)
-        start = (fit.theta, fit.unknowns)
-        last, scale = scale, min(scale, cost.typical_error(*start))
-        if scale > _STEADY * last:
-            break
-    assert fit is not None
-    return fit, scale
-
-
-def _cost(
-    timed: Mapping[str, TimedMatches], likelihood: Likelihood, known: Known, hypothesis: Hypothesis
-) -> CaptureCost:
-    return CaptureCost(timed[hypothesis.motion_model], hypothesis, likelihood, known.prior(hypothesis))
-
-
-def _judged(
-    timed: Mapping[str, TimedMatches], likelihood: Likelihood, known: Known, fit: CaptureFit
-) -> CaptureFit:
-    """A fit with its cost under a common distribution of the errors."""
-    return replace(fit, cost=_cost(timed, likelihood, known, fit.hypothesis)(fit.theta, fit.unknowns))
-
-
 def _near(fits: Sequence[CaptureFit], scale: float, far: float = _CLOSE) -> list[CaptureFit]:
     """Those whose log-likelihood is not far below the best one's, the best first."""
     fits = sorted(fits, key=lambda fit: fit.cost)
     return [fit for fit in fits if fit.cost - fits[0].cost <= far * scale**2]
-
-
-def _fitted(
-    timed: Mapping[str, TimedMatches],
-    known: Known,
-    likelihood: Likelihood,
-    fits: Sequence[CaptureFit],
-    delays: Sequence[bool],
-) -> list[CaptureFit]:
-    """The fits again, with and without a late right camera, from the nearest fit; the best of them first.
-
-    Those that cannot come near the best one are given up on the way.
-    """
-    out, fits = list[CaptureFit](), sorted(fits, key=lambda fit: fit.cost)
-    pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
-    for (scans, model), delayed in product(pairs, delays):
-        hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
-        of_pair = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
-        start = _start_from(timed, known, min(of_pair, key=lambda fit: fit.cost), hypothesis)
-        cost = _cost(timed, likelihood, known, hypothesis)
-        far = min((fit.cost for fit in out), default=np.inf) + _CLOSE * likelihood.scale**2
-        out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY, hopeless=far))
-    return out
-
-
-def _sharpened(
-    timed: Mapping[str, TimedMatches], known: Known, fits: list[CaptureFit], scale: float
-) -> tuple[Likelihood, list[CaptureFit]] | None:
-    """The fits on all matches, the best first, under the distribution of the best one's errors.
-
-    Its scale falls as the best one is fitted better, or another one becomes the best; none is put aside before.
-    """
-    everything = np.ones(timed[known.models[0]].count, dtype=np.bool_)
-    for _ in range(_FALLS):
-        best = min(fits, key=lambda fit: fit.cost)
-        full = _distribution(timed[best.hypothesis.motion_model], everything, best, scale)
-        if full is None:
-            return None
-        fits = _fitted(timed, known, full, fits, known.delays)
-        if full.scale > _STEADY * scale:
-            break
-        scale = full.scale
-    return full, _near(fits, full.scale)
-
-
-def _distribution(timed: TimedMatches, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:
-    """Of the errors under one fit, of the chosen matches that are not wrong."""
-    packed = timed.subset(among).packed(fit.hypothesis.scans, fit.unknowns)
-    found = heavy_tailed(packed, fit.theta, scale)
-    if found is None:
-        return None
-    freedom = np.repeat([1.0, 5.0], [len(packed.pairs), len(packed.tracks)])
-    chosen = among.copy()
-    chosen[among] = each_term(packed, fit.theta).squares / freedom <= (_REACH * found.scale) ** 2
-    return Likelihood(nu=found.nu, scale=max(found.scale, LEAST_SCALE_PX), chosen=chosen, trust=found.trust)
 
 
 class _Slope:
@@ -511,7 +477,7 @@ class _Slope:
         self.varies = RATIO in cost.free
         free = fit_capture(cost, start.theta, start.unknowns)
         # Once more as those beside it are found, or a start that is less settled than they looks like a valley.
-        self.best = fit_capture(cost, free.theta, free.unknowns, hold_ratio=True)
+        self.best = fit_capture(cost, free.theta, free.unknowns, fix_ratio=True)
         self.least, self.at, self.curvature = self.best.cost, float(self.best.unknowns[RATIO]), 0.0
         self._beside: tuple[CaptureFit, CaptureFit] = (self.best, self.best)
         reach = _FIRST_REACH
@@ -523,13 +489,13 @@ class _Slope:
             if fits and abs(away) <= reach:
                 break
             if abs(away) > reach:
-                self.best = self._held(self.best.unknowns[RATIO] + away)
+                self.best = self._at_ratio(self.best.unknowns[RATIO] + away)
             reach = float(np.clip(2.0 * sigma, _LEAST_REACH, _MOST_REACH))
 
     def _measure(self, reach: float) -> None:
         """Top and curvature of the parabola through three ratios, the best one and one on either side of it."""
         ratio = float(self.best.unknowns[RATIO])
-        below, above = self._beside = (self._held(ratio - reach), self._held(ratio + reach))
+        below, above = self._beside = (self._at_ratio(ratio - reach), self._at_ratio(ratio + reach))
         slope = (above.cost - below.cost) / (2.0 * reach)
         curvature = (above.cost - 2.0 * self.best.cost + below.cost) / reach**2
         self.curvature = max(float(curvature), 1e-9)
@@ -537,10 +503,10 @@ class _Slope:
         self.at = ratio + away
         self.least = self.best.cost - 0.5 * self.curvature * away**2
 
-    def _held(self, ratio: float) -> CaptureFit:
+    def _at_ratio(self, ratio: float) -> CaptureFit:
         unknowns = self.best.unknowns.copy()
         unknowns[RATIO] = ratio
-        return fit_capture(self._cost, self.best.theta, unknowns, hold_ratio=True)
+        return fit_capture(self._cost, self.best.theta, unknowns, fix_ratio=True)
 
     def peak(self, reference: float, unit: float) -> Peak:
         """In units of the errors' variance, px^2."""
@@ -564,18 +530,15 @@ class _Slope:
 
 
 def _dispersion(slope: _Slope, pixels: FloatArray) -> float:
-    """How many times the variance of the ratio is what independent errors would give; at least 1."""
-    tiles, scores = _tiles(pixels), slope.scores()
-    used = np.unique(tiles)
-    together = np.bincount(tiles, weights=scores - np.mean(scores))
-    variance = float(np.sum(together**2)) * len(used) / max(len(used) - 1, 1) / slope.curvature
-    return max(variance / slope.scale**2, 1.0)
+    """Variance of the ratio over the one that independent errors would give, at least 1.
 
-
-def _tiles(points: FloatArray) -> NDArray[np.int64]:
-    """Number (n,) of the tile of the image that a point (n, 2) lies in: about as many points in every column."""
-    tile = np.zeros(len(points), dtype=np.int64)
+    By tiles of the image with about as many points (n, 2) in every column.
+    """
+    tiles = np.zeros(len(pixels), dtype=np.int64)
     for axis, count in enumerate(_TILES):
-        edges = np.quantile(points[:, axis], np.arange(1, count) / count)
-        tile = tile * count + np.searchsorted(edges, points[:, axis])
-    return tile
+        edges = np.quantile(pixels[:, axis], np.arange(1, count) / count)
+        tiles = tiles * count + np.searchsorted(edges, pixels[:, axis])
+    scores, used = slope.scores(), len(np.unique(tiles))
+    together = np.bincount(tiles, weights=scores - np.mean(scores))
+    variance = float(np.sum(together**2)) * used / max(used - 1, 1) / slope.curvature
+    return max(variance / slope.scale**2, 1.0)

@@ -17,28 +17,28 @@ from rsbench.core.so3 import FloatArray
 
 AUTO = "auto"
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
-"""Differences of motions that say nothing, as between all models under a global shutter."""
+"""Differences between motions that count as the same, as of all models under a global shutter."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ModelChoice:
-    """What the matches say about the motion model."""
+    """The motion model that is used, and how it was chosen."""
 
     used: str
     parameters: Mapping[str, float]
     """Of the model used, beside w and d."""
     probability: Mapping[str, float]
-    """Of each model that was tried, the most probable first."""
+    """Of each model that was compared, the most probable first."""
     decided: bool
     """Whether the first of them is beyond doubt."""
     rival: str
-    """The most probable one of the others; empty where none was tried."""
+    """The most probable other one; empty where none was compared."""
     d_angle_deg: float
     """Between the d of the model used and that of the rival."""
     d_length_percent: float
     """By how much the rival's d is longer."""
     spread: FloatArray
-    """(6, 6) what not knowing the ratio, the offset and the model's own parameters adds to the covariance."""
+    """(6, 6) what the uncertain ratio, offset and parameters of the model add to the covariance."""
 
     def record(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -53,7 +53,8 @@ class ModelChoice:
         }
 
     def __str__(self) -> str:
-        shares = ", ".join(f"{name} {_percent(p)}" for name, p in list(self.probability.items())[:3] if p >= 0.001)
+        likely = [(name, p) for name, p in list(self.probability.items())[:3] if p >= 0.001]
+        shares = ", ".join(f"{name} {100.0 * p:.1f} %" if p <= 0.999 else f"{name} > 99.9 %" for name, p in likely)
         head = self.used if self.decided else f"cannot tell, so {self.used} is used"
         if not self.rival:
             return head
@@ -63,22 +64,20 @@ class ModelChoice:
         return f"{head} ({shares}); {change}{self.d_length_percent:+.2g} %"
 
 
-def _percent(p: float) -> str:
-    return f"{100.0 * p:.1f} %" if p <= 0.999 else "> 99.9 %"
+def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
+    """The most probable model; where that is in doubt linear, the paper's, unless the matches exclude it.
 
-
-def choose_model(capture: Capture, asked: str = AUTO) -> ModelChoice | None:
-    """The model found, else linear, the paper's, unless it is excluded; None where no hypothesis was judged.
+    None where no hypothesis was compared.
 
     Args:
-        asked: a model that is used whatever the matches prefer.
+        requested: a model that is used whatever the matches prefer.
     """
-    if asked not in (AUTO, *capture.peaks) or not capture.peaks:
+    if requested not in (AUTO, *capture.peaks) or not capture.peaks:
         return None
     probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
     best = next(iter(probability))
     undecided = probability[best] < CERTAIN and probability.get("linear", 0.0) > 1.0 - CERTAIN
-    used = asked if asked != AUTO else "linear" if undecided else best
+    used = requested if requested != AUTO else "linear" if undecided else best
     rival = next((name for name in probability if name != used), "")
     d = motion_at(capture.peaks[used]).d
     other = motion_at(capture.peaks[rival]).d if rival else d
@@ -96,7 +95,7 @@ def choose_model(capture: Capture, asked: str = AUTO) -> ModelChoice | None:
 
 
 def spline_choice(choice: ModelChoice | None, spline: Motion, law: Motion, probability: float) -> ModelChoice:
-    """The choice of a spline of that probability, in place of the law that was used, chosen or not."""
+    """The choice of a spline with this probability in place of the motion model ``law``."""
     laws = {law.name: 1.0} if choice is None else choice.probability
     angle, percent = _apart(spline.d, law.d)
     return ModelChoice(
@@ -124,14 +123,14 @@ def _parameters(peak: Peak) -> dict[str, float]:
 
 
 def motion_at(peak: Peak) -> Motion:
-    """The motion of the body, metres, that a hypothesis found."""
+    """The motion of the body, metres, under the best fit of a hypothesis."""
     model = peak.fit.hypothesis.motion_model
     w, d = load_kernel(model, _parameters(peak)).motion(peak.fit.theta)
     return make_motion(model, w, d, _parameters(peak))
 
 
 def spread_by_unknowns(peak: Peak) -> FloatArray:
-    """(6, 6) what not knowing the ratio and the other unknowns adds to the covariance of w and d."""
+    """(6, 6) what the uncertain ratio and other unknowns add to the covariance of w and d."""
     J = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak)).motion_jacobian(peak.fit.theta)
     slope = J @ peak.trade[:6]
     return np.asarray(J @ peak.fit.spread @ J.T + peak.sigma**2 * np.outer(slope, slope))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, RADIAL, CardSigma
-from rsbench.capture.hypotheses import Known, Scans, scans_of
+from rsbench.capture.hypotheses import Known, KnownInputs, Scans, scans_of
 from rsbench.capture.shutter_decision import as_global, examine_alone, known_of
 from rsbench.capture.two_frame_estimate import CERTAIN, Window, conclude, examine
 from rsbench.core.camera import Lens, PinholeCamera
@@ -28,104 +28,101 @@ from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 _TELLING = 0.5
-"""Standard deviation over the prior's, at most, of what is told."""
+"""Largest standard deviation of a determined value over the prior's."""
 _LEAST_TURN = np.deg2rad(0.25)
-"""Per frame period: where a rig turns less, errors of the calibration say more of a focal length than the motion
-does, and it is not asked. From a straight drive (KITTI) it came out 6 % too long, at a stated deviation of 2 %."""
+"""Per frame period: where a rig turns less, the focal length follows errors of the calibration more than the
+motion, and is not estimated. A straight drive (KITTI) gave one 6 % too long, at a stated standard deviation of 2
+%."""
 _FEWEST_TURNS = 3
-"""Windows of a rig whose rows show that its calibration errs: by their scatter alone is it known how much of that
-they take for a focal length (KITTI: single windows are off by up to eleven deviations)."""
+"""Windows of a rig whose rows show that its calibration errs: only their scatter shows how much of that error the
+focal length takes up (KITTI: single windows are off by up to eleven standard deviations)."""
 _LEFT_OVER = 0.03
-"""Share of a focal length by which it is off, about, where the calibration errs in more than its terms hold: found
-4 % too short from a KITTI excerpt that turns, at a deviation of 1 % by the scatter of its windows."""
+"""Relative error of a focal length where the calibration errs by more than its terms describe: a KITTI excerpt
+that turns gave 4 % too little, at a standard deviation of 1 % by the scatter of its windows."""
 _TOGETHER = np.array([2e-4, 2e-4])
-"""Share of a focal length, and k1, by which the errors that matches of pictures share put them off: without it
+"""Relative error of a focal length, and error of k1, by errors that matches of pictures share: without it the
 deviations of 21 pairs of traced frames were too small by a half (``benchmarks/wrong_cards.py``)."""
 _MOST_ROUNDS, _SETTLED = 4, 0.1
-"""Behind a lens the error is linear only nearby: again from what was found, until it moves by few deviations."""
+"""Behind a lens the error is linear only nearby: estimated again until it moves by this share of its deviation."""
 _TERMS = [FOCAL, RADIAL]
-_LATER = "is found with the errors of the calibration that rows show"
-_OPEN = "as the card has it: the matches cannot tell; turn the rig, or give more frames"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundCamera:
-    """A rig as its card has it, but for what the matches say of its cameras."""
+    """A rig as its card has it, except for what was estimated of its cameras."""
 
     rig: StereoRig
     sigma: CardSigma
-    """Of what was found; the card's where the matches do not tell."""
-    told: tuple[bool, bool]
-    """Whether they tell the focal length and k1; where not, the rig has the card's."""
+    """Of estimated values; the card's for others."""
+    determined: tuple[bool, bool]
+    """Whether the focal length and k1 were estimated; where not, the rig has the card's."""
     k1_later: bool = False
-    """Whether rows show that the calibration errs: k1 is then found with its other errors, and is no lens here."""
+    """Whether rows show that the calibration errs: k1 is then estimated with its other errors, and is no lens
+    here."""
 
     def words(self, given: StereoRig, sigma: CardSigma) -> str:
         """Such as "focal length 545.9 +- 0.4 px (card: 520.0 +- 20.0)"."""
-        said = list[str]()
+        parts, later = list[str](), "is found with the errors of the calibration that rows show"
+        undetermined = "as the card has it: the matches cannot tell; turn the rig, or give more frames"
         if sigma.focal:
             card = f"(card: {given.camera.fx:.1f} +- {sigma.focal:.1f})"
             found = f"{self.rig.camera.fx:.1f} +- {self.sigma.focal:.1f} px"
-            said.append(f"focal length {found if self.told[0] else _OPEN} {card}")
+            parts.append(f"focal length {found if self.determined[0] else undetermined} {card}")
         if sigma.k1:
             card = f"(card: {_k1(given):.3f} +- {sigma.k1:.3f})"
             found = f"{_k1(self.rig):.4f} +- {self.sigma.k1:.4f}"
-            open_ = _LATER if self.k1_later else _OPEN
-            said.append(f"k1 {found if self.told[1] else open_} {card}")
-        return "; ".join(said)
+            otherwise = later if self.k1_later else undetermined
+            parts.append(f"k1 {found if self.determined[1] else otherwise} {card}")
+        return "; ".join(parts)
 
 
 def find_camera(
     windows: Sequence[Correspondences],
     rig: StereoRig,
     sigma: CardSigma,
-    readout_ratio: float | None = None,
-    scanning: Scanning | None = None,
+    given: KnownInputs | None = None,
     robust: RobustOptions | None = None,
     seed: int = 0,
 ) -> FoundCamera:
-    """Focal length and k1 of a rig from the matches of one or more pairs of times; all else is found beside.
+    """Focal length and k1 of a rig from the matches of one or more pairs of times, with all else that is unknown.
 
     Where rows show that the calibration errs, k1 is one of these errors and stays the card's here.
 
     Args:
-        sigma: of the card; what it is sure of is not looked for.
-        readout_ratio, scanning: as ``shutter_decision.known_of`` takes them.
+        sigma: of the card; values with 0 are not estimated.
+        given: as ``known_of`` takes it; with a readout ratio alone, rows are read from the top.
     """
-    scanning = scanning if readout_ratio is None else scanning or Scanning()
-    known = known_of(windows[0], rig, readout_ratio, scanning)
+    given = given or KnownInputs()
+    if given.readout_ratio is not None and given.scanning is None:
+        given = replace(given, scanning=Scanning())
+    known = known_of(windows[0], rig, given)
     later = sigma.k1 > 0.0 and known.calibration_sigma[OFFSET] > 0.0
-    found, told, last = rig, np.zeros(2, dtype=np.bool_), np.zeros(2)
+    found, determined, last = rig, np.zeros(2, dtype=np.bool_), np.zeros(2)
     for _ in range(_MOST_ROUNDS):
-        prior = np.array([sigma.focal / found.camera.fx, sigma.k1])
-        errors = _errors_of(windows, found, _expecting(known, prior), robust, seed)
-        mended = None if errors is None else _mended(found, np.where(errors.told, errors.values, 0.0))
-        lost = errors is None or not np.any(errors.told) or np.any(told & ~errors.told)
+        prior, sigmas = np.array([sigma.focal / found.camera.fx, sigma.k1]), np.array(known.calibration_sigma)
+        sigmas[_TERMS] = np.where(prior > 0.0, prior, sigmas[_TERMS])
+        expecting = replace(known, calibration_sigma=tuple(sigmas.tolist()))
+        errors = _errors_of(windows, found, expecting, robust, seed)
+        mended = None if errors is None else _mended(found, np.where(errors.determined, errors.values, 0.0))
+        lost = errors is None or not np.any(errors.determined) or np.any(determined & ~errors.determined)
         if errors is None or mended is None or lost:
-            return FoundCamera(rig=rig, sigma=sigma, told=(False, False), k1_later=later)
-        found, told, last = mended, errors.told, errors.sigma * (mended.camera.fx, 1.0)
+            return FoundCamera(rig=rig, sigma=sigma, determined=(False, False), k1_later=later)
+        found, determined, last = mended, errors.determined, errors.sigma * (mended.camera.fx, 1.0)
         known = replace(known, scans=errors.scans)
         if found.camera.lens is None or np.all(np.abs(errors.values) < _SETTLED * errors.sigma):
             break
-    focal, k1 = np.where(told, last, (sigma.focal, sigma.k1))
-    stated = CardSigma(focal=float(focal), k1=float(k1))
-    return FoundCamera(rig=found, sigma=stated, told=(bool(told[0]), bool(told[1])), k1_later=later)
-
-
-def _expecting(known: Known, prior: FloatArray) -> Known:
-    """With standard deviations (2,) of the focal length, a share of it, and of k1: of 0 as they are."""
-    sigmas = np.array(known.calibration_sigma)
-    sigmas[_TERMS] = np.where(prior > 0.0, prior, sigmas[_TERMS])
-    return replace(known, calibration_sigma=tuple(sigmas.tolist()))
+    focal, k1 = np.where(determined, last, (sigma.focal, sigma.k1)).tolist()
+    both = (bool(determined[0]), bool(determined[1]))
+    return FoundCamera(rig=found, sigma=CardSigma(focal=focal, k1=k1), determined=both, k1_later=later)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Errors:
-    """Share by which a focal length is too short, and k1 too small, (2,) each."""
+    """Relative error by which a focal length is too short, and error by which k1 is too small, (2,) each."""
 
     values: FloatArray
     sigma: FloatArray
-    told: BoolArray
+    determined: BoolArray
     scans: tuple[Scans, ...]
     """Under which, beyond doubt."""
 
@@ -133,7 +130,7 @@ class _Errors:
 def _errors_of(
     windows: Sequence[Correspondences], rig: StereoRig, known: Known, robust: RobustOptions | None, seed: int
 ) -> _Errors | None:
-    """What the windows in which the rig turns say; None where they say nothing."""
+    """From the windows in which the rig turns; None where they show nothing."""
     examined = [(each, examine(each, rig, known, robust, seed)) for each in windows]
     turning = [(each, window) for each, window in examined if _turn(window) >= _LEAST_TURN]
     if not turning:
@@ -144,13 +141,14 @@ def _errors_of(
     best = capture.likeliest
     if best is None or best.probability < CERTAIN:
         return None
-    errs = known.calibration_sigma[OFFSET] > 0.0 and best.scans.together  # of others the rows differ anyway
+    errs = known.calibration_sigma[OFFSET] > 0.0 and best.scans.together  # rows of other scans differ anyway
     if errs and len(turning) < _FEWEST_TURNS:
         return None
     prior, left_over = np.array(known.calibration_sigma)[_TERMS], np.array([_LEFT_OVER if errs else 0.0, 0.0])
     sigma = np.hypot(np.hypot(np.array(best.calibration_sigma)[_TERMS], _TOGETHER), left_over)
-    told = (prior > 0.0) & (sigma <= _TELLING * prior) & [True, not errs]
-    return _Errors(values=np.array(best.calibration)[_TERMS], sigma=sigma, told=told, scans=(best.scans,))
+    determined = (prior > 0.0) & (sigma <= _TELLING * prior) & [True, not errs]
+    values = np.array(best.calibration)[_TERMS]
+    return _Errors(values=values, sigma=sigma, determined=determined, scans=(best.scans,))
 
 
 def _mended(rig: StereoRig, errors: FloatArray) -> StereoRig | None:
@@ -170,43 +168,45 @@ def _k1(rig: StereoRig) -> float:
 
 
 def _turn(window: Window) -> float:
-    """Angle, rad, per frame period, under what fits best; 0 where nothing does."""
+    """Angle, rad, per frame period, under the best fit; 0 where there is none."""
     if window.evidence is None:
         return 0.0
     best = max(window.evidence.peaks.values(), key=lambda peak: peak.value)
     return float(np.linalg.norm(best.fit.theta[:3]))
 
 
+# One camera
+
 PRIOR = 0.35
 """Standard deviation of the logarithm of a focal length over the width of the image, about 0: lenses from a half
 to two widths, of 90 to 28 degrees, are within two of them."""
 _MATCHES, _SAMPLES = 400, 100
-"""Of a pair, and of samples of them: neighbours in dense flow err alike."""
+"""Of a pair, and of samples of them: neighbours in dense flow have common errors."""
 _MODELS = ("inertial", "accelerated")
 _NEARBY, _PAIR_ROUNDS = 0.3, 4
-"""Share of a focal length that is found at once; one that is off by more is looked for again from there."""
+"""Relative error of a focal length that is found at once; beyond it, the search starts again from there."""
 _LEAST_PAIR_TURN, _LEAST_PAIR_MOVED = np.deg2rad(1.0), 0.01
-"""Per frame period, and the widths by which that moves the image: what turns less shows more of the errors of the
-flow than of a focal length, and a focal length that is far too short makes turns look large."""
+"""Per frame period, and the widths by which that moves the image: a smaller turn shows the errors of the flow more
+than the focal length, and a focal length that is far too short makes turns look large."""
 _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
 """Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
 _SHARED = 0.05
-"""By which the pairs of a video err alike."""
+"""Error that the pairs of a video have in common."""
 _LEAST_TURNING = 0.5
-"""Share of the pairs: where few seem to turn, they seem so by what they err."""
+"""Share of the pairs: where few seem to turn, they do so by their errors."""
 _BROKEN, _LEAST_GOOD = 3.0, 0.75
-"""Prior deviations beyond which a pair shows its shaking alone, and the share that must not be so."""
+"""Prior deviations beyond which a pair shows only its shake, and the share of pairs that must be within."""
 _TELLING_PAIRS = 0.65
-"""Standard deviation over the prior's, at most, of what is told."""
+"""Largest standard deviation of a determined value over the prior's."""
 
 
 class PairFocal(NamedTuple):
-    """What one pair of frames says."""
+    """The focal length from one pair of frames."""
 
     log: float
     """Logarithm of the focal length over the width of the image."""
     sigma: float
-    """By the noise of the matches alone."""
+    """From the noise of the matches alone."""
     turn: float
     """Radians per frame period."""
 
@@ -221,17 +221,17 @@ class FoundFocal:
     """Focal length of a camera, px."""
 
     focal: float
-    """The most probable one; where the pairs do not tell it, the width of the image."""
+    """The most probable one; where the pairs do not determine it, the width of the image."""
     sigma: float
-    told: bool
+    determined: bool
     pairs: int
-    """That it rests on."""
+    """That it is estimated from."""
 
 
 def focal_of_pair(
     matches: FloatArray, size: tuple[int, int], shutter: RollingShutter, options: RobustOptions, seed: int = 0
 ) -> PairFocal | None:
-    """What matches (n, 4) x0, y0, x1, y1, px, in random order, say; None where no motion explains them.
+    """From matches (n, 4) x0, y0, x1, y1, px, in random order; None where no motion explains them.
 
     Args:
         size: width and height, px.
@@ -264,13 +264,13 @@ def focal_of_pair(
 
 
 def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
-    """What all pairs of a video of this width say together."""
+    """From all pairs of a video of this width together."""
     solved = [each for each in pairs if each is not None]
     turning = [each for each in solved if each.turns]
     good = [each for each in turning if abs(each.log) <= _BROKEN * PRIOR]
-    untold = FoundFocal(focal=float(width), sigma=PRIOR * width, told=False, pairs=len(good))
+    undetermined = FoundFocal(focal=float(width), sigma=PRIOR * width, determined=False, pairs=len(good))
     if not good or len(good) < _LEAST_GOOD * len(turning) or len(turning) < _LEAST_TURNING * len(solved):
-        return untold
+        return undetermined
     logs, own = np.array([each.log for each in good]), np.array([each.sigma for each in good])
     scatter = _EXPECTED
     for _ in range(10):
@@ -281,6 +281,6 @@ def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
     variance = 1.0 / float(np.sum(weights)) + _SHARED**2
     sigma = (1.0 / variance + 1.0 / PRIOR**2) ** -0.5
     if sigma > _TELLING_PAIRS * PRIOR:
-        return untold
+        return undetermined
     focal = width * float(np.exp(mean * sigma**2 / variance))
-    return FoundFocal(focal=focal, sigma=sigma * focal, told=True, pairs=len(good))
+    return FoundFocal(focal=focal, sigma=sigma * focal, determined=True, pairs=len(good))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, row_pattern, term_sizes
-from rsbench.capture.hypotheses import ALL_SCANS, CALIBRATION, GLOBAL, MODELS, Known, Scans, scans_of
+from rsbench.capture.hypotheses import ALL_SCANS, CALIBRATION, GLOBAL, Known, KnownInputs, Scans, scans_of
 from rsbench.capture.hypothesis_ranking import COARSE, Peak
 from rsbench.capture.trajectory_tracks import thinned
 from rsbench.capture.two_frame_estimate import (
@@ -40,20 +40,22 @@ from rsbench.solvers.refined import RefinedSolver
 
 OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
-"""Standard deviation of a ratio that frames are corrected with, at most; more where it moves no pixel by this."""
+"""Largest standard deviation of a ratio that is used; a larger one is used where it moves no pixel by this."""
 _PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
-"""Standard deviation of each error of a calibration over the size of the row differences, px: rows show some,
-and the others come from the same calibration. From 0.1 px on there are any to find, of as many left-right matches:
-rendered pairs show 0.02 px at most, two excerpts of KITTI odometry 1.1 px."""
+"""Prior standard deviation of each error of a calibration over the size of the row differences, its limits, px,
+and the left-right matches that it needs: the other errors come from the same calibration as these differences.
+Below 0.1 px there are none to find: rendered pairs show at most 0.02 px, two excerpts of KITTI odometry 1.1 px."""
 _LEAST_SIZE = 1e-3
-"""px that 1 of a term moves a pixel by, at least: of an image of a narrow field there is little of the others."""
+"""px by which 1 of a term moves a pixel, at least: an image of a narrow field shows little of some terms."""
 _FROM_GLOBAL = 3.0
-"""Deviations from 0 of a ratio, at least, of lines that are said to be read one after the other: a pair of KITTI,
-whose calibration errs, gave 0.25 +- 0.09 from the left, at a probability of 0.98."""
+"""Standard deviations from 0 that a ratio of rolling lines needs: a pair of KITTI, whose calibration errs, gave
+0.25 +- 0.09 from the left, at a probability of 0.98."""
 _CLEARLY, LEAST_BACKWARDS, _NEAR = 0.999, 0.25, 0.2
 """Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
 _FEW = 600
-"""Tracks, or matches of one camera, that tell of most frames that time runs forward."""
+"""Tracks, or matches of one camera, that show for most frames that time runs forward."""
+_LOOK, _CLEARLY_LESS = 500, 0.97
+"""Matches of a quick look at the order of frames, and the share of the noise that is less than by chance."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
 
@@ -61,57 +63,44 @@ class NoMotionError(RsbenchError):
     """The frames are in order, but no motion explains their matches; the message says why."""
 
 
-def known_of(
-    matches: Correspondences,
-    rig: StereoRig,
-    readout_ratio: float | None,
-    scanning: Scanning | None,
-    calibration: tuple[float, ...] | None = None,
-    models: tuple[str, ...] = MODELS,
-) -> Known:
-    """What is known before the matches are asked; None of it is looked for.
+def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Known:
+    """What is known of a capture before its matches are fitted: the one step from given values.
 
-    Errors of the calibration are looked for where the row differences of the left-right matches show some, and are
-    expected to be as large as these: they come from the same calibration.
+    Errors of the calibration that are not given are estimated where the row differences of the left-right matches
+    show some; these set their prior, because they come from the same calibration.
     """
-    scans = ALL_SCANS
+    ratio, scanning, scans = given.readout_ratio, given.scanning, ALL_SCANS
     if scanning is not None:
-        width, height = rig.camera.width, rig.camera.height
-        rolling = scans_of(scanning.shutter_of(width, height, 1.0))
-        scans = (
-            (GLOBAL, rolling, reversed_scans(rolling))
-            if readout_ratio is None
-            else (rolling if readout_ratio > 0.0 else GLOBAL,)
-        )
+        rolling = scans_of(scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0))
+        scans = (GLOBAL, rolling, reversed_scans(rolling))
+        if ratio is not None:
+            scans = (rolling if ratio > 0.0 else GLOBAL,)
     return Known(
-        ratio=readout_ratio,
+        ratio=ratio,
         scans=scans,
         delay=None if scanning is None else scanning.right_delay,
-        calibration=calibration or NO_ERRORS,
-        calibration_sigma=_errors_expected(matches, rig) if calibration is None else NO_ERRORS,
-        models=models,
+        calibration=given.calibration or NO_ERRORS,
+        calibration_sigma=_errors_expected(matches, rig) if given.calibration is None else NO_ERRORS,
+        models=given.models,
     )
 
 
 def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, ...]:
-    """Standard deviation of each error of a calibration: the row differences show how large they are."""
-    stereo = _stereo(matches)
+    """Prior standard deviation of each error of a calibration, from the left-right matches of both times.
+
+    Those of the tracks where there are no others.
+    """
+    tracks, stereo = matches.tracks, np.concatenate([matches.stereo_0, matches.stereo_1])
+    stereo = stereo if len(stereo) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
     pattern = row_pattern(stereo, rig) if rig.camera.lens is None and len(stereo) >= _FEWEST else None
     sigma = 0.0 if pattern is None else min(_PRIOR_FACTOR * pattern.systematic_px, _MOST_PRIOR_PX)
-    if pattern is None or sigma <= _LEAST_PRIOR_PX:
+    if sigma <= _LEAST_PRIOR_PX:
         return NO_ERRORS
     camera = rig.camera
     rays = (0.5 * (stereo[:, :2] + stereo[:, 2:]) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     out = sigma / np.maximum(term_sizes(rays, camera.fx), _LEAST_SIZE)
-    out[FOCAL] = 0.0  # what the rows show says nothing of it
+    out[FOCAL] = 0.0  # which the rows do not show
     return tuple(out.tolist())
-
-
-def _stereo(matches: Correspondences) -> FloatArray:
-    """The left-right matches (n, 4) of both times; those of the tracks where there are no others."""
-    pairs = np.concatenate([matches.stereo_0, matches.stereo_1])
-    tracks = matches.tracks
-    return pairs if len(pairs) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
 
 
 def as_global(
@@ -123,11 +112,11 @@ def as_global(
 ) -> Capture:
     """A global shutter, where the matches allow nothing but one or nearly one (``nearly_global``).
 
-    What is unknown beside is found again under a global shutter.
+    All other unknowns are estimated again under a global shutter.
 
     Args:
-        windows: the matches from which, of cameras of which ``known`` is known.
-        under_global: what others say, if anything; asked where the shutter is global.
+        windows: the matches of the capture.
+        under_global: a capture under a global shutter, or None; called where the shutter is global.
     """
     candidates = nearly_global(capture)
     if candidates is None:
@@ -147,7 +136,7 @@ def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
     """The shutter of the most probable candidate.
 
     Raises:
-        NoMotionError: there is none, or the matches leave open what would matter; in words.
+        NoMotionError: there is none, or what the matches leave undetermined would matter.
     """
     best = capture.likeliest
     if best is None:
@@ -161,38 +150,37 @@ def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
 
 
 def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
-    """The shutter of a candidate; a camera with a global shutter beside one that rolls has none here.
+    """The shutter of a candidate.
 
     Raises:
         NoMotionError: one camera alone rolls.
     """
     camera, scans = rig.camera, candidate.scans
-    ratio = candidate.ratio if scans.rolls else 0.0
     if scans.rolls and "global" in (scans.left, scans.right):
         raise NoMotionError(f"{scans}: a rig of which one camera alone rolls cannot be corrected")
     delay = candidate.delay if abs(candidate.delay) > 2.0 * candidate.delay_sigma else 0.0
     if not scans.rolls:
         return RollingShutter(height=camera.height, readout_ratio=0.0, right_delay=delay)
     scanning = Scanning(scan=scans.left, right_scan=scans.right, right_delay=delay)  # pyrefly: ignore[bad-argument-type]
-    return scanning.shutter_of(camera.width, camera.height, ratio)
+    return scanning.shutter_of(camera.width, camera.height, candidate.ratio)
 
 
 def cannot_tell(capture: Capture) -> str:
-    """Which unknowns the matches leave open, what the ratio trades against, and what would settle it."""
+    """Which unknowns the matches leave undetermined, what the ratio trades against, and the remedy."""
     text = f"cannot tell the readout ratio: {capture.reason}"
     peak = capture.peaks.get(capture.motion_model)
     best = capture.likeliest
     if best is not None and peak is not None and best.sigma > _MAX_SIGMA:
-        text += f"; a larger ratio goes with {trade(peak)}"
+        text += f"; a larger ratio goes with {_trade(peak)}"
     return f"{text}. Give readout_ratio in the rig's card, or frames in which the rig turns, or more frames"
 
 
-def trade(peak: Peak) -> str:
-    """The parameter of the motion, or the offset, that takes up most of a change of the ratio, with its amount."""
+def _trade(peak: Peak) -> str:
+    """The parameter of the motion, or the offset, that compensates most of a change of the ratio, and by how
+    much."""
     w, d, offset = peak.trade[:3], peak.trade[3:6], float(peak.trade[6 + CALIBRATION.start + OFFSET])
     depth = 10.0 * max(float(np.linalg.norm(peak.fit.theta[3:])), 1e-6)
-    share = np.abs(np.concatenate([w, d / depth]))
-    k = int(np.argmax(share))
+    k = int(np.argmax(np.abs(np.concatenate([w, d / depth]))))
     more = "more" if peak.trade[k] * peak.fit.theta[k] >= 0.0 else "less"
     amount = 0.1 * abs(float(peak.trade[k]))
     unit = f"{np.rad2deg(amount):.2g} deg" if k < 3 else f"{amount:.2g} m"
@@ -202,12 +190,12 @@ def trade(peak: Peak) -> str:
 
 def reversed_scans(scans: Scans) -> Scans:
     """Lines read from the opposite side: what frames in the wrong order look like."""
-    opposite = {"top": "bottom", "bottom": "top", "left": "right", "right": "left", "global": "global"}
+    opposite = {**OPPOSITE, "global": "global"}
     return Scans(opposite[scans.left], opposite[scans.right])  # pyrefly: ignore[bad-argument-type]
 
 
 def runs_backwards(capture: Capture, scans: Scans) -> bool:
-    """Whether lines are read from the side opposite to what is said, or the frames are in the wrong order."""
+    """Whether lines are read from the side opposite to given scans, or the frames are in the wrong order."""
     best = capture.likeliest
     if best is None or best.scans != reversed_scans(scans) or best.scans == scans:
         return False
@@ -223,14 +211,16 @@ def scans_by_laws(
     seed: int,
     start: Motion | None = None,
 ) -> Scans | None:
-    """How lines are read, as is said or from the opposite side, by laws of motion, beyond doubt; None: unknown.
+    """The scans of a given shutter, or the opposite ones, whichever motion models show beyond doubt; None:
+    neither.
 
-    Near the ratio that is said: where none of them holds, laws find any. Of most frames a part of the matches
-    tells that they are as is said; all are asked where it does not. ``start`` is as in ``examine``.
+    Only near the given ratio: where no model holds, any ratio may come out. For most frames a part of the matches
+    shows the given scans; otherwise all matches are used. ``start`` is as in ``examine``.
     """
     few, found = thinned([matches], _FEW)[0], None
     for part in (matches,) if few is matches else (few, matches):
-        known = replace(known_of(part, rig, None, shutter.scanning, None, models), delay=shutter.right_delay)
+        known = known_of(part, rig, KnownInputs(scanning=shutter.scanning, models=models))
+        known = replace(known, delay=shutter.right_delay)
         best = conclude([examine(part, rig, known, options, seed, start)]).likeliest
         certain = best is not None and best.probability > _CLEARLY and best.sigma <= _NEAR
         found = best.scans if best and certain and abs(best.ratio - shutter.readout_ratio) <= _NEAR else None
@@ -240,18 +230,15 @@ def scans_by_laws(
 
 
 def record_of(capture: Capture) -> dict[str, Any]:
-    """What was found of the shutter and how sure it is, as JSON holds it."""
-    best = capture.likeliest
+    """What was estimated of the shutter and how certain it is, as JSON holds it."""
+    best = candidates_of(capture)[0] if capture.candidates else dict.fromkeys(_OF_A_CANDIDATE)
+    likeliest = capture.likeliest
     return {
-        "told": capture.told,
+        "told": capture.determined,
         "reason": capture.reason,
-        "left": None if best is None else best.scans.left,
-        "right": None if best is None else best.scans.right,
-        "probability": None if best is None else best.probability,
-        "readout_ratio": None if best is None else best.ratio,
-        "readout_ratio_sigma": None if best is None else best.sigma,
-        "right_delay": None if best is None else best.delay,
-        "right_delay_sigma": None if best is None else best.delay_sigma,
+        **best,
+        "right_delay": None if likeliest is None else likeliest.delay,
+        "right_delay_sigma": None if likeliest is None else likeliest.delay_sigma,
         "disparity_offset": capture.offset,
         "disparity_offset_sigma": capture.offset_sigma,
         "candidates": candidates_of(capture),
@@ -264,22 +251,16 @@ def record_of(capture: Capture) -> dict[str, Any]:
     }
 
 
+_OF_A_CANDIDATE = ("left", "right", "probability", "readout_ratio", "readout_ratio_sigma")
+
+
 def candidates_of(capture: Capture) -> list[dict[str, Any]]:
-    """Every way of reading that is not out of the question, the most probable first."""
-    return [
-        {
-            "left": each.scans.left,
-            "right": each.scans.right,
-            "probability": each.probability,
-            "readout_ratio": each.ratio,
-            "readout_ratio_sigma": each.sigma,
-        }
-        for each in capture.candidates
-    ]
+    """All scans that are not excluded, the most probable first."""
+    values = ((c.scans.left, c.scans.right, c.probability, c.ratio, c.sigma) for c in capture.candidates)
+    return [dict(zip(_OF_A_CANDIDATE, each, strict=True)) for each in values]
 
 
-_LOOK, _CLEARLY_LESS = 500, 0.97
-"""Matches of a quick look at the order of frames, and the share of the noise that is less than by chance."""
+# One camera
 
 
 def rig_of(camera: PinholeCamera) -> StereoRig:
@@ -288,51 +269,44 @@ def rig_of(camera: PinholeCamera) -> StereoRig:
 
 
 def known_alone(scan: Scan | None = None) -> Known:
-    """What is known of a camera whose readout ratio is not: that there is one, and perhaps its ``scan``.
+    """What is known of a camera whose readout ratio is not given, with its ``scan`` if that is.
 
-    The opposite scan stays possible: it is what frames in the wrong order show. Columns are for who says so: what
-    one camera's flow errs by may look like them.
+    The opposite scan stays possible, because frames in the wrong order show it. Columns are possible only where
+    ``scan`` gives them: errors of the flow of one camera resemble them.
     """
-    said = Scans(scan or "top", scan or "top")
-    return Known(scans=(GLOBAL, said, reversed_scans(said)), delay=0.0)
+    given = Scans(scan or "top", scan or "top")
+    return Known(scans=(GLOBAL, given, reversed_scans(given)), delay=0.0)
 
 
 def examine_alone(
     matches: FloatArray, camera: PinholeCamera, known: Known, options: RobustOptions, seed: int = 0
 ) -> Window:
     """Matches (n, 4) x0, y0, x1, y1, px, of two frames of a camera under each hypothesis; with outliers."""
-    given = Correspondences(left=matches)
-    return examine(given, rig_of(camera), known, options, seed, _start(given, camera, known, options, seed))
-
-
-def _start(
-    matches: Correspondences, camera: PinholeCamera, known: Known, options: RobustOptions, seed: int
-) -> Motion | None:
-    """The motion under a shutter between those that are possible; None when there is none."""
+    given, rig = Correspondences(left=matches), rig_of(camera)
+    # The search starts from the motion under a shutter between those that are possible.
     starts = {scans.left for scans in known.scans}
     scan, ratio = next(each for each in COARSE if ("global" if each[1] == 0.0 else each[0]) in starts)
     shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
     rng = np.random.default_rng(seed)
-    found = estimate_motion(matches, rig_of(camera), shutter, RefinedSolver(one_camera=True), options, rng)
-    return LinearMotion(w=found.estimate.w, d=found.estimate.d) if found.estimate.success else None
+    found = estimate_motion(given, rig, shutter, RefinedSolver(one_camera=True), options, rng).estimate
+    start = LinearMotion(w=found.w, d=found.d) if found.success else None
+    return examine(given, rig, known, options, seed, start)
 
 
 def fits_backwards(
     matches: FloatArray, camera: PinholeCamera, shutter: RollingShutter, options: RobustOptions, seed: int = 0
 ) -> bool:
-    """Whether matches (n, 4) fit better where lines are read from the other side: a quick look, no judgement."""
-    noise = list[float]()
+    """Whether matches (n, 4) fit better where lines are read from the other side: a quick look, no decision."""
+    noise, given = list[float](), Correspondences(left=matches[:: max(len(matches) // _LOOK, 1)])
     for scan in (shutter.scan_of("left"), OPPOSITE[shutter.scan_of("left")]):
-        seen = replace(shutter, scan=scan)
         solver, rng = RefinedSolver(motion_model="inertial", one_camera=True), np.random.default_rng(seed)
-        given = Correspondences(left=matches[:: max(len(matches) // _LOOK, 1)])
-        found = estimate_motion(given, rig_of(camera), seen, solver, options, rng)
-        noise.append(found.estimate.noise_px or np.inf if found.estimate.success else np.inf)
+        found = estimate_motion(given, rig_of(camera), replace(shutter, scan=scan), solver, options, rng).estimate
+        noise.append(found.noise_px or np.inf if found.success else np.inf)
     return noise[1] < _CLEARLY_LESS * noise[0]
 
 
 def conclude_alone(windows: Sequence[Window]) -> Capture:
-    """What all windows of a camera say together; a global shutter where all that they allow is one or nearly."""
+    """What all windows of a camera show together; a global shutter where they allow only one or nearly one."""
     capture = conclude(windows)
     candidates = nearly_global(capture)
     return capture if candidates is None else replace(capture, candidates=candidates, named=True)
@@ -342,26 +316,24 @@ def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
     """The shutter of the most probable candidate.
 
     Raises:
-        NoMotionError: there is none, or the frames leave open what would matter; in words.
+        NoMotionError: there is none, or what the frames leave undetermined would matter.
     """
+
+    def words(candidate: Candidate) -> str:
+        start = candidate.scans.left
+        return "all lines read at once" if start == "global" else f"lines read from the {start}"
+
+    remedy = "Give readout_ratio in the camera's card, or frames in which the camera turns, or more frames"
     best = capture.likeliest
     if best is None:
-        raise NoMotionError(f"cannot tell how the camera reads: {capture.reason}. {_GIVE}")
+        raise NoMotionError(f"cannot tell how the camera reads: {capture.reason}. {remedy}")
     certain = best.probability >= CERTAIN
     harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
     if certain and (best.sigma <= _MAX_SIGMA or harmless):
         return shutter_of(best, rig_of(camera))
     if certain:
-        how = f"{_words(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
+        how = f"{words(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
     else:
         likely = [each for each in capture.candidates if each.probability > 0.1]
-        how = ", or ".join(f"{_words(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
-    raise NoMotionError(f"cannot tell the readout ratio: the frames show {how}. {_GIVE}")
-
-
-_GIVE = "Give readout_ratio in the camera's card, or frames in which the camera turns, or more frames"
-
-
-def _words(candidate: Candidate) -> str:
-    start = candidate.scans.left
-    return "all lines read at once" if start == "global" else f"lines read from the {start}"
+        how = ", or ".join(f"{words(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
+    raise NoMotionError(f"cannot tell the readout ratio: the frames show {how}. {remedy}")

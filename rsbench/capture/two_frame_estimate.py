@@ -9,8 +9,8 @@ because a ratio under the wrong motion model is wrong by many of its own standar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,29 +33,29 @@ from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CERTAIN = 0.95
-"""Probability of what is told."""
+"""Probability from which a candidate is determined."""
 MAX_SIGMA = 0.015
-"""Standard deviation, at most, of a readout ratio that is told: 0.03 is then two of them."""
+"""Largest standard deviation of a determined readout ratio: 0.03 is then two of them."""
 FEWEST = 30
 """Matches between two times."""
 _LEAST_SHARE = 0.3
-"""Of the matches, that must agree with what is told."""
+"""Of the matches, that must agree with a determined shutter."""
 _NEARLY, _SMALL = 0.06, 0.15
-"""Readout ratio of nearly a global shutter, within two deviations; and the root mean square, at most, of
-the ratios that the matches then allow."""
+"""Readout ratio of nearly a global shutter, within two deviations; and the largest root mean square of the ratios
+that the matches then allow."""
 _STILL_PX = 1.0
 _UNLIKELY = 0.01
 _EXPECTED = {"top": 0.5, "global": 0.25, "bottom": 0.1, "left": 0.04, "right": 0.04}
-"""Probability, before matches are seen, of cameras that read alike, by where they begin."""
+"""Prior probability of cameras that read alike, by where they begin."""
 _APART, _ONE_GLOBAL = 0.06, 0.01
-"""Probability of cameras that roll in different ways, and of one camera that rolls beside one that does not."""
+"""Prior probability of cameras that roll differently, and of one camera that rolls beside one that does not."""
 _LATE = 0.2
-"""Probability, before matches are seen, that the right camera is late."""
+"""Prior probability that the right camera is late."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """How the cameras may read, and what follows from it."""
+    """How the cameras may read, with its probability and what follows from it."""
 
     scans: Scans
     probability: float
@@ -64,40 +64,40 @@ class Candidate:
     delay: float
     delay_sigma: float
     calibration: tuple[float, ...] = NO_ERRORS
-    """What the calibration is wrong by, see ``calibration.TERMS``."""
+    """Errors of the calibration, see ``calibration.TERMS``."""
     calibration_sigma: tuple[float, ...] = NO_ERRORS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Capture:
-    """What matches say of the shutters and the motion of a rig."""
+    """What matches show of the shutters and the motion of a rig; by default nothing."""
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...] = ()
     """The most probable first; those below one in a hundred are left out."""
-    models: Mapping[str, float]
+    models: Mapping[str, float] = field(default_factory=dict)
     """Probability of each motion model, the most probable first."""
-    peaks: Mapping[str, Peak]
-    """Of each motion model under the most probable scans: of the last window, where there are several."""
+    peaks: Mapping[str, Peak] = field(default_factory=dict)
+    """For each motion model under the most probable scans; of the last window, where there are several."""
     reason: str
-    """Why it cannot be told; empty where it is."""
-    named: bool
+    """Why the shutter is not determined; empty where it is."""
+    named: bool = False
     """Whether it is known which camera rolls and from where, though perhaps not how fast."""
-    windows: int
-    """Pairs of times that it rests on."""
+    windows: int = 0
+    """Pairs of times that the estimate uses."""
     matches: int
-    used: int
-    noise_px: float
+    used: int = 0
+    noise_px: float = float("nan")
     moved_px: float
     """Median distance that a match moves between the times."""
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """Whether the scans and their ratio are known."""
         return not self.reason
 
     @property
     def likeliest(self) -> Candidate | None:
-        """The most probable candidate, told or not."""
+        """The most probable candidate, determined or not."""
         return self.candidates[0] if self.candidates else None
 
     @property
@@ -112,7 +112,7 @@ class Capture:
 
     @property
     def calibration(self) -> tuple[float, ...]:
-        """What the calibration is wrong by, under the most probable candidate."""
+        """Errors of the calibration under the most probable candidate."""
         return NO_ERRORS if self.likeliest is None else self.likeliest.calibration
 
     @property
@@ -123,9 +123,9 @@ class Capture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Window:
-    """The matches of two successive times, judged under each hypothesis."""
+    """The matches of two successive times, compared under each hypothesis."""
 
-    evidence: WindowEvidence | None
+    evidence: WindowEvidence | None = None
     reason: str
     """Why there is none."""
     matches: int
@@ -143,7 +143,7 @@ def examine(
     """The matches of two times, with outliers; left-right matches are joined where there are no tracks.
 
     Args:
-        start: a motion near theirs, of any model; None has it looked for.
+        start: a motion near theirs, of any model; None: a robust search finds one.
     """
     known, options = known or Known(), options or RobustOptions()
     if len(matches.tracks) == 0 and len(matches.stereo_0) + len(matches.stereo_1) > 0:
@@ -152,12 +152,11 @@ def examine(
     count = len(pairs) - len(matches.tracks)
     moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
     if count < FEWEST:
-        reason = f"{count} matches between two times, need {FEWEST}"
-        return Window(evidence=None, reason=reason, matches=count, moved_px=moved)
+        return Window(reason=f"{count} matches between two times, need {FEWEST}", matches=count, moved_px=moved)
     if start is None:
         found, lag = find_start(matches, rig, known, options, seed)
         if found is None:
-            return Window(evidence=None, reason="no motion explains the matches", matches=count, moved_px=moved)
+            return Window(reason="no motion explains the matches", matches=count, moved_px=moved)
         motion = (found.estimate.w, found.estimate.d)
     else:
         motion, lag = (start.w, start.d), find_lag(matches.tracks, rig)
@@ -168,16 +167,16 @@ def examine(
 
 
 def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture:
-    """What all windows of one rig say together, at least one.
+    """What all windows of one rig show together, at least one.
 
     Args:
-        max_sigma: standard deviation, at most, of a readout ratio that is told.
+        max_sigma: largest standard deviation of a determined readout ratio.
     """
     used = [window.evidence for window in windows if window.evidence is not None]
     moved = float(np.median([window.moved_px for window in windows]))
     matches = sum(window.matches for window in windows)
     if not used:
-        return _nothing(windows[0].reason, matches, moved)
+        return Capture(reason=windows[0].reason, matches=matches, moved_px=moved)
     sums = _combined(used)
     logs = {key: _log_prior(key) + each.log_evidence for key, each in sums.items()}
     total = scipy.special.logsumexp(list(logs.values()))
@@ -187,9 +186,11 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture
     kept = sum(window.used for window in used)
     share = kept / sum(window.of for window in used)
     likely = sorted((key for key in sums if key.scans == candidates[0].scans), key=lambda key: shares[key])
+    names = dict.fromkeys(key.motion_model for key in shares)
+    models = {name: sum(p for key, p in shares.items() if key.motion_model == name) for name in names}
     return Capture(
         candidates=tuple(each for each in candidates if each.probability >= _UNLIKELY),
-        models=_shares_by(shares, lambda key: key.motion_model),
+        models=dict(sorted(models.items(), key=lambda each: -each[1])),
         peaks={key.motion_model: sums[key].last for key in likely},
         reason=_doubt(candidates, share, moved, max_sigma),
         named=share >= _LEAST_SHARE and candidates[0].probability >= CERTAIN,
@@ -202,9 +203,9 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture
 
 
 def nearly_global(capture: Capture) -> tuple[Candidate, ...] | None:
-    """The candidates with a global shutter first, where all that the matches allow is one or nearly one.
+    """The candidates with a global shutter first, where the matches allow only such a shutter or nearly one.
 
-    Whatever side it begins at: errors of a calibration are taken for small differences of times, and no camera has
+    Whatever side it begins at: errors of a calibration resemble small differences of times, and no camera has
     a readout that short. None where the matches allow more, or a global shutter alone.
     """
     near = [each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY]
@@ -214,21 +215,6 @@ def nearly_global(capture: Capture) -> tuple[Candidate, ...] | None:
     sigma = float(np.sqrt(sum(each.probability * (each.ratio**2 + each.sigma**2) for each in near) / probability))
     still = Candidate(scans=GLOBAL, probability=probability, ratio=0.0, sigma=sigma, delay=0.0, delay_sigma=0.0)
     return None if sigma > _SMALL else (still, *(each for each in capture.candidates if each not in near))
-
-
-def _nothing(reason: str, matches: int, moved_px: float) -> Capture:
-    return Capture(
-        candidates=(),
-        models={},
-        peaks={},
-        reason=reason,
-        named=False,
-        windows=0,
-        matches=matches,
-        used=0,
-        noise_px=float("nan"),
-        moved_px=moved_px,
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -245,17 +231,16 @@ class _Sum:
 
 
 def _combined(windows: Sequence[WindowEvidence]) -> dict[Hypothesis, _Sum]:
-    """The peaks of several windows of one rig, multiplied; their scatter counts where they say less."""
-    keys = dict.fromkeys(key for window in windows for key in window.peaks)
+    """The peaks of several windows of one rig, multiplied."""
     out = {}
-    for key in keys:
+    for key in dict.fromkeys(key for window in windows for key in window.peaks):
         peaks = [window.peaks[key] for window in windows if key in window.peaks]
-        lost = sum(window.lost for window in windows if key not in window.peaks)
-        out[key] = _product(peaks, lost)
+        out[key] = _product(peaks, sum(window.lost for window in windows if key not in window.peaks))
     return out
 
 
 def _product(peaks: Sequence[Peak], lost: float) -> _Sum:
+    """Peaks of several windows, multiplied; their scatter counts where it exceeds their standard deviations."""
     at, information = peaks[0].at, peaks[0].information
     if len(peaks) > 1 and information > 0.0:
         weights, places = np.array([peak.information for peak in peaks]), np.array([peak.at for peak in peaks])
@@ -264,26 +249,15 @@ def _product(peaks: Sequence[Peak], lost: float) -> _Sum:
         scatter = float(weights @ (places - at) ** 2)
         lost += 0.5 * scatter
         information /= max(scatter / (len(peaks) - 1), 1.0)
-    whole = Peak(
-        value=sum(peak.value for peak in peaks) - lost,
-        at=at,
-        information=information,
-        fit=peaks[-1].fit,
-        trade=peaks[-1].trade,
-    )
+    value = sum(peak.value for peak in peaks) - lost
+    whole = replace(peaks[-1], value=value, at=at, information=information)
     precisions = np.array([np.maximum(peak.fit.sigma, 1e-12) ** -2.0 for peak in peaks])
     values, whole_precision = np.array([peak.fit.unknowns for peak in peaks]), np.sum(precisions, axis=0)
     mean = np.sum(precisions * values, axis=0) / whole_precision
     scatter = np.sum(precisions * (values - mean) ** 2, axis=0) / max(len(peaks) - 1, 1)
-    sigmas = np.sqrt(np.maximum(scatter, 1.0) / whole_precision)
-    return _Sum(
-        log_evidence=whole.log_evidence,
-        at=at,
-        sigma=whole.sigma,
-        mean=mean,
-        sigmas=np.where(peaks[0].fit.sigma > 0.0, sigmas, 0.0),
-        last=peaks[-1],
-    )
+    sigmas = np.where(peaks[0].fit.sigma > 0.0, np.sqrt(np.maximum(scatter, 1.0) / whole_precision), 0.0)
+    evidence = whole.log_evidence
+    return _Sum(log_evidence=evidence, at=at, sigma=whole.sigma, mean=mean, sigmas=sigmas, last=peaks[-1])
 
 
 def _log_prior(key: Hypothesis) -> float:
@@ -295,23 +269,16 @@ def _log_prior(key: Hypothesis) -> float:
     return float(np.log((_ONE_GLOBAL / 8.0 if one_global else _APART / 12.0) * late))
 
 
-def _shares_by(shares: Mapping[Hypothesis, float], of: Callable[[Hypothesis], str]) -> dict[str, float]:
-    """Sums of probabilities by a property, the largest first."""
-    names = dict.fromkeys(map(of, shares))
-    sums = {name: sum(share for key, share in shares.items() if of(key) == name) for name in names}
-    return dict(sorted(sums.items(), key=lambda each: -each[1]))
-
-
 def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hypothesis, float]) -> Candidate:
-    """The scans under all motion models: mean and deviation of the mixture."""
+    """The scans under all motion models: mean and standard deviation of the mixture."""
     keys = [key for key in sums if key.scans == scans]
-    weights = np.array([shares[key] for key in keys])
+    parts, weights = [sums[key] for key in keys], np.array([shares[key] for key in keys])
     probability = float(np.sum(weights))
     weights = weights / probability if probability > 0.0 else np.full(len(keys), 1.0 / len(keys))
-    ratio, sigma = _mixture(weights, [(sums[key].at, sums[key].sigma) for key in keys])
-    delay, delay_sigma = _mixture(weights, [(sums[key].mean[DELAY], sums[key].sigmas[DELAY]) for key in keys])
+    ratio, sigma = _mixture(weights, [(each.at, each.sigma) for each in parts])
+    delay, delay_sigma = _mixture(weights, [(each.mean[DELAY], each.sigmas[DELAY]) for each in parts])
     errors, errors_sigma = _mixture(
-        weights, [(sums[key].mean[CALIBRATION], sums[key].sigmas[CALIBRATION]) for key in keys]
+        weights, [(each.mean[CALIBRATION], each.sigmas[CALIBRATION]) for each in parts]
     )
     return Candidate(
         scans=scans,
@@ -326,14 +293,14 @@ def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hy
 
 
 def _mixture(weights: FloatArray, parts: Sequence[tuple[Any, Any]]) -> tuple[FloatArray, FloatArray]:
-    """Means and deviations (...), of those of the parts."""
+    """Mean and standard deviation (...) of a mixture of parts with these."""
     means, sigmas = np.moveaxis(np.array(parts), 1, 0)
     mean = np.asarray(weights @ means)
     return mean, np.sqrt(weights @ (sigmas**2 + (means - mean) ** 2))
 
 
 def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_sigma: float) -> str:
-    """Why the best candidate cannot be told; empty where it can."""
+    """Why the best candidate is not determined; empty where it is."""
     best = candidates[0]
     if share < _LEAST_SHARE:
         return f"only {share:.0%} of the matches agree with any motion and shutter"
@@ -344,4 +311,4 @@ def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_s
         ratio = f"{best.ratio:.2f} +- {best.sigma:.2f}"
         return f"{best.scans}, but the matches do not determine how fast: {ratio}{still}"
     allowed = [f"{each.scans} ({each.probability:.0%})" for each in candidates if each.probability > 0.1]
-    return f"the matches allow {', or '.join(allowed) or 'many scans'}{still}"
+    return f"the matches allow {', '.join(allowed) or 'many scans'}{still}"

@@ -300,8 +300,8 @@ def _known(
     return {
         "units": {"length": _UNIT, "angle": "rad", "time": "frame period", "depth": f"{_UNIT}, 0 = unknown"},
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
-        "focal_length_assumed": focal is not None and not focal.told,
-        "focal_length_estimated": focal is not None and focal.told,
+        "focal_length_assumed": focal is not None and not focal.determined,
+        "focal_length_estimated": focal is not None and focal.determined,
         "focal_length_sigma": None if focal is None else focal.sigma,
         "scan": found.scan,
         "readout_ratio": found.shutter.readout_ratio,

@@ -51,7 +51,7 @@ def readout_words(shutter: RollingShutter, capture: Capture | None) -> str:
         return f"{shutter.readout_ratio:.3f} (given)"
     sure = f"{100.0 * best.probability:.0f} % sure" + "".join(f"; else {c.scans}" for c in capture.candidates[1:2])
     text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {sure})"
-    if not capture.told and capture.moved_px < 1.0:
+    if not capture.determined and capture.moved_px < 1.0:
         text += f"; matches move by {capture.moved_px:.1f} px, so that it hardly matters"
     if shutter.right_delay:
         text += f"; right camera late by {best.delay:+.3f} +- {best.delay_sigma:.3f} frame periods"

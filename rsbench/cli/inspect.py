@@ -89,7 +89,7 @@ def inspect(
             echo(f"rsbench: error: {' '.join(str(case).split())}", err=True)
             continue
         found = conclude(list(case.windows), max_sigma)
-        told = told and found.told
+        told = told and found.determined
         answers.append(_record(case, found))
         if json:
             _print_json(answers[-1])
@@ -231,10 +231,10 @@ def _record(case: _Case, found: Capture) -> dict[str, Any]:
     """What JSON says of one rig; what is not told is null."""
     from rsbench.capture.shutter_decision import candidates_of
 
-    named, best = (found.likeliest if known else None for known in (found.named, found.told))
+    named, best = (found.likeliest if known else None for known in (found.named, found.determined))
     return {
         "name": case.name,
-        "told": found.told,
+        "told": found.determined,
         "left": None if named is None else named.scans.left,
         "right": None if named is None else named.scans.right,
         "readout_ratio": None if best is None else best.ratio,

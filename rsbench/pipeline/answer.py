@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsbench.capture.calibration import recalibrated
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, record_of, shutter_found
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
@@ -94,7 +95,7 @@ def _shutter_of(
     still = Scanning().shutter_of(camera.width, camera.height, 0.0)
     if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
         return problem.known_shutter or still, None, ""
-    known = known_of(matches, problem.rig, None, problem.scanning)
+    known = known_of(matches, problem.rig, KnownInputs(scanning=problem.scanning))
     capture = conclude([examine(matches, problem.rig, known, options, seed)])
     capture = as_global(capture, [matches], problem.rig, known)
     try:

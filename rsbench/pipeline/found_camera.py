@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from itertools import islice
 
 from rsbench.capture.calibration import CardSigma, RefusedFramesError
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -49,5 +50,12 @@ def camera_of_frames(
         except RefusedFramesError:
             continue  # the correction says so of each
     if not matches:
-        return FoundCamera(rig=rig, sigma=sigma, told=(False, False))
-    return find_camera(matches, rig, sigma, readout_ratio, scanning, options.robust, options.seed)
+        return FoundCamera(rig=rig, sigma=sigma, determined=(False, False))
+    return find_camera(
+        matches,
+        rig,
+        sigma,
+        KnownInputs(readout_ratio=readout_ratio, scanning=scanning),
+        options.robust,
+        options.seed,
+    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
-from rsbench.capture.hypotheses import MODELS, scans_of
+from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
 from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
@@ -198,7 +198,8 @@ def chosen_model(
         asked: ``auto`` or the one to take.
         start: a motion near theirs, of any model.
     """
-    known = known_of(matches, rig, shutter.readout_ratio, shutter.scanning, NO_ERRORS)
+    given = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=NO_ERRORS)
+    known = known_of(matches, rig, given)
     capture = conclude([examine(matches, rig, known, robust, seed, start)])
     if asked not in (AUTO, *capture.peaks):  # one that the matches exclude, or another package's
         alone = conclude([examine(matches, rig, replace(known, models=(asked,)), robust, seed, start)])
@@ -341,7 +342,7 @@ def _calibrated(
     """What the matches say of a calibration that may be wrong, with a known shutter; None where it is right."""
     if calibration is not None or not scanning.rows_together:
         return None, calibration or NO_ERRORS
-    known = known_of(matches, rig, readout_ratio, scanning)
+    known = known_of(matches, rig, KnownInputs(readout_ratio=readout_ratio, scanning=scanning))
     if not any(known.calibration_sigma):
         return None, NO_ERRORS
     capture = find_capture(matches, rig, options, readout_ratio, scanning)
@@ -360,7 +361,8 @@ def find_capture(
     entry, models = options.solver, models_asked(options.motion_model)
     if options.motion_model is None and isinstance(entry.solver, RefinedSolver):
         models = (entry.solver.motion_model,)
-    known = known_of(matches, rig, readout_ratio, scanning, calibration, models)
+    given = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration, models=models)
+    known = known_of(matches, rig, given)
     capture = conclude([examine(matches, rig, known, options.robust, options.seed)])
     return as_global(capture, [matches], rig, known) if readout_ratio is None else capture
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.model_choice import motion_at
 from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
@@ -50,7 +51,10 @@ def asked_for(
     """
     inertial = InertialMotion(found.estimate.w, found.estimate.d)
     given = Correspondences(left=matches)
-    known = known_of(given, rig, shutter.readout_ratio, shutter.scanning, NO_ERRORS)
+    known_shutter = KnownInputs(
+        readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=NO_ERRORS
+    )
+    known = known_of(given, rig, known_shutter)
     capture = conclude([examine(given, rig, known, options, seed, inertial)])
     laws = [name for name in capture.models if name in capture.peaks]
     if not laws or laws[0] == inertial.name or capture.models.get(inertial.name, 0.0) > 1.0 - CERTAIN:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from rsbench.capture.calibration import RefusedFramesError
-from rsbench.capture.hypotheses import GLOBAL, Known
+from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_tracks import ENOUGH
@@ -147,8 +147,10 @@ class _Look:
     def _examine_waiting(self) -> None:
         options, models = self._options, models_asked(self._options.motion_model)
         for matches in self._waiting:
-            asked = (self._ratio, self._scanning, self._calibration)
-            known = self._known = self._known or known_of(matches, self._rig, *asked, models)
+            given = KnownInputs(
+                readout_ratio=self._ratio, scanning=self._scanning, calibration=self._calibration, models=models
+            )
+            known = self._known = self._known or known_of(matches, self._rig, given)
             if self.is_right:
                 return
             self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))

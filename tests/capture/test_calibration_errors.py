@@ -7,6 +7,7 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import LENS, NO_ERRORS, OFFSET, ROWS, TERMS, in_words, ray_shifts, recalibrated
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.components.motion_models import LinearMotion, TwistMotion
@@ -68,7 +69,7 @@ def test_errors_as_large_as_real_ones_are_found_with_the_shutter(ratio: float, s
     options = SimulationOptions(tracks=400, noise_px=0.1)
     exact = simulate(RIG, shutter, motion, options, np.random.default_rng(seed)).correspondences
     matches, errors = wrong(exact)
-    known = known_of(matches, RIG, None, Scanning())
+    known = known_of(matches, RIG, KnownInputs(scanning=Scanning()))
     capture = conclude([examine(matches, RIG, known)])
     best = capture.likeliest
     assert best is not None and capture.noise_px < 0.15
@@ -76,7 +77,8 @@ def test_errors_as_large_as_real_ones_are_found_with_the_shutter(ratio: float, s
     off = np.abs(np.array(best.calibration) - errors)
     for k in (OFFSET, *range(ROWS.start, ROWS.stop)):
         assert off[k] < 4.0 * best.calibration_sigma[k] + 0.02, TERMS[k]  # 0.02 px: the second order
-    blind = conclude([examine(matches, RIG, known_of(matches, RIG, None, Scanning(), NO_ERRORS))])
+    right = KnownInputs(scanning=Scanning(), calibration=NO_ERRORS)
+    blind = conclude([examine(matches, RIG, known_of(matches, RIG, right))])
     assert blind.noise_px > 0.2
 
 
@@ -96,4 +98,4 @@ def test_a_good_calibration_is_left_alone() -> None:
     )
     options = SimulationOptions(tracks=400, noise_px=0.1)
     matches = simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
-    assert known_of(matches, RIG, None, Scanning()).calibration_sigma == NO_ERRORS
+    assert known_of(matches, RIG, KnownInputs(scanning=Scanning())).calibration_sigma == NO_ERRORS

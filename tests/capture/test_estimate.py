@@ -59,7 +59,7 @@ def inspected(given: Correspondences) -> Capture:
 @pytest.mark.parametrize(("scan", "right", "delay"), [("left", "left", 0.0), ("top", "right", 0.1)])
 def test_camera_direction_and_ratio_are_told(scan: Scan, right: Scan, delay: float) -> None:
     found = inspected(matches(shutter(scan, right, 0.7, delay)))
-    assert found.told, found.reason
+    assert found.determined, found.reason
     best = found.likeliest
     assert best is not None
     assert best.scans == Scans(scan, right)
@@ -70,7 +70,7 @@ def test_camera_direction_and_ratio_are_told(scan: Scan, right: Scan, delay: flo
 
 def test_a_global_shutter_is_told() -> None:
     found = inspected(matches(RollingShutter(height=480, readout_ratio=0.0)))
-    assert found.told, found.reason
+    assert found.determined, found.reason
     assert found.likeliest is not None
     assert found.likeliest.scans == Scans("global", "global")
     assert found.likeliest.ratio == 0.0
@@ -86,7 +86,7 @@ def test_a_global_shutter_is_told() -> None:
 )
 def test_what_cannot_be_told(given: Correspondences, reason: str) -> None:
     found = inspected(given)
-    assert not found.told
+    assert not found.determined
     assert reason in found.reason
 
 
@@ -97,7 +97,7 @@ def test_what_moves_along_its_rows_does_not_show_their_readout() -> None:
     """
     sideways = LinearMotion(w=[0.0, 0.0, 0.0], d=[0.25, 0.0, 0.0])
     found = inspected(matches(shutter("top", "top", 0.8), sideways, noise=0.2, tracks=40))
-    assert not found.told
+    assert not found.determined
     assert {(each.scans.left, each.scans.right) for each in found.candidates} >= {
         ("global", "global"),
         ("top", "top"),
@@ -130,7 +130,7 @@ def test_times_are_those_of_the_shutter(lens: Lens | None, scan: Scan, right: Sc
     np.testing.assert_allclose(found.pairs, expected.pairs, atol=1e-12)
     np.testing.assert_allclose(found.tracks, expected.tracks, atol=1e-12)
     some = np.arange(timed.count) % 2 == 0
-    halved = timed.subset(some).packed(scans_of(known), unknowns(0.6, 0.05))
+    halved = timed.read(scans_of(known), some).packed(unknowns(0.6, 0.05))
     np.testing.assert_array_equal(halved.tracks, found.only(some).tracks)
     np.testing.assert_array_equal(halved.pairs, found.only(some).pairs)
 
@@ -211,7 +211,7 @@ def test_ratio_and_motion_model_are_found_together(name: str) -> None:
     alike = Known(scans=tuple(each for each in ALL_SCANS if each.together))
     found = conclude([examine(given.correspondences, RIG, alike)], max_sigma=0.05)
     best = found.likeliest
-    assert best is not None and found.told, found.reason
+    assert best is not None and found.determined, found.reason
     assert best.scans == Scans("top", "top")
     assert abs(best.ratio - 0.8) < 4.0 * best.sigma
     assert found.motion_model == name

@@ -32,12 +32,12 @@ def test_a_camera_that_turns_shows_its_focal_length(focal: float) -> None:
     # Exact but for 0.1 px of noise: 5 of its deviations, and less than a quarter of what two frames are trusted.
     assert abs(found.log - np.log(focal / WIDTH)) < min(5.0 * found.sigma, 0.06)
     told = conclude_focal(3 * [found], WIDTH)
-    assert told.told and abs(told.focal - focal) < 2.0 * told.sigma
+    assert told.determined and abs(told.focal - focal) < 2.0 * told.sigma
 
 
 def test_a_camera_that_goes_straight_on_does_not() -> None:
     found = conclude_focal([_pair(400.0, [0.0, 0.0, 0.0], [0.2, 0.1, 0.2], 1)], WIDTH)
-    assert not found.told and found.focal == WIDTH and found.sigma == PRIOR * WIDTH
+    assert not found.determined and found.focal == WIDTH and found.sigma == PRIOR * WIDTH
 
 
 def test_more_pairs_tell_more_and_the_more_they_scatter_the_less() -> None:
@@ -51,8 +51,8 @@ def test_more_pairs_tell_more_and_the_more_they_scatter_the_less() -> None:
 
 def test_pairs_that_show_no_lens_that_is_made_are_not_averaged() -> None:
     broken, good = PairFocal(1.5, 0.01, 0.1), PairFocal(-0.2, 0.01, 0.1)
-    assert not conclude_focal([broken, broken, good, good], WIDTH).told
+    assert not conclude_focal([broken, broken, good, good], WIDTH).determined
     assert conclude_focal([broken, good, good, good], WIDTH).pairs == 3
     still = PairFocal(-0.2, 0.01, np.deg2rad(0.3))
-    assert not conclude_focal([None, still], WIDTH).told
-    assert not conclude_focal([good, still, still], WIDTH).told
+    assert not conclude_focal([None, still], WIDTH).determined
+    assert not conclude_focal([good, still, still], WIDTH).determined

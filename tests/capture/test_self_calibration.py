@@ -9,7 +9,16 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import FOCAL, LENS, NO_ERRORS, RADIAL, CardSigma, ray_shifts
-from rsbench.capture.hypotheses import CALIBRATION, CaptureCost, Hypothesis, Known, Likelihood, Scans, TimedMatches
+from rsbench.capture.hypotheses import (
+    CALIBRATION,
+    CaptureCost,
+    Hypothesis,
+    Known,
+    KnownInputs,
+    Likelihood,
+    Scans,
+    TimedMatches,
+)
 from rsbench.capture.self_calibration import _mended, find_camera
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import Lens, PinholeCamera
@@ -19,6 +28,7 @@ from rsbench.core.shutter import RollingShutter, Scanning
 
 CAMERA = PinholeCamera.centred(640, 480, 520.0)
 BARREL = Lens(model="brown-conrady", k1=-0.2)
+AT_TOP = KnownInputs(readout_ratio=0.8, scanning=Scanning())
 TURN = np.deg2rad([1.0, 2.0, 0.5])
 
 
@@ -92,9 +102,9 @@ def test_a_card_that_errs_is_put_right(lens: Lens | None, factor: float, k1_too_
     matches, rig = matches_of(replace(CAMERA, lens=lens))
     sigma = CardSigma(focal=52.0, k1=0.05 if lens else 0.0)
     given = with_card(rig, factor, k1_too_large)
-    asked = (None, None) if lens is None else (0.8, Scanning())  # behind a lens it takes several rounds
-    found = find_camera([matches], given, sigma, *asked)
-    assert found.told == (True, lens is not None) and "card" in found.words(given, sigma)
+    known = None if lens is None else AT_TOP  # behind a lens it takes several rounds
+    found = find_camera([matches], given, sigma, known)
+    assert found.determined == (True, lens is not None) and "card" in found.words(given, sigma)
     assert abs(found.rig.camera.fx - CAMERA.fx) < min(4.0 * found.sigma.focal, 0.01 * CAMERA.fx)
     assert found.rig.camera.fy / found.rig.camera.fx == pytest.approx(1.0)
     if lens is not None and found.rig.camera.lens is not None:
@@ -107,8 +117,8 @@ def test_what_is_left_of_a_lens_is_found_as_one() -> None:
     true = replace(CAMERA, lens=Lens(model="brown-conrady", k1=0.02))
     matches, rig = matches_of(true, depths=(30.0, 100.0))
     given = replace(rig, camera=CAMERA)
-    found = find_camera([matches], given, CardSigma(k1=0.05), 0.8, Scanning())
-    assert found.told == (False, True) and found.rig.camera.lens is not None
+    found = find_camera([matches], given, CardSigma(k1=0.05), AT_TOP)
+    assert found.determined == (False, True) and found.rig.camera.lens is not None
     assert abs(found.rig.camera.lens.k1 - 0.02) < min(4.0 * found.sigma.k1, 0.01)
     assert found.rig.camera.fx == CAMERA.fx
 
@@ -120,8 +130,8 @@ def test_deviations_are_those_of_the_errors() -> None:
     for seed in range(3):
         matches, rig = matches_of(replace(CAMERA, lens=BARREL), seed=seed)
         given = with_card(rig, 1.04, 0.02)
-        found = find_camera([matches], given, CardSigma(focal=52.0, k1=0.05), 0.8, Scanning())
-        assert found.told == (True, True) and found.rig.camera.lens is not None
+        found = find_camera([matches], given, CardSigma(focal=52.0, k1=0.05), AT_TOP)
+        assert found.determined == (True, True) and found.rig.camera.lens is not None
         errors = (found.rig.camera.fx - CAMERA.fx, found.rig.camera.lens.k1 - BARREL.k1)
         ratios.append(np.divide(errors, (found.sigma.focal, found.sigma.k1)))
     sums = np.sum(np.square(ratios), axis=0)
@@ -131,8 +141,8 @@ def test_deviations_are_those_of_the_errors() -> None:
 def test_a_rig_that_does_not_turn_keeps_its_card() -> None:
     matches, rig = matches_of(CAMERA, w=np.deg2rad([0.0, 0.1, 0.0]))
     wrong, sigma = with_card(rig, 1.05), CardSigma(focal=52.0, k1=0.02)
-    found = find_camera([matches], wrong, sigma, 0.8, Scanning())
-    assert found.told == (False, False) and found.rig == wrong and found.sigma == sigma
+    found = find_camera([matches], wrong, sigma, AT_TOP)
+    assert found.determined == (False, False) and found.rig == wrong and found.sigma == sigma
     assert found.words(wrong, sigma).count("cannot tell") == 2
 
 
@@ -147,6 +157,6 @@ def test_where_rows_differ_k1_is_one_of_the_errors() -> None:
     """Row differences of half a pixel and more, of a scene at 2 to 10 m and a lens that nobody undistorted."""
     matches, rig = matches_of(replace(CAMERA, lens=Lens(model="brown-conrady", k1=0.05)))
     given, sigma = replace(rig, camera=CAMERA), CardSigma(k1=0.05)
-    found = find_camera([matches], given, sigma, 0.8, Scanning())
-    assert found.told == (False, False) and found.rig == given
+    found = find_camera([matches], given, sigma, AT_TOP)
+    assert found.determined == (False, False) and found.rig == given
     assert "with the errors of the calibration" in found.words(given, sigma)

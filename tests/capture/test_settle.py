@@ -18,6 +18,7 @@ from rsbench.capture.hypotheses import (
     CaptureCost,
     Hypothesis,
     Known,
+    KnownInputs,
     Likelihood,
     Scans,
     TimedMatches,
@@ -37,6 +38,7 @@ from rsbench.pipeline.frame_motion import solve_frames
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.5)
 TOP = Scanning()
+AT_TOP = KnownInputs(readout_ratio=0.8, scanning=TOP)
 W, D = np.array([0.02, -0.025, 0.015]), np.array([0.2, 0.1, -0.2])
 
 
@@ -50,7 +52,7 @@ def simulated(seed: int, ratio: float, degrees: float, tracks: int, noise: float
 
 def found_in(matches: Correspondences, models: tuple[str, ...] = ("linear",)) -> Capture:
     """With the scan known and the ratio not."""
-    return conclude([examine(matches, RIG, known_of(matches, RIG, None, TOP, None, models))])
+    return conclude([examine(matches, RIG, known_of(matches, RIG, KnownInputs(scanning=TOP, models=models)))])
 
 
 def reversed_in_time(matches: Correspondences) -> Correspondences:
@@ -160,9 +162,9 @@ def test_a_disparity_offset_is_found_with_the_ratio() -> None:
     tracks = c.tracks.copy()
     tracks[:, [3, 7]] += 0.5 * (tracks[:, [2, 6]] / 450.0 - 1.0)
     c = Correspondences(left=c.left, right=c.right, tracks=tracks)
-    known = known_of(c, RIG, None, TOP, None, ("linear",))
+    known = known_of(c, RIG, KnownInputs(scanning=TOP, models=("linear",)))
     assert known.calibration_sigma[OFFSET] > 0.1
-    assert known_of(c, RIG, None, TOP, of_offset(0.0)).calibration_sigma == NO_ERRORS
+    assert known_of(c, RIG, KnownInputs(scanning=TOP, calibration=of_offset(0.0))).calibration_sigma == NO_ERRORS
     capture = conclude([examine(c, RIG, known)])
     assert abs(capture.offset - offset) < 4.0 * capture.offset_sigma < 0.6
 
@@ -172,7 +174,8 @@ def test_a_disparity_offset_is_found_with_the_ratio() -> None:
 
 def test_a_global_shutter_leaves_nothing_to_choose() -> None:
     data = simulated(9, 0.0, 1.0, 600, noise=0.1)
-    known = known_of(data.correspondences, RIG, 0.0, TOP, NO_ERRORS)
+    given = KnownInputs(readout_ratio=0.0, scanning=TOP, calibration=NO_ERRORS)
+    known = known_of(data.correspondences, RIG, given)
     choice = choose_model(conclude([examine(data.correspondences, RIG, known)]))
     assert str(choice) == "linear; the others give the same motion"
 
@@ -211,7 +214,7 @@ def test_what_matches_cannot_tell_is_said_and_the_papers_model_used() -> None:
     truth = make_motion("twist", 0.03 * W, 0.02 * D)
     shutter, options = RollingShutter(height=900, readout_ratio=0.8), SimulationOptions(tracks=60, noise_px=1.0)
     matches = simulate(RIG, shutter, truth, options, np.random.default_rng(0)).correspondences
-    known = known_of(matches, RIG, 0.8, TOP)
+    known = known_of(matches, RIG, AT_TOP)
     capture = conclude([examine(matches, RIG, known, start=truth)])
     choice = choose_model(capture)
     assert choice is not None and choice.used == "linear" and not choice.decided
@@ -223,7 +226,7 @@ def test_what_matches_cannot_tell_is_said_and_the_papers_model_used() -> None:
 
 
 def test_the_papers_model_is_not_used_where_it_is_excluded() -> None:
-    capture = conclude([examine(matches_of("twist"), RIG, known_of(matches_of("twist"), RIG, 0.8, TOP))])
+    capture = conclude([examine(matches_of("twist"), RIG, known_of(matches_of("twist"), RIG, AT_TOP))])
     open_to = replace(capture, models={"twist": 0.9, "linear": 0.07, "accelerated": 0.03})
     both = replace(open_to, peaks=dict.fromkeys(open_to.models, next(iter(capture.peaks.values()))))
     chosen = choose_model(both)
@@ -234,10 +237,10 @@ def test_the_papers_model_is_not_used_where_it_is_excluded() -> None:
 
 
 def test_what_is_given_is_known() -> None:
-    given = known_of(Correspondences(), RIG, 0.8, Scanning(scan="bottom"))
+    given = known_of(Correspondences(), RIG, KnownInputs(readout_ratio=0.8, scanning=Scanning(scan="bottom")))
     assert (given.scans, given.ratio, given.shutter_known) == ((Scans("bottom", "bottom"),), 0.8, True)
-    assert known_of(Correspondences(), RIG, 0.0, TOP).scans == (GLOBAL,)
-    nothing = known_of(Correspondences(), RIG, None, None)
+    assert known_of(Correspondences(), RIG, KnownInputs(readout_ratio=0.0, scanning=TOP)).scans == (GLOBAL,)
+    nothing = known_of(Correspondences(), RIG, KnownInputs())
     assert len(nothing.scans) == 25 and nothing.delay is None and not nothing.shutter_known
     assert isinstance(nothing, Known)
 

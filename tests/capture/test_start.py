@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsbench.capture.hypothesis_ranking import Lag, with_lag_taken
+from rsbench.capture.hypothesis_ranking import Lag, without_lag
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -21,6 +21,6 @@ def test_a_lag_may_lead_to_where_a_lens_shows_nothing() -> None:
     beyond = 2.0 * ends[:, 1] - ends[:, 0]
     assert np.all(np.isnan(camera.ideal_pixels(beyond)))
     a_period = Lag(np.array([1.0, 0.0, 0.0]), np.eye(3))
-    taken = with_lag_taken(Correspondences(right=ends.reshape(1, 4)), a_period, rig)
+    taken = without_lag(Correspondences(right=ends.reshape(1, 4)), a_period, rig)
     ideal = camera.ideal_pixels(ends)
     np.testing.assert_allclose(taken.right[0, 2:], (2.0 * ideal[:, 1] - ideal[:, 0])[0])

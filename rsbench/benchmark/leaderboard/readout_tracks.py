@@ -27,7 +27,7 @@ from rsbench.benchmark.leaderboard.track import (
     Truth,
     score_row,
 )
-from rsbench.capture.hypotheses import MODELS, scans_of
+from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
 from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.core.correspondences import Correspondences, join_stereo, temporal_pairs
@@ -107,7 +107,7 @@ class ReadoutTrack(SolverTrack):
             matches = Correspondences(left=left, right=right)
         scanning = problem.shutter.scanning
         models = MODELS if entry.name == CHOOSES else (solver.motion_model,)
-        known = known_of(matches, problem.rig, None, scanning, None, models)
+        known = known_of(matches, problem.rig, KnownInputs(scanning=scanning, models=models))
         known = replace(known, scans=(scans_of(replace(problem.shutter, readout_ratio=1.0)),))
         seed = seed_of_answer(problem, entry)
         capture = conclude([examine(matches, problem.rig, known, RobustOptions(), seed)])
