@@ -311,4 +311,4 @@ def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_s
         ratio = f"{best.ratio:.2f} +- {best.sigma:.2f}"
         return f"{best.scans}, but the matches do not determine how fast: {ratio}{still}"
     allowed = [f"{each.scans} ({each.probability:.0%})" for each in candidates if each.probability > 0.1]
-    return f"the matches allow {', '.join(allowed) or 'many scans'}{still}"
+    return f"the matches allow {', or '.join(allowed) or 'many scans'}{still}"
