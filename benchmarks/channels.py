@@ -27,7 +27,7 @@ from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Viewpoint
-from rsbench.storage.files import beside
+from rsbench.vision.lines import beside
 
 Times = tuple[float, float]
 

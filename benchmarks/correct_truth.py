@@ -38,8 +38,8 @@ from rsbench.renderers.render import render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.load import load_scene
 from rsbench.vision.correction import Corrected, correct_frame, correction_flow
+from rsbench.vision.images import resample
 from rsbench.vision.quality import psnr
-from rsbench.vision.resample import resample
 
 BOUND_PX = 0.01
 SIDE: Side = "left"

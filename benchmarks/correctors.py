@@ -34,11 +34,9 @@ from rsbench.pipeline.array_correction import of_rig, options_of
 from rsbench.pipeline.chain import uncorrected
 from rsbench.pipeline.mono_correction import MonoFusionCorrector
 from rsbench.renderers.backend import start_backend
-from rsbench.vision.closing import finished
 from rsbench.vision.corrector import CorrectionProblem
-from rsbench.vision.fusion import Fused
-from rsbench.vision.published_quality import flip
-from rsbench.vision.quality import GAUSSIAN, Picture, ssim_map
+from rsbench.vision.fusion import Fused, finished
+from rsbench.vision.quality import GAUSSIAN, Picture, flip, ssim_map
 
 CARD = Path(__file__).with_suffix(".toml")
 SHOWN = ("none", "gyro", "rotation", "gs-mono", "mono", *(method.key for method in ON_REQUEST), "ours", "truth")

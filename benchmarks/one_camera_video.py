@@ -27,7 +27,7 @@ from rsbench.pipeline.array_correction import options_of
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
 from rsbench.pipeline.sequence_correction import correct_sequence
-from rsbench.vision.closing import finished
+from rsbench.vision.fusion import finished
 
 WAYS = ("uncorrected", "two frames", "video", "both cameras")
 

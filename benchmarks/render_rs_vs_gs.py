@@ -26,8 +26,8 @@ from rsbench.core.geometry import MovingObject, poses_of
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.backend import start_backend
-from rsbench.renderers.exposure import instant_count, instant_times
 from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.pixel_samples import instant_count, instant_times
 from rsbench.renderers.render import Frame, LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Light, Material, Scene, SceneMesh

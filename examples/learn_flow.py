@@ -43,7 +43,7 @@ from rsbench.pipeline.footage import read_frame
 from rsbench.storage.files import read_json, write_png
 from rsbench.vision.images import grey_u8
 from rsbench.vision.mono_fusion import Flows, MonoFusion, OwnMotion, find_flows
-from rsbench.vision.published_quality import psnr_deepunroll
+from rsbench.vision.quality import psnr_deepunroll
 
 try:
     import torch

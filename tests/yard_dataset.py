@@ -8,7 +8,7 @@ import trimesh
 from channel_faults import FAULTS
 
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 
 SCENE = """
 name = "yard"

@@ -22,8 +22,7 @@ from rsbench.pipeline.footage import check_alike, read_frame
 from rsbench.vision.corrector import CorrectionProblem, CorrectorEntry, find_corrected_rows
 from rsbench.vision.fusion import Fused
 from rsbench.vision.images import eight_bit
-from rsbench.vision.published_quality import psnr_deepunroll, ssim_deepunroll
-from rsbench.vision.quality import Picture, ssim
+from rsbench.vision.quality import Picture, psnr_deepunroll, ssim, ssim_deepunroll
 
 BASELINE = "uncorrected"
 _VIEW: View = ("left", 1)

@@ -20,8 +20,7 @@ from rsbench.benchmark.metric_plugins import (
 )
 from rsbench.benchmark.scoring import WORST_POSE, pose_errors
 from rsbench.core.errors import RsbenchError
-from rsbench.vision.published_quality import flip
-from rsbench.vision.quality import LastSsim, psnr
+from rsbench.vision.quality import LastSsim, flip, psnr
 from rsbench.vision.stereo_depth import depth_metrics
 
 _SSIM = LastSsim()

@@ -20,9 +20,9 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.feature_matcher import undistorted
 from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match
 from rsbench.vision.images import eight_bit
-from rsbench.vision.undistortion import undistorted
 
 TERMS = (
     "offset",

@@ -89,8 +89,8 @@ def _correct_given(given: Given, target: str, options: CorrectionOptions, close:
     from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.pipeline.isolated_parts import Isolation
-    from rsbench.vision.closing import finished
     from rsbench.vision.corrector import NotCorrectedError
+    from rsbench.vision.fusion import finished
 
     finish: Finish = finished if close else lambda fused: fused
     try:

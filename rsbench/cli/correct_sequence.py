@@ -139,7 +139,7 @@ def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShut
     import numpy as np
 
     from rsbench.dataset.corrected_frames import motion_record, write_entry, write_frame, write_poses
-    from rsbench.vision.closing import finished
+    from rsbench.vision.fusion import finished
 
     finish: Callable[[Fused], Fused] = finished if close else lambda fused: fused
     entry: dict[str, Any] = {"number": moment.number}

@@ -30,7 +30,7 @@ from rsbench.dataset.sequence_card import CameraCard as CameraCard
 from rsbench.dataset.sequence_card import SequenceCard as SequenceCard
 from rsbench.dataset.sequence_card import Variation as Variation
 from rsbench.dataset.trajectory import TrajectoryCard, parts_along
-from rsbench.renderers.electrons import Sensor, check_brightness
+from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.untrusted_files import check_size
 
 Twin = Literal["first", "middle", "last"]

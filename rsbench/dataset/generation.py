@@ -190,7 +190,7 @@ def _render_sequence(
 ) -> Iterator[None]:
     """Render into a folder of the workplace and place it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
-    from rsbench.renderers.clearance import obstacle
+    from rsbench.renderers.visibility import obstacle
 
     backend, (mitsuba_scene, digest) = start_backend(), stage.set_for(sequence)
     if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
@@ -235,7 +235,7 @@ def render_camera(
     ``later``.
     """
     from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.sensor_frame import sensed_rows
+    from rsbench.renderers.render import sensed_rows
     from rsbench.renderers.visibility import SceneRays
 
     geometry, sensor = card.geometry_of(sequence), card.sensor_of(sequence)

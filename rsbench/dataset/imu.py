@@ -23,7 +23,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 from rsbench.scenes.model import Start, Viewpoint
 from rsbench.storage.files import write_bytes, write_json
 from rsbench.storage.untrusted_files import inside, read_text

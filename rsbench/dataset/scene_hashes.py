@@ -13,10 +13,9 @@ import numpy as np
 
 from rsbench.components.cards import card_path
 from rsbench.core.errors import RsbenchError
-from rsbench.scenes.load import read_scene_card
+from rsbench.scenes.load import built_key, read_scene_card
 from rsbench.scenes.model import Scene, SceneMesh
 from rsbench.scenes.object_meshes import Body, MeshFile
-from rsbench.scenes.scene_cache import built_key
 from rsbench.storage.files import read_json, write_json
 
 

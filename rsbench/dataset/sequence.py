@@ -37,7 +37,7 @@ from rsbench.dataset.layout import (
 )
 from rsbench.dataset.matches import Matching
 from rsbench.dataset.object_records import MovingManifest, check_moving, numbers_of
-from rsbench.renderers.electrons import Sensor, check_brightness
+from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
 from rsbench.storage.untrusted_files import check_name, check_size, inside
 

@@ -9,7 +9,7 @@ from rsbench.components.cards import SHUTTER_KEY
 from rsbench.core.camera import Lens
 from rsbench.dataset.motion_card import MotionCard
 from rsbench.dataset.object_records import MovingCard
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 from rsbench.scenes.model import Start
 from rsbench.storage.untrusted_files import check_name
 

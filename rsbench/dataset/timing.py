@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.shutter import RollingShutter
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 from rsbench.storage.files import write_bytes, write_json
 from rsbench.storage.untrusted_files import read_text
 

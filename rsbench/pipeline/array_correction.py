@@ -20,10 +20,9 @@ from rsbench.pipeline.frame_motion import model_to_use
 from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.pipeline.mono_sequence import correct_all
 from rsbench.solvers.engine.base import Solver, entry_of
-from rsbench.vision.closing import finished
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.fusion import Fused
+from rsbench.vision.fusion import Fused, finished
 from rsbench.vision.stereo_matcher import load_matcher
 
 

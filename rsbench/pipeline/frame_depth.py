@@ -14,14 +14,10 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.vision.epipolar_search import depth_from_motion
 from rsbench.vision.images import eight_bit
-from rsbench.vision.motion_sweep import depth_from_motion
-from rsbench.vision.moving_stereo import moving_disparities
-from rsbench.vision.sky import sky_mask
-from rsbench.vision.stereo_depth import fill_holes
-from rsbench.vision.stereo_matcher import MatcherEntry, find_depths
-from rsbench.vision.timed_depth import timed_depth
-from rsbench.vision.undistortion import sensor_disparities
+from rsbench.vision.stereo_depth import fill_holes, moving_disparities, sky_mask, timed_depth
+from rsbench.vision.stereo_matcher import MatcherEntry, find_depths, sensor_disparities
 
 Images = Mapping[View, NDArray[Any]]
 

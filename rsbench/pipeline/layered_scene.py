@@ -25,9 +25,17 @@ from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
 from rsbench.vision.images import grey_u8
-from rsbench.vision.layer_fit import PlaneOptions, fronto_parallel
-from rsbench.vision.layer_motion import followed, on_layers, refined
-from rsbench.vision.layers import Labelled, LabelOptions, MovingCamera, label_pixels
+from rsbench.vision.layers import (
+    Labelled,
+    LabelOptions,
+    MovingCamera,
+    PlaneOptions,
+    followed,
+    fronto_parallel,
+    label_pixels,
+    on_layers,
+    refined,
+)
 from rsbench.vision.reprojection import F32
 
 _STILL_PX = 0.1

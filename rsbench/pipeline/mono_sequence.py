@@ -39,9 +39,8 @@ from rsbench.pipeline.mono_shutter import find_shutter
 from rsbench.pipeline.mono_ways import PIXELS, SeenPair, group_of, on_ways
 from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.pipeline.turned_frames import Turned, turned
-from rsbench.vision.closing import finished
-from rsbench.vision.frame_threads import map_ahead
-from rsbench.vision.fusion import Fused
+from rsbench.vision.fusion import Fused, finished
+from rsbench.vision.images import map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
 _AT_ONCE = 2

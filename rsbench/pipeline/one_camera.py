@@ -17,11 +17,10 @@ from rsbench.pipeline.baseline_motions import solved_alone
 from rsbench.pipeline.frame_depth import Images
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.zhuang import ZhuangSolver
-from rsbench.vision.baseline_depths import monocular_depth
 from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.correctors import FusionCorrector
-from rsbench.vision.flow import dense_flow
+from rsbench.vision.flow import dense_flow, monocular_depth
 from rsbench.vision.fusion import Fused
 
 

@@ -27,8 +27,8 @@ from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.pipeline.sequence_capture import FEWEST_FRAMES
 from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
 from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
-from rsbench.vision.frame_threads import ahead, map_ahead
 from rsbench.vision.fusion import Fused
+from rsbench.vision.images import ahead, map_ahead
 from rsbench.vision.stereo_matcher import needs_motion
 
 _AHEAD = 4

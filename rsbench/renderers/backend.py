@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 from rsbench.components.imports import signals_later
 from rsbench.core.errors import RsbenchError
-from rsbench.renderers import llvm, probe_cache
+from rsbench.renderers import llvm
 
 Preference = Literal["auto", "llvm", "cuda", "scalar"]
 
@@ -218,10 +218,10 @@ def probe_cuda(timeout: float = 120.0) -> llvm.ProbeResult:
     devices = ",".join(sorted(glob.glob("/dev/nvidia[0-9]*")))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
     key = f"cuda|{driver}|{status.st_mtime_ns}|{status.st_size}|{devices}|{visible}"
-    known = probe_cache.recall(key)
+    known = llvm.recall(key)
     if known is not None:
         return llvm.ProbeResult(ok=True, version=known)
     verdict = llvm.run_child(_CUDA_PROBE, [], {}, timeout)
     if verdict.ok:
-        probe_cache.remember(key, verdict.version)
+        llvm.remember(key, verdict.version)
     return verdict

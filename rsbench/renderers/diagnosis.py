@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from rsbench.renderers import llvm, probe_cache
+from rsbench.renderers import llvm
 from rsbench.renderers.backend import VARIANTS, probe_cuda
 
 _PACKAGES = (
@@ -133,7 +133,7 @@ def _processor() -> Iterator[DoctorRow]:
     usable = len(affinity(0)) if affinity is not None else os.cpu_count()
     yield DoctorRow("processor", "ok", llvm.cpu_features())
     yield DoctorRow("threads", "ok", f"{usable} usable of {os.cpu_count()}")
-    yield DoctorRow("probe cache", "ok", str(probe_cache.cache_file() or "none (no home folder)"))
+    yield DoctorRow("probe cache", "ok", str(llvm.cache_file() or "none (no home folder)"))
 
 
 def _llvm() -> Iterator[DoctorRow]:

@@ -1,21 +1,259 @@
-"""Integrators of radiance: ``sunsky``, free of noise, and Mitsuba's ``path`` on points of our own."""
+"""Integrators of radiance: ``sunsky``, free of noise, and Mitsuba's ``path`` on points of our own.
+
+Each moving object is a scene of its own, into whose frame every ray is carried at its own time. A lane knows where
+each object is at the time of its row, or of its instant of an exposure, as it knows the pose of its camera. So
+nothing is batched or interpolated, and without objects no instruction is added.
+
+Glossy surfaces lie below a clear coat. Light is mirrored by facets of the coat, or goes through it to the diffuse
+surface below and back. Both parts are those of one Mitsuba BSDF (``roughplastic``), which ``path`` uses too;
+``sunsky`` evaluates it without random numbers.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
-from rsbench.renderers.gloss import Coat, is_glossy
-from rsbench.renderers.object_tracing import Placed, first_surface, hidden, level
+import numpy as np
+from numpy.typing import NDArray
+
 from rsbench.renderers.scene import MitsubaScene
+
+
+class Hits(NamedTuple):
+    """Of rows of a frame, each (rows, width)."""
+
+    depth: NDArray[np.float32]
+    """z in the camera of the row, metres; 0 = no surface."""
+    labels: NDArray[np.uint8]
+    """Number of the object that moves and is seen there, 0 = none; see ``carried.SHADED``."""
+    gloss: NDArray[np.bool_]
+    """Whether the surface is glossy."""
+
+    @classmethod
+    def none(cls, rows: int, width: int) -> Hits:
+        """Nothing, to be filled."""
+        shape = rows, width
+        return cls(np.zeros(shape, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_))
+
+
+_BELOW_A_COAT = 0.95
+"""Of the light that comes evenly from all sides the share that passes the coat, over that which passes it upright.
+0.946 to 0.953 for the roughnesses that a material may have, by the sum of that BSDF over directions."""
+
+
+def is_glossy(bsdf: Any, active: Any) -> Any:
+    """Whether BSDFs have a coat."""
+    import mitsuba as mi
+
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection) & active
+
+
+class Coat:
+    """What glossy surfaces do where rays meet them."""
+
+    def __init__(self, hit: Any, normal: Any, ray: Any) -> None:
+        """
+        Args:
+            hit: Mitsuba's interaction, position and normals in the world.
+            normal: unit shading normals towards the eye.
+            ray: that met the surfaces.
+        """
+        import mitsuba as mi
+
+        self._bsdf, self._frame = hit.bsdf(), mi.Frame3f(normal)
+        self._hit = mi.SurfaceInteraction3f(hit)
+        self._hit.sh_frame, self._hit.wi = self._frame, self._frame.to_local(-ray.d)
+
+    def share_towards(self, direction: Any, active: Any) -> Any:
+        """Radiance by an irradiance of 1 from unit directions, measured across them: of coat and surface below."""
+        return self._bsdf.eval(_context("all"), self._hit, self._frame.to_local(direction), active)
+
+    def below(self, active: Any) -> Any:
+        """Radiance of the surface below by an even radiance of 1 from all sides: its albedo through the coat."""
+        import drjit as dr
+        import mitsuba as mi
+
+        upright = self._bsdf.eval(_context("diffuse"), self._hit, mi.Vector3f(0, 0, 1), active)
+        return upright * (dr.pi * _BELOW_A_COAT)
+
+    def mirrored(self, facet: Any, active: Any) -> tuple[Any, Any]:
+        """Rays by facets, drawn by points of the unit square, and the share of what they bring that is seen.
+
+        The middle of the square is the mirror direction, or nearly; the mean over all of it is the coat's light.
+        """
+        import mitsuba as mi
+
+        found, share = self._bsdf.sample(_context("coat"), self._hit, mi.Float(0.5), facet, active)
+        return self._hit.spawn_ray(self._frame.to_world(found.wo)), share
+
+
+@cache
+def _context(part: str) -> Any:
+    import mitsuba as mi
+
+    context = mi.BSDFContext()
+    if part != "all":
+        context.type_mask = mi.BSDFFlags.Diffuse if part == "diffuse" else mi.BSDFFlags.Glossy
+    return context
+
+
+SHADED = 128
+"""Added to the label of a pixel whose surface an object hides from the sun; the rest is the object's number, 0 of
+what stands still."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object where it is at the times of the lanes."""
+
+    scene: Any
+    """Of Mitsuba, in the frame of the object."""
+    ball: tuple[Any, Any]
+    """Centre, in that frame, and square of the radius of a ball around it."""
+    pose: list[Any]
+    """12 values: ``world_from_object``, R row-major, then t."""
+
+    def carried(self, ray: Any, active: Any) -> tuple[Any, Any]:
+        """A ray of the world in the frame of the object, where its parameters mean the same; and whether it may
+        meet the object."""
+        import drjit as dr
+        import mitsuba as mi
+
+        origin = mi.Point3f(*self._turned(ray.o - mi.Vector3f(*self.pose[9:])))
+        direction = mi.Vector3f(*level(self._turned(ray.d)))
+        centre, square = self.ball
+        to = centre - origin
+        off = dr.cross(to, direction)
+        return mi.Ray3f(origin, direction), active & (dr.dot(off, off) <= square * dr.dot(direction, direction))
+
+    def meets(self, ray: Any, active: Any) -> Any:
+        """Whether the object lies on rays of the world."""
+        own, near = self.carried(ray, active)
+        return self.scene.ray_test(own, coherent=True, active=near)
+
+    def _turned(self, v: Any) -> list[Any]:
+        """``R^T v``."""
+        R = self.pose
+        return [R[k] * v.x + R[3 + k] * v.y + R[6 + k] * v.z for k in range(3)]
+
+
+def placed(scene: MitsubaScene, sensor: Any, pose: Any, active: Any = True) -> list[Placed]:
+    """The objects of a scene at the times of poses of the sensor, one number for each lane."""
+    return [
+        Placed(each, ball, sensor.object_pose(number, pose, active))
+        for number, (each, ball) in enumerate(zip(scene.objects, scene.balls, strict=True))
+    ]
+
+
+class First(NamedTuple):
+    """What rays meet first, in the frame of what they meet."""
+
+    found: Any
+    """Mitsuba's preliminary intersection."""
+    ray: Any
+    pose: list[Any]
+    """12 values, as of ``Placed``."""
+    label: Any
+    """Number of the object, 0 of what stands still."""
+
+    def surface(self, flags: Any, active: Any) -> Any:
+        """Mitsuba's interaction, position and normals in the world."""
+        import mitsuba as mi
+
+        hit = self.found.compute_surface_interaction(self.ray, flags, active)
+        at = self._out(hit.p)
+        hit.p = mi.Point3f(*(value + place for value, place in zip(at, self.pose[9:], strict=True)))
+        hit.n, hit.sh_frame.n = (mi.Normal3f(*self._out(n)) for n in (hit.n, hit.sh_frame.n))
+        return hit
+
+    def _out(self, v: Any) -> list[Any]:
+        """``R v``."""
+        R = self.pose
+        return [R[3 * k] * v.x + R[3 * k + 1] * v.y + R[3 * k + 2] * v.z for k in range(3)]
+
+
+def first(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> First:
+    """The nearest of what stands still and of the objects."""
+    import mitsuba as mi
+
+    here = [mi.Float(float(k in (0, 4, 8))) for k in range(12)]
+    nearest = First(
+        scene.scene.ray_intersect_preliminary(ray, coherent=True, active=active), ray, here, mi.UInt32(0)
+    )
+    for number, each in enumerate(objects, start=1):
+        own_ray, near = each.carried(ray, active)
+        own = each.scene.ray_intersect_preliminary(own_ray, coherent=True, active=near)
+        other, nearer = First(own, own_ray, each.pose, mi.UInt32(number)), own.t < nearest.found.t
+        nearest = First(
+            _either(nearer, own, nearest.found),
+            _either(nearer, own_ray, nearest.ray),
+            [_either(nearer, a, b) for a, b in zip(other.pose, nearest.pose, strict=True)],
+            _either(nearer, other.label, nearest.label),
+        )
+    return nearest
+
+
+def first_surface(scene: MitsubaScene, ray: Any, flags: Any, active: Any, objects: Sequence[Placed]) -> Any:
+    """Mitsuba's interaction with what the rays meet first; position and normals in the world."""
+    if not objects:
+        return scene.scene.ray_intersect(ray, ray_flags=flags, coherent=True, active=active)
+    return first(scene, ray, active, objects).surface(flags, active)
+
+
+def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> Any:
+    """Whether anything lies on the rays."""
+    found = scene.scene.ray_test(ray, coherent=True, active=active)
+    for each in objects:
+        found = found | each.meets(ray, active & _not(found))
+    return found
+
+
+def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any, Any]:
+    """Of the first surface along rays its parameter, 0 where there is none, label (see ``SHADED``) and BSDF."""
+    import drjit as dr
+    import mitsuba as mi
+
+    nearest = first(scene, ray, active, objects)
+    hit = nearest.surface(mi.RayFlags.Minimal, active)
+    seen, shaded = hit.is_valid() & active, active & False
+    to_sun = hit.spawn_ray(scene.sky.sun_direction)
+    for each in objects:
+        shaded = shaded | each.meets(to_sun, seen & _not(shaded))
+    label = dr.select(seen, nearest.label, 0)
+    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label), hit.bsdf()
+
+
+def _not(value: Any) -> Any:
+    import drjit as dr
+
+    return ~value if dr.is_jit_v(value) else not value
+
+
+def _either(first: Any, own: Any, other: Any) -> Any:
+    import drjit as dr
+
+    if dr.is_jit_v(first):
+        return dr.select(first, own, other)
+    return own if first else other
+
+
+def level(direction: list[Any]) -> list[Any]:
+    """See ``sensor.LEAST_COMPONENT``."""
+    import drjit as dr
+
+    from rsbench.renderers.sensor import LEAST_COMPONENT
+
+    return [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
 
 
 def sunsky_radiance(
     scene: MitsubaScene,
     ray: Any,
     active: Any = True,
-    ways: Sequence[Any] = (),
+    sky_points: Sequence[Any] = (),
     objects: Sequence[Placed] = (),
     facet: Any = None,
 ) -> Any:
@@ -23,8 +261,8 @@ def sunsky_radiance(
 
     L = albedo (E_sun / pi max(n.s, 0) visible + S (0.6 + 0.4 n.up)), with S the cosine-weighted mean of the sky,
     so that level ground in the open has its exact sky irradiance and a wall three fifths of it. It draws no random
-    number: the same ray has the same radiance, in every renderer, process and number of threads. With ``ways``,
-    points on the unit sphere, the sky's part is that of ``_seen_sky``: all is direct light as ``path`` has it.
+    number: the same ray has the same radiance, in every renderer, process and number of threads. With
+    ``sky_points`` on the unit sphere the sky's part is that of ``_seen_sky``: all direct light as ``path`` has it.
 
     The coat of a glossy surface mirrors the sun, and by ``facet``, a point of the unit square, what the mirrored
     ray meets: its light without what glossy surfaces there would mirror in turn. Without ``facet``, the sun alone.
@@ -45,8 +283,8 @@ def sunsky_radiance(
     lit = on_surface & (facing > 0)
     dark = hidden(scene, hit.spawn_ray(sky.sun_direction), lit, objects)
     sun = sky.sun_radiance * dr.select(lit, dr.select(dark, 0, facing), 0)
-    if ways:
-        ambient = _seen_sky(scene, hit, normal, ways, on_surface)
+    if sky_points:
+        ambient = _seen_sky(scene, hit, normal, sky_points, on_surface)
     elif sky.mapped:
         ambient = sky.on_open_surface(normal)
     else:
@@ -63,7 +301,7 @@ def sunsky_radiance(
             return found
         mirrored, share = coat.mirrored(facet, shiny)
         mirrored.d = mi.Vector3f(*level(list(mirrored.d)))
-        return found + share * sunsky_radiance(scene, mirrored, shiny, ways, objects)
+        return found + share * sunsky_radiance(scene, mirrored, shiny, sky_points, objects)
 
     shiny = is_glossy(hit.bsdf(), on_surface)
     return dr.if_stmt(args=(light,), cond=shiny, true_fn=coated, false_fn=lambda plain: plain)
@@ -73,7 +311,7 @@ _WITHIN = 0.9999
 """Of the sphere's radius: the opposite of a normal would leave no direction."""
 
 
-def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, ways: Sequence[Any], active: Any) -> Any:
+def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, sky_points: Sequence[Any], active: Any) -> Any:
     """Radiance that a white open surface would have from the sky, times the share of its light that nothing hides.
 
     A unit normal plus a point on the unit sphere is a direction that the cosine law draws; of those directions the
@@ -83,8 +321,8 @@ def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, ways: Sequence[Any], a
     import mitsuba as mi
 
     seen, whole = mi.Color3f(0.0), mi.Color3f(0.0)
-    for way in ways:
-        direction = dr.normalize(normal + _WITHIN * way)
+    for point in sky_points:
+        direction = dr.normalize(normal + _WITHIN * point)
         light = scene.sky.seen_along(direction)
         dark = scene.scene.ray_test(hit.spawn_ray(direction), active=active)
         seen += dr.select(dark, 0, light)

@@ -3,6 +3,10 @@
 Dr.Jit loads libLLVM at run time. Its own search takes the first one it finds, and LLVM 15 and 16 (still the
 default of common systems) abort the whole process at the first kernel. So every candidate is first loaded by a
 child process that compiles a small kernel; only a library that survives that reaches the user's process.
+
+What the probes of earlier processes found is kept in the user's cache folder so that start-up costs nothing. Only
+successes are kept: the next start may cure a failure, and probing again costs a fraction of a second. No error of
+the cache is raised: without a home folder or with a read-only one nothing is remembered.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import glob
 import importlib.metadata
+import json
 import os
 import platform
 import re
@@ -21,8 +26,53 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsbench.components.imports import lifeline
-from rsbench.renderers import probe_cache
 from rsbench.storage.work_folder import cpu_key
+
+_MAXIMUM_ENTRIES = 64
+
+
+def cache_file() -> Path | None:
+    """Where verdicts are kept; None when the user has no home folder."""
+    chosen = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        base = Path(chosen) if chosen else Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return base / "rsbench" / "probes.json" if base.is_absolute() else None
+
+
+def recall(key: str) -> str | None:
+    """The version that a successful probe reported, or None."""
+    return _read().get(key)
+
+
+def remember(key: str, version: str) -> None:
+    """Store a successful probe; silently does nothing where nothing can be written."""
+    file = cache_file()
+    if file is None:
+        return
+    entries = {**_read(), key: version}
+    kept = dict(list(entries.items())[-_MAXIMUM_ENTRIES:])
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=file.parent, suffix=".tmp")
+        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as stream:
+            json.dump(kept, stream, indent=1)
+        os.replace(name, file)
+    except OSError:
+        return
+
+
+def _read() -> dict[str, str]:
+    file = cache_file()
+    try:
+        content = json.loads(file.read_text(encoding="utf-8")) if file is not None else {}
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(content, dict):
+        return {}
+    return {key: value for key, value in content.items() if isinstance(value, str)}
+
 
 MINIMUM_VERSION = 17
 """15 and 16 abort on CPUs with AVX-512 ("Cannot select ... fminimum"); 14 lacks opaque pointers."""
@@ -173,7 +223,7 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> ProbeResult:
         return ProbeResult(ok=False, reason=f"cannot be opened ({error.strerror})")
     drjit = importlib.metadata.version("drjit")
     key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{cpu_key()}"
-    known = probe_cache.recall(key)
+    known = recall(key)
     if known is not None:
         return ProbeResult(ok=True, version=known)
     with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
@@ -182,7 +232,7 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> ProbeResult:
     if verdict.ok and int(verdict.version.split(".")[0]) < MINIMUM_VERSION:
         return ProbeResult(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
     if verdict.ok:
-        probe_cache.remember(key, verdict.version)
+        remember(key, verdict.version)
     return verdict
 
 
@@ -216,8 +266,8 @@ def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], t
         return ProbeResult(ok=True, version=".".join(lines[-1].split()[1:]))
     if done.returncode < 0:
         return ProbeResult(ok=False, reason=f"killed its process (signal {-done.returncode})")
-    said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-    return ProbeResult(ok=False, reason=said[-1][:200] if said else f"exit code {done.returncode}")
+    printed = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    return ProbeResult(ok=False, reason=printed[-1][:200] if printed else f"exit code {done.returncode}")
 
 
 def load(candidate: Candidate) -> None:

@@ -1,11 +1,18 @@
-"""Sub-pixel positions of the samples of a pixel."""
+"""Positions of the samples of a pixel, and their times within the exposure of its row.
+
+A row collects light for a while about its row time. The exposure is cut into instants, midpoints of equal parts:
+an exposed frame is the mean of the frames of its instants, up to the Monte Carlo error of seeing some in a pixel.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rsbench.core.so3 import FloatArray
 
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -24,7 +31,7 @@ def subpixel_grid(samples: int) -> NDArray[np.float32]:
     return np.stack([x, y], axis=-1).astype(np.float32)
 
 
-def sky_ways(samples: int, rays: int) -> NDArray[np.float32]:
+def sky_points(samples: int, rays: int) -> NDArray[np.float32]:
     """Points (samples, rays, 3) on the unit sphere, evenly spread over all and over those of each sample.
 
     A Fibonacci lattice, whose heights go round the samples in steps of their golden section, so that no side of a
@@ -49,3 +56,33 @@ def golden_step(count: int) -> int:
     """Coprime with ``count`` and near its golden section: neighbours are brought far apart."""
     golden = round(0.618 * count)
     return next(step for step in range(max(1, golden), 2 * count + 2) if math.gcd(step, count) == 1)
+
+
+LEAST_INSTANTS = 64
+"""A blur of 64 px is then drawn without gaps."""
+
+
+def instant_count(samples: int) -> int:
+    """Instants of an exposure that is seen by ``samples`` per pixel: a multiple of them, one part for each."""
+    return samples * -(-LEAST_INSTANTS // samples)
+
+
+def instant_times(tau: FloatArray, exposure: float, instants: int) -> FloatArray:
+    """Times (instants, rows) of an exposure of length ``exposure`` about row times (rows); frame periods."""
+    parts = (np.arange(instants) + 0.5) / instants - 0.5
+    return tau + exposure * parts[:, None]
+
+
+def instant_of(seed: Any, pixel: Any, sample: Any, samples: int, instants: int) -> Any:
+    """Number of the instant that a sample of a pixel sees: a random one of its own part of the exposure.
+
+    Which sample has which part changes from pixel to pixel, so that no corner of all pixels is seen first. All
+    follow from (seed, pixel, sample) alone, as the random numbers of the path tracer do.
+    """
+    import mitsuba as mi
+
+    turn, salt = mi.sample_tea_32(seed, pixel)
+    within, _ = mi.sample_tea_32(salt, sample)
+    part = (sample * golden_step(samples) + turn % samples) % samples
+    per_part = instants // samples
+    return part * per_part + within % per_part

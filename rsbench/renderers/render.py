@@ -2,13 +2,14 @@
 
 Two methods make the same frame. ``stitched`` is how the paper made its data: a whole global-shutter image at the
 pose of every row, of which one row is kept. ``single-pass`` gives every ray the pose of its row in one kernel, at
-the price of one global-shutter image. They agree bit for bit, in image and depth.
+the price of one global-shutter image. They agree bit for bit, in image and depth. ``sensed_rows`` makes the frame
+as a camera delivers it: exposed, with noise, interpolated and compressed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -17,9 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry, poses_of
+from rsbench.core.rig import View
 from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
+from rsbench.renderers.image import Sensor, expose, processed, rows_needed
+from rsbench.renderers.integrators import Hits
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.ray_hits import Hits
+from rsbench.renderers.pixel_samples import instant_count, instant_times
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import make_sensor, object_tables, pose_table
 
@@ -29,7 +35,7 @@ OnGlobalFrame = Callable[[int, Float32Array], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """An image and its depth; the rows asked for, in that order (all ``height`` of them by default)."""
+    """An image and its depth; the requested rows, in that order (all ``height`` of them by default)."""
 
     image: Float32Array
     """(rows, width, 3) linear RGB radiance."""
@@ -202,3 +208,45 @@ def _tracer() -> ModuleType | Any:
     from rsbench.renderers import scalar_tracing
 
     return scalar_tracing
+
+
+def sensed_rows(
+    scene: MitsubaScene,
+    geometry: Geometry,
+    view: View,
+    sensor: Sensor,
+    frame_period_s: float,
+    options: RendererOptions,
+    rows: Sequence[int] | None = None,
+    twin: int | None = None,
+) -> NDArray[np.uint8]:
+    """Rows (rows, width, 3) of a frame, all by default; 8-bit sRGB.
+
+    Args:
+        scene: in the world frame of the motion.
+        geometry: the middle of a row's exposure is its time.
+        view: side of the rig and number of the frame.
+        sensor: of this camera and frame.
+        frame_period_s: seconds of a frame period, in which the motion counts.
+        options: how to render; their seed is that of the image, of the noise too.
+        rows: these only, with the bits that they have in the whole frame.
+        twin: all rows are exposed about the time of this row, counted as rows are read, as by a global shutter.
+    """
+    rig, shutter, (side, frame) = geometry.rig, geometry.shutter, view
+    tau = shutter.line_times(frame, side)
+    if twin is not None:
+        tau = np.full(tau.shape, tau[abs(shutter.first_line(side) - twin)])
+
+    def poses(tau: FloatArray) -> LinePoses:
+        camera = rig.cam_from_world(geometry.motion, tau, side)
+        return LinePoses(*camera, poses_of(geometry.objects, tau), columns=shutter.axis(side) == 0)
+
+    exposed = None
+    if sensor.exposure_s:
+        exposed = poses(instant_times(tau, sensor.exposure_s / frame_period_s, instant_count(options.samples)))
+    chosen = range(shutter.height) if rows is None else rows
+    options = replace(options, full_frames=False)
+    needed = rows_needed(sensor, chosen, shutter.height)
+    light = render(scene, rig.camera, poses(tau), options, exposed=exposed, rows=needed).image
+    read = expose(light * np.float32(options.exposure), sensor, options.seed, shutter.height, needed)
+    return processed(read, sensor, shutter.height, needed, chosen)

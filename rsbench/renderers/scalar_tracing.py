@@ -13,13 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.renderers.exposure import instant_of
-from rsbench.renderers.gloss import is_glossy
-from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
-from rsbench.renderers.object_tracing import Placed, depth_and_label, placed
+from rsbench.renderers.integrators import (
+    Hits,
+    Placed,
+    depth_and_label,
+    is_glossy,
+    lane_sampler,
+    path_integrator,
+    placed,
+    sunsky_radiance,
+)
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.pixel_samples import facet_points, sky_ways, subpixel_grid
-from rsbench.renderers.ray_hits import Hits
+from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points, subpixel_grid
 from rsbench.renderers.scene import MitsubaScene
 
 Float32Array = NDArray[np.float32]
@@ -80,14 +85,14 @@ def _sunsky(
     import drjit as dr
     import mitsuba as mi
 
-    ways = [mi.Vector3f(*way) for way in _ways(options.samples, options.sky_rays)[sample]]
+    sky_points_here = [mi.Vector3f(*point) for point in _sky_points(options.samples, options.sky_rays)[sample]]
     facet = mi.Point2f(facet_points(options.samples)[sample].tolist()) if scene.glossy else None
-    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), True, ways, objects, facet)
+    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), True, sky_points_here, objects, facet)
 
 
 @cache
-def _ways(samples: int, rays: int) -> Any:
-    return sky_ways(samples, rays).tolist() if rays else [[]] * samples
+def _sky_points(samples: int, rays: int) -> Any:
+    return sky_points(samples, rays).tolist() if rays else [[]] * samples
 
 
 def _path(

@@ -1,4 +1,4 @@
-"""Rays between eyes and points of our own choice: what stands between them, and what surface is met."""
+"""Rays between eyes and chosen points: what stands between them, what surface is met; a motion's collisions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
-from rsbench.core.geometry import MovingObject
+from rsbench.core.geometry import MovingObject, RelativeMotion
+from rsbench.core.motion import Motion
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import inverse, transform
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import LEAST_COMPONENT
 
 REACH = 1.0 - 1e-4
-"""Share of the way to the point that must be free. The rest is the point's own surface: rays and points are
+"""Share of the distance to the point that must be free. The rest is the point's own surface: rays and points are
 rounded to float32, so a ray that grazes a surface meets it a little early."""
 
 
@@ -48,7 +51,7 @@ class SceneRays:
         return found
 
     def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray:
-        """Share (n,) of the way to the points, or beyond them, at which the first surface is met; inf: at none.
+        """Distance (n,) of the first surface on each ray, in units of the distance to the point; inf: none.
 
         Of what stands still.
         """
@@ -57,7 +60,7 @@ class SceneRays:
         return np.where(np.isfinite(met), met, np.inf)
 
     def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces:
-        """What is met on the way to the points and beyond; ``tau`` as of ``blocked``."""
+        """What rays to the points, and beyond, meet first; ``tau`` as for ``blocked``."""
         met = _met(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
             pose = each.world_from_object(_at(tau, slice(None)))
@@ -79,7 +82,7 @@ class _Met(NamedTuple):
     normals: NDArray[np.float32]
     instances: NDArray[np.uint16]
     distance: NDArray[np.float32]
-    """(n,) in units of the way to the points."""
+    """(n,) in units of the distance to the point."""
 
 
 def _at(tau: FloatArray | None, chosen: Any) -> FloatArray:
@@ -103,10 +106,10 @@ def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
     found = []
     for ray in _rays(eyes, points):
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
-        dr.eval(hit.n, hit.t, hit.shape)  # together: asked for one by one, each traces the rays again
-        normals, ways = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
+        dr.eval(hit.n, hit.t, hit.shape)  # together: evaluated one by one, each traces the rays again
+        normals, directions = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
         numbers, distance = _numbers(scene, hit), np.atleast_1d(np.array(hit.t, dtype=np.float32))
-        found.append((_towards_eyes(normals, ways, numbers), numbers, distance))
+        found.append((_towards_eyes(normals, directions, numbers), numbers, distance))
     return _Met(*(each[0] if len(each) == 1 else np.concatenate(each) for each in zip(*found, strict=True)))
 
 
@@ -138,34 +141,78 @@ def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
     """Rays whose parameter is 1 at the points: one array of all of them, or each alone."""
     import mitsuba as mi
 
-    origins, ways = np.zeros((2, 3, len(points)), dtype=np.float32)
-    _fill_rays(eyes, points, origins, ways)
+    origins, directions = np.zeros((2, 3, len(points)), dtype=np.float32)
+    _fill_rays(eyes, points, origins, directions)
     if _wide():
-        return [mi.Ray3f(mi.Point3f(origins), mi.Vector3f(ways))]
-    return [mi.Ray3f(o, d) for o, d in zip(origins.T.tolist(), ways.T.tolist(), strict=True)]
+        return [mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions))]
+    return [mi.Ray3f(o, d) for o, d in zip(origins.T.tolist(), directions.T.tolist(), strict=True)]
 
 
 @compiled
 def _fill_rays(
-    eyes: FloatArray, points: FloatArray, origins: NDArray[np.float32], ways: NDArray[np.float32]
+    eyes: FloatArray, points: FloatArray, origins: NDArray[np.float32], directions: NDArray[np.float32]
 ) -> None:
-    """Origins and ways (3, n) in one pass: NumPy's, a component at a time, takes as long as tracing them."""
+    """Origins and directions (3, n) in one pass: NumPy's, a component at a time, takes as long as tracing them."""
     for n in range(points.shape[0]):
         for k in range(3):
-            way = np.float32(points[n, k] - eyes[n, k])
+            direction = np.float32(points[n, k] - eyes[n, k])
             origins[k, n] = eyes[n, k]
-            ways[k, n] = np.float32(0.0) if abs(way) < LEAST_COMPONENT else way  # NaN stays
+            directions[k, n] = np.float32(0.0) if abs(direction) < LEAST_COMPONENT else direction  # NaN stays
 
 
 @compiled
 def _towards_eyes(
-    normals: NDArray[np.float32], ways: NDArray[np.float32], numbers: NDArray[np.uint16]
+    normals: NDArray[np.float32], directions: NDArray[np.float32], numbers: NDArray[np.uint16]
 ) -> NDArray[np.float32]:
-    """Normals (n, 3) of those (3, n) that are met by ways (3, n); 0 where the number (n,) is."""
+    """Normals (n, 3) of those (3, n) that are met along directions (3, n); 0 where the number (n,) is."""
     out = np.zeros((numbers.size, 3), np.float32)
     for n in np.flatnonzero(numbers):
-        along = normals[0, n] * ways[0, n] + normals[1, n] * ways[1, n] + normals[2, n] * ways[2, n]
+        along = (
+            normals[0, n] * directions[0, n] + normals[1, n] * directions[1, n] + normals[2, n] * directions[2, n]
+        )
         sign = np.float32(-1.0) if along > 0 else np.float32(1.0)
         for k in range(3):
             out[n, k] = sign * normals[k, n] + np.float32(0.0)  # no -0
     return out
+
+
+def obstacle(
+    scene: MitsubaScene,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    frames: int,
+    objects: Sequence[MovingObject] = (),
+) -> str:
+    """The obstacle that a camera meets, in words; "" where there is none. ``objects`` of the scene move.
+
+    Followed in straight steps, from the middle of the rig at time 0 to each camera, and along its path until the
+    last row of the last of so many frames is read. A rig that starts inside a solid and stays there meets nothing.
+    """
+    tau = np.linspace(0.0, frames - 1 + shutter.readout_ratio, 1 + 2 * (frames - 1) * shutter.height)
+    for side in SIDES:
+        centres = inverse(rig.cam_from_world(motion, tau, side)).t
+        step = first_crossing(scene.scene, np.concatenate([np.zeros((1, 3)), centres]))
+        if step == 0:
+            return f"there is a surface between the middle of the rig and the {side} camera"
+        if step is not None:
+            return f"the {side} camera goes through a surface at time {tau[step - 1]:.3f}"
+        for number, (own, each) in enumerate(zip(scene.objects, objects, strict=True), start=1):
+            centres = inverse(rig.cam_from_world(RelativeMotion(motion, each), tau, side)).t
+            if (step := first_crossing(own, centres)) is not None:
+                return f"the {side} camera and moving object {number} meet at time {tau[step]:.3f}"
+    return ""
+
+
+def first_crossing(scene: Any, points: FloatArray) -> int | None:
+    """The first straight step, from point k of (n, 3), metres, to the next, that meets a surface; None: none.
+
+    ``scene`` is one of Mitsuba.
+    """
+    steps = np.diff(points, axis=0)
+    moving = np.flatnonzero(np.any(steps, axis=1))
+    if not len(moving):
+        return None
+    starts = points[moving]
+    met = moving[blocked(scene, starts, starts + steps[moving] / REACH)]
+    return int(met[0]) if len(met) else None

@@ -15,13 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.renderers.exposure import instant_of
-from rsbench.renderers.gloss import is_glossy
-from rsbench.renderers.integrators import lane_sampler, path_integrator, sunsky_radiance
-from rsbench.renderers.object_tracing import depth_and_label, placed
+from rsbench.renderers.integrators import (
+    Hits,
+    depth_and_label,
+    is_glossy,
+    lane_sampler,
+    path_integrator,
+    placed,
+    sunsky_radiance,
+)
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.pixel_samples import facet_points, sky_ways, subpixel_grid
-from rsbench.renderers.ray_hits import Hits
+from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points, subpixel_grid
 from rsbench.renderers.scene import MitsubaScene
 
 PACKET = 16
@@ -154,7 +158,7 @@ def _sunsky_band(
     lanes = _Lanes.of(rows, camera.width)
     grid = mi.Float(subpixel_grid(options.samples).ravel())
     count, rays = dr.opaque(mi.UInt32, options.samples), options.sky_rays
-    table = mi.Float(sky_ways(options.samples, rays).ravel()) if rays else None
+    table = mi.Float(sky_points(options.samples, rays).ravel()) if rays else None
     facets = mi.Float(facet_points(options.samples).ravel()) if scene.glossy else None
     x, y = mi.Float(lanes.column), mi.Float(lanes.row)
     pixel = None if sensor.lens is None else sensor.lens.pixel(x, y, lanes.active)
@@ -165,10 +169,10 @@ def _sunsky_band(
         pose = _pose(sensor, camera, lanes, k, options)
         origin, direction = sensor.row_ray(x + dx, y + dy, pose, lanes.active, pixel)
         ray = mi.Ray3f(origin, dr.normalize(direction))
-        ways = [_entry(table, k * rays + j) for j in range(rays)]
+        sky_points_here = [_entry(table, k * rays + j) for j in range(rays)]
         objects = placed(scene, sensor, pose, lanes.active) if still is None else still
         facet = None if facets is None else mi.Point2f(*(dr.gather(mi.Float, facets, 2 * k + j) for j in (0, 1)))
-        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, ways, objects, facet)
+        return k + 1, total + sunsky_radiance(scene, ray, lanes.active, sky_points_here, objects, facet)
 
     _, total = dr.while_loop(
         state=(dr.zeros(mi.UInt32, dr.width(lanes.row)), dr.zeros(mi.Color3f, dr.width(lanes.row))),

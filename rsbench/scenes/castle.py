@@ -11,11 +11,22 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.buildings import HouseStyle, house
-from rsbench.scenes.fort import curtain_wall, gatehouse, round_tower, square_tower, wall_stairs
 from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
-from rsbench.scenes.parts import Piece, assemble, grid, lump, placed
+from rsbench.scenes.parts import (
+    HouseStyle,
+    Piece,
+    assemble,
+    curtain_wall,
+    gatehouse,
+    grid,
+    house,
+    lump,
+    placed,
+    round_tower,
+    square_tower,
+    wall_stairs,
+)
+from rsbench.scenes.surfaces import paint_palette
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,13 +75,13 @@ def _ground() -> list[Piece]:
     x, y = np.meshgrid(np.linspace(-17.5, 17.5, 36), np.linspace(-19, 25.5, 46))
     z = 0.06 * np.sin(x * 0.7) * np.cos(y * 0.5) + 0.03 * np.sin(x * 1.9 + y * 1.3) - 0.03
     yard = grid("earth", np.stack([x, y, z], axis=-1), np.stack([x, y], axis=-1))
-    # The paved way from the camera's corner through the gate, worn into a gentle curve.
+    # The paved path from the camera's corner through the gate, worn into a gentle curve.
     t, across = np.meshgrid(np.linspace(-19, 46, 40), np.linspace(-1.9, 1.9, 5), indexing="ij")
     centre = 7.0 * np.clip((t + 8) / 28, 0, 1) ** 2 * (3 - 2 * np.clip((t + 8) / 28, 0, 1))
     x, y = centre + across * (1 + 0.12 * np.sin(t)), t
     z = 0.05 - 0.02 * across**2 + np.maximum(terrain_height(x, y), 0)
-    way = grid("cobbles", np.stack([x, y, z], axis=-1), np.stack([x, y], axis=-1))
-    return [hills, yard, way]
+    path = grid("cobbles", np.stack([x, y, z], axis=-1), np.stack([x, y], axis=-1))
+    return [hills, yard, path]
 
 
 def _walls(rng: np.random.Generator, parameters: CastleBuilder) -> list[Piece]:

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from rsbench.scenes.buildings import rectangle
 from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
-from rsbench.scenes.parts import Piece, Point, assemble, block, box, panel, placed, prism, revolve, tube
+from rsbench.scenes.parts import Piece, Point, assemble, block, box, panel, placed, prism, rectangle, revolve, tube
+from rsbench.scenes.surfaces import paint_palette
 
 _HALF, _START, _END, _HEIGHT = 1.6, -9.0, 15.0, 2.8
 _TILE, _JOINT = 0.6, 0.004
@@ -34,7 +33,7 @@ class CorridorBuilder(SceneBuilder):
     doors: int = 5
     """On each side."""
     lights: int = 5
-    """Openings in the ceiling; the only way in for the sun."""
+    """Openings in the ceiling; the sun enters through nothing else."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.doors <= 6:
@@ -85,9 +84,9 @@ def _side(rng: np.random.Generator, side: int, doors: int) -> list[Piece]:
     niche = [rectangle(-_NICHE[0], -0.1, _NICHE[1], 2.4)] if side > 0 else []
     if niche:
         places = [y for y in places if abs(y - _NICHE[0]) > _NICHE[1] / 2 + 0.9]
-    ways = [rectangle(-side * y, -0.1, _DOOR[0], _DOOR[1] + 0.1) for y in places]
+    doorways = [rectangle(-side * y, -0.1, _DOOR[0], _DOOR[1] + 0.1) for y in places]
     pieces = _wall(
-        _START - 0.3 if side < 0 else -_END - 0.3, _END + 0.3 if side < 0 else 0.3 - _START, [*ways, *niche]
+        _START - 0.3 if side < 0 else -_END - 0.3, _END + 0.3 if side < 0 else 0.3 - _START, [*doorways, *niche]
     )
     if niche:
         pieces += placed(_frame(_NICHE[1], 2.3), (-_NICHE[0], 0, 0))
@@ -102,12 +101,12 @@ def _side(rng: np.random.Generator, side: int, doors: int) -> list[Piece]:
     return placed(placed(pieces, (0, _HALF, 0)), (0, 0, 0), -90 * side)
 
 
-def _wall(left: float, right: float, ways: list[list[Point]]) -> list[Piece]:
+def _wall(left: float, right: float, doorways: list[list[Point]]) -> list[Piece]:
     """A painted wall whose front is y = 0; each paint lies a little before the one behind it."""
 
     def strip(surface: str, low: float, high: float, out: float) -> list[Piece]:
         outline = [(left, low), (right, low), (right, high), (left, high)]
-        return placed([panel(surface, outline, 0.3 if out == 0 else 0.06, ways)], (0, -out, 0))
+        return placed([panel(surface, outline, 0.3 if out == 0 else 0.06, doorways)], (0, -out, 0))
 
     pieces = strip("paint_white", -0.05, _HEIGHT + 0.05, 0.0) + strip("paint_sage", -0.04, _DADO, 0.004)
     return pieces + strip("steel", -0.03, 0.1, 0.016) + strip("paint_blue", _DADO - 0.02, _DADO + 0.04, 0.024)
@@ -140,8 +139,8 @@ def _end_walls() -> list[Piece]:
     """A glazed double door below a sign at the far end, a plain door behind the default viewpoint."""
     pieces: list[Piece] = []
     for heading, distance in ((0, _END), (180, -_START)):
-        way = rectangle(0, -0.1, 1.9 if heading == 0 else _DOOR[0], _DOOR[1] + 0.1)
-        wall = _wall(-_HALF - 0.2, _HALF + 0.2, [way])
+        doorway = rectangle(0, -0.1, 1.9 if heading == 0 else _DOOR[0], _DOOR[1] + 0.1)
+        wall = _wall(-_HALF - 0.2, _HALF + 0.2, [doorway])
         if heading == 0:
             for side in (-1, 1):
                 leaf = [box("paint_blue", (-0.47, 0.1, 0.008), (0.47, 0.145, 2.08)),

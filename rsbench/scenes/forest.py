@@ -12,8 +12,8 @@ import numpy as np
 
 from rsbench.scenes import props
 from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import Piece, assemble, flat, grid, lump, placed, tube
+from rsbench.scenes.surfaces import paint_palette
 
 _CLEAR = 1.7
 """No trunk stands nearer to the path, which runs along y from -4 to 2 m, so that the rig has room."""

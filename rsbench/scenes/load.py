@@ -1,20 +1,312 @@
-"""Scene cards: a builder, its parameters, the light and the viewpoints."""
+"""Scene cards: parsed, built or taken from the cache of built scenes, and lit, perhaps by an environment map.
+
+Our builders take seconds, and every process wants the same arrays. A scene is one file of the cache, named by what
+decides its arrays. It is written under another name and renamed when complete, so processes may fill the cache at
+the same time; zip's checksums detect a damaged file, which is built again.
+
+An environment map is light from all directions in place of the two-colour sky, from a lat-long HDR or EXR file.
+The middle of the map looks along +y of the scene, its right side along +x; its upper border is the zenith.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import contextlib
+import hashlib
+import io
+import json
+import os
+import re
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.components.cards import card_path, parse_card, read_toml
-from rsbench.components.imports import blaming
+from rsbench.components.imports import blaming, component_key, hash_of_files
 from rsbench.components.plugins import Kind, NoOptions, load_class, make_component
+from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
-from rsbench.scenes.environment import lit_by, read_environment
-from rsbench.scenes.model import Light, Scene, SceneBuilder, SceneMesh, Viewpoint
-from rsbench.scenes.scene_cache import built_key, cached_meshes, keep
+from rsbench.scenes.model import (
+    Environment,
+    FloatArray,
+    Light,
+    Material,
+    Scene,
+    SceneBuilder,
+    SceneMesh,
+    Viewpoint,
+)
+from rsbench.storage.untrusted_files import check_amount, read_bytes
+from rsbench.storage.work_folder import cpu_key, user_cache
+
+_PACKAGES = ("numpy", "trimesh", "shapely", "mapbox-earcut")
+"""Decide, with the sources of ``rsbench.scenes``, what our builders make of a card."""
+_MOST = 12
+"""Scenes that are kept: 0.2 GB each."""
+_ABANDONED_S = 3600.0
+_ARRAYS = ("vertices", "faces", "uv", "normals")
+
+
+def built_key(builder: SceneBuilder, seed: int) -> str | None:
+    """Equal keys are equal meshes on one machine; None when files or other packages' code decide too."""
+    if not builder.closed or type(builder).__module__.partition(".")[0] != "rsbench":
+        return None
+    package = Path(str(resources.files("rsbench")))
+    content = {
+        "builder": component_key(builder, {}),
+        "seed": seed,
+        "source": hash_of_files(package, sorted((package / "scenes").glob("*.py"))),
+        "packages": {each: version(each) for each in _PACKAGES},
+        "processor": cpu_key(),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def cached_meshes(key: str) -> tuple[SceneMesh, ...] | None:
+    """What ``keep`` stored under a key; None when there is nothing that can be read."""
+    folder = _folder()
+    if folder is None:
+        return None
+    path = folder / f"{key}.npz"
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            meshes = tuple(_unpacked(arrays))
+        os.utime(path)  # the least recently used goes first
+    except Exception:  # whatever a damaged file makes of those who read it
+        return None
+    return meshes
+
+
+def keep(key: str, meshes: tuple[SceneMesh, ...]) -> None:
+    """Store meshes; silently does nothing where nothing can be written."""
+    folder = _folder()
+    if folder is None:
+        return
+    partial = None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _trim(folder)
+        handle, partial = tempfile.mkstemp(dir=folder, suffix=".partial")
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **_packed(meshes))
+        os.replace(partial, folder / f"{key}.npz")
+    except OSError:
+        pass
+    finally:
+        if partial is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(partial)
+
+
+def _folder() -> Path | None:
+    base = user_cache()
+    return None if base is None else base / "scenes"
+
+
+def _trim(folder: Path) -> None:
+    """Make room for one more scene; what a killed process left goes too."""
+    kept = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+    for path in kept[: max(len(kept) - _MOST + 1, 0)]:
+        path.unlink(missing_ok=True)
+    for path in folder.glob("*.partial"):
+        if time.time() - path.stat().st_mtime > _ABANDONED_S:
+            path.unlink(missing_ok=True)
+
+
+def _packed(meshes: tuple[SceneMesh, ...]) -> dict[str, NDArray[Any]]:
+    """Arrays by name, and everything else as JSON; meshes that share a material share it again."""
+    materials = list({id(mesh.material): mesh.material for mesh in meshes}.values())
+    numbers = {id(material): number for number, material in enumerate(materials)}
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, material in enumerate(materials):
+        if material.texture is not None:
+            arrays[f"texture-{number}"] = material.texture
+    for number, mesh in enumerate(meshes):
+        found = {name: getattr(mesh, name) for name in _ARRAYS}
+        arrays |= {f"{name}-{number}": array for name, array in found.items() if array is not None}
+    content = {
+        "materials": [{**asdict(one), "texture": one.texture is not None} for one in materials],
+        "meshes": [{"name": mesh.name, "material": numbers[id(mesh.material)]} for mesh in meshes],
+    }
+    return arrays | {"content": np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)}
+
+
+def _unpacked(arrays: Any) -> Iterator[SceneMesh]:
+    content = json.loads(arrays["content"].tobytes())
+    materials = []
+    for number, found in enumerate(content["materials"]):
+        texture = arrays[f"texture-{number}"] if found["texture"] else None
+        parts: dict[str, Any] = {**found, "colour": tuple(found["colour"]), "texture": texture}
+        materials.append(Material(**parts))
+    for number, found in enumerate(content["meshes"]):
+        own = {name: arrays[f"{name}-{number}"] for name in _ARRAYS if f"{name}-{number}" in arrays}
+        yield SceneMesh(name=found["name"], material=materials[found["material"]], **own)
+
+
+PIXELS = 1 << 23
+"""Of a map: 4096 x 2048."""
+_CHANNELS = 16
+_REC_709 = np.array([0.2126, 0.7152, 0.0722])
+_SUN_DEG, _RING_DEG, _SUNNY = 5.0, 8.0, 50.0
+"""How far from the brightest pixel the sun's light is looked for, how far what lies around it, and how many times
+as bright as the median of the upper half it must be."""
+
+
+def read_environment(path: Path) -> NDArray[np.float32]:
+    """Linear radiance (H, 2 H, 3) of a Radiance HDR or an EXR file; its size is read before it is decoded.
+
+    Raises:
+        RsbenchError: it cannot be read, is too large, not twice as wide as high, or holds what is no light.
+    """
+    data, kind = read_bytes(path), path.suffix.lower()
+    if kind not in (".hdr", ".exr"):
+        raise RsbenchError(f"environment map {path}: must end in .hdr or .exr")
+    try:
+        radiance = _read_exr(data, path) if kind == ".exr" else _read_hdr(data, path)
+    except RsbenchError:
+        raise
+    except Exception as error:  # what a damaged file makes its decoder stumble over
+        raise RsbenchError(f"environment map {path}: damaged, or no {kind[1:].upper()} file") from error
+    if not (np.isfinite(radiance).all() and radiance.min() >= 0.0 and radiance.max() > 0.0):
+        raise RsbenchError(
+            f"environment map {path}: holds values below 0, that are not finite, or no light at all"
+        )
+    return radiance
+
+
+def _check_map(path: Path, width: int, height: int, channels: int = 3) -> None:
+    if width != 2 * height or height < 2:
+        raise RsbenchError(f"environment map {path}: {width} x {height}: a lat-long map is twice as wide as high")
+    check_amount(f"environment map {path}", "pixels", width * height, PIXELS)
+    check_amount(f"environment map {path}", "channels", channels, _CHANNELS)
+
+
+def _read_hdr(data: bytes, path: Path) -> NDArray[np.float32]:
+    size = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:4096])
+    if size is None or not data.startswith(b"#?"):
+        raise RsbenchError(f"environment map {path}: no Radiance HDR file with rows from the top")
+    height, width = int(size[1]), int(size[2])
+    _check_map(path, width, height)
+    decoded: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if decoded.shape != (height, width, 3):
+        raise ValueError("decoded to another size")
+    return np.ascontiguousarray(decoded[..., ::-1], dtype=np.float32)
+
+
+def _read_exr(data: bytes, path: Path) -> NDArray[np.float32]:
+    import OpenEXR
+
+    with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
+        headers = [part.header for part in file.parts]
+        low, high = headers[0]["dataWindow"]
+        width, height = (int(end - start) + 1 for start, end in zip(low, high, strict=True))
+        names = [channel.name for channel in headers[0]["channels"]]
+    if len(headers) != 1 or not {"R", "G", "B"} <= set(names):
+        raise RsbenchError(f"environment map {path}: one part with the channels R, G and B is needed")
+    _check_map(path, width, height, len(names))
+    with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+        pixels = [np.asarray(file.channels()[name].pixels, dtype=np.float32) for name in "RGB"]
+    return np.stack(pixels, axis=-1)
+
+
+def lit_by(light: Light, radiance: NDArray[np.float32], turn_deg: float) -> Light:
+    """The light of a map, which makes level ground in the open as bright as ``light`` does.
+
+    A sun in the map becomes the light's sun, so that it throws shadows without noise; a map without one has none.
+
+    Args:
+        light: in the frame of the scene, z up; its sun and sky only say how bright all is.
+        radiance: of ``read_environment``.
+        turn_deg: the map is turned by this much, anticlockwise from above.
+
+    Raises:
+        RsbenchError: no light comes from above.
+    """
+    directions, weights = _directions(radiance.shape[0])
+    sky, direction, irradiance = _without_sun(radiance.astype(np.float64), directions, weights)
+    level = np.sum(sky * (np.maximum(directions[..., 2], 0.0) * weights)[..., None], axis=(0, 1))
+    own = float((level + irradiance * direction[2]) @ _REC_709)
+    if own <= 0.0:
+        raise RsbenchError("environment map: its upper half is black")
+    up = np.asarray(light.sun_direction)[2]
+    mean = np.asarray(light.sky_horizon) / 3.0 + 2.0 * np.asarray(light.sky_zenith) / 3.0
+    factor = float((np.asarray(light.sun_irradiance) * up + np.pi * mean) @ _REC_709) / own
+    turn = so3.exp(np.array([0.0, 0.0, np.deg2rad(turn_deg)]))
+    return replace(
+        light,
+        sun_direction=tuple(turn @ direction),
+        sun_irradiance=tuple(factor * irradiance),
+        environment=Environment(radiance=_at_edges(factor * sky), frame_from_map=turn @ _SCENE_FROM_MAP),
+    )
+
+
+_SCENE_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""The map's axes are those of a camera that looks at its middle: x right, y down, z forward."""
+
+
+def _directions(height: int) -> tuple[FloatArray, FloatArray]:
+    """Of pixels (H, 2 H): unit directions (..., 3) in the frame of the scene, and solid angles (H, 1)."""
+    down = np.pi * (np.arange(height) + 0.5) / height
+    around = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
+    level = np.sin(down)[:, None]
+    directions = [level * np.sin(around), level * np.cos(around), np.cos(down)[:, None] + 0.0 * around]
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return np.stack(directions, axis=-1), (edges[:-1] - edges[1:])[:, None] * np.pi / height
+
+
+def _without_sun(
+    radiance: FloatArray, directions: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A map (H, W, 3) with what lies around its sun in its place, the sun's direction (3,) and irradiance (3,)."""
+    bright = radiance @ _REC_709
+    upper = bright[: len(bright) // 2]
+    peak = np.unravel_index(int(np.argmax(upper)), upper.shape)
+    if upper[peak] <= _SUNNY * np.median(upper):
+        return radiance, np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    apart = directions @ directions[peak]
+    near = apart > np.cos(np.deg2rad(_SUN_DEG))
+    ring = ~near & (apart > np.cos(np.deg2rad(_RING_DEG)))
+    around = np.median(radiance[ring], axis=0) if np.any(ring) else np.median(radiance, axis=(0, 1))
+    more = np.where(near[..., None], np.maximum(radiance - around, 0.0), 0.0) * weights[..., None]
+    direction = np.sum(directions * (more @ _REC_709)[..., None], axis=(0, 1))
+    sky = np.where(near[..., None], np.minimum(radiance, around), radiance)
+    return sky, direction / np.linalg.norm(direction), np.sum(more, axis=(0, 1))
+
+
+def _at_edges(radiance: FloatArray) -> NDArray[np.float32]:
+    """Values (H + 1, W, 3) at the edges of rows, the poles first and last."""
+    poles = (np.broadcast_to(np.mean(radiance[row], axis=0), (1, *radiance.shape[1:])) for row in (0, -1))
+    top, bottom = poles
+    between = 0.5 * (radiance[:-1] + radiance[1:])
+    return np.concatenate([top, between, bottom]).astype(np.float32)
+
+
+def irradiance_map(radiance: NDArray[np.float32], rows: int = 32) -> NDArray[np.float32]:
+    """Radiance (rows + 1, 2 rows, 3) of white diffuse surfaces that are open to a map (H + 1, 2 H, 3).
+
+    Their normals lie as the values of ``Environment.radiance`` do.
+    """
+    height = min(len(radiance) - 1, 4 * rows)
+    middle = 0.5 * (radiance[:-1] + radiance[1:])
+    small = np.asarray(cv2.resize(middle, (2 * height, height), interpolation=cv2.INTER_AREA), dtype=np.float64)
+    directions, weights = _directions(height)
+    light = (small * weights[..., None]).reshape(-1, 3)
+    down, around = np.pi * np.arange(rows + 1) / rows, np.pi * ((np.arange(2 * rows) + 0.5) / rows - 1.0)
+    level = np.sin(down)[:, None]
+    normals = np.stack(
+        [level * np.sin(around), level * np.cos(around), np.cos(down)[:, None] + 0.0 * around], axis=-1
+    )
+    seen = [np.maximum(row @ directions.reshape(-1, 3).T, 0.0) @ light for row in normals]
+    return (np.stack(seen) / np.pi).astype(np.float32)
+
 
 _FARTHEST = 1e9
 Rgb: TypeAlias = tuple[float, float, float]

@@ -1,16 +1,21 @@
 """A scene from a mesh file of the user: glTF, GLB, OBJ, OFF, PLY or STL, read by trimesh.
 
-A file may name others, such as textures, in its own folder and below.
+A file may name others, such as textures, in its own folder and below. The size that a file states is checked
+before trimesh reads it, and what trimesh ignores in a glTF header is read here: extensions that it cannot decode,
+and transforms of textures. The model is then placed: its size and place, the ground below it and walls around.
 """
 
 from __future__ import annotations
 
+import base64
 import io
 import logging
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import trimesh
@@ -18,11 +23,275 @@ from numpy.typing import NDArray
 
 from rsbench.components.imports import in_words
 from rsbench.core.errors import RsbenchError
-from rsbench.scenes.gltf import TextureTransform
-from rsbench.scenes.mesh_limits import TEXTURE, check_mesh_file
-from rsbench.scenes.mesh_placement import box_of, standing, surroundings
 from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
-from rsbench.storage.untrusted_files import FILE_BYTES, check_amount, check_size
+from rsbench.scenes.parts import Piece, assemble, box, grid
+from rsbench.scenes.surfaces import paint_palette
+from rsbench.storage.untrusted_files import (
+    FILE_BYTES,
+    check_amount,
+    check_image_size,
+    check_size,
+    parse_json,
+    read_bytes,
+)
+
+_TRANSFORM = "KHR_texture_transform"
+_HARMLESS = (_TRANSFORM, "KHR_materials_", "KHR_lights_", "EXT_texture_webp")
+"""Beginnings of extensions that may be required: we read them, or they say what a diffuse surface has not."""
+_ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureTransform:
+    """Of texture coordinates, in glTF's own frame: u right, v down."""
+
+    offset: tuple[float, float] = (0.0, 0.0)
+    rotation: float = 0.0
+    """Radians; anticlockwise as one sees it in a picture of u and v, so from +u towards -v."""
+    scale: tuple[float, float] = (1.0, 1.0)
+
+    def __call__(self, uv: FloatArray) -> FloatArray:
+        """Coordinates (n, 2), v up, as trimesh gives them: scaled, then rotated, then moved."""
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        u, v = uv[:, 0] * self.scale[0], (1.0 - uv[:, 1]) * self.scale[1]
+        turned = np.stack([c * u + s * v + self.offset[0], 1.0 - (c * v - s * u + self.offset[1])], axis=1)
+        return np.asarray(turned, dtype=np.float64)
+
+
+def check_extensions(header: Mapping[str, Any], where: str) -> None:
+    """Refuse what would be read as something else than it is.
+
+    Raises:
+        RsbenchError: the file requires an extension that is not read, or has materials of an old one.
+    """
+    for name in header.get("extensionsRequired", []):
+        if not str(name).startswith(_HARMLESS) or name == _ARCHIVED:
+            raise RsbenchError(f"{where}: needs the glTF extension {name}, which is not read: export it without")
+    if any(_ARCHIVED in material.get("extensions", {}) for material in header.get("materials", [])):
+        raise RsbenchError(f"{where}: has materials of {_ARCHIVED}: export it with metallic-roughness ones")
+
+
+def texture_transforms(header: Mapping[str, Any], where: str) -> dict[str, TextureTransform]:
+    """Transforms of base colour textures by the names of their materials.
+
+    Raises:
+        RsbenchError: materials of one name have several, or a texture uses other coordinates than the first.
+    """
+    found: dict[str, TextureTransform] = {}
+    for material in header.get("materials", []):
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+        stated = texture.get("extensions", {}).get(_TRANSFORM, {})
+        name = str(material.get("name"))
+        if stated.get("texCoord", texture.get("texCoord", 0)) != 0:
+            raise RsbenchError(
+                f"{where}: the texture of material {name!r} uses a second set of coordinates: export it with one"
+            )
+        transform = TextureTransform(
+            offset=_pair(stated.get("offset", (0.0, 0.0))),
+            rotation=float(stated.get("rotation", 0.0)),
+            scale=_pair(stated.get("scale", (1.0, 1.0))),
+        )
+        if found.setdefault(name, transform) != transform:
+            raise RsbenchError(
+                f"{where}: materials of the name {name!r} have several {_TRANSFORM}: give them names of their own"
+            )
+    return {name: transform for name, transform in found.items() if transform != TextureTransform()}
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    first, second = values
+    return float(first), float(second)
+
+
+PARTS = 1 << 12
+"""Nodes, meshes, materials and so on, of each kind."""
+VALUES = 1 << 26
+"""Numbers in the arrays of a file, and in those of all its parts, which may share them."""
+_DEEPEST = 64
+_VISITS = 1 << 28
+TEXTURE = 1 << 24
+"""Pixels of a texture, 4096 x 4096."""
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+_TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+def check_mesh_file(path: Path) -> dict[str, TextureTransform]:
+    """Refuse a mesh file that says of itself that it unfolds to too much; returns its transforms of textures.
+
+    Raises:
+        RsbenchError: that, a format that is not read, or a header that cannot be one.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise RsbenchError(
+            f"mesh file {path}: cannot be read: must end in {', '.join(SUFFIXES)}; export it as GLB"
+        )
+    data, where = read_bytes(path, FILE_BYTES), f"mesh file {path}"
+    try:
+        match path.suffix.lower():
+            case ".glb":
+                return _check_gltf(_json_chunk(data), where, _binary_chunk(data))
+            case ".gltf":
+                return _check_gltf(data, where)
+            case ".ply":
+                _check_ply(data, where)
+            case ".obj":
+                _check_obj(data, where)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise RsbenchError(f"{where}: cannot be read: {type(error).__name__} in its header: {error}") from error
+    return {}
+
+
+def _json_chunk(data: bytes) -> bytes:
+    if data[:4] != b"glTF" or data[16:20] != b"JSON":
+        raise ValueError("not binary glTF")
+    return data[20 : 20 + int.from_bytes(data[12:16], "little")]
+
+
+def _binary_chunk(data: bytes) -> bytes:
+    start = 20 + int.from_bytes(data[12:16], "little")
+    return data[start + 8 : start + 8 + int.from_bytes(data[start : start + 4], "little")]
+
+
+def _check_gltf(text: bytes, where: str, binary: bytes = b"") -> dict[str, TextureTransform]:
+    header = parse_json(text.decode("utf-8"), where)
+    for name, items in header.items():
+        if isinstance(items, list):
+            check_amount(where, name, len(items), PARTS)
+    sizes = [_size(accessor) for accessor in header.get("accessors", [])]
+    check_amount(where, "values of all accessors", sum(sizes), VALUES)
+    primitives = [primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]]
+    check_amount(where, "primitives", len(primitives), PARTS)
+    used = [index for primitive in primitives for index in _accessors(primitive)]
+    check_amount(where, "values of all primitives", sum(sizes[index] for index in used), VALUES)
+    _check_graph(header, where)
+    check_extensions(header, where)
+    if any(not {"bufferView", "sparse"} & set(header["accessors"][index]) for index in used):
+        raise RsbenchError(f"{where}: has meshes without data: export it without compression")
+    for number in _coloured_images(header):
+        _check_image(header, number, binary, f"{where}: image {number}")
+    return texture_transforms(header, where)
+
+
+def _coloured_images(header: dict[str, Any]) -> list[int]:
+    """Numbers of the images that colour a material, each once."""
+    textures = [
+        each.get("pbrMetallicRoughness", {}).get("baseColorTexture") for each in header.get("materials", [])
+    ]
+    sources = [header["textures"][each["index"]].get("source") for each in textures if each is not None]
+    return sorted({number for number in sources if number is not None})
+
+
+def _check_image(header: dict[str, Any], number: int, binary: bytes, where: str) -> None:
+    """Refuse an image inside the file that cannot be decoded, in whose place trimesh takes grey without a word.
+
+    Images in files of their own are read, and refused, as they are needed.
+    """
+    image = header["images"][number]
+    if str(image.get("uri", "")).startswith("data:"):
+        kind, _, text = image["uri"].partition(",")
+        data = base64.b64decode(text, validate=True) if kind.endswith(";base64") else unquote_to_bytes(text)
+    elif "bufferView" in image and binary:
+        view = header["bufferViews"][image["bufferView"]]
+        start = int(view.get("byteOffset", 0))
+        data = binary[start : start + int(view["byteLength"])]
+    else:
+        return
+    check_image_size(data, where, most=TEXTURE)
+
+
+def _check_graph(header: dict[str, Any], where: str) -> None:
+    """Refuse nodes that are not trees, as glTF requires, or so deep that each path takes long."""
+    children = [node.get("children", []) for node in header.get("nodes", [])]
+    parents = {child: number for number, each in enumerate(children) for child in each}
+    shown = [node for scene in header.get("scenes", []) for node in scene.get("nodes", [])]
+    check_amount(where, "nodes of all scenes", len(shown), PARTS)
+    if len(parents) < sum(map(len, children)):
+        raise RsbenchError(f"{where}: a node has two parents")
+    for node in parents:
+        depth = 0
+        while node in parents and depth <= _DEEPEST:
+            node, depth = parents[node], depth + 1
+        check_amount(where, "levels of nodes", depth, _DEEPEST)
+
+
+def _size(accessor: dict[str, Any]) -> int:
+    count, width = accessor["count"], _TYPES[accessor["type"]]
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise ValueError(f"count = {count!r}")
+    return count * width
+
+
+def _accessors(primitive: dict[str, Any]) -> Iterable[int]:
+    found = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+    if any(isinstance(index, bool) or not isinstance(index, int) or index < 0 for index in found):
+        raise ValueError(f"accessors {found}")
+    return found
+
+
+def _check_obj(data: bytes, where: str) -> None:
+    groups = len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE))
+    check_amount(where, "groups", groups, PARTS)
+    # Its reader goes through all vertices for each group.
+    vertices = len(re.findall(rb"^\s*v\s", data, re.MULTILINE))
+    check_amount(where, "vertices times groups", vertices * groups, _VISITS)
+
+
+def _check_ply(data: bytes, where: str) -> None:
+    header, _, content = data.partition(b"end_header")
+    counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\S+)", header, re.MULTILINE)]
+    # Each vertex and each face takes a byte at least; of text, each line is one.
+    if min(counts, default=0) < 0 or sum(counts) > len(content):
+        raise ValueError(f"states {sum(counts)} elements in {len(content)} bytes")
+    if b"ascii" in header and content.count(b"\n") > 2 * sum(counts) + PARTS:
+        raise ValueError(f"states {sum(counts)} elements in {content.count(bytes([10]))} lines")
+
+
+_GROUND, _WALL = "cobbles", "brick"
+_SUNK = 1e-3
+"""Of the model's size: a base at the height of the ground would share its surface."""
+_APART, _HIGH = 4.0, 2.0
+"""Of the model's size: from its axis to the walls, and their height."""
+
+
+def standing(meshes: Sequence[SceneMesh], size: float | None) -> tuple[SceneMesh, ...]:
+    """The same model over the scene's origin, its lowest point at z = 0.
+
+    Args:
+        meshes: of the model; all vertices that triangles use are within its box.
+        size: length of the longest side of that box, metres; None keeps it.
+    """
+    low, high = box_of(meshes)
+    factor = 1.0 if size is None else size / float(np.max(high - low))
+    foot = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+    return tuple(replace(mesh, vertices=factor * (mesh.vertices - foot)) for mesh in meshes)
+
+
+def box_of(meshes: Sequence[SceneMesh]) -> tuple[FloatArray, FloatArray]:
+    """Least and largest coordinates (3,) of what is seen of meshes."""
+    used = [mesh.vertices[np.unique(mesh.faces)] for mesh in meshes]
+    lows, highs = [part.min(axis=0) for part in used], [part.max(axis=0) for part in used]
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+def surroundings(meshes: Sequence[SceneMesh], ground: bool, backdrop: bool, seed: int) -> tuple[SceneMesh, ...]:
+    """Cobbles below a model, and a square of brick walls around it; its box decides their size."""
+    low, high = box_of(meshes)
+    size, (x, y) = float(np.max(high - low)), (low[:2] + high[:2]) / 2
+    floor, reach, pieces = float(low[2]) - _SUNK * size, _APART * size, list[Piece]()
+    if ground:
+        steps = np.linspace(-2 * reach, 2 * reach, 33)
+        across, along = np.meshgrid(steps, steps)
+        points = np.stack([x + across, y + along, np.full_like(across, floor)], axis=-1)
+        pieces.append(grid(_GROUND, points, np.stack([across, along], axis=-1)))
+    if backdrop:
+        thick, top = 0.1 * size, floor + _HIGH * size
+        for sign in (-1, 1):
+            near, far = sorted((sign * reach, sign * (reach + thick)))
+            pieces.append(box(_WALL, (x + near, y - reach, floor), (x + far, y + reach, top)))
+            pieces.append(box(_WALL, (x - reach, y + near, floor), (x + reach, y + far, top)))
+    made = assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+    return tuple(replace(mesh, name=f"around the model: {mesh.name}") for mesh in made)
+
 
 # Rows turn file axes into a right-handed frame with z up.
 _Z_UP = {
@@ -94,9 +363,7 @@ class MeshBuilder(SceneBuilder):
                 return meshes + surroundings(meshes, self.ground, self.backdrop, seed)
         except RsbenchError:
             raise
-        except (
-            Exception
-        ) as error:  # trimesh raises what a broken file makes it stumble over, often when asked late
+        except Exception as error:  # trimesh raises various errors on a broken file, often late
             raise RsbenchError(f"mesh file {path}: cannot be read: {in_words(error)}") from error
 
     def _meshes(self, path: Path) -> tuple[SceneMesh, ...]:

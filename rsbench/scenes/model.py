@@ -148,7 +148,7 @@ class SceneBuilder(ABC):
     """Makes the meshes of a scene. A frozen dataclass: its fields are the parameters that a scene card may set."""
 
     closed: ClassVar[bool] = False
-    """Whether parameters and seed alone decide the meshes, so that they can be kept; only ours are asked."""
+    """Whether parameters and seed alone decide the meshes, so that they can be cached; of our builders only."""
 
     @abstractmethod
     def build(self, seed: int, folder: Path) -> Sequence[SceneMesh]:

@@ -14,7 +14,7 @@ from rsbench.components.cards import choices
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.scenes.model import FloatArray, Material, Scene, SceneMesh
-from rsbench.scenes.textures import fractal_noise, to_bytes
+from rsbench.scenes.surfaces import fractal_noise, to_bytes
 
 MOST_MOVING = 64
 """Objects of a sequence."""
@@ -61,8 +61,10 @@ class MeshFile:
         Raises:
             RsbenchError: see ``MeshBuilder.build``.
         """
-        from rsbench.scenes.mesh import MeshBuilder  # which loads trimesh
-        from rsbench.scenes.mesh_placement import box_of
+        from rsbench.scenes.mesh import (
+            MeshBuilder,  # which loads trimesh
+            box_of,
+        )
 
         builder = MeshBuilder(
             file=self.file,

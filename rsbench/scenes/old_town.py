@@ -11,11 +11,28 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.buildings import HouseStyle, arch, house, rectangle
-from rsbench.scenes.fort import gatehouse, loop_window, square_tower
 from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
-from rsbench.scenes.parts import Piece, assemble, beam, box, grid, leaned, lump, panel, placed, profile, revolve
+from rsbench.scenes.parts import (
+    HouseStyle,
+    Piece,
+    arch,
+    assemble,
+    beam,
+    box,
+    gatehouse,
+    grid,
+    house,
+    leaned,
+    loop_window,
+    lump,
+    panel,
+    placed,
+    profile,
+    rectangle,
+    revolve,
+    square_tower,
+)
+from rsbench.scenes.surfaces import paint_palette
 
 _WALLS = ("plaster_0", "plaster_1", "plaster_2", "plaster_3", "plaster_4", "brick")
 _GROUNDS = ("stone", "ashlar_1", "ashlar_3", "brick")

@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.buildings import rectangle, window
 from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
-from rsbench.scenes.parts import Piece, assemble, box, grid, panel, placed, tube
+from rsbench.scenes.parts import Piece, assemble, box, grid, panel, placed, rectangle, tube, window
+from rsbench.scenes.surfaces import paint_palette
 
 _BORDER = ((-0.72, 2.2, 0.035), (0.74, 2.25, 0.05), (-1.16, 3.6, 0.06), (1.24, 3.8, 0.045))
 """Posts at the border of the default view: x, y, radius; metres."""

@@ -10,12 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from rsbench.scenes import furniture as fit
 from rsbench.scenes import props
-from rsbench.scenes.buildings import door, rectangle, window
 from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
-from rsbench.scenes.parts import Piece, Point, assemble, beam, box, grid, leaned, panel, picture, placed
+from rsbench.scenes.parts import (
+    Piece,
+    Point,
+    assemble,
+    beam,
+    box,
+    door,
+    grid,
+    leaned,
+    panel,
+    picture,
+    placed,
+    rectangle,
+    window,
+)
+from rsbench.scenes.surfaces import paint_palette
 
 _HALF_X, _HALF_Y = 2.7, 2.9
 
@@ -85,39 +97,39 @@ def _between(half: float, holes: list[list[tuple[float, float]]]) -> list[tuple[
 
 def _back_wall(rng: np.random.Generator, height: float) -> list[Piece]:
     y = _HALF_Y
-    pieces = placed(fit.fireplace(rng, 1.5, height), (0.55, y - 0.45, 0))
-    pieces += placed(fit.bookcase(rng, 1.35, min(2.3, height - 0.3)), (-0.98, y - 0.34, 0))
-    pieces += placed(fit.bookcase(rng, 1.2, min(2.3, height - 0.3)), (2.03, y - 0.34, 0))
-    pieces += placed(fit.framed(0, 0.55, 0.7), (-2.15, y - 0.02, 1.6))
-    return pieces + placed(fit.framed(5, 0.4, 0.5), (-2.2, y - 0.02, 0.95))
+    pieces = placed(props.fireplace(rng, 1.5, height), (0.55, y - 0.45, 0))
+    pieces += placed(props.bookcase(rng, 1.35, min(2.3, height - 0.3)), (-0.98, y - 0.34, 0))
+    pieces += placed(props.bookcase(rng, 1.2, min(2.3, height - 0.3)), (2.03, y - 0.34, 0))
+    pieces += placed(props.framed(0, 0.55, 0.7), (-2.15, y - 0.02, 1.6))
+    return pieces + placed(props.framed(5, 0.4, 0.5), (-2.2, y - 0.02, 0.95))
 
 
 def _seats() -> list[Piece]:
     corners = [(-1.1, -0.35, 0.012), (1.75, -0.05, 0.012), (1.55, 1.75, 0.012), (-1.3, 1.45, 0.012)]
     pieces = [picture("rug", corners)]
-    pieces += placed(fit.armchair(), (1.5, 1.15, 0), -50)
-    pieces += placed(fit.armchair("fabric_3"), (-0.75, 1.25, 0), 40)
-    pieces += placed(fit.armchair("fabric_0", 1.7), (2.1, -1.0, 0), -90)
-    pieces += placed(fit.floor_lamp(), (1.32, 1.98, 0)) + placed(fit.floor_lamp(1.5), (-1.75, 2.0, 0))
-    stool = fit.table((0.5, 0.5, 0.42))
-    return pieces + placed(stool, (0.45, 1.0, 0), 20) + placed(fit.candlestick(), (0.52, 1.05, 0.42))
+    pieces += placed(props.armchair(), (1.5, 1.15, 0), -50)
+    pieces += placed(props.armchair("fabric_3"), (-0.75, 1.25, 0), 40)
+    pieces += placed(props.armchair("fabric_0", 1.7), (2.1, -1.0, 0), -90)
+    pieces += placed(props.floor_lamp(), (1.32, 1.98, 0)) + placed(props.floor_lamp(1.5), (-1.75, 2.0, 0))
+    stool = props.table((0.5, 0.5, 0.42))
+    return pieces + placed(stool, (0.45, 1.0, 0), 20) + placed(props.candlestick(), (0.52, 1.05, 0.42))
 
 
 def _table(rng: np.random.Generator, chairs: int) -> list[Piece]:
     """The table in the foreground and what lies on it."""
-    pieces = placed(fit.table(), (0, 0, 0))
+    pieces = placed(props.table(), (0, 0, 0))
     places = ((0.0, 0.62, 4), (0.95, 0.05, -95), (-0.98, 0.0, 88), (0.35, -0.75, 176))
     for x, y, heading in places[:chairs]:
-        pieces += placed(fit.chair(), (x, y, 0), heading)
-    top = placed(fit.vase(rng, 0.26, 9), (0.32, 0.16, 0)) + placed(fit.fruit_bowl(rng), (-0.18, 0.14, 0))
-    top += placed(fit.candlestick(), (0.58, -0.08, 0)) + placed(fit.globe(0.11), (-0.58, 0.2, 0))
+        pieces += placed(props.chair(), (x, y, 0), heading)
+    top = placed(props.vase(rng, 0.26, 9), (0.32, 0.16, 0)) + placed(props.fruit_bowl(rng), (-0.18, 0.14, 0))
+    top += placed(props.candlestick(), (0.58, -0.08, 0)) + placed(props.globe(0.11), (-0.58, 0.2, 0))
     for k, (x, y, heading) in enumerate(
         ((-0.35, -0.18, 12), (-0.12, -0.24, -20), (0.33, -0.2, 35), (0.1, -0.08, 64))
     ):
-        top += placed(fit.sheet_of_paper(6 + k % 2), (x, y, 0.003 * k), heading)
+        top += placed(props.sheet_of_paper(6 + k % 2), (x, y, 0.003 * k), heading)
     for k in range(4):
         size = (0.035 + 0.008 * (k % 3), 0.17, 0.24 - 0.015 * k)
-        lying = leaned(fit.book(17 * k + 5, size), 0, 90)
+        lying = leaned(props.book(17 * k + 5, size), 0, 90)
         top += placed(lying, (0.42 + 0.02 * k, -0.3 + 0.01 * k, 0.022 + 0.042 * k), 8 * k - 10)
     return placed([*pieces, *placed(top, (0, 0, 0.76))], (0.1, 0.15, 0), 6)
 
@@ -127,23 +139,23 @@ def _sides(rng: np.random.Generator) -> list[Piece]:
     x, y = _HALF_X, _HALF_Y
     pieces: list[Piece] = []
     for k, (at, w, h) in enumerate(((1.2, 0.5, 0.65), (0.4, 0.62, 0.5), (-0.5, 0.75, 0.55), (-1.4, 0.5, 0.65))):
-        pieces += placed(fit.framed(k + 1, w, h), (x - 0.02, at, 1.65), -90)
+        pieces += placed(props.framed(k + 1, w, h), (x - 0.02, at, 1.65), -90)
     for middle in (-1.25, 1.05):
         bars = [piece for piece in window(1.3, 1.6, None, "walnut") if piece.surface != "glass"]
         pieces += placed(bars, (-x - 0.28, middle, 0.75), -90)
         for side in (-0.82, 0.82):
-            pieces += placed(fit.curtain(0.45, 2.25), (-x + 0.1, middle + side, 0.15), 90)
+            pieces += placed(props.curtain(0.45, 2.25), (-x + 0.1, middle + side, 0.15), 90)
         rod = ((-x + 0.1, middle - 1.1, 2.42), (-x + 0.1, middle + 1.1, 2.42))
         pieces.append(beam("brass", *rod, 0.03))
-        pieces += placed(fit.pot_plant(rng, 0.8), (-x + 0.22, middle + 0.1, 0.0)) if middle > 0 else []
-    pieces += placed(fit.pot_plant(rng), (-2.3, 2.15, 0)) + placed(fit.pot_plant(rng, 1.1), (2.35, 0.35, 0))
-    pieces += placed(fit.bookcase(rng, 1.3), (0.4, -y + 0.34, 0), 180)
+        pieces += placed(props.pot_plant(rng, 0.8), (-x + 0.22, middle + 0.1, 0.0)) if middle > 0 else []
+    pieces += placed(props.pot_plant(rng), (-2.3, 2.15, 0)) + placed(props.pot_plant(rng, 1.1), (2.35, 0.35, 0))
+    pieces += placed(props.bookcase(rng, 1.3), (0.4, -y + 0.34, 0), 180)
     pieces += placed(door(0.95, 2.1, "oak", "walnut")[:4], (-1.2, -y, 0), 180)
-    pieces += placed(fit.table((1.1, 0.45, 0.82)), (1.7, -y + 0.35, 0), 180)
-    pieces += placed(fit.vase(rng, 0.34, 8), (1.9, -y + 0.33, 0.82)) + placed(
-        fit.globe(0.14), (1.4, -y + 0.35, 0.82)
+    pieces += placed(props.table((1.1, 0.45, 0.82)), (1.7, -y + 0.35, 0), 180)
+    pieces += placed(props.vase(rng, 0.34, 8), (1.9, -y + 0.33, 0.82)) + placed(
+        props.globe(0.14), (1.4, -y + 0.35, 0.82)
     )
-    return pieces + placed(fit.framed(4, 0.8, 0.6), (1.7, -y + 0.02, 1.7), 180)
+    return pieces + placed(props.framed(4, 0.8, 0.6), (1.7, -y + 0.02, 1.7), 180)
 
 
 def _garden(rng: np.random.Generator) -> list[Piece]:

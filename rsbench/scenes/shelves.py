@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from rsbench.scenes.furnishings import CARTONS, cell_uv
-from rsbench.scenes.furniture import sheet_cell
 from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import Piece, assemble, beam, block, box, picture, placed, prism, revolve
+from rsbench.scenes.props import sheet_cell
+from rsbench.scenes.surfaces import CARTONS, cell_uv, paint_palette
 
 _AISLE = 2.2
 """Half its width, metres."""

@@ -12,23 +12,24 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.buildings import chimney, rectangle
 from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import (
     Piece,
     assemble,
     beam,
     block,
     box,
+    chimney,
     joined,
     leaned,
     panel,
     placed,
     profile,
+    rectangle,
     revolve,
     tube,
 )
+from rsbench.scenes.surfaces import paint_palette
 
 _HALF, _START, _END = 6.5, -14.0, 62.0
 _KERB = 2.4

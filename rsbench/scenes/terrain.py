@@ -14,14 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rsbench.scenes.buildings import chimney, gable_roof
 from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
-from rsbench.scenes.palette import paint_palette
 from rsbench.scenes.parts import (
     Piece,
     assemble,
     block,
     box,
+    chimney,
+    gable_roof,
     grid,
     joined,
     leaned,
@@ -31,6 +31,7 @@ from rsbench.scenes.parts import (
     revolve,
     tube,
 )
+from rsbench.scenes.surfaces import paint_palette
 
 _CUTS_X = (-110.0, -72.0, -36.0, -12.0, -8.0, 17.0, 42.0, 68.0, 105.0)
 _CUTS_Y = (-60.0, -32.0, -14.0, 6.0, 11.0, 31.0, 52.0, 76.0, 110.0, 160.0)
@@ -187,7 +188,7 @@ def _planted(
 
 
 def _yard(rng: np.random.Generator, plot: _Plot, at: Place, houses: int) -> list[Piece]:
-    """Houses along the road, a shed and a paved way."""
+    """Houses along the road, a shed and a paved path."""
     pieces: list[Piece] = []
     behind = 1 if plot.near == _ROAD[1] else -1
     edge = plot.near if behind > 0 else plot.far

@@ -24,7 +24,7 @@ from rsbench.core.projection import ROW_TOLERANCE_PX
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.views import ImageView
 from rsbench.verification.row_bands import by_bands
-from rsbench.vision.compiled_camera import Table, across_lines, line_of, look, optics_of, see
+from rsbench.vision.reprojection import Table, across_lines, line_of, look, optics_of, see
 
 _ROTATION, _SHIFT = 1e-10, 1e-10
 """What entries of a pose between two lines may err by, and metres: 1e-7 px of the longest lenses, and less than a
@@ -67,7 +67,7 @@ class Optics(NamedTuple):
     numbers: FloatArray
     """(6,) fx, fy, cx, cy, width, height."""
     ideal: Table
-    """As ``compiled_camera.Optics`` has it, and ``lens``."""
+    """As ``reprojection.Optics`` has it, and ``lens``."""
     lens: Table
 
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rsbench.core.so3 import FloatArray
-from rsbench.renderers.electrons import Mosaic, Sensor, filters
-from rsbench.renderers.image import linear_of_codes, srgb_of
+from rsbench.renderers.image import Mosaic, Sensor, filters, linear_of_codes, srgb_of
 from rsbench.verification.findings import Finding, rows_of
 
 T = TypeVar("T")

@@ -285,7 +285,7 @@ def _frame_checks(
     Each row of a sensor has random numbers of its own, and so its bits without the others; of an image that was
     interpolated or compressed, with those around.
     """
-    from rsbench.renderers.sensor_frame import sensed_rows
+    from rsbench.renderers.render import sensed_rows
 
     sequence, chosen, elsewhere = content.sequence, _of_image(content, options, view), not _made_here(content)
     with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
@@ -310,7 +310,7 @@ def _exposed_check(
     reported: set[str],
 ) -> Iterator[Check]:
     """The global-shutter image as the sensor exposes it."""
-    from rsbench.renderers.sensor_frame import sensed_rows
+    from rsbench.renderers.render import sensed_rows
 
     sequence, chosen = content.sequence, _of_image(content, options, view)
     if sequence.sensor is None or view.exposed in reported:

@@ -21,9 +21,16 @@ from rsbench.dataset.layout import clean_file
 from rsbench.dataset.object_records import SHADED, numbers_of
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, seen_from
-from rsbench.renderers.electrons import Sensor, expose, fall_off
-from rsbench.renderers.image import linear_of_codes
-from rsbench.renderers.processing import compressed, processed, rows_needed, shares_of_noise
+from rsbench.renderers.image import (
+    Sensor,
+    compressed,
+    expose,
+    fall_off,
+    linear_of_codes,
+    processed,
+    rows_needed,
+    shares_of_noise,
+)
 from rsbench.storage.untrusted_files import inside
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.frame_comparison import BoolArray, DepthMap

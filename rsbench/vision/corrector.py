@@ -125,7 +125,7 @@ class Corrector(ABC):
 
     @abstractmethod
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        """The corrected frames of the views asked for, with where each pixel comes from.
+        """The corrected frames of the requested views, with where each pixel comes from.
 
         Images keep the shape and type of the given ones. A frame that cannot be corrected is ``Fused.failed`` with
         the reason: a value, never an exception or the frame as it was.
@@ -136,8 +136,8 @@ class Corrector(ABC):
     ) -> list[dict[View, Fused]]:
         """``correct`` at the times of several target rows, in place of the problem's.
 
-        To be replaced where what takes long does not depend on the row. Of other packages' correctors, which work
-        in processes of their own, it is not asked.
+        Override it where the expensive part does not depend on the row. It is not called for correctors of other
+        packages, which run in processes of their own.
         """
         return [self.correct(replace(problem, target_row=row), views) for row in rows]
 
@@ -194,7 +194,7 @@ def find_corrected_rows(
         raise RsbenchError(f"{where}: correct_rows must return a list of {len(rows)}, one for each row")
     for found in answers:
         if not isinstance(found, dict) or set(found) != set(views):
-            raise RsbenchError(f"{where}: must return a dict of the views asked for, {', '.join(map(str, views))}")
+            raise RsbenchError(f"{where}: must return a dict of the requested views, {', '.join(map(str, views))}")
         for view, fused in found.items():
             _check(fused, problem.images[view], f"{where}: {view[0]} {view[1]}")
     return [{view: found[view] for view in views} for found in answers]

@@ -1,25 +1,219 @@
-"""Our correctors: the whole fusion, and what simpler assumptions leave of it."""
+"""Our correctors: the whole fusion, and what simpler assumptions leave of it.
+
+Things that move by themselves in front of a moving rig are found where flow contradicts geometry. Their depth
+comes from two cameras at one time and is right; the rig's motion does not predict where a row sees them at another
+time. Their flow does, scaled by the times of the rows: even motion in the image.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import Any, NamedTuple, final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.rig import VIEWS, Side, View
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import VIEWS, Side, StereoRig, View
 from rsbench.core.se3 import Pose
-from rsbench.vision.baseline_depths import plane_depth
-from rsbench.vision.correction import WarpOptions, warp_gain
+from rsbench.core.shutter import RollingShutter
+from rsbench.vision.correction import WarpOptions, draw_within, inverse_depth, warp_gain
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec, Depths
-from rsbench.vision.frame_threads import map_frames
+from rsbench.vision.flow import dense_flow, followed, returns_px
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
-from rsbench.vision.moving_things import Moving, draw_moving, find_moving
+from rsbench.vision.images import Interpolation, grey_u8, map_frames, resample
+from rsbench.vision.reprojection import reproject_pixels, reprojection_of
 
 F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+_RETURNS_PX = 1.0
+"""Distance from a pixel to where flow there and back ends, below which it is believed."""
+_MOVED_PX = 2.0
+"""Distance between the end of the flow and where geometry puts a still point, above which it moved."""
+_DISPARITY_PX = 1.0
+"""What depth may err by: a still point may be so much farther or nearer."""
+_NOISE_LEVELS, _CLEARLY = 1.0, 0.7
+"""Grey levels that differ anyway, and the part of the difference where geometry leads that must be left."""
+_MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
+"""Sides, px, of the windows in which most must move, and all; how far beyond, px, a thing goes on."""
+_LEAST = 0.004
+"""Of the image's area: a smaller thing is left to geometry, which errs in such spots too."""
+_SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
+"""Relative difference of inverse depth to the nearest certain pixel of a thing, up to which one is part of it, and
+of flow, up to which its own is kept."""
+_EDGE = 7
+"""Side, px, of the window in which what is nearest may hide a point: depth errs at edges."""
+_SMALLEST = 12
+"""Side of an image, px, that dense flow takes (OpenCV 5.0)."""
+_STRETCH_PX = 2.5
+"""Between neighbours at the target, above which what lies between them is not drawn."""
+_AGREE = 0.03
+"""Relative difference of depth, below which what moves lies on what stands, and is seen."""
+_FLOW_BYTES = 100.0
+
+
+class _Still(NamedTuple):
+    """Where a still point goes: (H, W, 2) px, NaN where that is unknown, and (H, W) whether it is hidden there."""
+
+    far: F32
+    """Of a point that is somewhat farther."""
+    near: F32
+    hidden: Mask
+    """By something nearer, so that what is seen there tells nothing of the point."""
+
+    def half(self) -> _Still:
+        """Of an image of half the size."""
+        return _Still(self.far[1::2, 1::2] / 2.0, self.near[1::2, 1::2] / 2.0, self.hidden[1::2, 1::2])
+
+
+class Moving(NamedTuple):
+    """What moves by itself in a frame."""
+
+    mask: Mask
+    """(H, W)."""
+    flow: F32
+    """(H, W, 2) px, to the other frame of the camera."""
+
+
+def find_moving(
+    images: Mapping[View, NDArray[Any]],
+    depth: Mapping[View, F32],
+    poses: Mapping[View, Pose],
+    rig: StereoRig,
+    shutter: RollingShutter,
+) -> dict[View, Moving]:
+    """Of all four frames (H, W[, 3]) with their depth (H, W) and the poses of their lines; empty where none is.
+
+    Of most scenes a look at a frame of half the size says that.
+    """
+    camera, baseline = rig.camera, rig.baseline
+    size, grid = camera.width * camera.height, camera.pixel_grid().astype(np.float32)
+    off = _DISPARITY_PX / (camera.fx * baseline)
+
+    def stays(view: View) -> _Still:
+        axis, other = shutter.axis(view[0]), _other(view)
+        maps = reprojection_of(camera, poses[view], poses[other], (axis, axis))
+        lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], inverse_depth(depth[view])
+        both = np.maximum(rho - np.float32(off), np.float32(0.0)), rho + np.float32(off)
+        (far, first), (near, second) = (reproject_pixels(maps, each, np.ascontiguousarray(lines)) for each in both)
+        there = cv2.dilate(np.nan_to_num(inverse_depth(depth[other])), np.ones((_EDGE, _EDGE), np.uint8))
+        before = np.float32(1.0 + _SAME_DEPTH) * np.maximum(both[0] * first, both[1] * second) + np.float32(off)
+        far, near = np.asarray(far - grid), np.asarray(near - grid)
+        between = np.asarray((far + near) / 2.0, dtype=np.float32)
+        return _Still(far, near, np.asarray(followed(there, between, cv2.BORDER_CONSTANT) > before))
+
+    first = VIEWS[0]
+    half = camera.width // 2, camera.height // 2
+    if min(half) < _SMALLEST:
+        return {}
+    small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
+    quick = dense_flow(*small), dense_flow(*small[::-1])
+    if not np.any(_moved(small, *quick, stays(first).half(), 0.5 * _MOVED_PX)):
+        return {}
+    both = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
+    flows, greys = dict(zip(VIEWS, both, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
+
+    def found(view: View) -> Moving:
+        other = _other(view)
+        mask = _moved((greys[view], greys[other]), flows[view], flows[other], stays(view), _MOVED_PX)
+        return _outlined(Moving(mask, flows[view]), inverse_depth(depth[view]))
+
+    return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
+
+
+def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: _Still, least: float) -> Mask:
+    """(H, W) large regions whose consistent flow ends off the curves on which points at rest move.
+
+    And where it leads is clearly more like what is there: flow errs too.
+    """
+    far, along = still.far, still.near - still.far
+    share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
+    nearest = far + np.clip(share, 0.0, 1.0)[..., None] * along
+    moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False of NaN
+    moved &= (returns_px(flow, back) < _RETURNS_PX) & ~still.hidden
+    dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * moved.size
+    large[0] = False
+    if not np.any(large):
+        return np.zeros_like(moved)
+    chosen = large[labels] & np.isfinite(nearest[..., 0]) & ~still.hidden
+    unlike = [np.bincount(labels[chosen], _unlike(greys, each)[chosen], count) for each in (flow, nearest)]
+    large &= unlike[0] + _NOISE_LEVELS * np.bincount(labels[chosen], minlength=count) < _CLEARLY * unlike[1]
+    return np.asarray(large[labels])
+
+
+def _unlike(greys: Sequence[NDArray[np.uint8]], flow: F32) -> F32:
+    """(H, W) grey levels by which a frame differs from the other one where ``flow`` (H, W, 2) px leads."""
+    return np.abs(followed(greys[1], flow, cv2.BORDER_CONSTANT).astype(np.float32) - greys[0])
+
+
+def _outlined(moving: Moving, rho: F32) -> Moving:
+    """Things as far as their own depth goes, and the flow of what they are near: flow runs over edges."""
+    core = cv2.erode(moving.mask.astype(np.uint8), np.ones((_CORE, _CORE), np.uint8)) & np.isfinite(rho)
+    if not np.any(core):
+        return Moving(np.zeros_like(moving.mask), moving.flow)
+    apart, label = cv2.distanceTransformWithLabels(1 - core, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    y, x = np.nonzero(core)
+    at = np.zeros((label.max() + 1, 2), dtype=np.intp)
+    at[label[y, x]] = np.stack([y, x], axis=-1)
+    v, u = np.moveaxis(at[label], -1, 0)
+    beside, flow = rho[v, u], moving.flow[v, u]
+    mask = (apart <= _NEAR_PX) & (np.abs(rho - beside) <= _SAME_DEPTH * beside)
+    own = moving.mask & (np.linalg.norm(moving.flow - flow, axis=-1) <= _SAME_FLOW_PX)
+    return Moving(np.asarray(mask), np.where(own[..., None], moving.flow, flow))
+
+
+def draw_moving(
+    fused: Fused,
+    image: NDArray[Any],
+    moving: Moving,
+    depth: F32,
+    view: View,
+    shutter: RollingShutter,
+    target_tau: float,
+    interpolation: Interpolation,
+) -> Fused:
+    """A corrected frame with what moves by itself in it, before what is farther.
+
+    Args:
+        fused: without it, see ``find_moving``.
+        image, depth: (H, W[, 3]), (H, W) of the frame of the ``view``.
+        moving: in that frame.
+        target_tau: time of the corrected frame, frame periods.
+    """
+    mask = moving.mask & (depth > 0.0)
+    if not np.any(mask):
+        return fused
+    y, x = np.nonzero(mask)
+    here = np.stack([x, y], axis=-1).astype(np.float64)
+    flow = moving.flow[y, x]
+    start = shutter.pixel_time(here, view[1], view[0])
+    passed = shutter.pixel_time(here + flow, 1 - view[1], view[0]) - start
+    with np.errstate(divide="ignore", invalid="ignore"):  # what ends when it began has no speed, and is not drawn
+        share = (target_tau - start) / passed
+    moved = np.full((*mask.shape, 3), np.nan)
+    moved[y, x, :2] = here + share[:, None] * flow
+    moved[y, x, 2] = inverse_depth(depth)[y, x]
+    source_map, buffer = draw_within(moved, _STRETCH_PX)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        behind = np.where(fused.origin == Origin.NOBODY, np.float32(-1.0), np.float32(1.0) / fused.depth)
+    take = (buffer >= 0.0) & ~(behind * (1.0 - _AGREE) > buffer)
+    drawn = resample(image, source_map, interpolation)
+    out, origin, z = fused.image.copy(), fused.origin.copy(), fused.depth.copy()
+    out[take], origin[take] = drawn[take], Origin.HERE
+    z[take] = 1.0 / np.maximum(buffer[take], np.float32(1e-9))
+    return Fused(image=out, origin=origin, depth=z)
+
+
+def _other(view: View) -> View:
+    return view[0], 1 - view[1]
+
+
 _NEAREST_SHARE = 0.999
+_PLANE_ROUNDS = 8
 _NEARER = 0.5
 """What has no depth may be nearer than the nearest that has: down to this share of its depth."""
 _FUSION_BYTES = 150.0
@@ -157,6 +351,32 @@ class PlaneCorrector(Corrector):
         return {
             view: _alone(problem, view, plane_depth(depth[view], problem.rig.camera), self.warp) for view in views
         }
+
+
+def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32:
+    """Depth (H, W) of the plane that fits a depth map (H, W) best: inverse depth affine in the (ideal) pixel.
+
+    Iterated least squares on absolute differences, so that the larger surface wins; 0 and NaN are unknown, inf is
+    infinitely far. Where the plane lies behind the camera the result is inf. A correction with it is a homography
+    per row. ``camera`` matters where it has a lens.
+    """
+    height, width = depth.shape
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
+    if camera is not None and camera.lens is not None:
+        x, y = np.moveaxis(camera.unproject(camera.pixel_grid())[..., :2], -1, 0)
+    basis = np.stack([np.ones_like(x), x, y], axis=-1)
+    known = depth > 0.0
+    if np.count_nonzero(known) < 3:
+        return np.full(depth.shape, np.inf, dtype=np.float32)
+    A, rho = basis[known], 1.0 / depth[known].astype(np.float64)
+    least = 1e-3 * max(float(np.median(rho)), 1e-12)
+    weights, plane = np.ones_like(rho), np.zeros(3)
+    for _ in range(_PLANE_ROUNDS):
+        plane, *_ = np.linalg.lstsq(A * weights[:, None], rho * weights, rcond=None)
+        weights = 1.0 / np.sqrt(np.maximum(np.abs(A @ plane - rho), least))
+    fitted = basis @ plane
+    with np.errstate(divide="ignore"):
+        return np.where(fitted > 0.0, 1.0 / np.maximum(fitted, 0.0), np.inf).astype(np.float32)
 
 
 def turned(problem: CorrectionProblem, view: View, options: WarpOptions) -> Fused:

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import SET_COLUMNS, Correspondences
+from rsbench.core.correspondences import SET_COLUMNS, Correspondences, lens_affine
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import View
-from rsbench.vision.undistortion import undistorted, with_lens
+from rsbench.core.so3 import FloatArray
+
+_FAR = -1e6
+"""Pixel of what the lens does not reach."""
 
 _OUTSIDE_PX = 1.0
 """How far beyond the centre of the outermost pixel a sub-pixel position may lie."""
@@ -86,3 +92,31 @@ def find_correspondences(
                 f"image, such as {points[outside][0].tolist()}"
             )
     return found
+
+
+def undistorted(image: NDArray[Any], camera: PinholeCamera) -> NDArray[Any]:
+    """The image (H, W[, 3]) without distortion, of the same size and intrinsics; cubic interpolation.
+
+    What lies beyond the distorted image is a mirror of its border: ``with_lens`` drops matches there. Rows of the
+    result are not read at one time: times belong to the pixels of the image as it was.
+    """
+    if camera.lens is None:
+        return image
+    source = np.nan_to_num(camera.lens_pixels(camera.pixel_grid()), nan=_FAR).astype(np.float32)
+    return np.asarray(
+        cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+    )
+
+
+def with_lens(matches: Correspondences, camera: PinholeCamera) -> Correspondences:
+    """Matches of undistorted images in pixels of the distorted ones; those with an end outside are dropped."""
+    if camera.lens is None:
+        return matches
+    sets, kept = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
+    for name in SET_COLUMNS:
+        rows = getattr(matches, name)
+        ends = camera.lens_pixels(rows.reshape(len(rows), rows.shape[1] // 2, 2))
+        kept[name] = np.all(camera.contains(ends), axis=1)
+        sets[name] = ends[kept[name]].reshape(-1, rows.shape[1])
+    affine = matches.affine[kept["left"][: len(matches.affine)]]
+    return replace(matches, **sets, affine=lens_affine(affine, sets["left"], camera))

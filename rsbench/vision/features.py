@@ -1,35 +1,361 @@
-"""Sub-pixel point correspondences of a stereo rig over two frames: SIFT, ratio test, mutual check, loops.
+"""Sub-pixel point correspondences of a stereo rig over two frames: SIFT, ratio test, mutual check, alignment.
 
 SIFT runs with ``enable_precise_upscale``: OpenCV's default enlarges the image by mapping index x to 2x + 0.5 and
 so reports every keypoint a quarter of a pixel too far right and down (measured 0.249, 0.244 px; 0.000 with it).
 Positions then follow this package's convention, centre of the top-left pixel (0, 0).
 
-Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
+SIFT descriptors are whole numbers up to 255 with a squared length below 2**24, so their products are exact in
+float32 whatever the order of the sums: the nearest descriptors depend neither on the BLAS nor on its threads.
+
+A keypoint detector places each end of a match on its own, to about a tenth of a pixel. ``refine_matches`` fits the
+grey levels of the patch at one end to the other image by an affine map, a gain and a bias, which leaves a few
+hundredths. A plain shift is not enough: on a patch that is rotated or slanted it errs by a tenth itself.
+
+Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004. Gruen, "Adaptive least squares
+correlation", South African Journal of Photogrammetry 1985; the iteration is the inverse compositional one of
+Baker and Matthews, IJCV 2004.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, final
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar, final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.components.compiled import compiled
 from rsbench.core.arguments import check_ranges
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import View
+from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs, unlinked_pairs
+from rsbench.core.rig import Side, View
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.descriptor_search import best_two
 from rsbench.vision.feature_matcher import FeatureMatcher
-from rsbench.vision.frame_threads import map_frames
-from rsbench.vision.half_size import at_full_size, halved
-from rsbench.vision.images import grey_u8
-from rsbench.vision.patch_alignment import refine_matches
-from rsbench.vision.recent import Recent, content_key
+from rsbench.vision.images import at_full_size, grey_u8, halved, keys_weights, map_frames
+
+_CHUNK = 256
+F32 = NDArray[np.float32]
+Found = tuple[NDArray[np.int64], F32, F32, NDArray[np.int64]]
+
+
+def best_two(
+    points_a: FloatArray,
+    descriptors_a: F32,
+    points_b: FloatArray,
+    descriptors_b: F32,
+    dx: tuple[float, float],
+    dy: tuple[float, float],
+) -> Found:
+    """Best candidate in b of each of a, its and the runner-up's squared distance, and the best in a of each of b.
+
+    Points (n, 2) must be sorted by y; the candidates b of a point a are those with b - a within ``dx`` and ``dy``
+    (px, both ends included). Indices are -1 and distances inf where there is no candidate.
+    """
+    n, m = len(points_a), len(points_b)
+    best, nearest = np.full(n, -1, dtype=np.int64), np.full(n, np.inf, dtype=np.float32)
+    second, back = np.full(n, np.inf, dtype=np.float32), np.full(m, -1, dtype=np.int64)
+    back_nearest = np.full(m, np.inf, dtype=np.float32)
+    norms_a: F32 = np.asarray(np.sum(descriptors_a * descriptors_a, axis=1, dtype=np.float32))
+    norms_b: F32 = np.asarray(np.sum(descriptors_b * descriptors_b, axis=1, dtype=np.float32))
+    window = np.array([*dx, *dy], dtype=np.float64)
+    for start in range(0, n, _CHUNK):
+        stop = min(start + _CHUNK, n)
+        low = int(np.searchsorted(points_b[:, 1], points_a[start, 1] + dy[0] - 1.0))
+        high = int(np.searchsorted(points_b[:, 1], points_a[stop - 1, 1] + dy[1] + 1.0))
+        if low >= high:
+            continue
+        products = descriptors_a[start:stop] @ descriptors_b[low:high].T
+        _scan(
+            products,
+            norms_a,
+            norms_b,
+            points_a,
+            points_b,
+            start,
+            low,
+            window,
+            best,
+            nearest,
+            second,
+            back,
+            back_nearest,
+        )
+    return best, nearest, second, back
+
+
+@compiled
+def _scan(
+    products: F32,
+    norms_a: F32,
+    norms_b: F32,
+    points_a: FloatArray,
+    points_b: FloatArray,
+    start: int,
+    low: int,
+    window: FloatArray,
+    best: NDArray[np.int64],
+    nearest: F32,
+    second: F32,
+    back: NDArray[np.int64],
+    back_nearest: F32,
+) -> None:
+    """Update the results with one block of products, rows from ``start`` of a, columns from ``low`` of b."""
+    rows, columns = products.shape
+    for r in range(rows):
+        i = start + r
+        x, y = points_a[i, 0], points_a[i, 1]
+        for c in range(columns):
+            j = low + c
+            distance = norms_a[i] + norms_b[j] - np.float32(2.0) * products[r, c]
+            # Most candidates improve on nothing; where they lie matters for the others only.
+            if distance >= second[i] and distance >= back_nearest[j]:
+                continue
+            dx, dy = points_b[j, 0] - x, points_b[j, 1] - y
+            if dx < window[0] or dx > window[1] or dy < window[2] or dy > window[3]:
+                continue
+            if distance < nearest[i]:
+                second[i] = nearest[i]
+                nearest[i], best[i] = distance, j
+            elif distance < second[i]:
+                second[i] = distance
+            if distance < back_nearest[j]:
+                back_nearest[j], back[j] = distance, i
+
+
+_BLUR_PX = 0.8
+"""Standard deviation of the smoothing before: the cubic kernel interpolates what is left without a bias."""
+_HALF = 7
+"""Patches are 2 _HALF + 1 px wide, with Gaussian weights."""
+_SPREAD = 0.6 * _HALF
+_ROUNDS, _CONVERGED_PX = 12, 1e-3
+_MOST_PX, _MOST_SHEAR, _MOST_GAIN = 1.0, 0.5, 0.5
+"""Changes, at most: of the place, of an element of the affine map, and of the contrast."""
+_MOST_SIGMA_PX = 0.1
+"""Standard deviation, as the patch's gradients and what the fit leaves say, of a place that is taken."""
+_PARAMETERS = 8
+_LEFT: Side = "left"
+_RIGHT: Side = "right"
+
+
+def refine_matches(images: Mapping[View, NDArray[Any]], matches: Correspondences) -> Correspondences:
+    """The matches with their later ends aligned to their first one; where that fails they stay as they are.
+
+    The first end is the left one of frame 0 where there is such, then the right one, then the left one of frame 1.
+    What several sets hold of one track stays one. The order within a set may change but for ``left`` with affine
+    frames, whose ends stay in place.
+
+    Args:
+        images: (H, W) or (H, W, 3), uint8 or uint16, of both sides and frames, in whose pixels the matches are.
+    """
+    with ThreadPoolExecutor() as pool:
+        views: list[View] = [("left", 0), ("right", 0), ("left", 1), ("right", 1)]
+        smooth = dict(zip(views, pool.map(lambda view: smoothed(images[view]), views), strict=True))
+        tracks, left, right = matches.tracks, matches.left, matches.right[unlinked_pairs(matches, _RIGHT)]
+        stereo_0, stereo_1 = (_not_of_tracks(matches, frame) for frame in (0, 1))
+        tasks = [
+            (views[0], views[1], tracks[:, 0:2], tracks[:, 2:4]),
+            (views[0], views[2], tracks[:, 0:2], tracks[:, 4:6]),
+            (views[0], views[3], tracks[:, 0:2], tracks[:, 6:8]),
+            (views[0], views[2], left[:, :2], left[:, 2:]),
+            (views[1], views[3], right[:, :2], right[:, 2:]),
+            (views[0], views[1], stereo_0[:, :2], stereo_0[:, 2:]),
+            (views[2], views[3], stereo_1[:, :2], stereo_1[:, 2:]),
+        ]
+        found = list(pool.map(lambda t: aligned(smooth[t[0]], smooth[t[1]], t[2], t[3])[0], tasks))
+    tracks = np.concatenate([tracks[:, :2], *found[:3]], axis=1)
+    return replace(
+        matches,
+        tracks=tracks,
+        left=np.concatenate([left[:, :2], found[3]], axis=1),
+        right=np.concatenate([track_pairs(tracks, _RIGHT), np.concatenate([right[:, :2], found[4]], axis=1)]),
+        stereo_0=np.concatenate([tracks[:, :4], np.concatenate([stereo_0[:, :2], found[5]], axis=1)]),
+        stereo_1=np.concatenate([tracks[:, 4:], np.concatenate([stereo_1[:, :2], found[6]], axis=1)]),
+    )
+
+
+def _not_of_tracks(matches: Correspondences, frame: int) -> FloatArray:
+    """The left-right matches of a frame that no track repeats."""
+    rows = matches.stereo_1 if frame else matches.stereo_0
+    half = matches.tracks[:, 4 * frame : 4 * frame + 4]
+    return rows[unlinked_pairs(Correspondences(left=rows, tracks=half[:, [0, 1, 0, 1, 2, 3, 2, 3]]), _LEFT)]
+
+
+def smoothed(image: NDArray[Any]) -> F32:
+    """Grey levels (H, W) as patches are cut from them."""
+    return np.asarray(cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _BLUR_PX))
+
+
+def aligned(a: F32, b: F32, points_a: FloatArray, points_b: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """The places (n, 2) in b of what is at points a, from places near them, and which of them were aligned.
+
+    Args:
+        a, b: (H, W) of ``smoothed``.
+        points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
+    """
+    out = np.array(points_b, dtype=np.float64)
+    done = np.zeros(len(out), dtype=np.bool_)
+    _align_all(a, b, np.ascontiguousarray(points_a, dtype=np.float64), out, done)
+    return out, done
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def _sample(image: F32, x: float, y: float) -> np.float32:
+    """The image at a place whose window of 4 x 4 px lies inside it."""
+    i, j = int(x), int(y)
+    wx, wy = keys_weights(np.float32(x - i)), keys_weights(np.float32(y - j))
+    total = np.float32(0.0)
+    for k in range(4):
+        row = image[j - 1 + k]
+        total += wy[k] * (wx[0] * row[i - 1] + wx[1] * row[i] + wx[2] * row[i + 1] + wx[3] * row[i + 2])
+    return total
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def _template(image: F32, x: float, y: float, grid: F32, J: F32) -> None:
+    """Derivatives (n, 8) of the patch's grey levels by the parameters; the last two are 1 and the levels."""
+    size = 2 * _HALF + 3
+    for j in range(size):
+        for i in range(size):
+            grid[j, i] = _sample(image, x + i - _HALF - 1, y + j - _HALF - 1)
+    half, k = np.float32(0.5), 0
+    for j in range(1, size - 1):
+        for i in range(1, size - 1):
+            gx, gy = half * (grid[j, i + 1] - grid[j, i - 1]), half * (grid[j + 1, i] - grid[j - 1, i])
+            u, v = np.float32(i - _HALF - 1), np.float32(j - _HALF - 1)
+            J[k, 0], J[k, 1], J[k, 2], J[k, 3], J[k, 4], J[k, 5] = gx, gy, gx * u, gx * v, gy * u, gy * v
+            J[k, 6], J[k, 7] = np.float32(1.0), grid[j, i]
+            k += 1
+
+
+@compiled(error_model="numpy")
+def _align_all(a: F32, b: F32, points: FloatArray, places: FloatArray, done: BoolArray) -> None:
+    size = 2 * _HALF + 1
+    grid, J = (
+        np.zeros((size + 2, size + 2), dtype=np.float32),
+        np.zeros((size * size, _PARAMETERS), dtype=np.float32),
+    )
+    weights = np.zeros(size * size)
+    for k in range(size * size):
+        weights[k] = np.exp(-((k % size - _HALF) ** 2 + (k // size - _HALF) ** 2) / (2.0 * _SPREAD**2))
+    margin = _HALF + 3
+    for n in range(len(points)):
+        x, y = points[n]
+        if not (margin <= x < a.shape[1] - margin and margin <= y < a.shape[0] - margin):
+            continue
+        _template(a, x, y, grid, J)
+        done[n] = _align(b, J, weights, places[n])
+
+
+@compiled(error_model="numpy")
+def _align(b: F32, J: F32, weights: FloatArray, place: FloatArray) -> bool:
+    """Move one place (2,) to where the patch fits; False, and no move, where it cannot be."""
+    count = len(J)
+    H = np.zeros((_PARAMETERS, _PARAMETERS))
+    for k in range(count):
+        for p in range(_PARAMETERS):
+            for q in range(p + 1):
+                H[p, q] += weights[k] * J[k, p] * J[k, q]
+    for p in range(_PARAMETERS):
+        H[p, p] *= 1.0 + 1e-9
+        for q in range(p):
+            H[q, p] = H[p, q]
+        if not H[p, p] > 0.0:
+            return False
+    inverse = np.linalg.inv(H)
+    x, y, gain, bias = place[0], place[1], 1.0, 0.0
+    A = np.zeros((2, 2))
+    A[0, 0] = A[1, 1] = 1.0
+    residuals = np.zeros(count)
+    for _ in range(_ROUNDS):
+        if not _residuals(b, J, A, x, y, gain, bias, residuals):
+            return False
+        step = _step(J, weights, residuals, inverse)  # pyrefly: ignore[bad-argument-type]
+        M = np.linalg.inv(np.array([[1.0 + step[2], step[3]], [step[4], 1.0 + step[5]]]))
+        A = A @ M
+        dx, dy = A[0, 0] * step[0] + A[0, 1] * step[1], A[1, 0] * step[0] + A[1, 1] * step[1]
+        x, y, bias, gain = x - dx, y - dy, bias + step[6], gain + step[7]
+        if not (abs(x - place[0]) < _MOST_PX and abs(y - place[1]) < _MOST_PX):
+            return False
+        if dx * dx + dy * dy < _CONVERGED_PX**2:
+            break
+    shear = max(abs(A[0, 0] - 1.0), abs(A[0, 1]), abs(A[1, 0]), abs(A[1, 1] - 1.0))
+    variance = np.sum(weights * residuals**2) / np.sum(weights) * max(inverse[0, 0], inverse[1, 1])
+    if not (shear < _MOST_SHEAR and abs(gain - 1.0) < _MOST_GAIN and variance < _MOST_SIGMA_PX**2):
+        return False
+    place[0], place[1] = x, y
+    return True
+
+
+@compiled(error_model="numpy")
+def _residuals(
+    b: F32, J: F32, A: FloatArray, x: float, y: float, gain: float, bias: float, out: FloatArray
+) -> bool:
+    """Grey levels of b under the patch less the patch's; False where it leaves the image."""
+    reach_x, reach_y = _HALF * (abs(A[0, 0]) + abs(A[0, 1])) + 2.0, _HALF * (abs(A[1, 0]) + abs(A[1, 1])) + 2.0
+    if not (reach_x <= x < b.shape[1] - reach_x - 1.0 and reach_y <= y < b.shape[0] - reach_y - 1.0):
+        return False
+    size = 2 * _HALF + 1
+    for k in range(len(out)):
+        u, v = k % size - _HALF, k // size - _HALF
+        level = _sample(b, x + A[0, 0] * u + A[0, 1] * v, y + A[1, 0] * u + A[1, 1] * v)
+        out[k] = level - (gain * J[k, 7] + bias)
+    return True
+
+
+@compiled(error_model="numpy")
+def _step(J: F32, weights: FloatArray, residuals: FloatArray, inverse: FloatArray) -> FloatArray:
+    """Least squares change (8,) of the parameters."""
+    g = np.zeros(_PARAMETERS)
+    for k in range(len(residuals)):
+        r = weights[k] * residuals[k]
+        for p in range(_PARAMETERS):
+            g[p] += r * J[k, p]
+    return inverse @ g
+
+
+T = TypeVar("T")
+
+
+class Recent(Generic[T]):
+    """At most so many results, the last requested ones; threads may share one cache.
+
+    Two threads that request the same at the same time both compute it.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._lock = most, threading.Lock()
+        self._kept = OrderedDict[Hashable, T]()
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        """The result of ``make``, or that of an earlier call with an equal key."""
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        found = make()
+        with self._lock:
+            self._kept[key] = found
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        return found
+
+    def clear(self) -> None:
+        """Keep nothing."""
+        with self._lock:
+            self._kept.clear()
+
+
+def content_key(image: NDArray[Any]) -> Hashable:
+    """Equal for images of equal size, type and content."""
+    digest = hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16).digest()
+    return digest, image.shape, image.dtype.str
+
 
 Indices = NDArray[np.int64]
 _MOST_FEATURES = 100_000
@@ -74,7 +400,7 @@ class MatchOptions:
     drop_contradicted: bool = True
     """Drop a temporal match when its loop through the other camera ends elsewhere."""
     refine: bool = False
-    """Align the ends of matches by the grey levels around them, see ``patch_alignment``."""
+    """Align the ends of matches by the grey levels around them, see ``refine_matches``."""
     enough_tracks: int = 0
     """Give tracks alone where there are as many as that, which is sooner done; 0 gives all matches."""
     half: bool = False
@@ -139,7 +465,7 @@ _REMEMBERED = 10_000
 
 
 def forget_features() -> None:
-    """Find them again, also in images that were asked for before: so that their time is counted."""
+    """Forget all features, so that later calls compute them again: for timings."""
     _DETECTED.clear()
     _PAIRED.clear()
 

@@ -69,3 +69,25 @@ def flow_depth(
     ahead = moved[..., 2] > 0.0
     seen = rig.camera.project(np.where(ahead[..., None], moved, 1.0))
     return depth, np.where(ahead, np.linalg.norm(seen - targets, axis=-1), np.inf)
+
+
+_NEAREST_SHARE = 0.999
+_CHUNK_ROWS = 100
+
+
+def monocular_depth(
+    flow: F32, rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int
+) -> F32:
+    """Depth (H, W) of every pixel of a frame from the flow (H, W, 2) to the other one, in the motion's unit.
+
+    inf where the rays do not meet in front of the camera. Median-filtered in inverse depth.
+    """
+    grid = rig.camera.pixel_grid()
+    rho = np.zeros(flow.shape[:2], dtype=np.float32)
+    for start in range(0, len(rho), _CHUNK_ROWS):
+        rows = slice(start, start + _CHUNK_ROWS)
+        rho[rows] = 1.0 / flow_depth(grid[rows], flow[rows], rig, shutter, motion, side, frame)[0]
+    # One pixel near the focus of expansion must not swallow the picture.
+    rho = cv2.medianBlur(np.minimum(rho, np.float32(np.quantile(rho, _NEAREST_SHARE))), 5)
+    with np.errstate(divide="ignore"):
+        return np.where(rho > 0.0, 1.0 / rho, np.inf).astype(np.float32)

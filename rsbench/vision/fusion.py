@@ -4,6 +4,11 @@ A pixel of the target is a hole of the corrected frame for one of three reasons:
 outside the frame, or its depth is unknown. Another image of the same scene may have seen it. Each is warped to the
 target like the frame itself; where several see the place, the nearest surface is what the target camera sees, and
 among those that agree in depth the earlier in the list wins.
+
+``finished`` makes the frame one to look at: it closes specks and slits that no frame shows and evens seams. A
+narrow hole that is closed can hide nothing; filling a wide one would be a guess at the scene, so it stays. The
+border between a near thing and what another frame shows behind it is cut along pixels: such a seam is a
+staircase, whereas the frame's own edges are as fine as its optics.
 """
 
 from __future__ import annotations
@@ -20,10 +25,9 @@ from numpy.typing import NDArray
 from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
-from rsbench.vision.compiled_camera import LineMaps, across_lines, line_of, look, see
-from rsbench.vision.correction import Corrected, LineView, WarpOptions, inverse_depth, line_maps, warp
-from rsbench.vision.forward_warp import move
-from rsbench.vision.resample import resample
+from rsbench.vision.correction import Corrected, LineView, WarpOptions, inverse_depth, line_maps, move, warp
+from rsbench.vision.images import resample
+from rsbench.vision.reprojection import LineMaps, across_lines, line_of, look, see
 from rsbench.vision.stereo_depth import known_beside
 
 Mask = NDArray[np.bool_]
@@ -316,3 +320,72 @@ def inpaint(image: NDArray[Any], missing: Mask, radius: float = 3.0) -> NDArray[
     planes = np.moveaxis(np.atleast_3d(image), -1, 0)
     filled = [cv2.inpaint(np.ascontiguousarray(plane), marked, radius, cv2.INPAINT_TELEA) for plane in planes]
     return np.stack(filled, axis=-1).reshape(image.shape)
+
+
+_WIDTH_SHARE, _LEAST_PX = 0.015, 5
+"""Width of a hole that is closed, at most, as a share of the image's width; and px of small images."""
+_LARGE_DISCS = 16
+"""Area of a region that is left black, at least, in squares of that width: below that it is a blot."""
+_RADIUS_PX = 3.0
+_SEAM_PX, _JUMP = 0.5, 0.05
+"""Deviation of the blur along seams, and relative difference of depths from which they are borders of things."""
+_FAR = 1e6
+"""Metres, or what else depth is in, in place of infinite and unknown depth."""
+
+
+def narrow(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The parts of ``holes`` (H, W) that are closed: but for those where discs of that width make a large region.
+
+    The border of the image ends a hole.
+    """
+    size = max(round(_WIDTH_SHARE * holes.shape[1]), _LEAST_PX) | 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    given = holes.astype(np.uint8)
+    core = cv2.erode(given, disc, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    wide = cv2.dilate(core, disc)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= _LARGE_DISCS * size**2
+    large[0] = False  # what is no hole
+    return np.asarray(holes & ~large[labels])
+
+
+def finished(fused: Fused) -> Fused:
+    """With narrow holes INVENTED from what lies around them, and even seams; a failed one as it is."""
+    return _even_seams(_closed(fused)) if fused.success else fused
+
+
+def _closed(fused: Fused) -> Fused:
+    holes = fused.origin == Origin.NOBODY
+    closed = narrow(holes)
+    if not np.any(closed):
+        return fused
+    # Wide holes are invented too and put back: their black is nothing that a slit should be closed with.
+    image = inpaint(fused.image, holes, _RADIUS_PX)
+    image[holes & ~closed] = 0
+    origin = np.where(closed, np.uint8(Origin.INVENTED), fused.origin)
+    return replace(fused, image=image, origin=origin)
+
+
+def _even_seams(fused: Fused) -> Fused:
+    """Blurred by half a pixel where one source ends and another begins, at a jump of the depth."""
+    known = np.isfinite(fused.depth) & (fused.depth > 0.0)
+    distance = np.log(np.where(known, fused.depth, np.float32(_FAR)))
+    sources, jumps = (
+        _beside([np.abs(np.diff(each, axis=axis)) > least for axis in (0, 1)])
+        for each, least in ((fused.origin.astype(np.int16), 0), (distance, np.log1p(_JUMP)))
+    )
+    seen = cv2.erode((fused.origin != Origin.NOBODY).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
+    seam = sources & jumps & seen
+    if not np.any(seam):
+        return fused
+    image = fused.image.copy()
+    image[seam] = cv2.GaussianBlur(image, (3, 3), _SEAM_PX)[seam]
+    return replace(fused, image=image)
+
+
+def _beside(between: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """(H, W) pixels on either side of what holds between neighbours: (H - 1, W) of columns, (H, W - 1) of rows."""
+    down, across = (
+        np.pad(each, [(1, 1) if k == axis else (0, 0) for k in (0, 1)]) for axis, each in enumerate(between)
+    )
+    return np.asarray(down[1:] | down[:-1] | across[:, 1:] | across[:, :-1])

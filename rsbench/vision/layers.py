@@ -1,37 +1,50 @@
-"""A still scene as a few planes, and which of them each pixel of two frames of one moving camera shows.
+"""A scene at rest as a few planes: found from matches, given to pixels, and used to refine the camera's motion.
 
 A plane is n (3,) with n . X = 1 for its points X in the world, the frame of the camera before it moves; 0 is the
 plane at infinity. In the camera of a line with pose R, t and centre c it is ``R n / (1 - n . c)``, whose product
 with a ray (u, v, 1) is the inverse depth there: so each pixel of a layer moves by the homography of its two lines.
 
 A pixel shows the layer at which the other frame looks most like it, as smoothly as costs allow. Layers hide each
-other: where the other frame shows a nearer one in the place of a pixel, its likeness there says nothing, and the
-layer costs what an unseen pixel costs. Which pixels are hidden is known from the layers of both frames, so they
+other: where the other frame shows a nearer one in the place of a pixel, its likeness there means nothing, and the
+layer costs what an unseen pixel costs. Which pixels are hidden follows from the layers of both frames, so they
 are found in rounds.
 
+A match on a layer constrains the motion by more than its epipolar constraint: by how far along the epipolar curve
+its end is. How much that counts depends on how thick the layer is: the errors of a match are those of its pixels
+and, along the curve, the parallax of a depth that scatters about the plane by the layer's thickness. Both are
+estimated from the matches, so that exact planes give the motion all that matches can, and a scene without planes
+does not bias it. Beside the given matches, pixels of a grid are followed through frames that the layers have
+aligned: the differences that the layers leave count as lengths. As differences of colour they would count pixels
+whose layer is a little off as errors of the motion, whatever their direction.
+
 After Vasu, Mohan M. R., Rajagopalan, "Occlusion-aware rolling shutter rectification of 3D scenes", CVPR 2018, of
-which the abstract alone was read: the equations are ours. Smoothness is ``semiglobal`` in place of graph cuts.
+which the abstract alone was read: the equations are ours. Smoothness is semi-global aggregation in place of graph
+cuts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
+from rsbench.components.motion_models import make_motion, model_name
 from rsbench.core.arguments import check_ranges
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, Side, StereoRig
-from rsbench.core.se3 import Pose
+from rsbench.core.se3 import Pose, compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.matching_cost import Comparer
+from rsbench.vision.flow import dense_flow, flow_depth
+from rsbench.vision.images import resample
+from rsbench.vision.plane_sweep import Comparer, aggregated
 from rsbench.vision.reprojection import F32, reproject_pixels, reprojection_of
-from rsbench.vision.resample import resample
-from rsbench.vision.semiglobal import aggregated
 from rsbench.vision.stereo_depth import known_beside
 
 Labels = NDArray[np.int64]
@@ -60,7 +73,7 @@ class LabelOptions:
     unseen: float = 0.2
     """What a pixel that the other frame does not see costs, 0 to 1, the worst likeness."""
     rounds: int = 2
-    """Times that hidden pixels are told by the layers of both frames."""
+    """Rounds of finding hidden pixels from the layers of both frames."""
 
     def __post_init__(self) -> None:
         if self.window % 2 == 0:
@@ -190,8 +203,8 @@ class _Pair:
     def across(self, frame: int) -> NDArray[np.bool_]:
         """(H, W) where parallax moves a pixel rather along its row than along its column."""
         near, far = (self._landed(frame, self._rhos[frame][k])[0] for k in (-1, 0))
-        way = np.abs(near - far)
-        return ~(way[..., 1] > way[..., 0])
+        direction = np.abs(near - far)
+        return ~(direction[..., 1] > direction[..., 0])
 
     def places(self, labels: Labels) -> F32:
         """(H, W, 2) px in frame 1 of the pixels of frame 0 on their layers (H, W)."""
@@ -224,3 +237,232 @@ def _numbered(places: F32) -> NDArray[np.int32]:
     known = np.where(np.isnan(places), np.float32(0.0), places)
     x, y = (np.clip(np.rint(known[..., k]).astype(np.int32), 0, most - 1) for k, most in ((0, width), (1, height)))
     return np.asarray(y * np.int32(width) + x, dtype=np.int32)
+
+
+FEWEST = 5
+"""Matches of a layer."""
+_ROUNDS = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneOptions:
+    """How many layers there are."""
+
+    most: int = 24
+    """Layers, beside that at infinity."""
+    thickness_px: float = 0.25
+    """Layers are split until their matches scatter by no more parallax over a frame period (root mean square)."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"most": (1, 64), "thickness_px": (1e-3, 1e3)})
+
+
+def fronto_parallel(matches: FloatArray, camera: MovingCamera, options: PlaneOptions) -> FloatArray:
+    """Planes (n, 3) that face the camera before it moves, from far to near, at the depths of matches (m, 4).
+
+    The first one is at infinity. Without a translation, or with too few matches, it is the only one.
+    """
+    gain, far = camera.parallax_px, np.zeros((1, 3))
+    if not gain > 0.0 or len(matches) < FEWEST:
+        return far
+    centres = grouped(_inverse_depths(matches, camera) * gain, options) / gain
+    planes = np.zeros((len(centres), 3))
+    planes[:, 2] = centres
+    return np.concatenate([far, planes])
+
+
+def _inverse_depths(matches: FloatArray, camera: MovingCamera) -> FloatArray:
+    """(m,) in the camera before it moves, of matches (m, 4); 0 where their rays do not meet before it."""
+    rig, shutter, side, motion = camera
+    pixels = matches[:, :2]
+    depth, _ = flow_depth(pixels, matches[:, 2:] - pixels, rig, shutter, motion, side, 0)
+    near = np.isfinite(depth)
+    pose = rig.cam_from_world(motion, shutter.pixel_time(pixels, 0, side), side)
+    points = transform(inverse(pose), np.where(near, depth, 1.0)[:, None] * rig.camera.unproject(pixels))
+    ahead = near & (points[:, 2] > 0.0)
+    return np.where(ahead, 1.0 / np.where(ahead, points[:, 2], 1.0), 0.0)
+
+
+def grouped(values: FloatArray, options: PlaneOptions) -> FloatArray:
+    """Centres, ascending, of groups of values (n,), px: the widest group is split until all are thin enough.
+
+    Medians in place of means keep strays out. Groups of a few strays, and what is no thicker than a layer at
+    infinity would be, are left out.
+    """
+    centres = np.array([np.median(values)])
+    while len(centres) < options.most:
+        wide = np.array([np.sqrt(np.mean(own**2)) if own.size else 0.0 for own in _offsets(values, centres)])
+        worst = int(np.argmax(wide))
+        if wide[worst] <= options.thickness_px:
+            break
+        own = values[_nearest(values, centres) == worst]
+        middle = 0.5 * (own.min() + own.max())
+        halves = [np.median(own[own <= middle]), np.median(own[own > middle])]
+        centres = _settled(values, np.concatenate([np.delete(centres, worst), halves]))
+    counts = np.bincount(_nearest(values, centres), minlength=len(centres))
+    return np.sort(centres[(counts >= FEWEST) & (centres > 0.5 * options.thickness_px)])
+
+
+def _nearest(values: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
+    return np.argmin(np.abs(values[:, None] - centres), axis=1)
+
+
+def _offsets(values: FloatArray, centres: FloatArray) -> list[FloatArray]:
+    group = _nearest(values, centres)
+    return [values[group == k] - centre for k, centre in enumerate(centres)]
+
+
+def _settled(values: FloatArray, centres: FloatArray) -> FloatArray:
+    """Centres that are the medians of what is nearest to them (Lloyd's iteration)."""
+    for _ in range(_ROUNDS):
+        offsets = _offsets(values, centres)
+        moved = centres + [float(np.median(own)) if own.size else 0.0 for own in offsets]
+        if np.array_equal(moved, centres):
+            break
+        centres = moved
+    return centres
+
+
+_GRID = 4
+"""px between two pixels that are followed."""
+_TOGETHER = 9.0
+"""Followed pixels that err alike: flow is that of patches of 8 px, and smooth beyond them."""
+_AROUND = np.ones((7, 7), np.uint8)
+"""px around one that must show its layer."""
+_LEAST_NOISE_PX = 0.02
+_MAD = 1.4826
+"""Standard deviations in a median absolute deviation of normal errors."""
+_LEAST_DEPTH = 1e-6
+_STEPS = 30
+
+
+class Followed(NamedTuple):
+    """Matches of one accuracy, on layers."""
+
+    matches: FloatArray
+    """(n, 4) x0, y0, x1, y1 px."""
+    layer: NDArray[np.int64]
+    """(n,) number of the plane."""
+    together: float = 1.0
+    """How many of them err alike: so many count as one."""
+
+
+def on_layers(matches: FloatArray, labelled: Labelled) -> Followed:
+    """Those of matches (n, 4) whose pixel in frame 0 lies within a layer that frame 1 sees."""
+    height, width = labelled.labels[0].shape
+    x, y = np.clip(np.rint(matches[:, :2]).astype(np.int64), 0, (width - 1, height - 1)).T
+    inner = _inner(labelled)[y, x]
+    return Followed(matches[inner], labelled.labels[0][y, x][inner])
+
+
+def followed(greys: tuple[F32, F32], labelled: Labelled) -> Followed:
+    """Matches of pixels of frame 0 on a grid: where the layer takes each, and from there what flow is left.
+
+    Grey frames (H, W) are compared once the layers have aligned them, so the flow is short and crosses no edge.
+    """
+    places, labels, seen = labelled.places, labelled.labels[0], labelled.seen[0]
+    aligned = np.where(seen, resample(greys[1], places), greys[0])
+    left = dense_flow(*(np.clip(np.rint(grey), 0, 255).astype(np.uint8) for grey in (greys[0], aligned)))
+    inner = _inner(labelled)
+    y, x = (_GRID * axis + _GRID // 2 for axis in np.indices([n // _GRID for n in labels.shape]).reshape(2, -1))
+    y, x = y[inner[y, x]], x[inner[y, x]]
+    by_x = 0.5 * (places[y, x + 1] - places[y, x - 1])
+    by_y = 0.5 * (places[y + 1, x] - places[y - 1, x])
+    ends = places[y, x] + left[y, x, :1] * by_x + left[y, x, 1:] * by_y
+    matches = np.concatenate([np.stack([x, y], axis=1), ends], axis=1).astype(np.float64)
+    return Followed(matches, labels[y, x], _TOGETHER)
+
+
+def _inner(labelled: Labelled) -> NDArray[np.bool_]:
+    """(H, W) whether all pixels around one of frame 0 show its layer, and frame 1 sees them; no border pixels."""
+    numbers = labelled.labels[0].astype(np.uint8)
+    seen = cv2.erode(labelled.seen[0].astype(np.uint8), _AROUND, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return (seen > 0) & (cv2.dilate(numbers, _AROUND) == cv2.erode(numbers, _AROUND))
+
+
+def refined(sets: Sequence[Followed], camera: MovingCamera, planes: FloatArray) -> tuple[Motion, FloatArray]:
+    """Motion, with d as long as before, and planes (p, 3) moved along their normals, by robust least squares.
+
+    Planes at infinity, and those of few matches, stay. The motion keeps its model.
+    """
+    motion, length = camera.motion, float(np.linalg.norm(camera.motion.d))
+    if not length > 0.0:
+        return motion, planes
+    counts = np.bincount(np.concatenate([each.layer for each in sets]), minlength=len(planes))
+    free = np.flatnonzero(np.any(planes != 0.0, axis=1) & (counts >= FEWEST))
+    weights = [_weights(each, camera, planes) for each in sets]
+    across_d = np.linalg.svd(motion.d[None])[2][1:]
+    name = model_name(type(motion))
+
+    def made(x: FloatArray) -> tuple[Motion, FloatArray]:
+        d = motion.d / length + x[3:5] @ across_d
+        moved = planes.copy()
+        moved[free] *= np.exp(x[5:])[:, None]
+        return make_motion(name, motion.w + x[:3], length * d / np.linalg.norm(d), motion.parameters), moved
+
+    def errors(x: FloatArray) -> FloatArray:
+        moving, moved = made(x)
+        seen = camera._replace(motion=moving)
+        parts: list[FloatArray] = []
+        for one, weight in zip(sets, weights, strict=True):
+            across, along, _ = _split(_ends(one.matches, seen, moved[one.layer]))
+            parts += [across / weight.across, along / weight.along]
+        return np.concatenate(parts)
+
+    if sum(len(one.layer) for one in sets) < FEWEST:
+        return motion, planes
+    found = least_squares(errors, np.zeros(5 + len(free)), loss="soft_l1", x_scale="jac", max_nfev=_STEPS)
+    return made(found.x)
+
+
+class _Ends(NamedTuple):
+    """Where matches on their layers should end."""
+
+    off: FloatArray
+    """(n, 2) px, less where they do."""
+    slope: FloatArray
+    """(n, 2) px per step of inverse depth."""
+
+
+def _ends(matches: FloatArray, camera: MovingCamera, planes: FloatArray) -> _Ends:
+    """Of matches (n, 4) on planes (n, 3), one each; both ends at the times of the rows in which they are."""
+    rig, shutter, side, motion = camera
+    halves = matches[:, :2], matches[:, 2:]
+    first, second = (rig.cam_from_world(motion, shutter.pixel_time(halves[f], f, side), side) for f in FRAMES)
+    rays = rig.camera.unproject(halves[0])
+    rho = np.sum(planes_seen(planes[:, None], first)[:, 0] * rays, axis=-1)
+    R, T = compose(second, inverse(first))
+    point = (R @ rays[..., None])[..., 0] + rho[:, None] * T
+    point[:, 2] = np.maximum(point[:, 2], _LEAST_DEPTH)
+    focal = np.array([rig.camera.fx, rig.camera.fy])
+    slope = focal * (T[:, :2] - point[:, :2] / point[:, 2:] * T[:, 2:]) / point[:, 2:]
+    return _Ends(rig.camera.project(point) - halves[1], slope)
+
+
+def _split(ends: _Ends) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Errors (n,) px across and along the epipolar curves, and the lengths (n,) of their slopes."""
+    length = np.linalg.norm(ends.slope, axis=-1)
+    direction = ends.slope / np.maximum(length, np.finfo(np.float64).tiny)[:, None]
+    across = ends.off[:, 0] * direction[:, 1] - ends.off[:, 1] * direction[:, 0]
+    return across, np.sum(ends.off * direction, axis=-1), length
+
+
+class _Weights(NamedTuple):
+    """What the errors of matches are divided by, (n,) px."""
+
+    across: FloatArray
+    along: FloatArray
+
+
+def _weights(given: Followed, camera: MovingCamera, planes: FloatArray) -> _Weights:
+    """From how far the matches miss at this motion and these planes."""
+    layer = given.layer
+    across, along, length = _split(_ends(given.matches, camera, planes[layer]))
+    noise = max(_MAD * float(np.median(np.abs(across))), _LEAST_NOISE_PX) if len(layer) else _LEAST_NOISE_PX
+    thickness = np.zeros(len(planes))
+    for k in np.unique(layer[length > 0.0]):
+        own = (layer == k) & (length > 0.0)
+        off, typical = _MAD * float(np.median(np.abs(along[own] / length[own]))), float(np.median(length[own]))
+        thickness[k] = max(off**2 - (noise / typical) ** 2, 0.0) ** 0.5
+    few = given.together**0.5
+    return _Weights(np.full(len(across), few * noise), few * np.hypot(noise, thickness[layer] * length))

@@ -128,17 +128,18 @@ def describe_lines(image: NDArray[Any], ends: FloatArray, options: LineOptions |
 
 
 def distances(a: Segments, b: Segments) -> FloatArray:
-    """Distances (n, m): the mean over one's descriptors of the nearest of the other, the larger of both ways."""
+    """Distances (n, m): the mean over a segment's descriptors of the nearest of the other segment; the larger of
+    both means."""
     if not (len(a.ends) and len(b.ends)):
         return np.zeros((len(a.ends), len(b.ends)))
     squares = np.sum(a.descriptors**2, axis=1)[:, None] + np.sum(b.descriptors**2, axis=1)
     apart = np.sqrt(np.maximum(squares - 2.0 * a.descriptors @ b.descriptors.T, 0.0))
-    ways = []
+    means = []
     for table, one, other in ((apart, a, b), (apart.T, b, a)):
         nearest = np.minimum.reduceat(table, other.first, axis=1)
         counts = np.diff([*one.first, len(one.descriptors)])
-        ways.append(np.add.reduceat(nearest, one.first, axis=0) / counts[:, None])
-    return np.maximum(ways[0], ways[1].T).astype(np.float64)
+        means.append(np.add.reduceat(nearest, one.first, axis=0) / counts[:, None])
+    return np.maximum(means[0], means[1].T).astype(np.float64)
 
 
 def match_segments(a: Segments, b: Segments, allowed: BoolArray, options: LineOptions | None = None) -> Indices:
@@ -208,7 +209,7 @@ def _column(ends: FloatArray, row: FloatArray) -> FloatArray:
 
 
 def _alike(a: FloatArray, b: FloatArray, options: LineOptions) -> BoolArray:
-    """Mask (n, m) of the segments that run the same way, with the same side the brighter one."""
-    way = [(ends[:, 2] - ends[:, 0]) + 1j * (ends[:, 3] - ends[:, 1]) for ends in (a, b)]
-    turn = np.angle(way[1] / way[0][:, None])
+    """Mask (n, m) of the segments of like direction, with the same side the brighter one."""
+    direction = [(ends[:, 2] - ends[:, 0]) + 1j * (ends[:, 3] - ends[:, 1]) for ends in (a, b)]
+    turn = np.angle(direction[1] / direction[0][:, None])
     return np.asarray(np.abs(turn) <= np.radians(options.max_turn_deg))

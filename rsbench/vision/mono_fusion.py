@@ -1,12 +1,12 @@
 """Two rolling-shutter frames of one camera to the image at one time: geometry where it holds, flow where not.
 
-A pixel of the standing scene has one unknown, its inverse depth: found along its own epipolar curve
-(``curve_sweep``), where the other frame confirms it; else by the dense flow, where that returns to its start and
-ends on the curve; along the border, as the surface beside it goes on (``border_depth``); else it is that of the
-farther neighbour in its row. What consistent flow carries beside the curve moves by itself: it goes its flow,
-scaled by the times of the rows. Both displacements are weighted by their variances. Each frame is drawn at the
-target, the nearer surface first, and what the first frame leaves empty is taken from the other one, moved to the
-same time.
+A pixel of the scene at rest has one unknown, its inverse depth: found along its own epipolar curve
+(``epipolar_search``), where the other frame confirms it; else by the dense flow, where that returns to its start
+and ends on the curve; in a band along the border, by extending the surface beside it (``continued``); else it is
+that of the farther neighbour in its row. What consistent flow carries off the curve moves by itself: it is moved
+by its flow, scaled by the times of the rows. Both displacements are weighted by their variances. Each frame is
+drawn at the target, the nearer surface first, and what the first frame leaves empty is taken from the other one,
+moved to the same time.
 """
 
 from __future__ import annotations
@@ -25,19 +25,66 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.vision import forward_warp
-from rsbench.vision.border_depth import continued
-from rsbench.vision.correction import WarpOptions, line_maps
-from rsbench.vision.curve_sweep import SweepOptions, Swept, largest_seen, search_size, sweep_frames
+from rsbench.vision.correction import WarpOptions, draw_within, line_maps, move_pixels
+from rsbench.vision.epipolar_search import SweepOptions, Swept, largest_seen, search_size, sweep_frames
 from rsbench.vision.flow import dense_flow, returns_px
-from rsbench.vision.frame_threads import map_frames
 from rsbench.vision.fusion import Fused, Origin, inpaint
-from rsbench.vision.images import grey_u8
+from rsbench.vision.images import grey_u8, map_frames, resample
 from rsbench.vision.reprojection import Reprojection, parallax_gain, reprojection_of
-from rsbench.vision.resample import resample
 from rsbench.vision.stereo_depth import fill_holes
 
 F32 = NDArray[np.float32]
+_FITTED, _WIDEST = 0.125, 0.15
+"""Of the image's height or width: what a line is fitted to beside a band, and how wide that is at most."""
+_BESIDE = 1 / 16
+"""Columns to either side, of the width, whose slopes count."""
+_ON_LINE = 0.05
+"""Root mean square off the line, of the inverse depth there, up to which there is one."""
+_MOST = 1.5
+"""Times the largest inverse depth that is known."""
+_START = 5
+"""Pixels whose median the line goes through, in their middle."""
+
+
+def continued(rho: F32) -> F32:
+    """Inverse depth (h, w), NaN where it is unknown, with bands along the border that are unknown filled."""
+    if not np.any(np.isfinite(rho)):
+        return rho
+    most = _MOST * float(np.nanmax(rho))
+    for _ in range(2):  # lower and upper ends of columns, then, turned, the ends of rows
+        rho = _below(_below(rho, most)[::-1], most)[::-1].T
+    return rho
+
+
+def _below(rho: F32, most: float) -> F32:
+    """``rho`` (h, w) with the unknown lower ends of columns filled, where what is above them is a line."""
+    height, width = rho.shape
+    known = np.isfinite(rho)
+    last = np.where(known.any(axis=0), height - 1 - np.argmax(known[::-1], axis=0), -1)
+    away = (np.arange(height)[:, None] - last).astype(np.float64)
+    reach = max(int(_FITTED * height), 4)
+    used = known & (away > -reach) & (away <= 0.0)
+    count = np.maximum(used.sum(axis=0), 1)
+    t, r = np.where(used, away, 0.0), np.where(used, rho, 0.0)
+    mean_t, mean_r = t.sum(axis=0) / count, r.sum(axis=0) / count
+    spread = np.maximum((t * t).sum(axis=0) / count - mean_t**2, 1e-9)
+    slope = ((t * r).sum(axis=0) / count - mean_t * mean_r) / spread
+    off = np.where(used, rho - (mean_r + slope * (away - mean_t)), 0.0)
+    error = np.sqrt((off * off).sum(axis=0) / count)
+    line = (count >= reach // 2) & (error < _ON_LINE * (mean_r - slope * mean_t)) & (last < height - 1)
+    line &= height - 1 - last < _WIDEST * height
+    if not np.any(line):
+        return rho
+    beside = int(_BESIDE * width)
+    slopes = np.pad(np.where(line, slope, np.nan), beside, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(slopes, 2 * beside + 1)[line]
+    start = np.nanmedian(np.where(used & (away > -_START), rho, np.nan)[:, line], axis=0)
+    out = rho.copy()
+    values = np.clip(start + np.nanmedian(windows, axis=1) * (away[:, line] + _START // 2), 0.0, most)
+    out[:, line] = np.where(away[:, line] > 0.0, values, rho[:, line])
+    return out
+
+
 Mask = NDArray[np.bool_]
 _RETURNS_PX = 1.0
 """Distance from a pixel to where flow there and back ends, below which the flow is believed."""
@@ -99,10 +146,10 @@ class OwnMotion:
 
 
 def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
-    """Flow both ways between two frames (H, W[, 3]), uint8 or uint16."""
+    """Flow from each of two frames to the other (H, W[, 3]), uint8 or uint16."""
     height, width = images[0].shape[:2]
-    ways = map_frames(lambda i: dense_flow(images[i], images[1 - i]), FRAMES, height * width, _FLOW_BYTES)
-    return Flows((ways[0], ways[1]), (returns_px(*ways), returns_px(*ways[::-1])))
+    both = map_frames(lambda i: dense_flow(images[i], images[1 - i]), FRAMES, height * width, _FLOW_BYTES)
+    return Flows((both[0], both[1]), (returns_px(*both), returns_px(*both[::-1])))
 
 
 class _Layer(NamedTuple):
@@ -187,10 +234,10 @@ class MonoFusion:
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
         """
         moved = self.places(frame, target_tau)
-        whole, stretched = forward_warp.draw_within(moved, np.inf), np.zeros(moved.shape[:2], dtype=np.bool_)
+        whole, stretched = draw_within(moved, np.inf), np.zeros(moved.shape[:2], dtype=np.bool_)
         source_map, buffer = whole
         if self.own.motion is not None:
-            near, torn = forward_warp.draw_within(moved, _STRETCH)
+            near, torn = draw_within(moved, _STRETCH)
             known = torn >= 0.0
             stretched = ~known & (buffer >= 0.0)
             source_map, buffer = np.where(known[..., None], near, source_map), np.where(known, torn, buffer)
@@ -209,7 +256,7 @@ class MonoFusion:
         if own.motion is not None:
             target = own.rig.cam_from_world(own.motion, target_tau, own.side)
             poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
-            forward_warp.move_pixels(layer.rho, line_maps(own.rig.camera, poses, target), moved)
+            move_pixels(layer.rho, line_maps(own.rig.camera, poses, target), moved)
             weight = layer.flow_share
         places = np.zeros((height, width, 3))
         _weigh(flow, layer.rho, weight, moved, target_tau - here, float(1 - 2 * frame), rate, places)

@@ -4,10 +4,14 @@ For every inverse depth of a grid the other views are resampled to what each pix
 surface there; that at which they look most alike wins. Over two frames of one camera this is depth from time, from
 the other camera depth from stereo, and from all views both. The planes face the camera of the pixel's line.
 
-Saurer, Koeser, Bouguet, Pollefeys, "Rolling shutter stereo", ICCV 2013. Ours are the aggregation (``semiglobal``)
-and the last rounds, in which the planes follow the surface that was found.
+Saurer, Koeser, Bouguet, Pollefeys, "Rolling shutter stereo", ICCV 2013. Ours are the aggregation and the last
+rounds, in which the planes follow the surface that was found.
 Views that a pixel may be hidden from: Kang, Szeliski, Chai, "Handling occlusions in dense multi-view stereo",
 CVPR 2001.
+Aggregation (``aggregated``): Hirschmueller, "Stereo processing by semi-global matching and mutual information",
+PAMI 2008: along each direction
+``L(p, k) = C(p, k) + min(L(q, k), L(q, k +- 1) + p1, min L(q) + p2) - min L(q)``, with q the pixel before p; the
+sum over directions is least at the hypothesis of a pixel. OpenCV's own takes images, not costs.
 """
 
 from __future__ import annotations
@@ -29,11 +33,132 @@ from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter
-from rsbench.vision.images import grey_u8
-from rsbench.vision.matching_cost import Comparer
+from rsbench.vision.images import grey_u8, resample
 from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject_pixels, reprojection_of
-from rsbench.vision.semiglobal import aggregated, winners
 from rsbench.vision.stereo_matcher import F32, Cameras, MotionMatcher
+
+_NOISE = 4.0
+"""Variance of grey levels, about that of noise and rounding: windows with less are alike by chance."""
+
+
+class Comparer:
+    """Zero-mean normalised cross-correlation of one image with others."""
+
+    def __init__(self, grey: F32, window: int) -> None:
+        self._grey, self._window = grey - np.float32(128.0), (window, window)
+        self._mean = self._box(self._grey)
+        self._variance = self._box(self._grey * self._grey) - self._mean * self._mean
+
+    def _box(self, values: NDArray[Any]) -> F32:
+        return np.asarray(cv2.boxFilter(values, -1, self._window, borderType=cv2.BORDER_REFLECT))
+
+    def cost_of(self, other: F32, places: F32, *, cubic: bool) -> F32:
+        """0 (alike) to 1 (H, W) of the other image (H, W) at places (H, W, 2) px; NaN where those are NaN."""
+        return np.where(
+            np.isnan(places[..., 0]), np.float32(np.nan), self.compared(self._seen(other, places, cubic))
+        )
+
+    def compared(self, other: F32) -> F32:
+        """0 (alike) to 1 (H, W) of another image (H, W) that lies on the same pixels."""
+        seen = other - np.float32(128.0)
+        mean = self._box(seen)
+        variance = self._box(seen * seen) - mean * mean
+        together = self._box(seen * self._grey) - mean * self._mean
+        noise = np.float32(_NOISE)
+        alike = together / np.sqrt((np.maximum(variance, 0) + noise) * (np.maximum(self._variance, 0) + noise))
+        return np.asarray(np.float32(0.5) * (1.0 - alike), dtype=np.float32)
+
+    @staticmethod
+    def _seen(other: F32, places: F32, cubic: bool) -> F32:
+        if cubic:
+            return np.asarray(resample(other, places))
+        known = np.nan_to_num(places, nan=0.0)
+        return np.asarray(cv2.remap(other, known, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+_FAR = np.float32(1e9)
+
+
+def aggregated(costs: U8, p1: int, p2: int) -> U16:
+    """Sum (H, W, n) over the eight directions of the costs (H, W, n) of n hypotheses in order.
+
+    ``p1`` and ``p2``, each at most 4000, are what steps by one and by more hypotheses cost.
+    """
+    total = np.zeros(costs.shape, dtype=np.uint16)
+    for step in (1, -1):
+        # Seen from the opposite corner, the same loops run in the opposite direction.
+        _pass(costs[::step, ::step], total[::step, ::step], np.float32(p1), np.float32(p2))
+    return total
+
+
+def winners(total: U16) -> F32:
+    """Hypothesis (H, W) of least cost, with the fraction of the parabola through it and its neighbours."""
+    best = np.zeros(total.shape[:2], dtype=np.float32)
+    _winners(total, best)
+    return best
+
+
+@compiled(error_model="numpy", fastmath={"nnan", "nsz"})
+def _pass(costs: U8, total: U16, p1: np.float32, p2: np.float32) -> None:
+    """Add the sums along the four directions that come from above and from the left."""
+    height, width, n = costs.shape
+    # One hypothesis of padding at both ends, and one pixel at both ends of a row.
+    above, here = np.zeros((3, width + 2, n + 2), np.float32), np.zeros((3, width + 2, n + 2), np.float32)
+    least_above, least_here = np.zeros((3, width + 2), np.float32), np.zeros((3, width + 2), np.float32)
+    beside = np.zeros((2, n + 2), np.float32)
+    for lines in (above, here):
+        lines[:, :, 0], lines[:, :, n + 1] = _FAR, _FAR
+    beside[:, 0], beside[:, n + 1] = _FAR, _FAR
+    for y in range(height):
+        beside[0, 1 : n + 1] = np.float32(0.0)
+        least = np.float32(0.0)
+        for x in range(width):
+            cost, into = costs[y, x], total[y, x]
+            least = _extend(cost, beside[x % 2], least, p1, p2, beside[1 - x % 2], into)
+            for k in range(3):
+                before = x + k  # the pixels above: to the left, straight, to the right
+                least_here[k, x + 1] = _extend(
+                    cost, above[k, before], least_above[k, before], p1, p2, here[k, x + 1], into
+                )
+        above, here = here, above
+        least_above, least_here = least_here, least_above
+
+
+@compiled(error_model="numpy", fastmath={"nnan", "nsz"}, inline="always")
+def _extend(
+    cost: U8, before: F32, least_before: np.float32, p1: np.float32, p2: np.float32, here: F32, into: U16
+) -> np.float32:
+    """One pixel further: fill ``here``, add it to ``into``, and return its least value."""
+    least, jump = _FAR, least_before + p2
+    for k in range(len(cost)):
+        reached = min(min(before[k + 1], jump), min(before[k], before[k + 2]) + p1)
+        value = np.float32(cost[k]) + reached - least_before
+        here[k + 1] = value
+        into[k] += np.uint16(np.int32(value))
+        least = min(least, value)
+    return least
+
+
+@compiled(error_model="numpy")
+def _winners(total: U16, best: F32) -> None:
+    height, width, n = total.shape
+    for y in range(height):
+        for x in range(width):
+            sums = total[y, x]
+            k = 0
+            for j in range(1, n):
+                if sums[j] < sums[k]:
+                    k = j
+            offset = np.float32(0.0)
+            if 0 < k < n - 1:
+                before, here, after = np.float32(sums[k - 1]), np.float32(sums[k]), np.float32(sums[k + 1])
+                bend = before - np.float32(2.0) * here + after
+                if bend > 0.0:
+                    offset = np.float32(0.5) * (before - after) / bend
+            best[y, x] = np.float32(k) + offset
+
 
 Sources = Literal["time", "stereo", "all"]
 _RANGES = {
@@ -78,7 +203,7 @@ class SweepMatcher(MotionMatcher):
     nearest_depth: float | None = None
     """Metres; None finds the range in the images, by a sweep at a quarter of the size."""
     least_parallax_px: float = 0.5
-    """Depth of less parallax is unknown: hardly told from infinity."""
+    """Depth of less parallax is unknown: hardly distinguishable from infinity."""
     consistency_px: float = 1.0
     """Largest difference of parallax to the depth of one other view, where that sees the pixel."""
     refine_rounds: int = 2

@@ -15,11 +15,16 @@ from rsbench.core.rig import View
 from rsbench.vision.correction import WarpOptions
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.correctors import turned
-from rsbench.vision.curves import image_curves
 from rsbench.vision.fusion import Fused
-from rsbench.vision.line_rotation import LineOptions, rotation_of_lines
-from rsbench.vision.manhattan import ManhattanOptions, rotation_of_directions
-from rsbench.vision.straightness import Points, Turn
+from rsbench.vision.straightness import (
+    LineOptions,
+    ManhattanOptions,
+    Points,
+    Turn,
+    image_curves,
+    rotation_of_directions,
+    rotation_of_lines,
+)
 
 _SHORTEST = 0.08
 """Of a curve, in heights of the image."""

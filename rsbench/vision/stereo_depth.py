@@ -1,29 +1,208 @@
 """Dense disparity of the rig's two images: semi-global matching, left-right check, sub-pixel refinement.
 
 The rig reads the same row of both cameras at the same time, so the pair of a rolling-shutter frame is rectified
-like a global-shutter one, and ``disparity = x_left - x_right`` needs no knowledge of the motion.
+like a global-shutter one, and ``disparity = x_left - x_right`` needs no knowledge of the motion. Where cameras
+read their lines at different times, ``moving_disparities`` and ``timed_depth`` use a motion that is known.
 
 Hirschmueller, "Stereo processing by semi-global matching and mutual information", PAMI 2008 (OpenCV's StereoSGBM).
+
+Semi-global matching interpolates its cost between whole disparities, which biases it by up to a quarter of a pixel
+with the fraction of the disparity (pixel locking). ``refine_disparity`` fits each pixel's disparity to the images:
+in the window around it the disparity is a plane, ``d(u, v) = d + a u + b v``, and each window pixel q measures
+``d_q + e_q / g_q`` with weight ``g_q^2``: its current disparity corrected by one Lucas-Kanade step along the row
+(``e`` the difference of the two images, ``g`` their slope). The matcher's own value enters as a weak measurement,
+so a window without texture is smoothed rather than lost. Pixels of another surface stay out of the window. On
+smooth textures the bias falls from 0.25 px to 0.003 px and the median error from 0.15 px to 0.01 px.
+
+Lucas and Kanade, IJCAI 1981; along the row only, on the rectified pair.
 """
 
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Literal, final
+from typing import Any, Literal, NamedTuple, final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.components.compiled import compiled
 from rsbench.core.arguments import check_ranges
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import Motion
+from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.vision.disparity_refinement import refine_disparity
-from rsbench.vision.half_size import guided_upsample, halved
-from rsbench.vision.images import grey_u8
-from rsbench.vision.stereo_matcher import StereoMatcher
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.vision.images import grey_u8, guided_upsample, halved, keys_weights, resample
+from rsbench.vision.stereo_matcher import (
+    F32,
+    MatcherEntry,
+    StereoMatcher,
+    between_pixels,
+    find_disparities,
+    widened,
+)
 
-F32 = NDArray[np.float32]
+_RADIUS = 4
+_SURFACE_STEP = np.float32(1.5)  # px of disparity between the centre and a window pixel of the same surface
+_PRIOR = np.float32(
+    4.0
+)  # weight of the matcher's value, (grey levels per px)^2: half a grey level of noise against 1/4 px
+_FARTHEST = 1.0  # px that the refinement may move a disparity
+_BAND = 32  # rows of one piece of work
+
+
+def refine_disparity(
+    reference: NDArray[np.uint8], other: NDArray[np.uint8], disparity: F32, *, iterations: int = 2
+) -> F32:
+    """Refined disparity (H, W), px; NaN stays NaN. Grey images (H, W), ``reference`` as the left one."""
+    a, b = reference.astype(np.float32), other.astype(np.float32)
+    start = np.ascontiguousarray(disparity, dtype=np.float32)
+    current = start
+    for _ in range(iterations):
+        weight, pull, fitted = (np.zeros_like(start) for _ in range(3))
+        _in_bands(len(a), lambda y0, y1: _measure(a, b, current, y0, y1, weight, pull))  # noqa: B023
+        _in_bands(len(a), lambda y0, y1: _fit_planes(current, weight, pull, y0, y1, fitted))  # noqa: B023
+        current = np.clip(fitted, start - np.float32(_FARTHEST), start + np.float32(_FARTHEST))
+    return current
+
+
+def _in_bands(height: int, work: Callable[[int, int], None]) -> None:
+    """Call ``work(first_row, end_row)`` over all rows, on all cores; the compiled loops run without the GIL."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        pieces = [pool.submit(work, y, min(y + _BAND, height)) for y in range(0, height, _BAND)]
+        for piece in pieces:
+            piece.result()
+
+
+@compiled(error_model="numpy")
+def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weight: F32, pull: F32) -> None:
+    """Fill each pixel's weight ``g^2`` plus the prior's, and ``g e``: what the images say of its disparity.
+
+    ``g`` is the mean slope along the row of ``a`` and of ``b`` where the disparity puts it, ``e`` is ``b`` there
+    minus ``a``.
+    """
+    width = a.shape[1]
+    for y in range(first_row, end_row):
+        for x in range(width):
+            weight[y, x] = _PRIOR
+            at = x - disparity[y, x]
+            if not (at > -1.0 and at < width):
+                continue
+            i = int(np.floor(at))
+            t = np.float32(at - i)
+            w0, w1, w2, w3 = keys_weights(t)
+            before, here = b[y, min(max(i - 1, 0), width - 1)], b[y, min(max(i, 0), width - 1)]
+            ahead, beyond = b[y, min(max(i + 1, 0), width - 1)], b[y, min(max(i + 2, 0), width - 1)]
+            partner = w0 * before + w1 * here + w2 * ahead + w3 * beyond
+            # The kernel's own derivative; on a whole pixel it is the central difference, as for ``a``.
+            bend = 2.0 * before - 5.0 * here + 4.0 * ahead - beyond
+            twist = 3.0 * here - before - 3.0 * ahead + beyond
+            slope_b = 0.5 * (ahead - before) + t * bend + 1.5 * t * t * twist
+            slope_a = 0.5 * (a[y, min(x + 1, width - 1)] - a[y, max(x - 1, 0)])
+            slope = 0.5 * (slope_a + slope_b)
+            weight[y, x] += slope * slope
+            pull[y, x] = slope * (partner - a[y, x])
+
+
+@compiled(error_model="numpy")
+def _fit_planes(disparity: F32, weight: F32, pull: F32, first_row: int, end_row: int, fitted: F32) -> None:
+    """Centre value of the plane fitted to each pixel's window; NaN where the disparity is NaN."""
+    height, width = disparity.shape
+    line, window = np.zeros((5, width), np.float32), np.zeros((9, width))
+    for y in range(first_row, end_row):
+        window[:] = 0.0
+        for row in range(max(y - _RADIUS, 0), min(y + _RADIUS + 1, height)):
+            line[:] = 0.0
+            for u in range(-_RADIUS, _RADIUS + 1):
+                here, there = slice(max(0, -u), width - max(0, u)), slice(max(0, u), width - max(0, -u))
+                _add_column(
+                    np.float32(u),
+                    disparity[y, here],
+                    disparity[row, there],
+                    weight[row, there],
+                    pull[row, there],
+                    line[0, here],
+                    line[1, here],
+                    line[2, here],
+                    line[3, here],
+                    line[4, here],
+                )
+            _add_line(float(row - y), line, window)
+        for x in range(width):
+            fitted[y, x] = disparity[y, x] + _plane_at_centre(window[:, x])
+
+
+@compiled(error_model="numpy")
+def _add_column(
+    u: np.float32,
+    centre: F32,
+    disparity: F32,
+    weight: F32,
+    pull: F32,
+    w0: F32,
+    wu: F32,
+    wuu: F32,
+    r0: F32,
+    ru: F32,
+) -> None:
+    """Add the window pixel u columns beside every pixel of a row to its sums: of w, w u, w u^2, r and r u.
+
+    All pixels of a row at once, contiguous and without a branch: the compiler makes vector instructions of it.
+    """
+    for x in range(len(centre)):
+        offset = disparity[x] - centre[x]
+        same = abs(offset) <= _SURFACE_STEP
+        w = weight[x] if same else np.float32(0.0)
+        r = weight[x] * offset + pull[x] if same else np.float32(0.0)
+        w0[x] += w
+        wu[x] += w * u
+        wuu[x] += w * u * u
+        r0[x] += r
+        ru[x] += r * u
+
+
+@compiled(error_model="numpy")
+def _add_line(v: float, line: F32, window: FloatArray) -> None:
+    """Add the sums of a window row, v rows below the centre, to (9, n): these 5, w v, w u v, w v^2, r v."""
+    for x in range(line.shape[1]):
+        w0, wu, r0 = line[0, x], line[1, x], line[3, x]
+        for k in range(5):
+            window[k, x] += line[k, x]
+        window[5, x] += w0 * v
+        window[6, x] += wu * v
+        window[7, x] += w0 * v * v
+        window[8, x] += r0 * v
+
+
+@compiled(error_model="numpy")
+def _plane_at_centre(sums: FloatArray) -> float:
+    """The plane's value at the window's centre, relative to the disparity there."""
+    w0, wu, wuu, r0, ru, wv, wuv, wvv, rv = (
+        sums[0],
+        sums[1],
+        sums[2],
+        sums[3],
+        sums[4],
+        sums[5],
+        sums[6],
+        sums[7],
+        sums[8],
+    )
+    # Moments about the weighted centre. A window one pixel wide has no slope across it: a little stiffness.
+    uu, uv, vv = wuu - wu * wu / w0 + 0.1 * w0, wuv - wu * wv / w0, wvv - wv * wv / w0 + 0.1 * w0
+    su, sv = ru - wu * r0 / w0, rv - wv * r0 / w0
+    determinant = uu * vv - uv * uv
+    slope_u, slope_v = (su * vv - sv * uv) / determinant, (sv * uu - su * uv) / determinant
+    return (r0 - slope_u * wu - slope_v * wv) / w0
+
+
 U8 = NDArray[np.uint8]
 _MODES = {
     "sgbm": cv2.StereoSGBM_MODE_SGBM,
@@ -59,7 +238,8 @@ class SgmOptions:
     num_disparities: int | None = None
     """Disparities searched, from 0; None derives them from ``nearest_depth``."""
     least_disparity: float = 0.5
-    """Smaller disparities are unknown: hardly told from infinity, and what the matcher says without texture."""
+    """Smaller disparities are unknown: they are hardly distinguishable from infinity, and what the matcher returns
+    without texture."""
     nearest_depth: float | None = None
     """Metres; None finds the range in the images, by matching them at a quarter of the size."""
     block_size: int = 5
@@ -316,3 +496,265 @@ def depth_metrics(
         "on_sky": float(np.mean(given[sky])) if np.any(sky) else math.nan,
         "coverage": int(np.count_nonzero(known)) / max(int(np.count_nonzero(surface)), 1),
     }
+
+
+Mask = NDArray[np.bool_]
+_SMOOTH_LEVELS = 2.0
+"""Largest standard deviation, grey levels, of 3 x 3 pixels of sky."""
+_LEAST_SHARE = 0.002
+"""Of the image; smaller areas are left alone."""
+_FAR_QUANTILE = 0.4
+"""Of all disparities: what surrounds the sky is farther than this."""
+_RIM = 7
+_REDDER = 6.0
+"""Levels by which the mean red of the sky may exceed its mean blue."""
+
+
+def sky_mask(image: NDArray[Any], disparity: NDArray[np.float32]) -> Mask:
+    """Pixels (H, W) that look like sky in ``image`` (H, W[, 3] RGB), uint8 or uint16.
+
+    ``disparity`` (H, W), px, NaN where unknown.
+    """
+    grey = grey_u8(image).astype(np.float32)
+    mean = cv2.blur(grey, (3, 3))
+    deviation = np.sqrt(np.maximum(cv2.blur(grey * grey, (3, 3)) - mean * mean, 0.0))
+    smooth = (deviation <= _SMOOTH_LEVELS).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(smooth, connectivity=4)
+    sky = np.zeros(grey.shape, dtype=np.bool_)
+    known = np.isfinite(disparity)
+    if not np.any(known):
+        return sky
+    far = float(np.quantile(disparity[known], _FAR_QUANTILE))
+    brightness = float(np.median(grey))
+    for label in range(1, count):
+        if stats[label, cv2.CC_STAT_TOP] > 0 or stats[label, cv2.CC_STAT_AREA] < _LEAST_SHARE * grey.size:
+            continue
+        area = labels == label
+        if float(np.mean(grey[area])) >= brightness and _is_blue(image, area) and _is_far(area, disparity, far):
+            sky |= area
+    # The 3 x 3 windows that touch an edge were not smooth: one pixel of the sky along it is missing.
+    return cv2.dilate(sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+def _is_blue(image: NDArray[Any], area: Mask) -> bool:
+    if image.ndim == 2 or image.shape[2] == 1:
+        return True
+    levels = 1.0 if image.dtype == np.uint8 else 257.0
+    red, blue = (float(np.mean(image[..., channel][area])) / levels for channel in (0, 2))
+    return red - blue <= _REDDER
+
+
+def _is_far(area: Mask, disparity: NDArray[np.float32], far: float) -> bool:
+    """Whether most of what surrounds the area is far; an area with no known rim may be sky."""
+    grown = cv2.dilate(area.astype(np.uint8), np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)) > 0
+    rim = disparity[grown & ~area]
+    rim = rim[np.isfinite(rim)]
+    return rim.size == 0 or float(np.quantile(rim, 0.25)) <= far
+
+
+_CHUNK = 1 << 16
+
+
+def timed_depth(
+    depth: F32, rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int
+) -> F32:
+    """Depth (H, W), metres, in each line's own camera, from that which a rig at rest would mean by its disparity.
+
+    A pixel and its disparity say where the other camera saw the point; with a lens that is on another line, read
+    at another time. The depth is that at which the other camera, where it was then, sees the point in that column.
+    What is unknown (0) and infinitely far (inf) stays so; a point behind either camera becomes infinitely far.
+    """
+    camera, sign = rig.camera, 1.0 if side == "left" else -1.0
+    other: Side = "right" if side == "left" else "left"
+    out = depth.copy()
+    y, x = np.nonzero((depth > 0.0) & np.isfinite(depth))
+    poses, axis = row_poses(rig, shutter, motion, side, frame), shutter.axis(side)
+    for start in range(0, len(y), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        pixels = np.stack([x[part], y[part]], axis=-1)
+        lines = pixels[:, axis]
+        rays = camera.unproject(pixels)
+        ends = camera.ideal.project(rays)
+        ends[:, 0] -= sign * rig.disparity(depth[y[part], x[part]])
+        tau = shutter.pixel_time(camera.lens_pixels(ends), frame, other)
+        # Beyond what the lens shows there is no time: as if it were read with the pixel itself.
+        tau = np.where(np.isnan(tau), shutter.pixel_time(pixels, frame, side), tau)
+        R, t = compose(rig.cam_from_world(motion, tau, other), inverse(Pose(poses.R[lines], poses.t[lines])))
+        column = camera.ideal.unproject(ends)[:, 0]
+        turned = (R @ rays[..., None])[..., 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = (column * t[:, 2] - t[:, 0]) / (turned[:, 0] - column * turned[:, 2])
+        ahead = np.isfinite(z) & (z > 0.0) & (turned[:, 2] * z + t[:, 2] > 0.0)
+        out[y[part], x[part]] = np.where(ahead, z, np.inf)
+    return out
+
+
+_ROUNDS, _SETTLED, _STILL_PX = 5, 0.02, 0.5
+"""Of matching, at most; it ends earlier where what is known moves by more than so many px at less than this share
+of the pixels. Late cameras and columns take two or three, opposite scans all."""
+_STEPS = 5
+"""Of the search for the line that sees a point: it leaves of the error what a pixel moves in a line."""
+_SMOOTH = 5
+"""Window, px, of the median that what is known passes before images are resampled by it."""
+
+
+class _Eye(NamedTuple):
+    """One camera of the rig, and the poses of its lines."""
+
+    camera: PinholeCamera
+    poses: Pose
+    axis: int
+
+    def pose_at(self, pixels: FloatArray) -> Pose:
+        """Pose (..., 3, 3), (..., 3) of the line of pixels (..., 2), between lines by straight interpolation.
+
+        It errs by an eighth of the square of the turn between two lines, 1e-10 of a fast one.
+        """
+        R, t = self.poses
+        count = len(t)
+        line = np.clip(np.nan_to_num(pixels[..., self.axis]), -count, 2 * count)
+        below = np.clip(np.floor(line).astype(np.int64), 0, count - 2)
+        share = (line - below)[..., None]
+        return Pose(
+            R[below] + share[..., None] * (R[below + 1] - R[below]), t[below] + share * (t[below + 1] - t[below])
+        )
+
+
+class _Looked(NamedTuple):
+    """Pixels (H, W, 2) of a camera and their rays (H, W, 3); NaN where its lens shows nothing.
+
+    Both from ideal places: from pixels with a lens Newton's method would have to find the rays.
+    """
+
+    pixels: FloatArray
+    rays: FloatArray
+
+
+def moving_disparities(
+    entry: MatcherEntry,
+    images: Mapping[Side, NDArray[np.uint8]],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    frame: int,
+) -> tuple[F32, F32]:
+    """Disparities (H, W) on the pixels of both cameras, ideal px, NaN where unknown; by any matcher and scan.
+
+    A disparity is that which the other camera would have shown at the time of the pixel: ``rig.depth`` makes it
+    the depth in the camera of the pixel's own line. ``images`` (H, W[, 3]) by side.
+
+    Raises:
+        RsbenchError: see ``find_disparities``.
+    """
+    eyes = {
+        side: _Eye(rig.camera, row_poses(rig, shutter, motion, side, frame), shutter.axis(side)) for side in SIDES
+    }
+    first, second = (_of_side(entry, images, rig, eyes, side) for side in SIDES)
+    return first, second
+
+
+def _of_side(
+    entry: MatcherEntry,
+    images: Mapping[Side, NDArray[np.uint8]],
+    rig: StereoRig,
+    eyes: Mapping[Side, _Eye],
+    side: Side,
+) -> F32:
+    camera, wide = rig.camera, widened(rig.camera)
+    other: Side = "right" if side == "left" else "left"
+    sign, grid, level = (1.0 if side == "left" else -1.0), wide.pixel_grid(), replace(rig, camera=wide)
+    own = images[side] if camera.lens is None else resample(images[side], _shown(camera, wide, grid))
+    rho = np.zeros(grid.shape[:2])
+    for _ in range(_ROUNDS):
+        ends = _ends(level, eyes[side], eyes[other], sign, rho)
+        seen = resample(images[other], _inside(camera, ends).astype(np.float32))
+        left, right = (own, seen) if side == "left" else (seen, own)
+        both = find_disparities(entry, left, right, level)
+        here, there = both if side == "left" else both[::-1]
+        partner = grid + _across(sign * there)
+        before, gain = rho, camera.fx * rig.baseline
+        rho = _without_holes(_inverse_depth(eyes[side], eyes[other], _looked(camera, wide, partner), ends))
+        if np.mean(gain * np.abs(rho - before) > _STILL_PX) < _SETTLED:
+            break
+    known = np.isfinite(here)
+    places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
+    moved = (ends - grid).astype(np.float32)
+    ends = places + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
+    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), _inside(camera, ends))
+    disparity = np.where(known, gain * rho, np.nan)
+    return _on_sensor(camera, wide, disparity.astype(np.float32))
+
+
+def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) -> FloatArray:
+    """Where the other camera, at its own times, sees what it would see at its ideal pixels at those of ``eye``.
+
+    (H, W, 2) px of the other image, NaN where it does not; ``rho`` (H, W) 1 / m is the inverse depth there, and
+    that of the partner in ``eye``, whose line's time is meant.
+    """
+    grid = rig.camera.pixel_grid()
+    partner = _looked(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
+    R, t = eye.pose_at(partner.pixels)
+    X = _turned(np.swapaxes(R, -1, -2), partner.rays - rho[..., None] * t)
+    ends = _pixels(eye.camera, rig.camera, grid)
+    for _ in range(_STEPS):
+        R, t = other.pose_at(ends)
+        ends = other.camera.project(_turned(R, X) + rho[..., None] * t)
+    return ends
+
+
+def _inverse_depth(eye: _Eye, other: _Eye, own: _Looked, ends: FloatArray) -> FloatArray:
+    """Inverse depth (H, W), 1 / m, of pixels (H, W, 2) whose points the other camera sees at ``ends``; NaN: none.
+
+    By the columns of the ends, as disparities are; the rows hold the guess that the image was resampled by.
+    """
+    (R, t), (S, s) = eye.pose_at(own.pixels), other.pose_at(ends)
+    turn = S @ np.swapaxes(R, -1, -2)
+    ray, step = _turned(turn, own.rays), s - _turned(turn, t)
+    column = other.camera.unproject(ends)[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rho = (ray[..., 0] - column * ray[..., 2]) / (column * step[..., 2] - step[..., 0])
+        return np.where(np.isfinite(rho) & (rho >= 0.0), rho, np.nan)
+
+
+def _without_holes(rho: FloatArray) -> FloatArray:
+    """Inverse depth (H, W) without holes: there that of the farther neighbour in the row; and without specks."""
+    filled = fill_holes(rho.astype(np.float32))
+    anywhere = np.nanmedian(filled) if np.any(np.isfinite(filled)) else 0.0
+    filled = np.where(np.isfinite(filled), filled, np.float32(anywhere))
+    return np.asarray(cv2.medianBlur(filled, _SMOOTH), dtype=np.float64)
+
+
+def _turned(R: FloatArray, x: FloatArray) -> FloatArray:
+    return np.asarray((R @ x[..., None])[..., 0])
+
+
+def _across(steps: NDArray[Any]) -> FloatArray:
+    """(H, W, 2) px along rows."""
+    return np.stack([steps, np.zeros_like(steps)], axis=-1).astype(np.float64)
+
+
+def _pixels(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> FloatArray:
+    """Pixels (H, W, 2) of the camera with its lens at places of the wide one without."""
+    return places if wide is camera else camera.project(wide.unproject(places))
+
+
+def _looked(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> _Looked:
+    rays, pixels = wide.unproject(places), _pixels(camera, wide, places)
+    return _Looked(pixels, np.where(np.isfinite(pixels[..., :1]), rays, np.nan))
+
+
+def _shown(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> F32:
+    return _inside(camera, _pixels(camera, wide, places)).astype(np.float32)
+
+
+def _inside(camera: PinholeCamera, pixels: FloatArray) -> FloatArray:
+    """Pixels (H, W, 2), NaN beside the image."""
+    return np.where(camera.contains(pixels)[..., None], pixels, np.nan)
+
+
+def _on_sensor(camera: PinholeCamera, wide: PinholeCamera, disparity: F32) -> F32:
+    """Disparity of the wide camera on the pixels of the camera with its lens."""
+    if wide is camera:
+        return disparity
+    shift = np.array([wide.cx - camera.cx, wide.cy - camera.cy])
+    return between_pixels(disparity, camera.ideal_pixels(camera.pixel_grid()) + shift)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -15,11 +16,19 @@ from numpy.typing import NDArray
 
 from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import check_ideal, check_plain
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.vision.images import resample
+
+_WIDEST = 2.0
+"""Times the size of the image: what a lens shows beyond has no depth from the other camera."""
+_ONE_SURFACE_PX = 1.0
+"""Disparities of neighbours that differ by more are not interpolated."""
 
 F32 = NDArray[np.float32]
 Cameras = Literal["ideal", "any"]
@@ -72,8 +81,8 @@ class MotionMatcher(StereoMatcher):
     ) -> dict[View, NDArray[Any]]:
         """``depths`` of some of the images.
 
-        To be replaced where that takes less. Of other packages' matchers, which work in processes of their own, it
-        is not asked.
+        Override it where that is cheaper. It is not called for matchers of other packages, which run in processes
+        of their own.
         """
         found = self.depths(images, rig, shutter, motion)
         return {view: found[view] for view in views}
@@ -195,3 +204,64 @@ def _checked(disparity: object, size: tuple[int, ...], where: str) -> F32:
     if known.size and np.median(known) < 0.0:
         raise RsbenchError(f"{where}: is mostly below 0, such as {known.min()}; disparity is x_left - x_right")
     return found
+
+
+def sensor_disparities(
+    entry: MatcherEntry, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig
+) -> tuple[F32, F32]:
+    """``find_disparities`` on the pixels (H, W) of cameras with or without a lens, in ideal px.
+
+    The matcher sees a pair without distortion that is as wide as the images reach. Its disparities are carried
+    back to the pixels of the images; those whose other end lies outside the other image are dropped.
+
+    Raises:
+        RsbenchError: see ``find_disparities``.
+    """
+    camera = rig.camera
+    if camera.lens is None:
+        return find_disparities(entry, left, right, rig)
+    ideal, wide = camera.ideal_pixels(camera.pixel_grid()), widened(camera)
+    places = camera.project(wide.unproject(wide.pixel_grid()))
+    inside: F32 = np.where(camera.contains(places)[..., None], places, np.nan).astype(np.float32)
+    levels = [resample(image, inside) for image in (left, right)]
+    both = find_disparities(entry, levels[0], levels[1], replace(rig, camera=wide))
+    shift = np.array([wide.cx - camera.cx, wide.cy - camera.cy])
+    first, second = (
+        _with_partner(between_pixels(found, ideal + shift), ideal, camera, 1.0 if side == "left" else -1.0)
+        for side, found in zip(SIDES, both, strict=True)
+    )
+    return first, second
+
+
+def widened(camera: PinholeCamera) -> PinholeCamera:
+    """The camera without its lens, with an image that holds all that this one shows; the camera without a lens."""
+    return camera if camera.lens is None else _around(camera.ideal, camera.ideal_pixels(camera.pixel_grid()))
+
+
+def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
+    """The ideal camera with an image that holds these pixels (..., 2), by whole pixels, at most ``_WIDEST``."""
+    size = np.array([ideal.width, ideal.height])
+    spare = np.floor((_WIDEST - 1.0) * 0.5 * size)
+    low = np.clip(np.ceil(-np.nanmin(pixels, axis=(0, 1))), 0.0, spare).astype(int)
+    high = np.clip(np.ceil(np.nanmax(pixels, axis=(0, 1)) - (size - 1)), 0.0, spare).astype(int)
+    width, height = (size + low + high).tolist()
+    return replace(ideal, width=width, height=height, cx=ideal.cx + low[0], cy=ideal.cy + low[1])
+
+
+def between_pixels(disparity: F32, places: FloatArray) -> F32:
+    """Disparity (H, W), px, at places (h, w, 2): between its pixels on one surface, else that of the nearest."""
+    height, width = disparity.shape
+    x, y = np.moveaxis(np.clip(np.floor(places).astype(np.int64), 0, [width - 2, height - 2]), -1, 0)
+    s, t = places[..., 0] - x, places[..., 1] - y
+    corners = [disparity[y, x], disparity[y, x + 1], disparity[y + 1, x], disparity[y + 1, x + 1]]
+    upper, lower = (a + s * (b - a) for a, b in (corners[:2], corners[2:]))
+    nearest = np.select([(t < 0.5) & (s < 0.5), t < 0.5, s < 0.5], corners[:3], corners[3])
+    one = np.ptp(np.stack(corners), axis=0) <= _ONE_SURFACE_PX  # false where one of them is not known
+    inside = np.all((places >= -0.5) & (places <= np.array([width, height]) - 0.5), axis=-1)
+    return np.where(inside, np.where(one, upper + t * (lower - upper), nearest), np.nan).astype(np.float32)
+
+
+def _with_partner(disparity: F32, ideal: FloatArray, camera: PinholeCamera, sign: float) -> F32:
+    """The disparities whose other end the other camera shows."""
+    other = np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1)
+    return np.where(camera.contains(camera.lens_pixels(other)), disparity, np.float32(np.nan))

@@ -1,4 +1,10 @@
-"""How straight curves of a rolling-shutter frame become when its rows are turned: rotation from straight lines.
+"""Rotation of one rolling-shutter frame from its curves: straight lines in space, bent as the camera turned.
+
+Curves are edges of the image: chains of sub-pixel places. A place is the maximum of the gradient's length along a
+row, by a parabola through its logarithm: exact where a step was blurred by a Gaussian (C. Steger, An unbiased
+detector of curvilinear structures, PAMI 1998, has the same of its profile). Places of neighbouring rows are one
+curve where the edge's own direction leads from one to the other. A curve that no parabola follows is cut where it
+is farthest from it. Flat edges are found likewise in the columns.
 
 A camera that turns by exp(s w) in the time s sees the points of a line in space, whose plane through the centre
 has the normal l at s = 0, on rays r with
@@ -7,25 +13,35 @@ has the normal l at s = 0, on rays r with
 
 A curve is l's two degrees of freedom and what the rotation bends. To first order, l . (r - s w x r) = 0, the
 model of Y. Lao, O. Ait-Aider, A Robust Method for Strong Rolling Shutter Effects Correction Using Lines with
-Automatic Feature Selection, CVPR 2018. An upright line that is not slanted tells roll, and off the middle pitch;
-yaw shears it, which leaves it straight: only slanted lines off the middle tell yaw.
+Automatic Feature Selection, CVPR 2018. An upright line that is not slanted determines roll, and off the middle
+pitch; yaw shears it, which leaves it straight: only slanted lines off the middle determine yaw.
 
 One rotation makes everything straight: the pitch that turns all rows' rays into one plane (height / (focal
 length x readout ratio), tens of degrees in a frame period; C. Albl, A. Sugimoto, T. Pajdla, Degeneracies in
 Rolling Shutter SfM, ECCV 2016, have it of points). Errors are therefore px in the frame as it was, a flat
 curve's at the time that an error of its row changes too: as l . q, or in the corrected image, they would shrink
-towards that rotation and draw every estimate there. Nothing is looked for beyond ``FARTHEST`` expected sizes of
+towards that rotation and draw every estimate there. Nothing is searched beyond ``FARTHEST`` expected sizes of
 a component.
 
-All curves' points lie one after another, (N,); ``curve`` (N,) says whose each is, from 0 to K - 1.
+``rotation_of_lines`` (Lao, Ait-Aider) draws samples of four curves, solves the linear model, and fits all curves
+that become straight with it. ``rotation_of_directions`` estimates three orthogonal directions and the rotation
+together, from short pieces of lines (P. Purkait, C. Zach, A. Leonardis, Rolling Shutter Correction in Manhattan
+World, ICCV 2017): a piece whose line runs along the direction v has a normal l with l . v = 0 once its rows are
+turned back, so a piece too short to be bent counts too, and a line that yaw sheared is off its direction. The
+directions are searched by those of three pieces as if nothing had turned (two for the first direction, one for the
+second), and then fitted with the rotation to the pieces that agree, ever more strictly.
+
+All curves' points lie one after another, (N,); ``curve`` (N,) is the number of each one's curve, from 0 to K - 1.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +50,109 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.images import grey_u8
+
+F32 = NDArray[np.float32]
+Curves = list[FloatArray]
+"""Each (n, 2) places x, y, px, in the order in which it runs."""
+
+_BLUR_PX = 1.0
+_LEAST_GRADIENT = 6.0
+"""Grey levels per px at an edge: three deviations of the gradient of 8-bit noise of 3 levels so blurred."""
+_BESIDE_PX, _SAME_DIRECTION, _SAME_STRENGTH = 0.6, 0.94, 0.6
+"""Of places that are one curve: how far the second is from where the first leads, the cosine of the angle between
+their directions (20 degrees), and the least ratio of their gradients."""
+_BENT_PX = 0.35
+"""Greatest distance of a curve's smoothed places from a parabola."""
+_SMOOTHED = 7
+
+
+def image_curves(image: NDArray[Any], least_length: float) -> Curves:
+    """Curves of at least ``least_length`` px, longest first, of an image (H, W[, 3]), uint8 or uint16."""
+    grey = grey_u8(image).astype(np.float32)
+    upright = _curves_down(grey, least_length)
+    flat = [each[:, ::-1] for each in _curves_down(np.ascontiguousarray(grey.T), least_length)]
+    return sorted([*upright, *flat], key=lambda each: -extent(each))
+
+
+def extent(curve: FloatArray) -> float:
+    """Distance between the ends of a curve (n, 2), px."""
+    return float(np.linalg.norm(curve[-1] - curve[0]))
+
+
+def _curves_down(grey: F32, least_length: float) -> Curves:
+    """Curves that cross rows."""
+    places = _places(grey)
+    after = [_followers(here, there) for here, there in itertools.pairwise(places)]
+    curves: Curves = []
+    started: list[set[int]] = [set() for _ in places]
+    for row, followers in enumerate(after):
+        for first in range(len(followers)):
+            if first in started[row] or followers[first] < 0:
+                continue
+            chain, y, k = list[tuple[float, float]](), row, first
+            while k >= 0:
+                chain.append((places[y][k, 0], float(y)))
+                started[y].add(k)
+                k = int(after[y][k]) if y < len(after) else -1
+                y += 1
+            curves += _parabolas(np.array(chain), least_length)
+    return curves
+
+
+def _places(grey: F32) -> list[FloatArray]:
+    """Of each row, edges (n, 4): x, gradient along x and y, its length; those more upright than flat."""
+    blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
+    gx, gy = (cv2.Scharr(blurred, cv2.CV_32F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1)))
+    strength = np.maximum(np.hypot(gx, gy), np.float32(1e-3))
+    inner = strength[:, 1:-1]
+    peak = (inner >= strength[:, :-2]) & (inner > strength[:, 2:]) & (inner > _LEAST_GRADIENT)
+    peak &= np.abs(gx[:, 1:-1]) >= np.abs(gy[:, 1:-1])
+    log = np.log(strength.astype(np.float64))
+    found = []
+    for y, row in enumerate(peak):
+        x = np.flatnonzero(row) + 1
+        before, at, behind = log[y, x - 1], log[y, x], log[y, x + 1]
+        offset = 0.5 * (behind - before) / np.maximum(2.0 * at - before - behind, 1e-9)
+        found.append(np.column_stack([x + np.clip(offset, -0.5, 0.5), gx[y, x], gy[y, x], strength[y, x]]))
+    return found
+
+
+def _followers(here: FloatArray, there: FloatArray) -> NDArray[np.intp]:
+    """For each place (n, 4) of a row that of the next one which goes on from it; -1 where there is none."""
+    none = np.full(len(here), -1, dtype=np.intp)
+    if len(here) == 0 or len(there) == 0:
+        return none
+    lead = here[:, 0] - here[:, 2] / here[:, 1]  # along the edge, across its gradient
+    back = there[:, 0] + there[:, 2] / there[:, 1]
+    apart = np.abs(there[None, :, 0] - lead[:, None]) + np.abs(back[None] - here[:, None, 0])
+    cosine = (here[:, None, 1] * there[None, :, 1] + here[:, None, 2] * there[None, :, 2]) / (
+        here[:, None, 3] * there[None, :, 3]
+    )
+    ratio = np.minimum(here[:, None, 3], there[None, :, 3]) / np.maximum(here[:, None, 3], there[None, :, 3])
+    bad = (apart > 2.0 * _BESIDE_PX) | (cosine < _SAME_DIRECTION) | (ratio < _SAME_STRENGTH)
+    apart = np.where(bad, np.inf, apart)
+    best = np.argmin(apart, axis=1)
+    mutual = np.argmin(apart, axis=0)[best] == np.arange(len(here))
+    return np.where(mutual & np.isfinite(apart[np.arange(len(here)), best]), best, none)
+
+
+def _parabolas(chain: FloatArray, least_length: float) -> Curves:
+    """The parts of a chain (n, 2) that parabolas x(y) follow."""
+    if len(chain) < _SMOOTHED or extent(chain) < least_length:
+        return []
+    y = chain[:, 1] - chain[:, 1].mean()
+    basis = np.stack([np.ones_like(y), y, y * y / len(y)], axis=-1)
+    fit, *_ = np.linalg.lstsq(basis, chain[:, 0], rcond=None)
+    off = np.convolve(chain[:, 0] - basis @ fit, np.full(_SMOOTHED, 1.0 / _SMOOTHED), mode="same")
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) <= _BENT_PX:
+        return [chain]
+    cut = int(np.clip(worst, _SMOOTHED, len(chain) - _SMOOTHED))
+    if not 0 < cut < len(chain):
+        return []
+    return [*_parabolas(chain[:cut], least_length), *_parabolas(chain[cut:], least_length)]
+
 
 FARTHEST = 4.0
 """Standard deviations of a component of the rotation within which it is looked for."""
@@ -140,20 +259,20 @@ class Turned:
         J = so3.left_jacobian(p.time[:, None] * self.w)
         above = (J @ so3.cross(normals[p.curve], self.q)[..., None])[..., 0]
         # Own turns by s (J dw) x own; each slope's direction, crossed with own, is the derivative by J dw.
-        way = np.where(
+        direction = np.where(
             p.upright[:, None],
             np.array([1.0 / p.focal[0], 0.0, 0.0]),
             np.array([0.0, 1.0 / p.focal[1], 0.0]) - p.row_time * so3.cross(self.w, p.rays),
         )
-        below = p.time[:, None] * (so3.cross(own, way)[:, None] @ J)[:, 0]
+        below = p.time[:, None] * (so3.cross(own, direction)[:, None] @ J)[:, 0]
         below -= np.where(p.upright[:, None], 0.0, p.row_time * so3.cross(p.rays, own))
         slope = _safe(self.slopes(own))[:, None]
         return np.asarray((p.time[:, None] * above - self.errors(normals)[:, None] * below) / slope)
 
-    def by_normals(self, normals: FloatArray, ways: FloatArray) -> FloatArray:
-        """(N, m) derivatives of ``errors`` by steps of the normals along m ways (K, m, 3)."""
-        above = np.einsum("ni,nmi->nm", self.q, ways[self.points.curve])
-        below = np.stack([self.slopes(self.own(ways[:, k])) for k in range(ways.shape[1])], axis=-1)
+    def by_normals(self, normals: FloatArray, directions: FloatArray) -> FloatArray:
+        """(N, m) derivatives of ``errors`` by steps of the normals along m directions (K, m, 3)."""
+        above = np.einsum("ni,nmi->nm", self.q, directions[self.points.curve])
+        below = np.stack([self.slopes(self.own(directions[:, k])) for k in range(directions.shape[1])], axis=-1)
         slope = _safe(self.slopes(self.own(normals)))[:, None]
         return np.asarray((above - self.errors(normals)[:, None] * below) / slope)
 
@@ -192,7 +311,7 @@ def reduced(points: Points, errors: FloatArray, by_all: FloatArray, by_own: Floa
 
 
 def across(normals: FloatArray) -> FloatArray:
-    """(K, 2, 3) the two ways in which unit normals (K, 3) can turn."""
+    """(K, 2, 3) the two directions in which unit normals (K, 3) can turn."""
     return np.asarray(np.linalg.svd(normals[:, None])[2][:, 1:])
 
 
@@ -202,10 +321,10 @@ def step_of(turned: Turned, normals: FloatArray) -> Step:
     return reduced(turned.points, turned.errors(normals), turned.by_turn(normals), by_normals)
 
 
-def moved(normals: FloatArray, ways: FloatArray, step: Step, x: FloatArray) -> FloatArray:
+def moved(normals: FloatArray, directions: FloatArray, step: Step, x: FloatArray) -> FloatArray:
     """(K, 3) the normals after the own unknowns' best step beside the global step x (p,)."""
     t = -step.own @ np.append(x, 1.0)
-    there = normals + np.einsum("km,kmi->ki", t, ways)
+    there = normals + np.einsum("km,kmi->ki", t, directions)
     return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True))
 
 
@@ -231,13 +350,13 @@ class Turn(NamedTuple):
     """(3, 3) rad^2 of w, from the errors and the prior."""
 
     def determined(self, prior: float) -> FloatArray | None:
-        """w (3,) in the directions that the curves tell, 0 in those they leave open; None where they tell none.
+        """w (3,) in the directions that the curves determine, 0 in the others; None where they determine none.
 
-        A direction is told where its standard deviation is at most half of ``prior``, rad.
+        A direction is determined where its standard deviation is at most half of ``prior``, rad.
         """
         variances, axes = np.linalg.eigh(self.covariance)
-        told = axes[:, variances <= 0.25 * prior**2]
-        return np.asarray(told @ (told.T @ self.w)) if told.shape[1] else None
+        known = axes[:, variances <= 0.25 * prior**2]
+        return np.asarray(known @ (known.T @ self.w)) if known.shape[1] else None
 
 
 def straightened(points: Points, start: FloatArray, prior: float) -> Turn:
@@ -272,12 +391,243 @@ def _descended(
     def cost(at: Turned, normals: FloatArray) -> float:
         return float(np.sum(at.errors(normals) ** 2)) + hold * float(at.w @ at.w)
 
-    before, ways = cost(at, normals), across(normals)
+    before, directions = cost(at, normals), across(normals)
     for part in _PARTS:
         w = at.w + part * x
         if not np.max(np.abs(w)) <= most:
             continue
-        there, lines = Turned.by(at.points, w), moved(normals, ways, step, part * x)
+        there, lines = Turned.by(at.points, w), moved(normals, directions, step, part * x)
         if cost(there, lines) < before:
             return there, lines
+    return None
+
+
+FEWEST_LINES = 4
+"""Curves of a sample, and below which there is no rotation."""
+_ROUNDS = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineOptions:
+    """Of the search."""
+
+    threshold_px: float = 0.2
+    """Root mean square by which the points of a curve may miss a line."""
+    samples: int = 500
+    """Random samples of the search."""
+    prior_deg: float = 3.0
+    """What a component of the rotation in a frame period is expected to be, a standard deviation."""
+
+    @property
+    def prior(self) -> float:
+        return float(np.radians(self.prior_deg))
+
+
+def rotation_of_lines(points: Points | None, options: LineOptions, rng: np.random.Generator) -> Turn | str:
+    """The rotation that makes most curves straight, or why there is none; None are the points of no curve."""
+    count = 0 if points is None else points.count
+    if points is None or count < FEWEST_LINES:
+        return f"{count} curves that may be lines; {FEWEST} are needed"
+    still = Turned.by(points, np.zeros(3))
+    w = _best_sample(step_of(still, lines_at(still)), points, options, rng)
+    kept = np.zeros(count, dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        at = Turned.by(points, w)
+        errors = at.errors(lines_at(at))
+        straight = points.means(errors**2) < options.threshold_px**2
+        if np.count_nonzero(straight) < FEWEST_LINES:
+            return f"{np.count_nonzero(straight)} of {count} curves become straight together; {FEWEST} are needed"
+        if np.array_equal(straight, kept):
+            break
+        kept = straight
+        w = straightened(points.chosen(kept), w, options.prior).w
+    return straightened(points.chosen(kept), w, options.prior)
+
+
+def _best_sample(system: Step, points: Points, options: LineOptions, rng: np.random.Generator) -> FloatArray:
+    """w (3,) of the sample whose motion leaves the least truncated squared errors; that of none among them."""
+    chosen = np.argsort(rng.random((options.samples, points.count)), axis=1)[:, :FEWEST_LINES]
+    hold = (options.threshold_px / options.prior) ** 2
+    A = system.A[chosen].sum(axis=1) + hold * np.eye(3)
+    w = np.concatenate([np.zeros((1, 3)), -np.linalg.solve(A, system.b[chosen].sum(axis=1)[..., None])[..., 0]])
+    w = w[np.max(np.abs(w), axis=1) <= FARTHEST * options.prior]
+    squares = system.c + 2.0 * w @ system.b.T + np.einsum("si,kij,sj->sk", w, system.A, w)
+    most = options.threshold_px**2 * points.sums(np.ones(len(points.time)))
+    return np.asarray(w[np.argmin(np.minimum(squares, most).sum(axis=1))])
+
+
+FEWEST = 8
+"""Curves that agree, below which there is no rotation: six unknowns, and two that could contradict."""
+_SIN = 0.1
+"""Sine of the angle within which a piece of a search agrees with a direction: a fast turn shears by so much."""
+_COARSER = (8.0, 4.0, 2.0, 1.0)
+"""Thresholds of the rounds, in units of the last."""
+_STARTS, _ROUND_STEPS, _LAST_STEPS = 3, 3, 30
+_CONVERGED = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManhattanOptions:
+    """Of the search."""
+
+    threshold_px: float = 0.3
+    """Root mean square by which the points of a curve may miss a line along its direction."""
+    least_share: float = 0.3
+    """Of all points that must lie on lines along the directions."""
+    samples: int = 500
+    """Random samples of the search."""
+    prior_deg: float = 3.0
+    """What a component of the rotation in a frame period is expected to be, a standard deviation."""
+
+    @property
+    def prior(self) -> float:
+        return float(np.radians(self.prior_deg))
+
+
+class _World(NamedTuple):
+    """Curves at a rotation, the directions, and each curve's."""
+
+    at: Turned
+    axes: FloatArray
+    """(3, 3) columns are the directions in the middle of the readout."""
+    normals: FloatArray
+    """(K, 3)"""
+    own: NDArray[np.intp]
+    """(K,) number of a curve's direction."""
+
+    def along(self) -> FloatArray:
+        """(K, 3) the direction of each curve."""
+        return np.asarray(self.axes.T[self.own])
+
+    def squares(self) -> FloatArray:
+        """(K,) mean squared errors, px^2."""
+        return self.at.points.means(self.at.errors(self.normals) ** 2)
+
+
+def rotation_of_directions(
+    points: Points | None, options: ManhattanOptions, rng: np.random.Generator
+) -> Turn | str:
+    """The rotation with which most curves run along three directions, or why there is none; None: no curves."""
+    count = 0 if points is None else points.count
+    if points is None or count < FEWEST:
+        return f"{count} curves that may be lines; {FEWEST} are needed"
+    best: tuple[float, Turn] | None = None
+    reason = "no three directions"
+    for axes in _directions(points, options, rng):
+        found = _fitted(points, axes, options)
+        if isinstance(found, str):
+            reason = found
+        elif best is None or found[0] < best[0]:
+            best = found
+    return reason if best is None else best[1]
+
+
+def _directions(points: Points, options: ManhattanOptions, rng: np.random.Generator) -> list[FloatArray]:
+    """Triples of directions (3, 3), columns, that most points agree with as if nothing had turned, apart."""
+    n, weights = Turned.by(points, np.zeros(3)).nearest_normals(), points.sums(np.ones(len(points.time)))
+    i, j, k = np.argsort(rng.random((options.samples, points.count)), axis=1)[:, :3].T
+    first = so3.cross(n[i], n[j])
+    second = so3.cross(first, n[k])
+    lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
+    good = (lengths[0] > 0.02) & (lengths[1] > 0.02 * lengths[0])
+    first, second = first[good] / lengths[0][good, None], second[good] / lengths[1][good, None]
+    triples = np.stack([first, second, so3.cross(first, second)], axis=-1)  # (S, 3, 3)
+    off = np.min(np.abs(np.einsum("ki,sij->skj", n, triples)), axis=2)
+    scores = np.maximum(1.0 - (off / _SIN) ** 2, 0.0) @ weights
+    chosen: list[FloatArray] = []
+    for best in np.argsort(-scores):
+        alike = [np.max(np.abs(triples[best].T @ other), axis=1).min() for other in chosen]
+        if all(each < np.cos(2.0 * _SIN) for each in alike):
+            chosen.append(triples[best])
+        if len(chosen) == _STARTS:
+            break
+    return chosen
+
+
+def _fitted(points: Points, axes: FloatArray, options: ManhattanOptions) -> tuple[float, Turn] | str:
+    """Truncated squared errors of all curves, and the rotation; or why there is none."""
+    world = _assigned(Turned.by(points, np.zeros(3)), axes)
+    turn, kept = None, np.zeros(points.count, dtype=np.bool_)
+    for coarser in _COARSER:
+        kept = world.squares() < (coarser * options.threshold_px) ** 2
+        if np.count_nonzero(kept) < FEWEST:
+            agree = f"{np.count_nonzero(kept)} of {points.count} curves agree with three directions"
+            return f"{agree}; {FEWEST} are needed"
+        inner = _World(
+            Turned.by(points.chosen(kept), world.at.w), world.axes, world.normals[kept], world.own[kept]
+        )
+        turn, axes = _least_squares(inner, options.prior, _LAST_STEPS if coarser == 1.0 else _ROUND_STEPS)
+        world = _assigned(Turned.by(points, turn.w), axes)
+    counts = points.sums(np.ones(len(points.time)))
+    if (share := float(counts[kept].sum() / counts.sum())) < options.least_share:
+        return f"only {share:.0%} of the curves' points lie on lines along three directions"
+    if np.count_nonzero(np.bincount(world.own[kept], minlength=3) > 1) < 2:
+        return "lines along one direction alone"
+    assert turn is not None
+    return float(counts @ np.minimum(world.squares(), options.threshold_px**2)), turn
+
+
+def _assigned(at: Turned, axes: FloatArray) -> _World:
+    """Each curve with the direction that it misses least, and the line nearest to it along that direction."""
+    products = at.points.sums(at.q[:, :, None] * at.q[:, None])
+    normals = np.zeros((3, at.points.count, 3))
+    for k in range(3):
+        basis = np.delete(axes, k, axis=1)
+        normals[k] = np.linalg.eigh(basis.T @ products @ basis)[1][..., 0] @ basis.T
+    squares = np.stack([at.points.means(at.errors(each) ** 2) for each in normals])
+    own = np.argmin(squares, axis=0)
+    return _World(at, axes, normals[own, np.arange(at.points.count)], own)
+
+
+def _least_squares(world: _World, prior: float, steps: int) -> tuple[Turn, FloatArray]:
+    """Gauss and Newton's steps of rotation and directions; ``prior`` as in ``straightness.straightened``."""
+    points, covariance = world.at.points, np.zeros((3, 3))
+    for _ in range(steps):
+        step, directions = _step(world)
+        squares = float(np.sum(world.at.errors(world.normals) ** 2))
+        variance = noise_variance(points, squares, 6 + points.count)
+        hold = np.diag([variance / prior**2] * 3 + [0.0] * 3)
+        A, w = step.A.sum(axis=0) + hold, np.append(world.at.w, np.zeros(3))
+        x = -np.linalg.lstsq(A, step.b.sum(axis=0) + hold @ w, rcond=None)[0]
+        covariance = variance * np.linalg.pinv(A, hermitian=True)[:3, :3]
+        after = _descended_world(world, step, directions, x, hold[0, 0], FARTHEST * prior)
+        if after is None:
+            break
+        world = after
+        if not x[:3] @ x[:3] > _CONVERGED**2 * np.trace(covariance):
+            break
+    return Turn(world.at.w, world.normals, np.asarray(covariance)), world.axes
+
+
+def _step(world: _World) -> tuple[Step, FloatArray]:
+    """The step (6,) of rotation and turn of the directions; how lines (K, 1, 3) move about their directions."""
+    directions = so3.cross(world.along(), world.normals)[:, None]
+    turns = so3.cross(np.eye(3), world.normals[:, None])  # of the normals with the directions, about x, y, z
+    by_all = np.hstack([world.at.by_turn(world.normals), world.at.by_normals(world.normals, turns)])
+    errors, by_own = world.at.errors(world.normals), world.at.by_normals(world.normals, directions)
+    return reduced(world.at.points, errors, by_all, by_own), directions
+
+
+def _descended_world(
+    world: _World, step: Step, directions: FloatArray, x: FloatArray, hold: float, most: float
+) -> _World | None:
+    """Where the step x, or a part of it, lowers the errors; None where none does."""
+
+    def cost(each: _World) -> float:
+        return float(np.sum(each.at.errors(each.normals) ** 2)) + hold * float(each.at.w @ each.at.w)
+
+    before = cost(world)
+    for part in _PARTS:
+        w = world.at.w + part * x[:3]
+        if not np.max(np.abs(w)) <= most:
+            continue
+        turn = so3.exp(part * x[3:])
+        axes = turn @ world.axes
+        normals = moved(world.normals, directions, step, part * x) @ turn.T
+        along = axes.T[world.own]  # what the finite steps moved off the directions goes back
+        normals = normals - np.sum(normals * along, axis=1, keepdims=True) * along
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        after = _World(Turned.by(world.at.points, w), axes, normals, world.own)
+        if cost(after) < before:
+            return after
     return None

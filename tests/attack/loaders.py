@@ -127,7 +127,7 @@ def _place(folder: Path, name: str) -> Path:
 def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
     from rsbench.dataset.sequence import read_dataset, read_sequence
     from rsbench.pipeline.footage import read_frame
-    from rsbench.scenes.environment import read_environment
+    from rsbench.scenes.load import read_environment
     from rsbench.storage.files import load_arrays, load_matches, read_depth, read_png, read_poses
 
     data = folder / "data"

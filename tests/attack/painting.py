@@ -31,7 +31,7 @@ def show_frames(folder: Path) -> None:
 
     A frame that was not kept raises ``FileNotFoundError``.
     """
-    from rsbench.renderers import backend, clearance, render, scene
+    from rsbench.renderers import backend, render, scene, visibility
 
     def show(_: Any, camera: Any, poses: Any, options: Any, **more: Any) -> Any:
         with np.load(_path(folder, camera, poses, options)) as kept:
@@ -39,7 +39,7 @@ def show_frames(folder: Path) -> None:
 
     started = backend.Backend(variant=(folder / "variant").read_text())
     backend.start_backend = lambda *_, **__: started
-    clearance.obstacle = lambda *_, **__: ""  # it was looked for when the frames were rendered
+    visibility.obstacle = lambda *_, **__: ""  # it was looked for when the frames were rendered
     scene.MitsubaScene = lambda built, *_: SimpleNamespace(glossy=built.glossy)  # pyrefly: ignore[bad-assignment]
     setattr(render, "render", show)  # noqa: B010  an assignment has the wrong type
 

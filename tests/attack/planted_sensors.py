@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from attack.planting import RNG, VICTIM, Fault, Plant, image_of, manifest_of, put
 from rsbench.dataset.sequence import read_sequence
-from rsbench.renderers.electrons import Sensor, expose
-from rsbench.renderers.image import linear_of_codes
-from rsbench.renderers.processing import compressed, processed, rows_needed
+from rsbench.renderers.image import Sensor, compressed, expose, linear_of_codes, processed, rows_needed
 from rsbench.storage.files import read_png, write_png
 
 CAMERA = Sensor(

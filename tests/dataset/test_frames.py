@@ -33,7 +33,7 @@ from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pa
 from rsbench.dataset.layout import files_of, is_of_sequence
 from rsbench.dataset.sequence import read_dataset, read_pairs
 from rsbench.dataset.views import ImageView
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
 from rsbench.storage.files import background_writer, read_depth, read_png, write_depth, write_png

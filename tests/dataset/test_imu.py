@@ -29,7 +29,7 @@ from rsbench.dataset.imu import (
     write_imu,
 )
 from rsbench.dataset.sequence import read_sequence, sequence_manifest
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 from rsbench.storage.files import write_json
 from rsbench.verification.imu_checks import imu_faults
 

@@ -29,11 +29,11 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.object_records import NUMBER, SHADED, TAKEN, MovingCard
 from rsbench.dataset.posed_scenes import seen_scene
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.renderers.clearance import obstacle
-from rsbench.renderers.electrons import Sensor
+from rsbench.renderers.image import Sensor
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.visibility import obstacle
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset

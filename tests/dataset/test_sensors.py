@@ -23,13 +23,10 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.posed_scenes import seen_scene
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.views import ImageView
-from rsbench.renderers.electrons import Sensor, fall_off
-from rsbench.renderers.image import to_srgb8
+from rsbench.renderers.image import Sensor, compressed, fall_off, to_srgb8
 from rsbench.renderers.options import RendererOptions
-from rsbench.renderers.processing import compressed
-from rsbench.renderers.render import LinePoses, render
+from rsbench.renderers.render import LinePoses, render, sensed_rows
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.sensor_frame import sensed_rows
 from rsbench.scenes.model import Scene
 from rsbench.storage.files import read_png, write_png
 from rsbench.verification import sensor_checks, verify_dataset

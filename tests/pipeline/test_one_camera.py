@@ -17,9 +17,9 @@ from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.one_camera import ZhuangCorrector
 from rsbench.solvers.engine.robust_motion import RobustOptions
-from rsbench.vision.baseline_depths import monocular_depth
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, find_corrected
+from rsbench.vision.flow import monocular_depth
 from rsbench.vision.fusion import Origin
 
 RIG = StereoRig(camera=PinholeCamera.centred(96, 96, 120.0), baseline=0.4)

@@ -23,7 +23,7 @@ from rendering_child import GENERATE, assert_alike, child, needs_llvm, run_child
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_dataset
-from rsbench.renderers import backend, diagnosis, llvm, probe_cache
+from rsbench.renderers import backend, diagnosis, llvm
 from rsbench.renderers.backend import Backend, start_backend
 from rsbench.renderers.llvm import Candidate, ProbeResult
 from rsbench.storage.files import read_depth, read_png
@@ -321,19 +321,19 @@ def test_a_damaged_or_unwritable_cache_is_no_cache(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "rsbench").mkdir()
     (tmp_path / "rsbench" / "probes.json").write_text(content)
-    assert probe_cache.recall("k") is None
-    probe_cache.remember("k", "21")
-    assert probe_cache.recall("k") == "21"
+    assert llvm.recall("k") is None
+    llvm.remember("k", "21")
+    assert llvm.recall("k") == "21"
     assert json.loads((tmp_path / "rsbench" / "probes.json").read_text())["k"] == "21"
     file = tmp_path / "file"
     file.write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))
-    probe_cache.remember("k", "21")
-    assert probe_cache.recall("k") is None
+    llvm.remember("k", "21")
+    assert llvm.recall("k") is None
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(Path, "home", classmethod(lambda cls: (_ for _ in ()).throw(RuntimeError("no home"))))
-    probe_cache.remember("k", "21")
-    assert probe_cache.recall("k") is None
+    llvm.remember("k", "21")
+    assert llvm.recall("k") is None
 
 
 def test_without_a_driver_cuda_costs_no_process(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,13 @@
-"""The single pass and the paper's recipe are the same image, bit for bit."""
+"""Equal bits of the methods, of samplers and threads; memory."""
 
 from __future__ import annotations
 
+import json
+import os
+import statistics
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +16,8 @@ import pytest
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers import wavefront
+from rsbench.renderers.backend import start_backend
+from rsbench.renderers.integrators import lane_sampler, reversed_bits, sobol
 from rsbench.renderers.options import Integrator, Method, RendererOptions
 from rsbench.renderers.render import LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
@@ -115,3 +123,141 @@ def test_bad_requests_are_refused_in_one_line(scene: Any, row_poses: Any) -> Non
         render(scene, CAMERA, LinePoses(R, t), on_gs_frame=lambda row, image: None)
     with pytest.raises(RsbenchError, match=r"\(3, 3\)"):
         render_global(scene, CAMERA, R, t)
+
+
+SAMPLES, DIMENSIONS = 16, 6
+
+
+@pytest.fixture(scope="module")
+def points() -> Any:
+    """(pixels, dimensions, samples, 2) of 50 pixels, and (pixels, samples) of the single dimension after them."""
+    start_backend()
+    import mitsuba as mi
+
+    if "scalar" in mi.variant():
+        pytest.skip("whole numbers of the scalar variant are its own test")
+    pixel, sample = np.divmod(np.arange(50 * SAMPLES), SAMPLES)
+    sampler = lane_sampler()
+    sampler.seed_lanes(mi.UInt32(3), mi.UInt32(pixel), mi.UInt32(sample))
+    pairs = np.stack([np.array(sampler.next_2d()).T for _ in range(DIMENSIONS)])
+    return pairs.reshape(DIMENSIONS, 50, SAMPLES, 2).swapaxes(0, 1), np.array(sampler.next_1d()).reshape(
+        50, SAMPLES
+    )
+
+
+def test_the_second_coordinate_is_sobols() -> None:
+    """Against its direction numbers, by the recurrence of the primitive polynomial x + 1."""
+    for index in [*range(40), 12345, 0xDEADBEEF]:
+        expected, direction, rest = 0, 1 << 31, index
+        while rest:
+            expected ^= direction * (rest & 1)
+            rest, direction = rest >> 1, direction ^ (direction >> 1)
+        assert sobol(reversed_bits(index)) == expected
+        assert reversed_bits(index) == int(f"{index:032b}"[::-1], 2)
+
+
+def test_every_elementary_interval_of_a_pixel_has_its_point(points: Any) -> None:
+    """A (0, 4, 2)-net: one point in each of 16 boxes of every shape; so the mean of a step is exact to a box."""
+    pairs, single = points
+    for wide in (1, 2, 4, 8, 16):
+        boxes = np.floor(pairs * [wide, SAMPLES // wide]).astype(int)
+        number = np.sort(boxes[..., 0] * (SAMPLES // wide) + boxes[..., 1], axis=-1)
+        assert np.all(number == np.arange(SAMPLES))
+    assert np.all(np.sort(np.floor(SAMPLES * single), axis=-1) == np.arange(SAMPLES))
+
+
+def test_pixels_and_dimensions_have_points_of_their_own(points: Any) -> None:
+    """Means over pixels and correlations between dimensions are those of independent draws, to five deviations."""
+    pairs, _ = points
+    flat = pairs.reshape(-1, SAMPLES, 2)
+    assert len(np.unique(flat[:, 0], axis=0)) == len(flat)
+    first = pairs[:, :, 0]  # of the first sample of each pixel: nothing spreads these
+    assert np.all(np.abs(first.mean(axis=0) - 0.5) < 5.0 / np.sqrt(12 * 50))
+    columns = first.reshape(50, -1)
+    off = np.corrcoef(columns, rowvar=False) - np.eye(columns.shape[1])
+    assert np.max(np.abs(off)) < 5.0 / np.sqrt(50)
+
+
+def test_numbers_depend_on_pixel_and_sample_alone() -> None:
+    """Of some lanes in another order, as of a row that is rendered by itself."""
+    start_backend()
+    import mitsuba as mi
+
+    found = []
+    for pixel, sample in (([5, 9, 5], [0, 3, 7]), ([9, 5], [3, 7])):
+        sampler = lane_sampler()
+        sampler.seed_lanes(mi.UInt32(1), mi.UInt32(pixel), mi.UInt32(sample))
+        sampler.next_2d(), sampler.next_1d()
+        found.append(np.array(sampler.next_2d()).T)
+    np.testing.assert_array_equal(found[0][1:], found[1])
+
+
+# Textures of other sizes each time, as scenes have: Dr.Jit's cache serves arrays of the same size only.
+CHILD = """
+import json, sys
+import numpy as np
+from rsbench.core.camera import PinholeCamera
+from rsbench.renderers.backend import start_backend
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import LinePoses, render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+
+def resident():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096 / 2**20
+
+def scene(size):
+    meshes = [
+        SceneMesh(
+            name="wall",
+            vertices=np.array([[-9, -9, z], [9, -9, z], [9, 9, z], [-9, 9, z]], dtype=float),
+            faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
+            material=Material(name="paper", texture=np.full((size, size, 3), 100 + z, dtype=np.uint8)),
+            uv=np.array([[0, 1], [1, 1], [1, 0], [0, 0]], dtype=float),
+        )
+        for z in (4, 5, 6)
+    ]
+    return Scene(name="walls", meshes=tuple(meshes), light=Light(sun_direction=(0, -1, -1), up=(0, -1, 0)))
+
+start_backend("llvm")
+camera = PinholeCamera.centred(64, 48, 50.0)
+poses = np.tile(np.eye(3), (48, 1, 1)), np.zeros((48, 3))
+found = []
+for size in (1600, 1500, 1550, 1450, 1525, 1575):
+    empty = resident()
+    held, full = MitsubaScene(scene(size)), {}
+    for integrator in ("sunsky", "path"):
+        render(held, camera, LinePoses(*poses), RendererOptions(samples=4, integrator=integrator))
+        full[integrator] = resident()
+    del held
+    found.append({"texels": 3 * size**2, "empty": empty, **full, "after": resident()})
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the memory of a process from /proc")
+def test_scenes_are_given_back_and_hold_no_texture_twice() -> None:
+    # The C library keeps freed blocks of some MB for itself unless told to map each one anew.
+    environ = {**os.environ, "MALLOC_MMAP_THRESHOLD_": "1000000"}
+    command = [sys.executable, "-c", CHILD]
+    done = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=300, check=False)
+    if "found no usable libLLVM" in done.stderr:
+        pytest.skip("no usable LLVM on this machine")
+    assert done.returncode == 0, done.stderr
+    first, *later = json.loads(done.stdout.splitlines()[-1])
+    # For `sunsky` four bytes a texel, for `path` four float32 channels beside them. A quarter of that is four
+    # times what images, meshes and ray tracing take here, and a third of the second copy (three channels) that
+    # Mitsuba keeps of a texture whose tensor was looked at. Such a copy would be in every scene; in one, on a busy
+    # machine, what is about to be freed may still be there.
+    for integrator, size in (("sunsky", 4), ("path", 4 + 16)):
+        taken = [scene[integrator] - scene["empty"] - scene["texels"] * size / 2**20 for scene in later]
+        shares = [each / (scene["texels"] * 16 / 2**20) for each, scene in zip(taken, later, strict=True)]
+        assert statistics.median(shares) < 0.25, (integrator, shares)
+    # The first scene brings what stays, compiled kernels above all. Scenes that stayed would be 100 MB each, 300
+    # by the fourth; a moment's memory of the run time has been seen to add 20 to one of them on a busy machine.
+    assert min(scene["after"] for scene in later[2:]) - first["after"] < 30, found(first, later)
+
+
+def found(first: dict[str, float], later: list[dict[str, float]]) -> list[float]:
+    return [round(scene["after"] - first["after"], 1) for scene in later]

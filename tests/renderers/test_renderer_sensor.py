@@ -1,18 +1,30 @@
-"""The sensor plugin with Mitsuba's own render loop, and what compiles when."""
+"""Rays of the sensor, through a lens, within an exposure; options."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from rsbench.core.camera import PinholeCamera
+from rsbench.components.cards import list_cards, load_card, parse_card
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.projection import row_poses as line_poses
+from rsbench.core.rig import StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import Integrator, RendererOptions
+from rsbench.renderers.pixel_samples import instant_count, instant_of, instant_times
 from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import make_sensor, pose_table
+from rsbench.scenes.model import Light, Material, Scene
 
 CAMERA = PinholeCamera(width=32, height=24, fx=26.0, fy=27.0, cx=14.0, cy=12.5)
 
@@ -111,3 +123,234 @@ def test_pose_table_holds_the_inverse_pose(row_poses: Any) -> None:
     np.testing.assert_allclose(table[:, :9].reshape(-1, 3, 3) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-6)
     centre = table[:, 9:]
     np.testing.assert_allclose(np.einsum("hij,hj->hi", R, centre) + t, 0.0, atol=1e-6)
+
+
+BARREL = Lens(model="brown-conrady", k1=-0.28, k2=0.07, p1=0.002, p2=-0.001, k3=0.004)
+FISHEYE = Lens(model="kannala-brandt", k1=-0.04, k2=0.012, k3=-0.003, k4=0.0005)
+LENS_CAMERA = PinholeCamera.centred(30, 24, 20.0)
+
+
+@pytest.mark.parametrize("shrunk", [1, 16])
+@pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["barrel", "fisheye"])
+def test_rays_at_every_sample_are_the_host_s(lens: Lens, shrunk: int) -> None:
+    """In a small camera a sample is far from its pixel's centre: many steps are needed."""
+    start_backend()
+    import drjit as dr
+    import mitsuba as mi
+
+    width, height, cx, cy = 640 // shrunk, 480 // shrunk, 322.0 / shrunk, 236.5 / shrunk
+    camera = PinholeCamera(width=width, height=height, fx=400 / shrunk, fy=405 / shrunk, cx=cx, cy=cy, lens=lens)
+    still = np.broadcast_to(np.eye(3), (height, 3, 3)), np.zeros((height, 3))
+    sensor = make_sensor(camera, *still)
+    rng = np.random.default_rng(0)
+    low, high = np.array([-0.49, -0.49]), np.array([width - 0.51, height - 0.51])
+    corners = np.array([low, high, [low[0], high[1]], [high[0], low[1]], [cx, cy]])
+    pixels = np.concatenate([corners, rng.uniform(low, high, size=(300, 2))])
+    pixels = pixels.astype(np.float32)
+    if dr.is_jit_v(mi.Float):
+        x, y = mi.Float(pixels[:, 0].copy()), mi.Float(pixels[:, 1].copy())
+        rays = sensor.lens
+        found = np.stack([np.array(each) for each in rays.coordinates(x, y, rays.pixel(x, y, True))], axis=-1)
+    else:
+        found = np.array([list(sensor.row_ray(x, y, 0)[1])[:2] for x, y in pixels.tolist()])
+    expected = camera.unproject(pixels.astype(np.float64))[:, :2]
+    # What is rounded to single precision is the answer alone: half a unit in the last place. Before that a ray is
+    # within 1e-8 px of its sample; 4 times that where the lens squeezes the image.
+    np.testing.assert_allclose(found, expected, rtol=6e-8, atol=4e-8 / camera.fx)
+
+
+@pytest.mark.parametrize("exposed", [False, True])
+@pytest.mark.parametrize("scan", ["top", "bottom", "left", "right"])
+def test_single_pass_is_stitched_with_a_lens_and_every_scan(town: Any, scan: Scan, exposed: bool) -> None:
+    start_backend()
+    scene = MitsubaScene(town)
+    camera = replace(LENS_CAMERA, lens=BARREL if scan in ("top", "left") else FISHEYE)
+    rig = StereoRig(camera=camera, baseline=0.2)
+    shutter = RollingShutter(height=24, width=30, readout_ratio=0.8, scan=scan)
+    motion = LinearMotion((-0.1, 0.2, 0.1), (-0.4, 0.1, 0.3))
+    poses, columns = line_poses(rig, shutter, motion, "left", 0), shutter.axis("left") == 0
+    options, rows = RendererOptions(samples=4, seed=7), [0, 1, 11, 23]
+    instants = instant_times(shutter.line_times(0, "left"), 0.2, 64)
+    blur = LinePoses(*rig.cam_from_world(motion, instants, "left")) if exposed else None
+    one = render(scene, camera, LinePoses(*poses, columns=columns), options, exposed=blur)
+    other = replace(options, method="stitched")
+    stitched = render(scene, camera, LinePoses(*poses, columns=columns), other, exposed=blur, rows=rows)
+    np.testing.assert_array_equal(one.image[rows], stitched.image)
+    np.testing.assert_array_equal(one.depth[rows], stitched.depth)
+    # The scan is seen at all: its first line is the global shutter's at that time, the last one is not.
+    first = shutter.first_line("left")
+    still = Pose(*(np.broadcast_to(part[first], part.shape) for part in poses))
+    gs = render(scene, camera, LinePoses(*still, columns=columns), options)
+    lines = one.depth.T if columns else one.depth
+    gs_lines = gs.depth.T if columns else gs.depth
+    np.testing.assert_array_equal(lines[first], gs_lines[first])
+    assert np.mean(one.depth != gs.depth) > 0.3
+
+
+def test_depth_is_that_of_the_ray_through_the_lens(quad: Any, town: Any) -> None:
+    start_backend()
+    # A wall at z = 3 + 0.5 x: along a ray (u, v, 1) it is met at z = 3 / (1 - 0.5 u).
+    wall = quad([[-60, -60, -27], [60, -60, 33], [60, 60, 33], [-60, 60, -27]])
+    camera = replace(LENS_CAMERA, lens=BARREL)
+    poses = np.broadcast_to(np.eye(3), (24, 3, 3)), np.zeros((24, 3))
+    depth = render(
+        MitsubaScene(Scene(name="wall", meshes=(wall,), light=town.light)), camera, LinePoses(*poses)
+    ).depth
+    u = camera.unproject(camera.pixel_grid())[..., 0]
+    np.testing.assert_allclose(depth, 3.0 / (1.0 - 0.5 * u), rtol=2e-6)  # single precision
+
+
+EXPOSED = PinholeCamera.centred(30, 24, 26.0)
+W, D = np.array([-0.1, 0.2, 0.1]), np.array([-0.4, 0.1, 0.3])
+
+
+def _poses(tau: Any) -> Pose:
+    """Linear motion at times (...)."""
+    tau = np.asarray(tau)
+    R = Rotation.from_rotvec((tau[..., None] * W).reshape(-1, 3)).as_matrix().reshape(*tau.shape, 3, 3)
+    return Pose(R, tau[..., None] * D)
+
+
+def _times(exposure: float, instants: int) -> tuple[Any, Any]:
+    rows = 0.8 * np.arange(EXPOSED.height) / EXPOSED.height
+    return rows, instant_times(rows, exposure, instants)
+
+
+@pytest.mark.parametrize("integrator", ["sunsky", "path"])
+def test_single_pass_is_stitched_from_exposed_frames(town: Scene, integrator: Integrator) -> None:
+    rows, instants = _times(0.5, 64)
+    scene, geometry = MitsubaScene(town), _poses(rows)
+    options = RendererOptions(integrator=integrator, samples=4, seed=7)
+    whole = render(scene, EXPOSED, LinePoses(*geometry), options, exposed=LinePoses(*_poses(instants)))
+    sharp = render(scene, EXPOSED, LinePoses(*geometry), options)
+    for full in (True, False):
+        stitched = replace(options, method="stitched", full_frames=full)
+        oracle = render(scene, EXPOSED, LinePoses(*geometry), stitched, exposed=LinePoses(*_poses(instants)))
+        np.testing.assert_array_equal(whole.image, oracle.image)
+        np.testing.assert_array_equal(whole.depth, oracle.depth)
+    np.testing.assert_array_equal(whole.depth, sharp.depth)
+    assert np.abs(whole.image - sharp.image).max() > 0.05, "nothing is blurred"
+
+
+def test_an_exposed_frame_is_the_mean_of_its_instants(town: Scene) -> None:
+    """Over many seeds, as each sample sees one of the instants of its part; 5 standard errors of the mean."""
+    rows, instants = _times(0.3, instant_count(4))
+    scene, geometry, exposed = MitsubaScene(town), _poses(rows), _poses(instants)
+    frames = np.stack(
+        [
+            render(
+                scene,
+                EXPOSED,
+                LinePoses(*geometry),
+                RendererOptions(samples=4, seed=seed),
+                exposed=LinePoses(*exposed),
+            ).image
+            for seed in range(40)
+        ]
+    )
+    # 64 instants, all sub-pixel samples at each: what the exposed frame is a random part of.
+    truth = np.mean(
+        [render(scene, EXPOSED, LinePoses(*_poses(tau)), RendererOptions(samples=4)).image for tau in instants],
+        axis=0,
+    )
+    error = frames.mean(axis=0) - truth
+    sigma = frames.std(axis=0, ddof=1) / np.sqrt(len(frames))
+    assert np.sqrt(np.mean(error**2)) < 1.2 * np.sqrt(np.mean(sigma**2))
+    assert np.mean(np.abs(error) > 5.0 * sigma + 1e-6) < 0.005
+    sharp = render(scene, EXPOSED, LinePoses(*geometry), RendererOptions(samples=4)).image
+    assert np.abs(truth - sharp).max() > 0.05, "nothing is blurred"
+
+
+def test_an_edge_is_smeared_as_far_as_it_moves(quad: Callable[..., Any]) -> None:
+    """Closed form: a camera that moves sideways sees an upright edge as a ramp of f v e / z pixels."""
+    wall = quad(
+        [[-50, -50, 4], [0, -50, 4], [0, 50, 4], [-50, 50, 4]], Material(name="dark", colour=(0.0, 0.0, 0.0))
+    )
+    light = quad(
+        [[0, -50, 4], [50, -50, 4], [50, 50, 4], [0, 50, 4]], Material(name="white", colour=(0.8, 0.8, 0.8))
+    )
+    scene = MitsubaScene(
+        Scene(name="edge", meshes=(wall, light), light=Light(sun_direction=(0, 0, -1), up=(0, -1, 0)))
+    )
+    camera, exposure, speed = PinholeCamera.centred(64, 48, 40.0), 0.4, 3.0
+    tau = instant_times(np.zeros(48), exposure, 64)
+    t = np.zeros((64, 48, 3))
+    t[..., 0] = -speed * tau
+    exposed = Pose(np.broadcast_to(np.eye(3), (64, 48, 3, 3)), t)
+    still = np.broadcast_to(np.eye(3), (48, 3, 3)), np.zeros((48, 3))
+    image = render(
+        scene, camera, LinePoses(*still), RendererOptions(samples=16), exposed=LinePoses(*exposed)
+    ).image[..., 0]
+    profile = image.mean(axis=0) / image[:, -1].mean()
+    ramp = camera.fx * speed * exposure / 4.0  # 12 px
+    expected = np.clip((np.arange(64) - camera.cx) / ramp + 0.5, 0.0, 1.0)
+    # A sample knows its time to a part of the exposure: 48 rows average 16 samples each, so to 0.3 / sqrt(768).
+    assert ramp == pytest.approx(12.0)
+    np.testing.assert_allclose(profile, expected, atol=0.05)
+
+
+@pytest.mark.parametrize("samples", [1, 4, 9, 16, 25, 36, 64, 100])
+def test_samples_share_the_exposure_evenly(samples: int) -> None:
+    """Each sample of a pixel has its own part, whichever pixel; over pixels every sample sees every instant."""
+    from rsbench.renderers.backend import start_backend
+
+    start_backend()
+    instants = instant_count(samples)
+    assert instants >= 64 and instants % samples == 0
+    seen = np.array(
+        [[int(_first(instant_of(3, pixel, k, samples, instants))) for k in range(samples)] for pixel in range(30)]
+    )
+    parts = np.sort(seen * samples // instants, axis=1)
+    assert np.array_equal(parts, np.broadcast_to(np.arange(samples), parts.shape))
+    assert len(np.unique(seen[:, 0])) > 10 or instants < 30
+
+
+def _first(value: Any) -> Any:
+    return np.ravel(np.array(value))[0]
+
+
+def test_instants_that_samples_cannot_share_are_refused(town: Scene) -> None:
+    rows, instants = _times(0.3, 6)
+    with pytest.raises(RsbenchError, match="6 instants: a multiple of the 4 samples is needed"):
+        render(
+            MitsubaScene(town),
+            EXPOSED,
+            LinePoses(*_poses(rows)),
+            RendererOptions(samples=4),
+            exposed=LinePoses(*_poses(instants)),
+        )
+
+
+def test_every_card_that_comes_along_is_valid() -> None:
+    cards = {name: load_card(RendererOptions, "renderers", name) for name in list_cards("renderers")}
+    assert {"default", "path", "stitched", "preview"} <= set(cards)
+    assert all(card.description for card in cards.values())
+    assert (cards["default"].method, cards["default"].integrator, cards["default"].samples) == (
+        "single-pass",
+        "sunsky",
+        16,
+    )
+    assert cards["stitched"].method == "stitched" and cards["path"].integrator == "path"
+    # Images of one dataset may come from any of them: equal brightness.
+    assert len({card.exposure for card in cards.values()}) == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("samples", 15, "perfect square"),
+        ("samples", 0, "perfect square"),
+        ("samples", 16.0, "samples"),
+        ("method", "warp", "single-pass"),
+        ("integrator", "magic", "sunsky"),
+        ("max_depth", 0, "allowed are 1 to"),
+        ("exposure", -1.0, "positive"),
+        ("seed", -1, "4294967295"),
+        ("sky_rays", 65, "0 to 64"),
+        ("sample", 4, "samples"),
+    ],
+)
+def test_bad_values_are_refused_with_what_is_allowed(field: str, value: Any, says: str) -> None:
+    with pytest.raises(RsbenchError, match=says) as refusal:
+        parse_card(RendererOptions, {field: value}, "my.toml")
+    assert "my.toml" in str(refusal.value) and "\n" not in str(refusal.value)

@@ -15,8 +15,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
 from rsbench.scenes.load import BUILDERS, load_scene, read_scene_card
 from rsbench.scenes.model import Material, Scene
-from rsbench.scenes.palette import RECIPES
-from rsbench.scenes.surfaces import Surface
+from rsbench.scenes.surfaces import RECIPES, Surface
 
 DEPTHS = {
     "castle": (4.0, (8, 27), 70.0),
@@ -177,7 +176,7 @@ def test_default_views_have_depths_a_stereo_rig_can_use(scene: Scene, name: str)
 
 
 def unpainted(names: Iterable[str], seed: int) -> dict[str, Surface]:
-    """Surfaces of the right size without pictures, which follow from the seed (test_scene_textures)."""
+    """Surfaces of the right size without pictures, which follow from the seed (test_scene_parts)."""
     sizes = {name: RECIPES[name].metres for name in names}
     return {n: Surface(Material(name=n), None if size is None else (size, size)) for n, size in sizes.items()}
 

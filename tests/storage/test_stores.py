@@ -23,7 +23,7 @@ from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.posed_scenes import Built
 from rsbench.dataset.store_destination import store_destination
-from rsbench.renderers import clearance, scene
+from rsbench.renderers import scene, visibility
 from rsbench.storage.object_store import Store, path_or_url
 from rsbench.storage.work_folder import HIDDEN
 
@@ -73,7 +73,7 @@ def quick(dataset: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = SimpleNamespace(viewpoints={"default": None}, seen_from=lambda *place: None)
     monkeypatch.setattr(generation, "build_scene", lambda name: Built(nothing, hashes[Path(name).stem]))
     monkeypatch.setattr(generation, "render_camera", render)
-    monkeypatch.setattr(clearance, "obstacle", lambda *moving: "")
+    monkeypatch.setattr(visibility, "obstacle", lambda *moving: "")
     monkeypatch.setattr(scene, "MitsubaScene", lambda scene: SimpleNamespace(glossy=False))
 
 

@@ -1,4 +1,4 @@
-"""Correctors: ours against the closed-form world of conftest, and what others' may answer."""
+"""Correctors, things that move by themselves, and simpler depths: one plane, flow."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from cv2 import GaussianBlur
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rsbench.components.cards import list_cards
 from rsbench.components.plugins import wrap
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import VIEWS, View
+from rsbench.core.projection import back_project, rs_project_near
+from rsbench.core.rig import VIEWS, StereoRig, View
+from rsbench.core.shutter import RollingShutter
 from rsbench.vision.corrector import (
     CORRECTORS,
     CorrectionProblem,
@@ -22,7 +28,8 @@ from rsbench.vision.corrector import (
     find_corrected_rows,
     load_corrector,
 )
-from rsbench.vision.correctors import FusionCorrector, PlaneCorrector, RotationCorrector
+from rsbench.vision.correctors import FusionCorrector, PlaneCorrector, RotationCorrector, plane_depth
+from rsbench.vision.flow import dense_flow, flow_depth, monocular_depth
 from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.quality import psnr
 
@@ -226,3 +233,189 @@ def test_rows_must_be_as_many_as_were_asked_for(world: Build, shapes: Any) -> No
     with pytest.raises(RsbenchError, match="must return a list of 2"):
         find_corrected_rows(wrap(CORRECTORS, Forgets(_changed())), problem, VIEWS, (0.0, 80.0))
     assert len(find_corrected_rows(wrap(CORRECTORS, Says(_changed())), problem, VIEWS, (0.0, 80.0))) == 2
+
+
+SIZE = {"size": (240, 320), "focal": 300.0, "readout_ratio": 1.0, "shortest": 0.5}
+VIEW = ("left", 1)
+ROW = 120.0
+
+
+@pytest.fixture(scope="module")
+def worlds(world: Build, shapes: Any) -> tuple[Any, Any]:
+    """A wall, and a ball that falls 19 px in a frame period as the rig sees it, but is still to the rig."""
+    plane, sphere = shapes
+    wall = world((plane((0.0, 0.1, 1.0), 7.0),), d=(0.3, 0.0, 0.05), w_deg=(0.2, 0.3, 0.0), **SIZE)
+    still = {"w_deg": (0.0, 0.0, 0.0), "seed": 1}
+    return wall, world((sphere((0.0, 0.2, 4.0), 0.9),), d=(0.0, 0.25, 0.0), **still, **SIZE)
+
+
+def _both(worlds: tuple[Any, Any], look: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Image, depth, and what shows the ball."""
+    wall, ball = worlds
+    (near, depth), (far, behind) = look(ball), look(wall)
+    hit = np.isfinite(depth)
+    return np.where(hit[..., None], near, far), np.where(hit, depth, behind), hit
+
+
+def _problem(worlds: tuple[Any, Any], u8: Any) -> CorrectionProblem:
+    seen = {view: _both(worlds, lambda each, view=view: each.rolling(*view)) for view in VIEWS}
+    depth = {view: each[1].astype(np.float32) for view, each in seen.items()}
+    return CorrectionProblem(
+        images={view: u8(each[0]) for view, each in seen.items()},
+        rig=worlds[0].rig,
+        shutter=worlds[0].shutter,
+        target_row=ROW,
+        motion=worlds[0].motion,
+        depth=depth,
+        guess={view: np.zeros_like(each) for view, each in depth.items()},
+    )
+
+
+def _rms(a: Any, b: Any, mask: Any) -> float:
+    return float(np.sqrt(np.mean((np.asarray(a, dtype=np.float64) - b)[mask] ** 2)))
+
+
+@pytest.mark.slow
+def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[Any, Any], u8: Any) -> None:
+    problem = _problem(worlds, u8)
+    tau = float(problem.shutter.time_after(ROW, 1, "left"))
+    true, _, on_ball = _both(worlds, lambda each: each.still("left", tau))
+    found = {moving: FusionCorrector(moving=moving).correct(problem, [VIEW])[VIEW] for moving in (False, True)}
+    inner = cv2.erode(on_ball.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)
+    rim = cv2.dilate(on_ball.astype(np.uint8), np.ones((31, 31), np.uint8)).astype(bool)
+    # Geometry leaves the ball where its rows saw it, up to 0.3 periods of 19 px off. Flow errs by a tenth.
+    errors = {moving: _rms(each.image, 255.0 * true, inner) for moving, each in found.items()}
+    assert errors[True] < 0.4 * errors[False]
+    assert _rms(found[True].image, 255.0 * true, rim) < 0.7 * _rms(found[False].image, 255.0 * true, rim)
+    assert np.mean(found[True].origin[inner] == Origin.HERE) > 0.98
+    np.testing.assert_array_equal(found[True].image[~rim], found[False].image[~rim])
+
+
+@pytest.mark.slow
+def test_where_everything_stands_nothing_changes(
+    worlds: tuple[Any, Any], world: Build, shapes: Any, u8: Any
+) -> None:
+    plane, sphere = shapes
+    standing = world((plane((0.0, 0.1, 1.0), 7.0), sphere((0.0, 0.2, 4.0), 0.9)), d=(0.3, 0.0, 0.05), **SIZE)
+    nothing = world((sphere((0.0, 50.0, 4.0), 0.9),), d=(0.0, 0.0, 0.0), **SIZE)
+    problem = _problem((standing, nothing), u8)
+    images = [FusionCorrector(moving=moving).correct(problem, VIEWS) for moving in (False, True)]
+    for view in VIEWS:
+        np.testing.assert_array_equal(images[0][view].image, images[1][view].image)
+
+
+def test_what_passes_before_a_plain_wall_does_not_set_it_in_motion(world: Build, shapes: Any, u8: Any) -> None:
+    """Flow runs from an edge into what has no texture, and fits there: the edge hides where geometry leads."""
+    plane, sphere = shapes
+    wall = world((plane((0.0, 0.0, 1.0), 30.0),), d=(0.4, 0.0, 0.0), **SIZE)
+    ball = world((sphere((0.0, 0.0, 4.0), 1.3),), d=(0.4, 0.0, 0.0), **SIZE)
+    seen = {view: _both((wall, ball), lambda each, view=view: each.rolling(*view)) for view in VIEWS}
+    problem = _problem((wall, ball), u8)
+    shaded = {
+        view: np.where(hit[..., None], problem.images[view], np.uint8(190)) for view, (*_, hit) in seen.items()
+    }
+    problem = replace(problem, images=shaded)
+    images = [FusionCorrector(moving=moving).correct(problem, VIEWS) for moving in (False, True)]
+    for view in VIEWS:
+        np.testing.assert_array_equal(images[0][view].image, images[1][view].image)
+
+
+def test_nothing_is_found_without_depth_or_texture(worlds: tuple[Any, Any], u8: Any) -> None:
+    problem = _problem(worlds, u8)
+    shape = problem.images[VIEW].shape
+    grey = {view: np.full(shape, 90, np.uint8) for view in VIEWS}
+    blind = {view: np.zeros(shape[:2], np.float32) for view in VIEWS}
+    for changed in (replace(problem, images=grey), replace(problem, depth=blind, guess=blind)):
+        one, other = (FusionCorrector(moving=moving).correct(changed, [VIEW])[VIEW] for moving in (False, True))
+        np.testing.assert_array_equal(one.image, other.image)
+
+
+@pytest.mark.slow
+def test_columns_have_times_too(worlds: tuple[Any, Any], u8: Any) -> None:
+    """The same frames, said to be read by columns: at the time of a column, what it shows of the ball stays."""
+    problem = _problem(worlds, u8)
+    shutter = RollingShutter(height=240, width=320, readout_ratio=1.0, scan="left")
+    by_columns = replace(problem, shutter=shutter, target_row=160.0)
+    fused = FusionCorrector().correct(by_columns, [VIEW])[VIEW]
+    *_, on_ball = _both(worlds, lambda each: each.rolling(*VIEW))
+    column = cv2.erode(on_ball.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)[:, 160]
+    assert np.count_nonzero(column) > 30
+    assert _rms(fused.image[:, 160], problem.images[VIEW][:, 160], column) < 2.0  # resampled at float32 places
+
+
+@settings(max_examples=10)
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.5, 20.0), st.integers(0, 100))
+def test_the_plane_is_found_among_other_surfaces(a: float, b: float, z: float, seed: int) -> None:
+    """A fifth of the pixels lies on something else: absolute differences leave the plane where it is."""
+    y, x = np.mgrid[:48, :64] / 48.0
+    true = z / (1.0 + a * x + b * y)
+    rng = np.random.default_rng(seed)
+    seen = np.where(rng.random(true.shape) < 0.2, 0.3 * true, true)
+    seen[rng.random(true.shape) < 0.1] = 0.0
+    found = plane_depth(seen)
+    # Float32, and weights that stop at a thousandth of the median inverse depth.
+    np.testing.assert_allclose(found, true, rtol=3e-3)
+
+
+def test_a_plane_of_nothing_is_at_infinity() -> None:
+    assert np.all(np.isinf(plane_depth(np.zeros((6, 8)))))
+
+
+def test_a_plane_seen_edge_on_ends_at_infinity() -> None:
+    y = np.linspace(-1.0, 1.0, 40)[:, None]
+    depth = np.where(y > 0.1, 1.0 / np.maximum(y, 0.1), np.inf) * np.ones((1, 30))
+    assert np.all(plane_depth(np.where(np.isfinite(depth), depth, 0.0))[:15] > 100.0)
+
+
+def test_one_camera_measures_a_plane_in_the_unit_of_its_translation(world: Build, shapes: Any) -> None:
+    scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),), w_deg=(0.0, 0.0, 0.0), d=(0.3, 0.0, 0.0))
+    camera = scene.rig.camera
+    flow = np.zeros((camera.height, camera.width, 2), dtype=np.float32)
+    flow[..., 0] = camera.fx * 0.3 / 5.0
+    for unit in (1.0, 10.0):
+        rig = StereoRig(camera=camera, baseline=scene.rig.baseline * unit)
+        motion = type(scene.motion)(scene.motion.w, scene.motion.d * unit)
+        found = monocular_depth(flow, rig, scene.shutter, motion, "left", 0)
+        np.testing.assert_allclose(found, 5.0 * unit, rtol=1e-5)
+
+
+def test_no_motion_in_the_picture_is_infinitely_far(world: Build, shapes: Any) -> None:
+    scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),), w_deg=(0.0, 0.0, 0.0), d=(0.3, 0.0, 0.0))
+    flow = np.zeros((scene.rig.camera.height, scene.rig.camera.width, 2), dtype=np.float32)
+    assert np.all(np.isinf(monocular_depth(flow, scene.rig, scene.shutter, scene.motion, "left", 0)))
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_exact_flow_gives_the_exact_depth(world: Build, shapes: Any, side: Any, frame: int) -> None:
+    """The flow of every pixel's point by the row equation; every row of either frame has its own pose."""
+    scene = world((shapes[0]((0.1, 0.2, 1.0), 5.0),), d=(0.3, -0.1, 0.05))
+    _, depth = scene.rolling(side, frame)
+    geometry = scene.rig, scene.shutter, scene.motion
+    grid = scene.rig.camera.pixel_grid()
+    points = back_project(*geometry, side, frame, grid, depth)
+    seen = rs_project_near(*geometry, side, 1 - frame, points, grid[..., 1])
+    inside = np.isfinite(seen.depth)
+    found, error = flow_depth(grid[inside], (seen.pixels - grid)[inside], *geometry, side, frame)
+    # rs_project_near stops at 1e-9 px; the parallax is some 15 px. The depth map itself is float32.
+    np.testing.assert_allclose(found, depth[inside], rtol=1e-5)
+    assert np.max(error) < 1e-4
+
+
+def test_flow_that_the_motion_forbids_has_its_error(world: Build, shapes: Any) -> None:
+    """Sideways motion moves pixels along the rows: 3 px across them are an error; the wrong way is infinite."""
+    scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),), w_deg=(0.0, 0.0, 0.0), d=(0.3, 0.0, 0.0))
+    geometry = scene.rig, scene.shutter, scene.motion
+    pixels = np.array([[40.0, 30.0], [40.0, 30.0], [40.0, 30.0]])
+    depth, error = flow_depth(pixels, np.array([[8.0, 0.0], [8.0, 3.0], [-2.0, 0.0]]), *geometry, "left", 0)
+    assert np.isfinite(depth[0]) and error[0] < 1e-9
+    assert 2.5 < error[1] < 3.5  # the rows are also read at other times
+    assert np.isinf(depth[2]) and error[2] == pytest.approx(2.0)
+
+
+def test_dense_flow_follows_a_shift() -> None:
+    rng = np.random.default_rng(0)
+    image = GaussianBlur(rng.integers(0, 255, (120, 160)).astype(np.float32), (0, 0), 2.0)
+    image = (255 * (image - image.min()) / np.ptp(image)).astype(np.uint8)
+    flow = dense_flow(image, np.roll(image, (2, 3), axis=(0, 1)))
+    np.testing.assert_allclose(np.median(flow[20:-20, 20:-20], axis=(0, 1)), [3.0, 2.0], atol=0.1)

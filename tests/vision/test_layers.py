@@ -28,9 +28,17 @@ from rsbench.vision.corrector import (
     load_corrector,
 )
 from rsbench.vision.fusion import Origin
-from rsbench.vision.layer_fit import PlaneOptions, fronto_parallel, grouped
-from rsbench.vision.layer_motion import Followed, refined
-from rsbench.vision.layers import LabelOptions, MovingCamera, label_pixels, planes_seen
+from rsbench.vision.layers import (
+    Followed,
+    LabelOptions,
+    MovingCamera,
+    PlaneOptions,
+    fronto_parallel,
+    grouped,
+    label_pixels,
+    planes_seen,
+    refined,
+)
 from rsbench.vision.quality import psnr
 
 DEPTHS = np.array([7.0, 4.5, 3.0])

@@ -16,15 +16,14 @@ from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
 from rsbench.core.shutter import Scanning
-from rsbench.vision.compiled_camera import distort, optics_of
 from rsbench.vision.correction import correct_frame, correction_flow
+from rsbench.vision.epipolar_search import depth_from_motion
+from rsbench.vision.feature_matcher import with_lens
 from rsbench.vision.fusion import Origin, SourceView, fuse
-from rsbench.vision.motion_sweep import depth_from_motion
 from rsbench.vision.quality import psnr
-from rsbench.vision.stereo_depth import seen_by_other
-from rsbench.vision.stereo_matcher import load_matcher
-from rsbench.vision.timed_depth import timed_depth
-from rsbench.vision.undistortion import sensor_disparities, with_lens
+from rsbench.vision.reprojection import distort, optics_of
+from rsbench.vision.stereo_depth import seen_by_other, timed_depth
+from rsbench.vision.stereo_matcher import load_matcher, sensor_disparities
 
 GEOMETRY_PX = 0.01
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.002, p2=-0.001)

@@ -51,9 +51,8 @@ from rsbench.storage.files import (
     write_png,
 )
 from rsbench.vision.corrector import CORRECTORS
-from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, needs_motion
-from rsbench.vision.timed_depth import timed_depth
-from rsbench.vision.undistortion import sensor_disparities
+from rsbench.vision.stereo_depth import timed_depth
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, needs_motion, sensor_disparities
 
 Step = Callable[[str], None]
 

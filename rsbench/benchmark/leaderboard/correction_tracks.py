@@ -46,13 +46,22 @@ from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.pipeline.mono_correction import find_own_motion, flow_matches, refusal
 from rsbench.storage.files import write_bytes
-from rsbench.vision.closing import finished
 from rsbench.vision.corrector import CorrectorSpec, demand_corrected, load_corrector
 from rsbench.vision.flow import dense_flow
-from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.fusion import Fused, Origin, finished
 from rsbench.vision.mono_fusion import find_flows
-from rsbench.vision.published_quality import flip, ssim_deepunroll, ssim_uniform
-from rsbench.vision.quality import GAUSSIAN, Picture, psnr_within, ssim_map, ssim_within, to_unit, window_mask
+from rsbench.vision.quality import (
+    GAUSSIAN,
+    Picture,
+    flip,
+    psnr_within,
+    ssim_deepunroll,
+    ssim_map,
+    ssim_uniform,
+    ssim_within,
+    to_unit,
+    window_mask,
+)
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 """An image (H, W, 3) and where something was drawn (H, W)."""

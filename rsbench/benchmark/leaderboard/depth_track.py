@@ -42,8 +42,7 @@ from rsbench.pipeline.frame_matches import match_frames
 from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.storage.files import write_depth
 from rsbench.vision.stereo_depth import depth_metrics
-from rsbench.vision.stereo_matcher import load_matcher, needs_motion
-from rsbench.vision.undistortion import sensor_disparities
+from rsbench.vision.stereo_matcher import load_matcher, needs_motion, sensor_disparities
 
 _LIMITS_PX = (1, 2, 3)
 _WORST_PART: Numbers = {

@@ -77,7 +77,7 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.storage.files import read_table, write_bytes
 from rsbench.storage.untrusted_files import read_bytes
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.undistortion import between_pixels
+from rsbench.vision.stereo_matcher import between_pixels
 
 CHOOSES = "rs-stereo-auto"
 """Entry of the recommended solver under the motion model that the matches prefer: what ``rsbench solve`` does."""

@@ -28,9 +28,9 @@ from rsbench.pipeline.frame_matches import find_matches
 from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
 from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
 from rsbench.solvers.engine.base import load_solver_entry
-from rsbench.vision.baseline_depths import plane_depth
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import load_corrector
+from rsbench.vision.correctors import plane_depth
 from rsbench.vision.fusion import Fused, Origin
 
 Depth = NDArray[np.float32]

@@ -28,8 +28,7 @@ from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.vision.published_quality import flip, ssim_deepunroll, ssim_uniform
-from rsbench.vision.quality import psnr, ssim_within
+from rsbench.vision.quality import flip, psnr, ssim_deepunroll, ssim_uniform, ssim_within
 
 Mask = NDArray[np.bool_]
 ROW_BANDS = 9

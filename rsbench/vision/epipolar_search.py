@@ -1,0 +1,480 @@
+"""Depth from a camera's own known motion: a search along every pixel's epipolar curve.
+
+Dense flow follows gradients and loses what moves by more than its own size: posts, signs, branches. Where the
+motion is known the flow of a pixel has one unknown, its inverse depth. Values of it, evenly apart, are tried, and
+each is compared with the other frame (census and the truncated difference of grey levels). A result counts where
+the other frame's search agrees. ``depth_from_motion`` searches single pixels that need a depth, and averages costs
+over those in a small window; ``sweep_frames`` searches both frames at a fraction of the size and aggregates costs
+semi-globally (``plane_sweep.aggregated``).
+
+Costs: Zabih, Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.components.compiled import compiled
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.motion import Motion
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import FRAMES, Side, StereoRig
+from rsbench.core.se3 import Pose
+from rsbench.core.shutter import RollingShutter
+from rsbench.vision.correction import inverse_depth
+from rsbench.vision.images import grey_u8, map_frames
+from rsbench.vision.plane_sweep import aggregated, winners
+from rsbench.vision.reprojection import (
+    Reprojection,
+    across_lines,
+    homography,
+    land,
+    line_of,
+    parallax_gain,
+    reproject,
+    reproject_pixels,
+    reprojection_of,
+)
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+_REACH = 0.2
+"""Of the image's longer side: the largest parallax that is searched."""
+_WINDOW = 5
+_PLAIN = 1, 1, 40
+"""Costs of a differing bit of 24, of a grey level, and of a place outside the other frame."""
+_LEVELS = 16
+"""Grey levels that count at most."""
+_BAND = 32
+"""Rows whose costs of all depths are kept at a time."""
+_ALIKE = 14.0
+"""Largest mean cost in the window of a depth that counts; unlike places cost about 20."""
+_AGREE_PX = 1.5
+"""Largest difference of parallax between a pixel and the place where the other frame sees it."""
+
+
+def depth_from_motion(
+    images: tuple[NDArray[Any], NDArray[Any]],
+    depths: tuple[F32, F32],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    wanted: tuple[int, ...] = (0, 1),
+) -> tuple[F32, F32]:
+    """Depth (H, W), metres, of the pixels of both frames of one camera whose depth is 0; 0 where it stays unknown.
+
+    ``images`` (H, W[, 3]) are uint8 or uint16, ``depths`` (H, W) what is known of both; inf is infinitely far. The
+    warp moves a pixel by less than its parallax between the frames, so the depth is as good as the correction
+    needs it, however small the parallax.
+
+    Args:
+        wanted: frames whose depth is needed; that of the others stays unknown.
+    """
+    found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
+    poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
+    axes = (shutter.axis(side), shutter.axis(side))
+    maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
+    gain = parallax_gain(rig.camera, *maps)
+    count = int(_REACH * max(depths[0].shape))
+    unknown = [depth == 0.0 for depth in depths]
+    if gain == 0.0 or not any(np.any(mask) for mask in unknown):
+        return found
+    greys = [grey_u8(image) for image in images]
+    censuses = [census(grey) for grey in greys]
+    rhos = [inverse_depth(depth) for depth in depths]
+    for frame in (*wanted, *({0, 1} - set(wanted))):
+        searched = unknown[frame]
+        if frame not in wanted:  # only to confirm the other one
+            searched = searched & _landed(rhos[1 - frame], unknown[1 - frame], maps[1 - frame])
+        y, x = np.nonzero(searched)
+        both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
+        rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
+    for frame in wanted:
+        _keep_agreeing(rhos[frame], rhos[1 - frame], unknown[frame], maps[frame], _AGREE_PX / gain, found[frame])
+    return found
+
+
+def _landed(rho: F32, wanted: Mask, maps: Reprojection) -> Mask:
+    """Places (H, W) of the other frame where ``wanted`` pixels are seen, and those in their windows."""
+    marks = np.zeros(rho.shape, dtype=np.uint8)
+    _mark(rho, wanted, maps, marks)
+    return np.asarray(cv2.dilate(marks, np.ones((_WINDOW, _WINDOW), np.uint8)) > 0)
+
+
+def _search(
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
+    both: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32], NDArray[np.uint32]],
+    maps: Reprojection,
+    count: int,
+    step: float,
+) -> F32:
+    """Inverse depth (n,) at which pixels (n,), in order of rows, look most alike, of multiples of ``step``; NaN:
+    none does."""
+    numbers = np.full(both[0].shape, -1, dtype=np.int64)
+    numbers[y, x] = np.arange(len(y))
+    best, costs = np.zeros(len(y), dtype=np.int64), np.zeros((len(y), 3), dtype=np.float32)
+    firsts = np.searchsorted(y, np.arange(len(numbers) + 1))
+    _find_best(y, x, numbers, firsts, *both, maps, count, step, best, costs)
+    before, least, after = costs.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bend = before - 2.0 * least + after
+        offset = np.where(np.isfinite(bend) & (bend > 0.0), 0.5 * (before - after) / bend, 0.0)
+    rho = np.maximum(best + np.clip(offset, -0.5, 0.5), 0.0) * step
+    return np.where((least <= _ALIKE) & (best < count - 1), rho, np.nan).astype(np.float32)
+
+
+def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """(H, W) of 24 bits: which of the 5 x 5 neighbours are darker than the pixel."""
+    padded = cv2.copyMakeBorder(grey, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
+    height, width = grey.shape
+    bits = np.zeros(grey.shape, dtype=np.uint32)
+    for k in range(25):
+        if k != 12:
+            bits = (bits << np.uint32(1)) | (padded[k // 5 :, k % 5 :][:height, :width] < grey)
+    return bits
+
+
+@compiled(error_model="numpy", inline="always")
+def ones(bits: np.uint32) -> np.int64:
+    """Number of bits that are 1 (Warren, "Hacker's delight", 2002)."""
+    n = np.uint64(bits)
+    n -= (n >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    n = (n & np.uint64(0x3333333333333333)) + ((n >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    n = (n + (n >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((n * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@compiled(error_model="numpy")
+def _find_best(
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    firsts: NDArray[np.int64],
+    grey: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    census: NDArray[np.uint32],
+    other_census: NDArray[np.uint32],
+    maps: Reprojection,
+    count: int,
+    step: float,
+    best: NDArray[np.int64],
+    costs: F32,
+) -> None:
+    """Number of the best inverse depth of each pixel (n,), and the mean costs in its window (n, 3) of that before
+    it, of itself, and of that after it; infinite of none.
+
+    Args:
+        numbers: (H, W) of the pixels, -1 of those that are not searched.
+        firsts: (H + 1,) number of the first pixel of each row.
+    """
+    height, width = grey.shape
+    reach, lines = _WINDOW // 2, len(maps.A)
+    most = 0
+    for top in range(0, height, _BAND):
+        low, high = firsts[max(top - reach, 0)], firsts[min(top + _BAND + reach, height)]
+        most = max(most, high - low)
+    volume = np.zeros((most, count), dtype=np.uint8)
+    total = np.zeros(count, dtype=np.uint16)
+    for top in range(0, height, _BAND):
+        low, high = firsts[max(top - reach, 0)], firsts[min(top + _BAND + reach, height)]
+        for i in range(low, high):
+            here = grey[y[i], x[i]], census[y[i], x[i]]
+            _fill_costs(
+                y[i], x[i], here[0], here[1], other, other_census, maps, step, lines, _PLAIN, volume[i - low]
+            )
+        for i in range(firsts[top], firsts[min(top + _BAND, height)]):
+            total[:] = 0
+            weight = 0
+            for v in range(max(y[i] - reach, 0), min(y[i] + reach + 1, height)):
+                for u in range(max(x[i] - reach, 0), min(x[i] + reach + 1, width)):
+                    if numbers[v, u] >= 0:
+                        weight += 1
+                        row = volume[numbers[v, u] - low]
+                        for k in range(count):
+                            total[k] += row[k]
+            best[i] = _least(total, np.float32(weight), costs[i])
+
+
+@compiled(error_model="numpy")
+def _least(total: NDArray[np.uint16], weight: np.float32, costs: F32) -> int:
+    """The first number of the least cost; fills it and those beside it."""
+    best = 0
+    for k in range(1, len(total)):
+        if total[k] < total[best]:
+            best = k
+    costs[0] = total[best - 1] / weight if best > 0 else np.inf
+    costs[1] = total[best] / weight
+    costs[2] = total[best + 1] / weight if best + 1 < len(total) else np.inf
+    return best
+
+
+@compiled(error_model="numpy")
+def _fill_costs(
+    y: int,
+    x: int,
+    level: np.uint8,
+    bits: np.uint32,
+    other: NDArray[np.uint8],
+    other_census: NDArray[np.uint32],
+    maps: Reprojection,
+    step: float,
+    far: int,
+    prices: tuple[int, int, int],
+    cost: NDArray[np.uint8],
+) -> None:
+    """Cost of each inverse depth 0, step, 2 step, ... (count,) at a pixel of grey ``level`` and census ``bits``.
+
+    Args:
+        far: places at least so many lines above the frame, or twice as many below its top, are not followed.
+        prices: of a bit that differs, of a grey level, and of a place outside the other frame.
+    """
+    height, width = other.shape
+    last = len(maps.A) - 1
+    line = min(line_of(maps.columns, x, y), last)
+    M, b = homography(x, y, line, maps)
+    for k in range(len(cost)):
+        # One step along the curve changes the line by one at most: its pose is that of the last landing.
+        u, v, _ = land(M, b, k * step, maps.lens)
+        along = across_lines(maps.there, u, v)
+        seen_by = min(max(int(along + 0.5), 0), last) if -far < along < 2 * far else line
+        if seen_by != line:
+            line = seen_by
+            M, b = homography(x, y, line, maps)
+        cost[k] = prices[2]
+        if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+            ty, tx = int(v + 0.5), int(u + 0.5)
+            unlike = min(abs(np.int64(level) - np.int64(other[ty, tx])), _LEVELS)
+            cost[k] = prices[0] * ones(bits ^ other_census[ty, tx]) + prices[1] * unlike
+
+
+@compiled(error_model="numpy")
+def _keep_agreeing(
+    rho: F32,
+    other: F32,
+    wanted: Mask,
+    maps: Reprojection,
+    tolerance: float,
+    depth: F32,
+) -> None:
+    """Write the depth of ``wanted`` pixels whose inverse depth the other frame confirms where it sees them."""
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            if not wanted[y, x] or not rho[y, x] >= 0.0:
+                continue
+            u, v, s = _seen_at(x, y, rho[y, x], maps)
+            inside = -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5
+            if inside and abs(other[int(v + 0.5), int(u + 0.5)] - rho[y, x] * s) <= tolerance:
+                depth[y, x] = 1.0 / rho[y, x] if rho[y, x] > 0.0 else np.inf
+
+
+@compiled(error_model="numpy")
+def _mark(rho: F32, wanted: Mask, maps: Reprojection, marks: NDArray[np.uint8]) -> None:
+    """Mark where the other frame sees ``wanted`` pixels."""
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            if wanted[y, x] and rho[y, x] >= 0.0:
+                u, v, _ = _seen_at(x, y, rho[y, x], maps)
+                if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+                    marks[int(v + 0.5), int(u + 0.5)] = 1
+
+
+@compiled(error_model="numpy")
+def _seen_at(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float, float]:
+    """Where the other frame sees a pixel, and its inverse depth there by that here."""
+    lines = len(maps.A)
+    line, u, v, s = line_of(maps.columns, x, y), np.nan, np.nan, np.nan
+    for _ in range(6):
+        u, v, s = reproject(x, y, rho, line, maps)
+        along = across_lines(maps.there, u, v)
+        if not -lines < along < 2 * lines:
+            break
+        line = min(max(int(along + 0.5), 0), lines - 1)
+    return u, v, s
+
+
+U8 = NDArray[np.uint8]
+_AGGREGATED = 6, 4, 90
+"""Costs of a differing bit of 24, of a grey level, of which at most ``_LEVELS`` count, 208 together, and of a
+place outside the other frame, between those of like and of unlike places."""
+_MEDIAN = 5
+_FEWEST = 4
+_COARSE, _COARSE_REACH = 4, 0.2
+"""Shrinking of the first search, at options of half the size, and its parallax, of the image's longer side."""
+_TEXTURED, _TEXTURE_LEVELS = 5, 5.0
+"""Side of a window, px, and the deviation of its grey levels; in a smooth sky anything looks alike."""
+_NEAREST, _MARGIN, _MARGIN_PX = 0.998, 1.2, 2.0
+_BYTES = 500.0
+"""Per pixel of the swept frame: the volume and its sums."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """The search along the curves."""
+
+    shrink: int = 2
+    """Part of the frames' size at which they are compared: a half, a third."""
+    step_px: float = 1.0
+    """Parallax between two planes at that size."""
+    planes: int = 128
+    """At most so many."""
+    window: int = 3
+    """Side, px, of the square over which costs are averaged."""
+    p1: int = 48
+    """What a step to the next plane costs, of 255."""
+    p2: int = 255
+    """Of larger steps."""
+    agree_px: float = 1.0
+    """Largest difference of parallax to the other frame's, at that size."""
+
+    def __post_init__(self) -> None:
+        if not (self.shrink >= 1 and self.step_px > 0.0 and self.planes >= _FEWEST and self.agree_px > 0.0):
+            raise ValueError(f"shrink, step_px, agree_px must be positive and planes at least {_FEWEST}: {self}")
+        if self.window % 2 == 0 or not 0 <= self.p1 <= self.p2 <= 4000:
+            raise ValueError(f"window must be odd and 0 <= p1 <= p2 <= 4000: {self}")
+
+
+class Swept(NamedTuple):
+    """Of one frame, at the size of the search."""
+
+    rho: F32
+    """(h, w) inverse depth in each row's own camera, in the motion's unit; at least 0."""
+    agrees: Mask
+    """(h, w) whether the other frame's search confirms it."""
+
+
+def sweep_frames(
+    greys: Sequence[U8],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    most: float,
+    options: SweepOptions,
+) -> tuple[Swept, Swept]:
+    """Inverse depth of both frames of one camera, searched from 0 to ``most``.
+
+    Args:
+        greys: (H, W) of frames 0 and 1.
+        rig: its body is where that camera is; without a lens.
+        shutter: reads rows.
+        motion: of the body.
+        side: which camera.
+        most: largest inverse depth.
+        options: see there.
+    """
+    height, width = search_size(greys[0].shape, options)
+    camera = _resized(rig.camera, width, height)
+    small = [np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)) for grey in greys]
+    poses = [_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
+    maps = [reprojection_of(camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
+    gain = parallax_gain(camera, *maps)
+    count = min(max(math.ceil(gain * most / options.step_px) + 1, _FEWEST), options.planes)
+    step = most / (count - 1)
+    codes = [census(grey) for grey in small]
+
+    def search(frame: int) -> F32:
+        volume = np.zeros((height, width, count), dtype=np.uint8)
+        other = 1 - frame
+        _fill_volume(small[frame], small[other], codes[frame], codes[other], maps[frame], step, volume)
+        volume = np.asarray(cv2.blur(volume, (options.window, options.window))).reshape(volume.shape)
+        found = winners(aggregated(volume, options.p1, options.p2)) * np.float32(step)
+        return np.asarray(cv2.medianBlur(np.maximum(found, np.float32(0.0)), _MEDIAN))
+
+    rhos = map_frames(search, FRAMES, width * height, _BYTES)
+    least = options.agree_px / max(gain, 1e-12)
+    first, second = (Swept(rhos[i], _agrees(rhos[i], rhos[1 - i], maps[i], least)) for i in FRAMES)
+    return first, second
+
+
+def largest_seen(
+    greys: Sequence[U8],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    options: SweepOptions,
+) -> float:
+    """Largest inverse depth of textured places that both frames show, with a margin; arguments: ``sweep_frames``.
+
+    By a search at a quarter of the size, as far as things are expected to move: where flow lost a near thing, its
+    depth would not be looked for. 0 where there is none.
+    """
+    poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
+    maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
+    gain = max(parallax_gain(rig.camera, *maps), 1e-9)
+    coarse = replace(options, shrink=_COARSE * options.shrink // 2)
+    swept = sweep_frames(greys, rig, shutter, motion, side, _COARSE_REACH * max(greys[0].shape) / gain, coarse)
+    height, width = swept[0].rho.shape
+    known = []
+    for grey, each in zip(greys, swept, strict=True):
+        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        mean, square = (cv2.blur(part, (_TEXTURED, _TEXTURED)) for part in (small, small * small))
+        known.append(each.rho[each.agrees & (square - mean * mean > _TEXTURE_LEVELS**2)])
+    rho = np.concatenate(known)
+    return _MARGIN * float(np.quantile(rho, _NEAREST)) + _MARGIN_PX / gain if len(rho) else 0.0
+
+
+def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int]:
+    """Rows and columns at which frames (H, W) are compared."""
+    return max(shape[0] // options.shrink, 8), max(shape[1] // options.shrink, 8)
+
+
+def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * x,
+        fy=camera.fy * y,
+        cx=(camera.cx + 0.5) * x - 0.5,
+        cy=(camera.cy + 0.5) * y - 0.5,
+    )
+
+
+def _poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, height: int) -> Pose:
+    """``cam_from_world`` of the rows of a frame of ``height`` rows, each at the mean time of its own."""
+    scale = shutter.height / height
+    rows = (np.arange(height) + 0.5) * scale - 0.5
+    tau = shutter.pixel_time(np.stack([np.zeros_like(rows), rows], axis=-1), frame, side)
+    return rig.cam_from_world(motion, tau, side)
+
+
+def _agrees(rho: F32, other: F32, maps: Reprojection, tolerance: float) -> Mask:
+    """(h, w) whether the other frame's inverse depth is the same within ``tolerance`` where it sees the point."""
+    height, width = rho.shape
+    places, factors = reproject_pixels(maps, rho, np.indices(rho.shape, dtype=np.int32)[0])
+    seen = np.isfinite(places[..., 0])
+    nearest = np.rint(np.where(seen[..., None], places, 0.0)).astype(np.intp)
+    x, y = np.moveaxis(np.clip(nearest, 0, (width - 1, height - 1)), -1, 0)
+    return np.asarray(seen & (np.abs(other[y, x] - rho * factors) < tolerance))
+
+
+@compiled(error_model="numpy")
+def _fill_volume(
+    grey: U8,
+    other: U8,
+    code: NDArray[np.uint32],
+    other_code: NDArray[np.uint32],
+    maps: Reprojection,
+    step: float,
+    volume: U8,
+) -> None:
+    """Costs (h, w, n) of the inverse depths 0, step, 2 step, ... of every pixel."""
+    last = len(maps.A) - 1
+    for y in range(len(grey)):
+        for x in range(grey.shape[1]):
+            _fill_costs(
+                y, x, grey[y, x], code[y, x], other, other_code, maps, step, last, _AGGREGATED, volume[y, x]
+            )
