@@ -270,7 +270,7 @@ def test_files_outside_the_models_folder_are_not_read(tmp_path: Path) -> None:
 def test_a_texture_is_measured_before_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     textured_quad().export(tmp_path / "quad.glb")
     monkeypatch.setattr("rsbench.scenes.mesh.TEXTURE", 3)
-    assert "texture: 2 x 2 pixels: 4 is more than 3" in refusal(tmp_path, 'file = "quad.glb"')
+    assert "2 x 2 pixels: 4 is more than 3" in refusal(tmp_path, 'file = "quad.glb"')
     monkeypatch.setattr("rsbench.scenes.mesh.TEXTURE", 4)
     monkeypatch.setattr("rsbench.scenes.mesh._TEXTURES", 2)
     assert "pixels of all textures: 4 is more than 2" in refusal(tmp_path, 'file = "quad.glb"')
