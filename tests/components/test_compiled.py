@@ -142,7 +142,7 @@ def test_every_source_with_compiled_code_decides_the_version() -> None:
         if "import compiled\n" in path.read_text()
     }
     assert users <= marked
-    assert {"solvers/engine/residuals.py", "vision/resample.py"} <= users
+    assert {"solvers/engine/residuals.py", "vision/images.py"} <= users
     assert not any("njit" in (package / name).read_text() for name in marked - {"components/compiled.py"})
 
 
