@@ -1,4 +1,4 @@
-"""Options of commands whose work can be done by many machines, or whose results can go to a store."""
+"""Options of commands that can use many machines, or write results to an object store."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Scheduler = Annotated[
 
 
 def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1) -> Workers:
-    """Processes here, or a cluster.
+    """Processes on this machine, or a cluster.
 
     Raises:
-        RsbenchError: both are given, distributed is not installed, or there is no such scheduler file.
+        RsbenchError: both are given, distributed is not installed, or the scheduler file is missing.
     """
     if scheduler is None:
         return workers or default
@@ -36,13 +36,13 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
 
     if workers is not None:
         raise RsbenchError(
-            f"--workers {workers}: the cluster of --scheduler {scheduler} has its own; give one of both"
+            f"--workers {workers}: the cluster of --scheduler {scheduler} has its own; give one of the two"
         )
     if find_spec("distributed") is None:  # before scenes are built
         raise RsbenchError("--scheduler needs distributed: pip install 'rsbench[cluster]'")
     if not scheduler.endswith(".json"):
         return Cluster(address=scheduler)
-    if not Path(scheduler).is_file():  # for which distributed would wait without end
+    if not Path(scheduler).is_file():  # distributed would wait for it without end
         raise RsbenchError(
             f"--scheduler {scheduler}: no such file; make it with: dask scheduler --scheduler-file {scheduler}"
         )
@@ -53,7 +53,7 @@ _Place = TypeVar("_Place", Path, Path | str)
 
 
 def shared_path(path: _Place, scheduler: str | None) -> _Place:
-    """A path as the machines of a cluster, which work in other folders, must be told it; a URL is what it was."""
+    """An absolute path for the machines of a cluster, whose working folders differ; a URL stays unchanged."""
     if scheduler is None or isinstance(path, str):
         return path
     from rsbench.storage.work_folder import refuse_url
@@ -64,10 +64,10 @@ def shared_path(path: _Place, scheduler: str | None) -> _Place:
 
 @contextmanager
 def results_at(out: str, scheduler: str | None) -> Iterator[Path]:
-    """The folder into which a command writes what is for ``out``: that folder, or one whose files go to that URL.
+    """The folder into which a command writes: ``out``, or one whose files are copied to the URL ``out``.
 
     Raises:
-        RsbenchError: a URL that cannot be taken, or one with a cluster; see ``mirrored``.
+        RsbenchError: a URL that is not supported, or a URL with a cluster; see ``mirrored``.
     """
     from rsbench.core.errors import RsbenchError
     from rsbench.storage.object_store import path_or_url, shown

@@ -1,17 +1,14 @@
-"""The first use of an installation: a second process compiles what ``correct`` needs, beginning elsewhere.
+"""The first use of an installation: a second process compiles what ``correct`` needs, in another order.
 
-The command compiles in the order in which it comes to its functions. Half of their time is the motion's, and the
-spline is the last of it, so the process begins there, goes on to depth and correction, and takes the rest when
-both are through with their halves. What one of them compiled the other loads from the cache on disk
-(``rsbench.components.compiled``).
+The command compiles functions in the order of their first calls. Half of the time is spent on the motion, whose
+spline comes last, so the second process begins with the spline, continues with depth and correction, and ends with
+the rest. Each loads from the cache on disk what the other has compiled (``rsbench.components.compiled``).
 """
 
 from __future__ import annotations
 
 import gc
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -20,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import cache_folder
-from rsbench.components.imports import end_with, lifeline
+from rsbench.components.imports import end_with, lifeline, start_child
 from rsbench.core.rig import VIEWS, View
 
 _WIDTH, _HEIGHT, _DISPARITY = 160, 120, 5
@@ -30,36 +27,29 @@ _COMMAND = "import sys; from rsbench.cli.compile_ahead import compile_all; compi
 
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
-    """While the body runs, and where nothing is compiled yet and there is a second core, compile beside it."""
+    """Compile in a second process while the body runs, if nothing is compiled yet and there are two cores."""
     folder = cache_folder()
     if folder is None or any(folder.glob("*.nbi")) or (os.cpu_count() or 1) < 2:
         yield
         return
     with lifeline() as line:
-        with suppress(OSError):  # no process to be had: the command compiles alone
-            subprocess.Popen(
-                [sys.executable, "-c", _COMMAND, str(line)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,  # its own process group, which ends with this process
-                pass_fds=(line,) if _POSIX else (),
-            )
+        with suppress(OSError):  # no second process: the command compiles alone
+            start_child(_COMMAND, line=line)
         yield
 
 
 def compile_all(line: int) -> None:
-    """Run the parts of the chain on small images; end with the parent."""
+    """Run the parts of the chain on small images; ends with the parent."""
     if _POSIX:
         end_with(line)
-    gc.disable()  # compiling makes much that lasts, and looking for garbage among it takes a twentieth
+    gc.disable()  # compiling makes many lasting objects; collecting garbage would take a twentieth of the time
     for part in parts():
-        with suppress(Exception):  # whatever it is, the command meets it too, and says so
+        with suppress(Exception):  # the command meets the same error and reports it
             part()
 
 
 def parts() -> list[Callable[[], object]]:
-    """What compiles the spline, depth, correction, motion and matching, in this order."""
+    """Calls that compile the spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
     from rsbench.capture.two_frame_spline import shaken_motion
     from rsbench.components.motion_models import LinearMotion

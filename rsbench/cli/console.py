@@ -1,6 +1,7 @@
-"""What the commands share: progress bars on stderr, tables on stdout, and silence where it is asked for.
+"""Output of all commands: progress bars on stderr, tables on stdout, and ``--quiet``.
 
-Texts are printed as they are: what looks like rich's markup in them, ``[view]`` say, is no markup."""
+Texts are printed literally: brackets such as ``[view]`` are not taken for rich's markup.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import pandas as pd
-    from rich.table import Table
+    from rich.progress import Progress, ProgressColumn
 
 _GAP = 2
 """Cells between columns."""
@@ -23,57 +24,53 @@ _quiet = False
 
 
 def be_quiet(quiet: bool) -> None:
-    """``--quiet``: no progress, no tables, no notes; results, their paths and errors stay."""
+    """``--quiet``: no progress, tables or notes; results, their paths and errors stay."""
     global _quiet
     _quiet = quiet
 
 
 def is_quiet() -> bool:
-    """Whether ``--quiet`` was given, for a command whose table is its result."""
+    """Whether ``--quiet`` was given, for a command whose result is a table."""
     return _quiet
 
 
 def echo(text: str | None, err: bool = False, nl: bool = True) -> None:
-    """Results on stdout, or faults and notes on stderr; control characters of what others wrote are escaped."""
+    """Print results on stdout, or errors and notes on stderr; control characters are escaped."""
     import typer
 
     typer.echo(printable(text or ""), err=err, nl=nl)
 
 
 def say(note: str) -> None:
-    """A line on stdout that is no result."""
+    """Print a note on stdout, unless ``--quiet``."""
     if not _quiet:
         echo(note)
 
 
+def _progress(
+    before: tuple[ProgressColumn, ...] = (), after: tuple[ProgressColumn, ...] = (), **options: Any
+) -> Progress:
+    """A count of steps, with columns before and after it; no markup, since names of files may have brackets."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    label, word = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[word]}"))
+    columns = (label, *before, MofNCompleteColumn(), TimeElapsedColumn(), *after, word)
+    return Progress(*columns, console=Console(stderr=True), **options)
+
+
 @contextmanager
 def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A bar with time left, on stderr; the yielded function advances it by one step and shows a word."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    """A progress bar on stderr; the yielded function advances it by one step and shows a word."""
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn("{task.description}", markup=False),  # names of files and sequences may have brackets
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[word]}", markup=False),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=_quiet) as progress:
+    left = (TextColumn("left"), TimeRemainingColumn())
+    with _progress((BarColumn(),), left, disable=_quiet) as progress:
         task = progress.add_task(label, total=total, word="")
 
         def advance(word: str) -> None:
             word = printable(word)
-            done = progress.tasks[0].completed + 1  # may become more than was expected
+            done = progress.tasks[0].completed + 1  # may exceed the expected total
             progress.update(task, completed=done, total=max(total, done), word=word)
 
         yield advance
@@ -81,22 +78,11 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def late_progress(label: str) -> Iterator[Callable[[str], None]]:
-    """A count of steps on a terminal's stderr, for work of more than two seconds; stdout stays free."""
+    """A counter of steps on stderr of a terminal, for work of more than two seconds; stdout is not used."""
     import time
 
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[word]}", markup=False),
-    )
-    # Redirected, what a command prints would go where the bar is.
-    progress = Progress(
-        *columns, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False
-    )
+    # Without redirection, since a command's output would go to stderr with the bar.
+    progress = _progress(transient=True, redirect_stdout=False, redirect_stderr=False)
     task = progress.add_task(label, total=None, word="")
     start = time.monotonic()
 
@@ -126,13 +112,15 @@ def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None =
 def print_rows(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], right: Iterable[str] = ()
 ) -> None:
-    """A table on stdout; the columns in ``right`` are aligned there.
+    """A table on stdout; the columns in ``right`` are aligned to the right.
 
-    One that is wider than the terminal goes on below itself, with the columns that tell its rows apart: no word or
-    number is broken. Redirected, it takes the room that it needs, unless COLUMNS says otherwise.
+    A table that is wider than the terminal is continued below, its key columns repeated, so that no word or number
+    is broken. Redirected output is as wide as needed, unless COLUMNS is set.
     """
+    from rich import box
     from rich.cells import cell_len
     from rich.console import Console
+    from rich.table import Table
     from rich.text import Text
 
     if _quiet:
@@ -144,7 +132,12 @@ def print_rows(
     if not (console.is_terminal or "COLUMNS" in os.environ):
         console.width = max(80, sum(lines) + _GAP * len(lines) + 1)
     for number, block in enumerate(_blocks(words, _keys(texts), console.width)):
-        table = _empty_table(title if number == 0 else "")
+        table = Table(
+            title=Text(title, "table.title") if title and number == 0 else None,
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+        )
         widths = _shared(
             [words[k] for k in block], [lines[k] for k in block], console.width - _GAP * len(block) - 1
         )
@@ -157,13 +150,13 @@ def print_rows(
 
 
 def _keys(rows: Sequence[Sequence[str]]) -> int:
-    """How many of the first columns tell all rows apart; 1 when none do."""
+    """The number of first columns that identify every row; 1 if none do."""
     counts = range(1, len(rows[0]) if rows else 1)
     return next((count for count in counts if len({tuple(row[:count]) for row in rows}) == len(rows)), 1)
 
 
 def _blocks(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
-    """Columns of the tables into which one is cut, each with the keys; one of all where a word has no room."""
+    """Columns of the parts of a table, each with the key columns; one part where a word would not fit."""
     room -= sum(widths[:keys]) + _GAP * keys + 1
     blocks: list[list[int]] = [[]]
     for k in range(keys, len(widths)):
@@ -176,29 +169,16 @@ def _blocks(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
 
 
 def _shared(least: Sequence[int], most: Sequence[int], room: int) -> Sequence[int | None]:
-    """Widths of columns, which share what their longest words leave; None where these have no room."""
+    """Widths of columns, which share the room beyond their longest words; None where these do not fit."""
     spare = room - sum(least)
     if spare < 0:
         return [None] * len(least)
     wanted = [high - low for low, high in zip(least, most, strict=True)]
-    # What wants little has it before sentences, which can go on in another line.
+    # Short cells come before sentences, which can be wrapped.
     level = max(
         range(max(wanted, default=0) + 1), key=lambda k: (sum(min(each, k) for each in wanted) <= spare) * k
     )
     return [low + min(each, level) for low, each in zip(least, wanted, strict=True)]
-
-
-def _empty_table(title: str) -> Table:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    return Table(
-        title=Text(title, "table.title") if title else None,
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )
 
 
 def _cell(value: Any, digits: int | None) -> str:

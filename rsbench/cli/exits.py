@@ -47,11 +47,11 @@ _SHOW_CURSOR = "\x1b[?25h"
 
 
 class Stopped(BaseException):
-    """The process was asked to end; no ``KeyboardInterrupt``, which typer answers in words of its own."""
+    """A signal to end arrived; not ``KeyboardInterrupt``, for which typer prints its own message."""
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> NoReturn:
-    """A handler for the time in which nothing has begun that must be closed."""
+    """Signal handler while nothing has to be closed yet."""
     with contextlib.suppress(OSError):
         os.write(2, f"{_ending()}\n".encode())
     os._exit(128 + number)
@@ -59,16 +59,16 @@ def end_at_once(number: int, frame: FrameType | None = None) -> NoReturn:
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """The whole of a command, in the main thread."""
+    """Context of a whole command, in the main thread."""
     before = {number: signal.getsignal(number) for number in _SIGNALS}
-    # Ignored from the start, as of a background process of a shell without job control, it stays so.
+    # A signal that is ignored from the start, as in the background of a shell without job control, stays ignored.
     ours = [number for number, handler in before.items() if handler != signal.SIG_IGN]
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         received.append(number)
         for each in _SIGNALS:
-            signal.signal(each, signal.SIG_IGN)  # a second one must not disturb the closing
+            signal.signal(each, signal.SIG_IGN)  # a second signal must not disturb the closing
         raise Stopped
 
     with _watched():
@@ -77,7 +77,7 @@ def stoppable() -> Iterator[None]:
                 signal.signal(number, stop)
             yield
         except BaseException:
-            # What a signal interrupts may turn it into an error of its own, as the import of a module does.
+            # Interrupted code may raise another error instead, as the import of a module does.
             if not received:
                 raise
             _print_ending()
@@ -89,7 +89,7 @@ def stoppable() -> Iterator[None]:
 
 @contextmanager
 def _watched() -> Iterator[None]:
-    """With a thread that ends the process when the main thread does not heed a signal."""
+    """Run a thread that ends the process when the main thread does not react to a signal."""
     if os.name != "posix":
         yield
         return
@@ -98,7 +98,7 @@ def _watched() -> Iterator[None]:
     done = threading.Event()
     threading.Thread(target=_watch, args=(reader, done), daemon=True).start()
     wakeup = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    # ``Stopped`` raised where Python can pass nothing on, as in a destructor, is left to the thread.
+    # Where ``Stopped`` cannot be passed on, as in a destructor, the thread ends the process.
     sys.unraisablehook = lambda problem: None if problem.exc_type is Stopped else hook(problem)
     try:
         yield
@@ -110,18 +110,18 @@ def _watched() -> Iterator[None]:
 
 
 def _watch(reader: int, done: threading.Event) -> None:
-    """End the process where the main thread does not."""
+    """End the process if the main thread has not after ``_PATIENCE_S``."""
     with open(reader, "rb", buffering=0) as stream:
         while byte := stream.read(1):
             if byte[0] in _SIGNALS and not done.wait(_PATIENCE_S):
                 speaker = threading.Thread(target=_print_ending, daemon=True)
                 speaker.start()
-                speaker.join(_SPEECH_S)  # whoever should read it may have stopped reading
+                speaker.join(_SPEECH_S)  # the reader of stderr may block
                 os._exit(128 + byte[0])
 
 
 def _print_ending() -> None:
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody may be left to read it
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr may be closed
         cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
         sys.stderr.write(f"{cursor}{_ending()}\n")
         sys.stderr.flush()
@@ -138,7 +138,7 @@ _KEPT = 20
 
 
 def describe(error: Exception) -> str:
-    """One line about an error that is not the user's, with the log that tells more."""
+    """One line about an unexpected error, with the path of its log."""
     words = " ".join(traceback.format_exception_only(error)[-1].split())
     log = _write_log("".join(traceback.format_exception(error)))
     where = f"what led to it: {log}" if log is not None else "no log of it could be written"
@@ -147,7 +147,7 @@ def describe(error: Exception) -> str:
 
 
 def _write_log(text: str) -> Path | None:
-    """Where the user may write, never in the current folder; the oldest logs go."""
+    """Write a log to the user's cache or a temporary folder, and remove the oldest; None if neither works."""
     now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
     system = f"rsbench {__version__}, Python {platform.python_version()}, {platform.platform()}"
     content = f"{now}\n{system}\n{sys.argv}\n\n{text}"

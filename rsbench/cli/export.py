@@ -35,7 +35,7 @@ EXPORT_EPILOG = """[bold]Examples[/bold]
 
 
 class Target(StrEnum):
-    """Formats; tests hold them equal to ``rsbench.interop.writers.exporter.FORMATS``."""
+    """Formats; a test compares them with ``rsbench.interop.writers.exporter.FORMATS``."""
 
     COLMAP = "colmap"
     TUM = "tum"
@@ -73,7 +73,7 @@ def export(
 ) -> None:
     """Write a dataset, or corrected footage, in the layout of COLMAP, evo and others.
 
-    What a format cannot hold is said or refused.
+    A note names what a format cannot represent; some sequences are refused.
     """
     from rsbench.cli.console import late_progress, say
     from rsbench.interop.writers.exporter import export_dataset
@@ -143,12 +143,12 @@ def view(
 
 
 def _has_screen() -> bool:
-    """Whether a window can open: on Linux, by the variables that name a display."""
+    """Whether a window can open: on Linux, if a display variable is set."""
     return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def _view_one(scene: Scene, save: Path | None, advance: Callable[[str], None]) -> None:
-    """To the viewer, or to a file that appears when it is whole."""
+    """Open the viewer, or write a file, which appears when it is complete."""
     from rsbench.interop.writers.rerun_scene import open_viewer, write_recording
 
     if save is None:

@@ -28,11 +28,11 @@ COMPONENTS = {
     "correctors": "rsbench.vision.corrector:CORRECTORS",
     "metrics": "rsbench.benchmark.metric_plugins:METRICS",
 }
-"""Kinds whose names may come from installed packages, and where their ``plugins.Kind`` is."""
+"""Kinds whose names may come from installed packages, and the location of their ``plugins.Kind``."""
 
 
 _GROUPS = {"builders": "rsbench.scenes"}
-"""Groups of entry points that are not called as the kind is."""
+"""Groups of entry points whose name differs from that of the kind."""
 
 
 def kind_names() -> list[str]:
@@ -43,7 +43,7 @@ def kind_names() -> list[str]:
 
 
 def component_kind(kind: str) -> Any:
-    """The ``plugins.Kind`` of a kind; None for cards that name no class."""
+    """The ``plugins.Kind`` of a kind; None for kinds whose cards name no class."""
     if kind not in COMPONENTS:
         return None
     from importlib import import_module
@@ -62,7 +62,7 @@ def names_of(kind: str) -> list[str]:
 
 
 def complete(kind: str) -> Callable[[str], list[str]]:
-    """Completion of the names of one kind for a shell, which must be quick: cards only, and entry points."""
+    """Shell completion of the names of one kind, from cards and entry points only, to be quick."""
 
     def names(incomplete: str) -> list[str]:
         return [name for name in _quick_names(kind) if name.startswith(incomplete)]
@@ -76,18 +76,18 @@ def named(kind: str, text: str) -> Any:
 
 
 def complete_kind(incomplete: str) -> list[str]:
-    """Completion of a kind."""
+    """Shell completion of a kind."""
     return [name for name in kind_names() if name.startswith(incomplete)]
 
 
 def complete_any(incomplete: str) -> list[str]:
-    """Completion of a name of any kind."""
+    """Shell completion of a name of any kind."""
     names = {name for kind in kind_names() for name in _quick_names(kind)}
     return sorted(name for name in names if name.startswith(incomplete))
 
 
 def _quick_names(kind: str) -> list[str]:
-    """Names without importing what they stand for; those of classes without a card are left out."""
+    """Names of one kind without imports; classes of rsbench without a card are left out."""
     from importlib import metadata
 
     from rsbench.components.cards import CardKind, list_cards
@@ -97,7 +97,7 @@ def _quick_names(kind: str) -> list[str]:
         try:
             group = _GROUPS.get(kind, f"rsbench.{kind}")
             names |= {point.name for point in metadata.entry_points(group=group)}
-        except Exception:  # a package whose files about itself cannot be read; ``rsbench list`` says more
+        except Exception:  # metadata of a package that cannot be read: ``rsbench list`` reports it
             return sorted(names)
     return sorted(names)
 
@@ -127,7 +127,7 @@ def list_(
     kinds = kind_names()
     if kind is not None and kind not in kinds:
         raise RsbenchError(f"kind {kind!r} does not exist{choices(kind, kinds)}")
-    rows = _names_by_kind(kinds) if kind is None else entries(kind)
+    rows = entries(kind) if kind else [{"kind": each, "names": names_of(each)} for each in kinds]
     if json:
         echo(json_module.dumps(rows))
         return
@@ -143,15 +143,10 @@ def list_(
         say(f"cards: {folder}; copy one, edit it, and pass its path (ending in .toml) instead of a name")
 
 
-def _names_by_kind(kinds: list[str]) -> list[dict[str, Any]]:
-
-    return [{"kind": kind, "names": names_of(kind)} for kind in kinds]
-
-
 def entries(kind: str) -> list[dict[str, Any]]:
-    """Name, origin, description, card and fault of everything of one kind.
+    """Name, origin, description, card and error of all names of one kind.
 
-    What an installed package offers is loaded, to tell whether it can be; its faults are its own.
+    Components of installed packages are loaded to see whether they work; an error concerns only that entry.
     """
     from rsbench.components import plugins
     from rsbench.components.cards import list_cards
@@ -248,7 +243,7 @@ def _text(value: object) -> str:
 
 
 def _kinds_of(name: str, kind: str | None) -> list[str]:
-    """Kinds in which to look a name up."""
+    """The kinds that have this name."""
     from rsbench.components.cards import choices, current_name
     from rsbench.core.errors import RsbenchError
 
@@ -258,7 +253,7 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
             raise RsbenchError(f"--kind {kind!r} does not exist{choices(kind, kinds)}")
         return [kind]
     if name.endswith(".toml"):
-        raise RsbenchError(f"{name}: say of which kind it is: --kind {'|'.join(kinds)}")
+        raise RsbenchError(f"{name}: give its kind: --kind {'|'.join(kinds)}")
     names = {each: names_of(each) for each in kinds}
     found = [each for each in kinds if current_name(each, name) in names[each]]
     if not found:
@@ -268,7 +263,7 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
 
 
 def _about(name: str, kind: str) -> dict[str, Any]:
-    """All that can be said of one component or card."""
+    """All properties of one component or card."""
     from rsbench.components import plugins
     from rsbench.components.cards import FORMER_NAMES, card_path, read_toml
 
@@ -284,7 +279,7 @@ def _about(name: str, kind: str) -> dict[str, Any]:
         "name": entry.name,
         "formerly": sorted(former for former, now in FORMER_NAMES.get(kind, {}).items() if now == entry.name),
         "description": entry.description,
-        "origin": _origin(described, entry.name) if entry.path is None else None,
+        "origin": _offer(described, entry.name).origin if entry.path is None else None,
         "card": entry.path.as_posix() if entry.path is not None else None,
         **_about_component(entry.component),
         **{key: value for key, value in vars(entry.options).items()},
@@ -294,8 +289,7 @@ def _about(name: str, kind: str) -> dict[str, Any]:
 
 
 def _about_component(component: object) -> dict[str, Any]:
-    """Its class, and what it declares in its ``spec``."""
-
+    """Its class, and the fields of its ``spec``."""
     cls = type(component)
     about: dict[str, Any] = {"class": f"{cls.__module__}:{cls.__qualname__}"}
     spec = getattr(component, "spec", None)
@@ -305,25 +299,12 @@ def _about_component(component: object) -> dict[str, Any]:
 
 
 def _plain(value: object) -> object:
-    """Values of a spec, as JSON has them."""
+    """Values of a spec for JSON."""
     from collections.abc import Mapping, Set
 
     if isinstance(value, Mapping):
         return dict(value)
     return sorted(value) if isinstance(value, Set) else value
-
-
-def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
-    """A class that no card describes: other cards name it, and set its parameters."""
-    from rsbench.components import plugins
-
-    cls = plugins.load_class(kind, name, Path())
-    return {
-        "description": plugins.description_of(kind, _offer(kind, name)),
-        "origin": _origin(kind, name),
-        "class": f"{cls.__module__}:{cls.__qualname__}",
-        "parameters": parameters_of(cls),
-    }
 
 
 def _offer(kind: Kind[Any, Any], name: str) -> Offer:
@@ -332,8 +313,17 @@ def _offer(kind: Kind[Any, Any], name: str) -> Offer:
     return next(offer for offer in plugins.offers(kind) if offer.name == name)
 
 
-def _origin(kind: Kind[Any, Any], name: str) -> str:
-    return _offer(kind, name).origin
+def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
+    """A class without a card of its own; other cards name it and set its parameters."""
+    from rsbench.components import plugins
+
+    cls, offer = plugins.load_class(kind, name, Path()), _offer(kind, name)
+    return {
+        "description": plugins.description_of(kind, offer),
+        "origin": offer.origin,
+        "class": f"{cls.__module__}:{cls.__qualname__}",
+        "parameters": parameters_of(cls),
+    }
 
 
 def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
@@ -344,8 +334,8 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
         component: an object of it, for the values.
 
     Returns:
-        ``parameter``, ``type``, ``default``, ``value`` (as a card would write them; "" when there is none) and
-        ``meaning`` of each.
+        ``parameter``, ``type``, ``default``, ``value`` (as in a card; "" where there is none) and ``meaning`` of
+        each.
     """
     meanings = field_docstrings(cls)
     required = inspect.Parameter.empty
@@ -353,11 +343,15 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
     for name, parameter in inspect.signature(cls).parameters.items():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        default = _default_of(cls, name, parameter.default)
+        kind, default = parameter.annotation, _default_of(cls, name, parameter.default)
         rows.append(
             {
                 "parameter": name,
-                "type": "" if parameter.annotation is required else _type_name(parameter.annotation),
+                "type": kind
+                if isinstance(kind, str)
+                else ""
+                if kind is required
+                else getattr(kind, "__name__", str(kind)),
                 "value": value_in_a_card(getattr(component, name)) if hasattr(component, name) else "",
                 "default": "required" if default is required else value_in_a_card(default),
                 "meaning": meanings.get(name, ""),
@@ -367,19 +361,15 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
 
 
 def _default_of(cls: type, name: str, given: object) -> object:
-    """The default that the signature shows, or that a factory makes."""
+    """The default in the signature, or the value that a factory makes."""
     for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
         if field.name == name and field.default_factory is not dataclasses.MISSING:
             return field.default_factory()
     return given
 
 
-def _type_name(annotation: object) -> str:
-    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
-
-
 def value_in_a_card(value: object) -> Any:
-    """A value as a card would write it; None, which no card can write, is empty text."""
+    """A value as in a card; empty text for None, which a card cannot hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: value_in_a_card(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, (list, tuple)):
@@ -390,26 +380,20 @@ def value_in_a_card(value: object) -> Any:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Texts below the fields of a class and of those above it, in one line each."""
+    """Docstrings below the fields of a class and its base classes, in one line each."""
     return {name: text for parent in reversed(cls.__mro__[:-1]) for name, text in _own_docstrings(parent)}
 
 
 @functools.cache
 def _own_docstrings(cls: type) -> tuple[tuple[str, str], ...]:
-    """Names and texts of the fields of a class itself; finding its source takes up to a tenth of a second."""
+    """Names and docstrings of a class's own fields; cached, as finding the source takes up to 0.1 s."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
-    except (OSError, TypeError, SyntaxError, IndexError):  # made in a shell, or without its source
+    except (OSError, TypeError, SyntaxError, IndexError):  # defined in a shell, or without source
         return ()
     found = []
     for field, text in itertools.pairwise(tree.body) if isinstance(tree, ast.ClassDef) else ():
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and _is_text(text):
-            told = str(text.value.value)  # pyrefly: ignore[missing-attribute]
-            found.append((field.target.id, " ".join(told.split())))
+        match field, text:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
+                found.append((name, " ".join(words.split())))
     return tuple(found)
-
-
-def _is_text(node: ast.stmt) -> bool:
-    return (
-        isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-    )

@@ -1,8 +1,8 @@
 """Cards: the TOML files that users read, copy, edit and compare, parsed into frozen dataclasses.
 
-A card is named (``castle``), and looked up among the cards that come with rsbench, or is a path
-(``my/castle.toml``). Parsing is strict: unknown keys, wrong types and numbers that are not finite are refused
-in one line that names the file, the field, the value and what is allowed. The key ``shutter`` of several kinds
+A card is given by name (``castle``, one of those that come with rsbench) or by path (``my/castle.toml``). Parsing
+is strict: unknown keys, wrong types and numbers that are not finite are refused in one line that names the file,
+the field, the value and what is allowed. The key ``shutter`` of several kinds
 names a shutter card, the readout time of a real camera.
 """
 
@@ -43,10 +43,10 @@ CardKind = Literal[
 ]
 
 FORMER_NAMES: Mapping[str, Mapping[str, str]] = {"solvers": {"rs-stereo": "rs-stereo-refined"}}
-"""By kind, names that commands and files may still give, and what each is called now; no list shows them."""
+"""Former names by kind, which commands and files may still use, with the present name; no list shows them."""
 
 FORMER_UNTIL = "release 1.1"
-"""The first that does not read them: what is renamed warns for one release."""
+"""The first release that does not read former names; until then they give a warning."""
 
 Extra = Literal["forbid", "ignore"]
 _LONGEST = 100
@@ -62,12 +62,12 @@ def list_cards(kind: CardKind) -> dict[str, Path]:
 
 
 def current_name(kind: str | None, name: str) -> str:
-    """What a component or card is called now, by its name of today or a former one."""
+    """The present name of a component or card, from that or a former name."""
     return FORMER_NAMES.get(kind or "", {}).get(name, name)
 
 
 def name_of_today(kind: str | None, name: str) -> str:
-    """``current_name`` of what a user gave, who is warned of a former one, which goes with the next release."""
+    """``current_name`` of a name that a user gave; warns of a former name."""
     now = current_name(kind, name)
     if now != name:
         text = f"{kind}: {name!r} is now called {now!r}; the old name is read until {FORMER_UNTIL}"
@@ -84,9 +84,9 @@ def card_path(kind: CardKind, name_or_path: str | Path) -> Path:
     value = os.fspath(name_or_path)
     if value.endswith(".toml") or "/" in value or os.sep in value:
         path = Path(value)
-        if not os.path.isfile(path) and path == Path(kind, path.name):  # where cards of this kind were in 0.1
+        if not os.path.isfile(path) and path == Path(kind, path.name):  # the folder of this kind in 0.1
             path = list_cards(kind).get(name_of_today(kind, path.stem), path)
-        if not os.path.isfile(path):  # False, and no error, of a name that is too long
+        if not os.path.isfile(path):  # False, not an error, for a name that is too long
             raise RsbenchError(f"{kind} card {value}: no such file")
         return path
     cards, name = list_cards(kind), name_of_today(kind, value)
@@ -150,18 +150,18 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str, *, extra: Extr
 
 @functools.lru_cache(maxsize=64)
 def _adapter(cls: type, extra: Extra) -> TypeAdapter[Any]:
-    """Kept, for it takes a hundred times as long to make as to use.
+    """Cached: making one takes a hundred times as long as using it.
 
-    pydantic takes no settings for a standard dataclass itself, but hands those of a container down to it.
+    pydantic has no settings for a standard dataclass itself; those of a container apply to it.
     """
     config = ConfigDict(extra=extra, strict=True, allow_inf_nan=False)
     return TypeAdapter(tuple[cls], config=config)
 
 
 def check_values(data: Mapping[str, Any], where: str) -> None:
-    """Refuse numbers that are not finite, however deep they lie, and what lies too deep.
+    """Refuse numbers that are not finite, at any depth, and too deep nesting.
 
-    Fields typed ``Any`` would let them pass.
+    Fields typed ``Any`` would accept both.
 
     Raises:
         RsbenchError: one line with ``where`` and the dotted field.
@@ -253,7 +253,7 @@ SHUTTER_KEY = {
     "shutter": "Name of a shutter card or a path to one, in place of ``readout_ratio``: the readout time of a "
     "real camera's mode over the frame period, which is the mode's unless ``frame_period_s`` is given."
 }
-"""Of the tables in which ``with_shutter`` replaces the key."""
+"""A shorthand of tables in which ``with_shutter`` replaces the key."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,10 +267,10 @@ class ShutterCard:
     fps: float
     """Frames per second of the mode."""
     width: int
-    """Pixels of the mode's frames across; the readout time is theirs, whatever the size of the images that take
-    it."""
+    """Width of the mode's frames, px; the readout time applies to these, whatever the size of the images that
+    use this card."""
     height: int
-    """Pixels of the mode's frames down."""
+    """Height of the mode's frames, px."""
     source: str
     """Where the readout time comes from."""
 
@@ -288,9 +288,7 @@ class ShutterCard:
 
 
 def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A table of a card in which ``shutter = NAME`` is replaced by what it means.
-
-    That is ``readout_ratio`` and, unless the table has its own, ``frame_period_s``.
+    """A table of a card, ``shutter = NAME`` replaced by ``readout_ratio`` and, unless given, ``frame_period_s``.
 
     Raises:
         RsbenchError: no such shutter, a readout ratio beside it, or a frame period shorter than its readout.
@@ -319,21 +317,21 @@ def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_shutters(card: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A dataset's card in which every ``shutter`` is replaced by what it means; what is wrong stays so.
+    """A dataset's card with every ``shutter`` replaced; values of wrong types stay for the parser to refuse.
 
     Raises:
         RsbenchError: as ``with_shutter``.
     """
 
-    def meant(value: Any) -> Any:
+    def replaced(value: Any) -> Any:
         return with_shutter(value, where) if isinstance(value, dict) else value
 
     def values(axis: Any) -> Any:
-        return {key: meant(value) for key, value in axis.items()} if isinstance(axis, dict) else axis
+        return {key: replaced(value) for key, value in axis.items()} if isinstance(axis, dict) else axis
 
     made = with_shutter(card, where)
     if isinstance(sequences := made.get("sequence"), list):
-        made["sequence"] = [meant(sequence) for sequence in sequences]
+        made["sequence"] = [replaced(sequence) for sequence in sequences]
     if isinstance(grid := made.get("grid"), dict):
         made["grid"] = {name: values(axis) for name, axis in grid.items()}
     return made

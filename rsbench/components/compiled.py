@@ -1,10 +1,10 @@
-"""Compiled functions: one decorator for the whole package, and where their machine code is kept.
+"""Compiled functions: one decorator for the whole package, and the cache of their machine code.
 
-Compiling takes tens of seconds on a slow machine, so it is done once per installation and kept on disk: in
-``NUMBA_CACHE_DIR`` where the user set it, else in the user's cache folder, else in a temporary folder. There each
-version of the compiled sources has a folder of its own: Numba looks only at the file of the function that it
-loads, not at those of the functions which that one calls. Each signature of a function has a file of its own, so
-that processes which compile at the same time write the same, and none spoils what another wrote.
+Compiling takes tens of seconds on a slow machine, so its result is kept on disk: in ``NUMBA_CACHE_DIR`` where the
+user set it, else in the user's cache folder, else in a temporary folder. Each version of the compiled sources has
+its own folder there, because Numba checks only the file of the function that it loads, not the files of functions
+which that one calls. Each signature of a function has its own file, so that processes which compile at the same
+time write the same files.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from rsbench.storage.work_folder import temporary, user_cache
 F = TypeVar("F", bound=Callable[..., object])
 
 _LOGGER = logging.getLogger("rsbench")
-_WORTH_SAYING_S = 1.0
+_LONG_S = 1.0
 _KEPT_DAYS = 30
 _VERSION = re.compile(r"[0-9a-f]{16}")
-"""Names of the folders of versions."""
+"""Names of the folders of source versions."""
 _MARKS = (b"@compiled", b"MotionKernel")
-"""What files with compiled code hold; all of them decide the version."""
+"""Marks of files with compiled code; the version is the hash of all such files."""
 
 
 @overload
@@ -56,7 +56,7 @@ def _compiled(function: F, options: dict[str, Any]) -> F:
 
 
 class _Locator:
-    """Names a function in the cache; where the cache is, ``cache_folder`` alone says."""
+    """Names a function in the cache; ``cache_folder`` alone decides where the cache is."""
 
     def __init__(self, py_func: Callable[..., object], py_file: str) -> None:
         self._py_file = py_file
@@ -87,11 +87,11 @@ class _KernelCache(FunctionCache):
         return str(cache_folder() or "")
 
     def flush(self) -> None:
-        """Nothing: another version of the sources has another folder."""
+        """Nothing to do: another version of the sources has another folder."""
 
     def _file(self, sig: tuple[Any, ...], key: Any) -> IndexDataCacheFile | None:
         folder = cache_folder()
-        # The code of a foreign type is not among the sources that the folder stands for.
+        # The hash of the folder does not cover the code of a foreign type.
         if folder is None or not self._enabled or any(getattr(kind, "foreign", False) for kind in sig):
             return None
         signature = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
@@ -105,7 +105,7 @@ class _KernelCache(FunctionCache):
             try:
                 found = file.load(key)
                 found = None if found is None else self._impl.rebuild(target_context, found)
-            except Exception:  # half a file, or one of another Numba: whatever it raises, compiling mends it
+            except Exception:  # half a file, or one of another Numba: it is compiled again
                 found = None
         if found is None:
             _STOPWATCH.begin()
@@ -124,18 +124,18 @@ class _KernelCache(FunctionCache):
 
 
 class _Stopwatch:
-    """Says in one line that kernels are being compiled, when it takes so long that somebody may wonder."""
+    """Warns in one line, once, when compiling takes long."""
 
     def __init__(self) -> None:
-        self.depth, self.started, self.seconds, self.said = 0, 0.0, 0.0, False
+        self.depth, self.started, self.seconds, self.warned = 0, 0.0, 0.0, False
 
     def begin(self) -> None:
-        """A function is compiled; those that it calls are, inside."""
+        """Compiling of a function begins; functions that it calls are compiled inside."""
         now = time.perf_counter()
         if self.depth == 0:
             self.started = now
-        elif not self.said and self.seconds + now - self.started > _WORTH_SAYING_S:
-            self.said = True
+        elif not self.warned and self.seconds + now - self.started > _LONG_S:
+            self.warned = True
             _LOGGER.warning("rsbench: compiling, once per installation: up to a minute")
         self.depth += 1
 
@@ -163,7 +163,7 @@ def source_version() -> str:
 @functools.cache
 def cache_folder() -> Path | None:
     """Folder of the compiled code of these sources, made if missing; None where nothing can be written."""
-    for base in (_asked_for(), user_cache(), temporary()):
+    for base in (Path(config.CACHE_DIR) if config.CACHE_DIR else None, user_cache(), temporary()):
         if base is None:
             continue
         folder = base / "kernels" / source_version()[:16]
@@ -179,12 +179,8 @@ def cache_folder() -> Path | None:
     return None
 
 
-def _asked_for() -> Path | None:
-    return Path(config.CACHE_DIR) if config.CACHE_DIR else None
-
-
 def _remove_old(folder: Path) -> None:
-    """Code of other versions that nobody has added to for a month; nothing else, wherever the cache was put."""
+    """Remove code of other versions whose folder has not changed for a month, and nothing else."""
     oldest = time.time() - _KEPT_DAYS * 86400
     for other in folder.parent.iterdir():
         with contextlib.suppress(OSError):  # another process removed it first

@@ -40,8 +40,8 @@ _NUMERIC_FILES = ("components/compiled.py", "components/motion_kernels.py", "com
 def component_key(component: object, parameters: Mapping[str, Any]) -> str:
     """Hash of a component's class, source, parameters, and the keys of the components inside it.
 
-    A dataclass's parameters are all its fields, so that a changed default is a change; another object's are what
-    its card gave.
+    The parameters of a dataclass are all its fields, so that a changed default changes the key; those of another
+    class are the ones that its card gives.
     """
     cls = type(component)
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
@@ -56,15 +56,15 @@ def component_key(component: object, parameters: Mapping[str, Any]) -> str:
 
 
 def _text(value: object) -> str:
-    """A value that JSON does not know, without its address in memory, which differs in every run."""
+    """Text of a value that JSON cannot represent, without its address in memory, which differs in every run."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
 
 
 def source_version(cls: type) -> str:
     """Hash of the source that a class's answers come from.
 
-    All of rsbench's numerics for its own; the whole package of another's; for a single file, that file and the
-    files beside it that it imports.
+    That is all of rsbench's numerics for its own classes, the whole package for another package's, and for a
+    single file that file and the files beside it that it imports.
     """
     module = cls.__module__
     if module.partition(".")[0] == "rsbench":
@@ -83,7 +83,7 @@ def source_version(cls: type) -> str:
 
 
 def with_neighbours(file: Path) -> list[Path]:
-    """A file, and the modules and packages beside it that it imports, and those that they import, sorted."""
+    """A file and the modules and packages beside it that it imports, directly or not, sorted."""
     found: set[Path] = set()
     todo = [file]
     while todo:
@@ -131,7 +131,7 @@ def file_hash(path: Path) -> str:
 
 
 def entry_points_by_name(group: str) -> dict[str, list[metadata.EntryPoint]]:
-    """Entry points of a group; of one name more than one, where they differ. Loads nothing."""
+    """Entry points of a group; several of one name where they differ. Loads nothing."""
     found: dict[str, list[metadata.EntryPoint]] = {}
     for point in points_of(group, tuple((folder, _changed(folder)) for folder in sys.path)):
         same = found.setdefault(point.name, [])
@@ -144,16 +144,16 @@ def package_of(point: metadata.EntryPoint) -> str:
     """The package's name."""
     try:
         name = point.dist.name if point.dist is not None else None
-    except Exception:  # files about the package are missing or cannot be read
+    except Exception:  # metadata of the package are missing or cannot be read
         name = None
     return name or "a package"
 
 
 @lru_cache(maxsize=16)
 def points_of(group: str, folders: tuple[tuple[str, int], ...]) -> Sequence[metadata.EntryPoint]:
-    """Entry points of a group while ``folders``, those of ``sys.path`` and when they changed, stay the same.
+    """Entry points of a group, cached while ``folders`` (of ``sys.path``, with times of change) are equal.
 
-    A package whose files about itself cannot be read has none, and stops no other.
+    A package whose metadata cannot be read has none, and does not affect others.
     """
     try:
         return tuple(metadata.entry_points(group=group))
@@ -168,7 +168,7 @@ def points_of(group: str, folders: tuple[tuple[str, int], ...]) -> Sequence[meta
 
 
 def _changed(folder: str) -> int:
-    """When something was last put into a folder, or taken out; ns."""
+    """When a folder last changed, ns."""
     try:
         return os.stat(folder or ".").st_mtime_ns
     except OSError:
@@ -176,11 +176,11 @@ def _changed(folder: str) -> int:
 
 
 IMPORT_LIMIT = "RSBENCH_IMPORT_LIMIT_S"
-"""Variable of the environment: seconds in which another package's module must be imported."""
+"""Environment variable: seconds within which another package's module must be imported."""
 _LIMIT_S = 60.0
 _POSIX = os.name == "posix"
 _IMPORTED = 173
-"""Exit code of a process in which a module was tried, that no module is likely to choose."""
+"""Exit code of the child process after a module was imported; no module is likely to choose it."""
 _COMMAND = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from rsbench.components.imports import import_and_end; "
@@ -190,7 +190,7 @@ _expendable = False
 _beside_cards: dict[str, tuple[Path, str]] = {}
 """Modules that were imported from beside a card: file, and its hash when it was imported."""
 _threads: list[threading.Thread] = []
-"""Those that others' code started."""
+"""Threads that other packages' code started."""
 _folders: list[str] = []
 """Folders of cards on ``sys.path``, the last used first."""
 _RENAMED = {
@@ -214,7 +214,7 @@ _RENAMED = {
 
 @contextlib.contextmanager
 def blaming(where: str, what: str) -> Iterator[None]:
-    """What others' code raises becomes one line with its name; what it prints stays out of answers on stdout.
+    """Turn what other packages' code raises into one line with its name; what it prints goes to stderr.
 
     Threads that it starts do not keep the command from ending, see ``abandoned_threads``.
     """
@@ -222,7 +222,7 @@ def blaming(where: str, what: str) -> Iterator[None]:
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
-    except RecursionError:  # whoever closed the circle says so
+    except RecursionError:  # the caller reports the circle
         raise
     except (Exception, SystemExit) as error:
         text = str(error).partition("\n")[0] if isinstance(error, RsbenchError) else in_words(error)
@@ -238,7 +238,7 @@ def in_words(error: BaseException) -> str:
 
 
 def import_target(target: str, folder: Path | None, where: str) -> object:
-    """What ``package.module:Class`` names; modules in a folder are found too."""
+    """The object that ``package.module:Class`` names, from what is installed or from modules in a folder."""
     module, _, name = target.partition(":")
     module = _RENAMED.get(module, module)
     if not all(part.isidentifier() for part in [*module.split("."), name]):
@@ -251,18 +251,18 @@ def import_target(target: str, folder: Path | None, where: str) -> object:
 
 
 def abandoned_threads() -> bool:
-    """Whether threads run that others' code started, and for which Python would wait at its end."""
+    """Whether threads of other packages' code are alive for which Python would wait at exit."""
     return any(thread.is_alive() for thread in _threads)
 
 
 def try_import(module: str, version: str = "") -> None:
-    """Import another package's module in a process of its own first, so that it cannot end or stop this one.
+    """Import another package's module in a child process first, so that it cannot end or block this one.
 
-    What it raises there is left to the import here. Each version of a module is tried once, and none that is
-    rsbench's own, or imported already.
+    An exception there is ignored: the import here raises it again. Each version of a module is tried once; modules
+    of rsbench and modules that are imported already are not tried.
 
     Raises:
-        ImportError: what became of the process.
+        ImportError: the child ended or took too long.
     """
     if _expendable or module.partition(".")[0] == "rsbench" or module in sys.modules:
         return
@@ -274,14 +274,7 @@ def try_import(module: str, version: str = "") -> None:
 def _fate(module: str, version: str) -> str:
     limit_s, path = _import_limit(), json.dumps([str(entry) for entry in sys.path])
     with lifeline() as line:
-        process = subprocess.Popen(
-            [sys.executable, "-c", _COMMAND, path, module, str(limit_s), str(line)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # its own process group
-            pass_fds=(line,) if _POSIX else (),
-        )
+        process = start_child(_COMMAND, path, module, str(limit_s), line=line)
         try:
             code = process.wait(limit_s)
         except subprocess.TimeoutExpired:
@@ -295,6 +288,23 @@ def _fate(module: str, version: str) -> str:
     return "" if code == _IMPORTED else ending(code)
 
 
+def start_child(code: str, *arguments: str, line: int, **options: Any) -> subprocess.Popen[bytes]:
+    """Start Python code in a process group of its own, to which a terminal's Ctrl-C does not go.
+
+    Args:
+        code: its last argument is ``line``.
+        line: see ``lifeline``.
+        options: of ``subprocess.Popen``; standard streams lead nowhere by default.
+    """
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    return subprocess.Popen(
+        [sys.executable, "-u", "-c", code, *arguments, str(line)],
+        start_new_session=True,
+        pass_fds=(line,) if _POSIX else (),
+        **(streams | options),
+    )
+
+
 def _import_limit() -> float:
     text = os.environ.get(IMPORT_LIMIT, "")
     with contextlib.suppress(ValueError):
@@ -304,9 +314,9 @@ def _import_limit() -> float:
 
 
 def import_and_end(module: str, limit_s: float, line: int) -> NoReturn:
-    """In a process of its own: import a module, and say by the exit code that this came to an end."""
+    """In the child process: import a module and end, with the exit code ``_IMPORTED``."""
     if _POSIX:
-        signal.alarm(math.ceil(limit_s) + 1)  # should the parent be gone by then, where ``end_with`` does nothing
+        signal.alarm(math.ceil(limit_s) + 1)  # in case the parent is gone, where ``end_with`` does nothing
         end_with(line)
     with contextlib.suppress(BaseException):
         importlib.import_module(module)
@@ -315,7 +325,7 @@ def import_and_end(module: str, limit_s: float, line: int) -> NoReturn:
 
 @contextlib.contextmanager
 def lifeline() -> Iterator[int]:
-    """A descriptor for a child to inherit and to give to ``end_with``; -1 where there are none."""
+    """A descriptor for a child to inherit and to pass to ``end_with``; -1 where the system has none."""
     if not _POSIX:
         yield -1
         return
@@ -328,10 +338,10 @@ def lifeline() -> Iterator[int]:
 
 
 def end_with(line: int) -> None:
-    """In a child that leads its group: let Linux kill the group when the parent is gone.
+    """In a child that leads its process group: let Linux kill the group when the parent is gone.
 
-    Even while code that holds Python's lock loops, and whatever the parent's end was: the other end of the pipe is
-    closed then.
+    However the parent ended, its end of the pipe is closed; this works even while code that holds Python's lock
+    loops.
     """
     if sys.platform == "linux":
         import fcntl
@@ -341,12 +351,12 @@ def end_with(line: int) -> None:
             fcntl.fcntl(line, fcntl.F_SETOWN, -os.getpgrp())
             fcntl.fcntl(line, fcntl.F_SETSIG, signal.SIGKILL)
             fcntl.fcntl(line, fcntl.F_SETFL, fcntl.fcntl(line, fcntl.F_GETFL) | os.O_ASYNC)
-            if select.select([line], [], [], 0.0)[0]:  # it was gone before
+            if select.select([line], [], [], 0.0)[0]:  # the parent is gone already
                 os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
 def import_untried() -> None:
-    """From now on nothing is tried first: this process is one that others' code may end."""
+    """Import without trying in a child first: this process is one that other packages' code may end."""
     global _expendable
     _expendable = True
 
@@ -362,15 +372,15 @@ def ending(code: int) -> str:
 
 
 def search(card: Path) -> None:
-    """Find modules beside a card too, in child processes as well, whatever in it names them."""
+    """Let modules beside a card be imported, in child processes too."""
     _put_on_path(str(card.parent.resolve()))
 
 
 def _import_beside(module: str, folder: Path) -> object:
     """Import a module that is installed or lies in a folder.
 
-    The folder stays on the path, after everything that is installed, for what is imported later, in child
-    processes too. A module that changed since it was imported is imported anew.
+    The folder stays on the path, after everything that is installed, for later imports, in child processes too. A
+    module that has changed since it was imported is imported again.
     """
     _put_on_path(str(folder))
     _forget_changed(folder)
@@ -393,7 +403,7 @@ def _import_beside(module: str, folder: Path) -> object:
 
 
 def _put_on_path(folder: str) -> None:
-    """At the end of the path, before the folders of other cards."""
+    """Put a folder at the end of the path, before the folders of other cards."""
     if folder in sys.path and folder not in _folders:
         return
     if folder in _folders:
@@ -403,7 +413,7 @@ def _put_on_path(folder: str) -> None:
 
 
 def _forget_changed(folder: Path) -> None:
-    """Drop the modules of a folder when the file of one of them changed."""
+    """Forget the modules of a folder when the file of one of them has changed."""
     mine = {name: file for name, (file, _) in _beside_cards.items() if file.is_relative_to(folder)}
     if any(not file.is_file() or file_hash(file) != _beside_cards[name][1] for name, file in mine.items()):
         for name in mine:
@@ -412,7 +422,7 @@ def _forget_changed(folder: Path) -> None:
 
 
 def _refuse_other(name: str, beside: Path) -> None:
-    """A module beside a card must not be taken for one of the same name from elsewhere."""
+    """Raise ImportError where a module beside a card has the name of a module from elsewhere."""
     if name in sys.modules:
         other = _file_of(name)
     else:
@@ -429,22 +439,22 @@ def _file_of(module: str) -> Path | None:
 
 @contextlib.contextmanager
 def signals_later() -> Iterator[None]:
-    """Let handlers of Ctrl-C and SIGTERM run after the block.
+    """Delay the handlers of Ctrl-C and SIGTERM until after the block.
 
-    Native code may crash when they raise while it is imported, as Mitsuba now and then did.
+    Native code may crash when they raise while it is imported, as Mitsuba sometimes did.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # handlers run in the main thread alone
         return
-    came = list[int]()
+    received = list[int]()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    held = {number: handler for number, handler in before.items() if callable(handler)}
-    for number in held:
-        signal.signal(number, lambda number, _: came.append(number))
+    handlers = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in handlers:
+        signal.signal(number, lambda number, _: received.append(number))
     try:
         yield
     finally:
-        for number, handler in held.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
-        for number in came:
+        for number in received:
             signal.raise_signal(number)

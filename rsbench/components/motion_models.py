@@ -59,12 +59,7 @@ MOTIONS: Kind[Motion, NoOptions] = Kind(
     },
 )
 _SAME = 1e-9
-"""Radians and metres by which another package's model may miss its own w and d."""
-
-
-def list_motions() -> list[str]:
-    """Names of all motion models, sorted."""
-    return list_names(MOTIONS)
+"""Radians and metres by which the poses of another package's model may differ from its own w and d."""
 
 
 def motion_model(name: str) -> type[Motion]:
@@ -82,15 +77,15 @@ def _built_in(name: str) -> type[Motion]:
 
 
 def model_name(model: type[Motion]) -> str:
-    """What ``motion_model`` finds the class by."""
+    """The name by which ``motion_model`` finds a class."""
     own = f"{model.__module__}:{model.__qualname__}"
     name = getattr(model, "name", "")
-    known = name in MOTIONS.built_in or name in list_motions()  # which reads what every package says of itself
+    known = name in MOTIONS.built_in or name in list_names(MOTIONS)  # reads the metadata of all packages
     return name if known and motion_model(name) is model else own
 
 
 def motion_record(motion: Motion) -> dict[str, Any]:
-    """The motion as JSON holds it: ``read_motion`` makes it again."""
+    """A motion as JSON, for ``read_motion``."""
     own = {"parameters": motion.parameters} if motion.parameters else {}
     return {"model": model_name(type(motion)), "w": motion.w.tolist(), "d": motion.d.tolist(), **own}
 
@@ -98,8 +93,7 @@ def motion_record(motion: Motion) -> dict[str, Any]:
 def read_motion(record: Mapping[str, Any]) -> Motion:
     """The motion of a ``motion_record``.
 
-    A class that it names must be installed or on Python's path: no code is run from the folder where data happen
-    to lie.
+    A class that it names must be installed or on Python's path: no code is run from the folder of the data.
 
     Raises:
         RsbenchError: see ``make_motion``.
@@ -118,10 +112,15 @@ def make_motion(name: str, w: ArrayLike, d: ArrayLike, parameters: Mapping[str, 
     """
     model, where = motion_model(name), f"motion model {name!r}"
     check_parameters(name, parameters or {})
-    if not _foreign(model):
+    if model.__module__.partition(".")[0] == "rsbench":
         try:
             return model(w, d, **dict(parameters or {}))
-        except (TypeError, ValueError, ArithmeticError, LookupError) as error:  # parameters of any type and shape
+        except (
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            LookupError,
+        ) as error:  # parameters may have any type and shape
             raise RsbenchError(f"{where}: {error}") from error
     with blaming(where, "cannot be made"):
         motion = model(w, d, **dict(parameters or {}))
@@ -130,7 +129,7 @@ def make_motion(name: str, w: ArrayLike, d: ArrayLike, parameters: Mapping[str, 
 
 
 def check_parameters(name: str, parameters: Mapping[str, Any]) -> None:
-    """Raises RsbenchError when there is no such model, or it has no parameter of one of these names."""
+    """Refuse an unknown model or unknown parameters, with RsbenchError."""
     if not parameters and name in MOTIONS.built_in:
         return
     known = list(inspect.signature(motion_model(name)).parameters)[2:]
@@ -140,7 +139,7 @@ def check_parameters(name: str, parameters: Mapping[str, Any]) -> None:
 
 
 def drawn_parameters(name: str, parameters: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-    """The parameters with those drawn that are random by default, such as the seed of a shake."""
+    """The parameters, and random draws of those that are random by default, such as the seed of a shake."""
     check_parameters(name, parameters)
     return motion_model(name).drawn(parameters, rng)
 
@@ -158,12 +157,8 @@ def fixed_endpoint(name: str, parameters: Mapping[str, Any]) -> tuple[np.ndarray
         raise RsbenchError(f"motion model {name!r}: {error}") from error
 
 
-def _foreign(model: type[Motion]) -> bool:
-    return model.__module__.partition(".")[0] != "rsbench"
-
-
 def _check_ends(motion: Motion, where: str) -> None:
-    """Another package's model must start at the body and reach (w, d) after a period: the truth of all scores."""
+    """Another package's model must start at the body and reach (w, d) after a period: all scores rely on it."""
     with blaming(where, "body_from_world fails"):
         R, t = motion.body_from_world(np.array([0.0, 1.0]))
         missed = [so3.angle(R @ np.stack([np.eye(3), so3.exp(motion.w).T])), t - np.stack([np.zeros(3), motion.d])]

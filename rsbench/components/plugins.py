@@ -1,10 +1,9 @@
 """Components by name: cards that come with rsbench, a user's card, or an installed package's entry point.
 
-Every kind of component is found in the same way. A name is that of a card, of an entry point, or of a class of
-rsbench's own that needs no card; a value that ends in ``.toml`` is the path of a card. A card says
-``class = "package.module:Class"``, may say ``description``, sets ``parameters``, and may set the options of its
-kind. A name that two packages claim is an error of whoever uses that name, and of nobody else; what a package
-raises is told in one line, with its name.
+All kinds of components are found alike. A name is that of a card, of an entry point, or of a class of rsbench's
+own that needs no card; a value that ends in ``.toml`` is the path of a card. A card has ``class =
+"package.module:Class"``, may have ``description``, ``parameters`` and the options of its kind. A name that two
+packages claim is an error only when that name is used; an exception of a package becomes one line with its name.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True)
 class NoOptions:
-    """Of a kind whose cards set nothing beside the parameters."""
+    """Options of a kind whose cards set only parameters."""
 
 
 def _anything_goes(component: Any) -> None:
@@ -59,7 +58,7 @@ def _anything_goes(component: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """What a card may say of how its component is run."""
+    """How a component is run, as its card sets it."""
 
     time_limit_s: float = 300.0
     """Wall-clock time for one problem, after which a component of another package has failed."""
@@ -80,13 +79,13 @@ class Kind(Generic[Component, Options]):
     group: str = ""
     """Group of its entry points; by default ``rsbench.<folder of its cards>``."""
     base: type[Component]
-    """Contract: what classes must be below of."""
+    """Contract: the class of which all components are subclasses."""
     options: type[Options]
-    """Dataclass of what a card may set beside the parameters; without values it must be valid."""
+    """Dataclass of the keys that a card may set beside the parameters; all have defaults."""
     built_in: Mapping[str, str] = field(default_factory=dict)
     """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
     check: Callable[[Component], None] = _anything_goes
-    """Raises ValueError when what a component declares cannot be right."""
+    """Raises ValueError for a component whose declarations are inconsistent."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "group", self.group or f"rsbench.{self.cards}")
@@ -94,7 +93,7 @@ class Kind(Generic[Component, Options]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Entry(Generic[Component, Options]):
-    """A component under the name by which tables, files and seeds know it."""
+    """A component under the name that tables, files and seeds use."""
 
     name: str
     path: Path | None
@@ -109,7 +108,7 @@ class Entry(Generic[Component, Options]):
 
     @property
     def built_in(self) -> bool:
-        """Whether the class, and that of the component inside it, is rsbench's own: it may run in this process."""
+        """Whether its class and those of the components inside are rsbench's own, to run in this process."""
         part: object = self.component
         while part is not None:
             if type(part).__module__.partition(".")[0] != "rsbench":
@@ -120,7 +119,7 @@ class Entry(Generic[Component, Options]):
 
 @dataclass(frozen=True, kw_only=True)
 class Offer:
-    """A name, before anything is loaded."""
+    """A name that is available; nothing is loaded yet."""
 
     name: str
     origin: str
@@ -143,14 +142,14 @@ class CardContent:
 
 
 _OWN = tuple(each.name.rstrip("_") for each in dataclasses.fields(CardContent))
-"""Keys that every card of a component has."""
+"""Keys that cards of all kinds of components may have."""
 
 
 def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManager[None]:
-    """Run a component's code: what another package's raises becomes one line that names the component.
+    """Run a component's code: an exception of another package's becomes one line with the component's name.
 
     Raises:
-        RsbenchError: its kind, its name and what it raised. Errors in our own code pass as they are.
+        RsbenchError: kind, name and exception. Errors in rsbench's own components are not changed.
     """
     if entry.built_in:
         return contextlib.nullcontext()
@@ -158,7 +157,7 @@ def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManage
 
 
 def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Component, Options]:
-    """The entry of a component that was made without a card; its class names it."""
+    """The entry of a component that was made without a card, named after its class."""
     return Entry(
         name=type(component).__name__,
         path=None,
@@ -170,12 +169,12 @@ def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Componen
 
 
 def list_names(kind: Kind[Any, Any]) -> list[str]:
-    """Names of all components of a kind, sorted; a clash of names is not an error here."""
+    """Names of all components of a kind, sorted; two of one name are no error here."""
     return sorted({offer.name for offer in offers(kind)})
 
 
 def offers(kind: Kind[Any, Any]) -> list[Offer]:
-    """Every claim to a name of a kind, sorted by name: two of one name are a clash. Loads nothing."""
+    """All available names of a kind, sorted; two of one name clash when it is used. Loads nothing."""
     cards = list_cards(kind.cards) if kind.cards is not None else {}
     own = [Offer(name=name, origin="rsbench", path=path) for name, path in cards.items()]
     own += [Offer(name=name, origin="rsbench") for name in kind.built_in if name not in cards]
@@ -227,10 +226,10 @@ def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) 
 
 
 def description_of(kind: Kind[Any, Any], offer: Offer) -> str:
-    """What the class of an offer without a card says of itself first.
+    """The first paragraph of the docstring of an offer's class, for an offer without a card.
 
     Raises:
-        RsbenchError: its name is that of another too, it cannot be loaded or is not of this kind.
+        RsbenchError: another offer has its name, it cannot be loaded, or it is not of this kind.
     """
     _only_offer(kind, offer.name, "")
     return _first_paragraph(_offered_class(kind, offer)[0])
@@ -254,7 +253,7 @@ def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -
 
 
 def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Component], str]:
-    """The class of an offer without a card, and how messages call it."""
+    """The class of an offer without a card, and its name for messages."""
     if offer.point is None:
         return _checked(kind, import_target(kind.built_in[offer.name], None, offer.name), offer.name), offer.name
     where = f"entry point {kind.group}:{offer.name} ({_owner(offer)})"
@@ -341,7 +340,7 @@ def make_component(
 
 
 def _has_dataclass_init(cls: type) -> bool:
-    """Whether the constructor is that which ``@dataclass`` writes, on this class or one above it."""
+    """Whether the constructor is the one that ``@dataclass`` writes, for this class or a base class."""
     owner = next(parent for parent in cls.__mro__ if "__init__" in vars(parent))
     params = vars(owner).get("__dataclass_params__")
     return params is not None and bool(params.init)
@@ -361,5 +360,5 @@ def _blamed_parse(cls: type[Component], parameters: Mapping[str, Any], where: st
             f"{where}: parameters: the fields of {cls.__name__} must have types that a card can hold "
             f"(numbers, texts, tuples, dataclasses): {str(error).partition(chr(10))[0]}"
         ) from error
-    except (Exception, SystemExit) as error:  # the constructor's own
+    except (Exception, SystemExit) as error:  # raised by the constructor
         raise RsbenchError(f"{where}: parameters: {in_words(error)}") from error

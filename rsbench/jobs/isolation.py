@@ -35,17 +35,17 @@ from typing import Any, BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.imports import end_with, ending, import_untried
+from rsbench.components.imports import end_with, ending, import_untried, start_child
 from rsbench.storage.untrusted_files import unpack_arrays
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""Of a process that computes with as many threads as they say."""
+"""Environment variables that limit the threads of numerical libraries."""
 START_LIMIT_S = 300.0
-"""Loading a module, and compiling what it needs, once."""
+"""Time to load a module and to compile what it needs."""
 NO_ANSWER = "gave no valid answer"
 _POLL_S = 0.1
 _LAST_ANSWER_S = 10.0
-"""Time to read the answer of a process that has ended; only a process that left its group makes a call wait so."""
+"""Time to read the answer of a process that has ended; only one that left its group makes a call wait so long."""
 _KEPT_BYTES = 8192
 _LONGEST_REASON = 300
 _POSIX = os.name == "posix"
@@ -56,27 +56,27 @@ _COMMAND = (
 _LENGTH_BYTES = 8
 _LONGEST_BYTES = 1 << 32
 _KINDS = "biufU"
-"""Of arrays: truth values, numbers and text."""
+"""Kinds of arrays: truth values, numbers and text."""
 Server = Callable[..., object]
 """Answers one call, in the child: picklable arguments in, plain data out."""
 
 
-class EntryFailure(Exception):  # noqa: N818  it is no error of ours
-    """Raised in a child where other people's code is at fault; the message is the reason of the failure."""
+class EntryFailure(Exception):  # noqa: N818  not an error of rsbench
+    """Raised in a child for a fault of other people's code; the message is the reason."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """What became of one call."""
+    """The result of one call."""
 
     value: Any
     """The answer, already decoded; None after a failure."""
     reason: str
-    """Why there is none; empty after a success."""
+    """Why the call failed; empty after a success."""
     output: str
-    """The end of what the child has printed so far."""
+    """The last part of what the child has printed so far."""
     ended: bool = False
-    """Whether the process has ended by itself, or was killed by others: not what the call was about, perhaps."""
+    """Whether the process ended by itself or was killed by others, perhaps for another reason than this call."""
 
     @property
     def success(self) -> bool:
@@ -84,11 +84,11 @@ class Outcome:
 
 
 class Cancelled(Exception):  # noqa: N818
-    """Raised by a call whose worker was told to stop."""
+    """Raised by a call whose worker is stopped."""
 
 
 class IsolatedWorker:
-    """A child process that answers calls, one at a time, of any thread; use as a context manager."""
+    """A child process that answers calls from any thread, one at a time; use as a context manager."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class IsolatedWorker:
             start_limit_s: time for ``factory``.
             environment: variables that the child has besides those of this process.
             cancel: once set, perhaps by another thread, calls end with ``Cancelled``.
-            memory_mb: what the child may use; where the system does not tell what it does, nothing is limited.
+            memory_mb: limit of the child's memory; not applied where the system does not report its use.
         """
         self._memory_mb = memory_mb
         self._start = (factory, arguments)
@@ -128,10 +128,10 @@ class IsolatedWorker:
             RuntimeError: rsbench's own code in the child is at fault.
             Cancelled: see ``cancel``.
         """
-        with self._one_call:  # the answers to two would be mixed up
+        with self._one_call:  # answers to two calls would be mixed up
             try:
                 if self._child is not None and self._child.ended:
-                    self.close()  # it died after its last answer, which is no fault of this call
+                    self.close()  # it died after its last answer: not a fault of this call
                 if self._child is None:
                     self._child = _Child(self._environment)
                     started = self._exchange(self._start, self._start_limit_s)
@@ -140,7 +140,7 @@ class IsolatedWorker:
                         return replace(started, reason=f"did not start: {started.reason}")
                 return self._exchange(arguments, limit_s)
             except BaseException:
-                self.close()  # an answer that nobody waits for must not be taken for the next one
+                self.close()  # its answer must not be taken for that of the next call
                 raise
 
     def close(self) -> None:
@@ -188,29 +188,16 @@ class _Child:
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.overdue = False
-        """Whether an answer has not come in time, or took too much memory."""
+        """Whether an answer did not come in time, or took too much memory."""
         self._printed = b""
         self._lifeline: int | None = None
         lifeline_end = -1
         if _POSIX:
             lifeline_end, self._lifeline = os.pipe()
         try:
-            self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-u",
-                    "-c",
-                    _COMMAND,
-                    json.dumps([str(entry) for entry in sys.path]),
-                    str(lifeline_end),
-                ],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,  # its own process group; a terminal's Ctrl-C is the parent's alone
-                env=environment,
-                pass_fds=(lifeline_end,) if _POSIX else (),
-            )
+            pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+            path = json.dumps([str(entry) for entry in sys.path])
+            self._process = start_child(_COMMAND, path, line=lifeline_end, env=environment, **pipes)
         finally:
             if _POSIX:
                 os.close(lifeline_end)
@@ -232,8 +219,8 @@ class _Child:
     def exchange(
         self, request: bytes, limit_s: float, cancel: threading.Event, memory_mb: float | None
     ) -> tuple[bytes | None, str]:
-        """The answer to a request, or None and what became of the process."""
-        # A child that does not read must not hold up its parent.
+        """The answer to a request, or None and why there is none."""
+        # A child that does not read must not block its parent.
         threading.Thread(target=self._send, args=(request,), daemon=True).start()
         end = time.monotonic() + limit_s
         while (left := end - time.monotonic()) > 0.0:
@@ -244,7 +231,7 @@ class _Child:
                 return None, f"used more than {memory_mb:g} MB of memory"
             if ended := self.ended:
                 self._kill_group()  # its own children may keep the pipe open
-            try:  # what ended may have answered before: the reader comes to the end of the pipe, perhaps late
+            try:  # a process that ended may have answered before
                 answer = self._answers.get(timeout=_LAST_ANSWER_S if ended else min(left, _POLL_S))
             except queue.Empty:
                 if ended:
@@ -286,7 +273,7 @@ class _Child:
                 os.killpg(self._process.pid, signal.SIGKILL)
 
     def _ending(self) -> str:
-        """How the process has ended; it is given a moment to do so."""
+        """How the process ended, after waiting for a second at most."""
         try:
             code = self._process.wait(1.0)
         except subprocess.TimeoutExpired:
@@ -296,7 +283,7 @@ class _Child:
 
     def _send(self, request: bytes) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError, ValueError):  # the child is gone, which the reader tells
+        with contextlib.suppress(OSError, ValueError):  # the child is gone: the reader notices
             send(self._process.stdin, request)  # pyrefly: ignore[bad-argument-type]
 
     def _read_answers(self) -> None:
@@ -330,7 +317,7 @@ def encode(value: object) -> bytes:
     """A value as bytes.
 
     Raises:
-        TypeError: it holds something that is no plain data.
+        TypeError: it holds something that is not plain data.
     """
     arrays: list[NDArray[Any]] = []
     text = json.dumps(_flat(value, arrays))
@@ -341,24 +328,24 @@ def encode(value: object) -> bytes:
 
 
 def decode(data: bytes, classes: Mapping[str, type]) -> Any:
-    """The value of ``encode``; dataclasses are made by their constructors, and only those of ``classes``.
+    """The value that ``encode`` was given; dataclasses must be in ``classes`` and are made by their constructors.
 
     Raises:
-        ValueError: the bytes are no such value, or a constructor refuses its fields.
+        ValueError: the bytes are not such a value, or a constructor refuses its fields.
     """
     try:
         arrays = unpack_arrays(io.BytesIO(data), "message", limit=len(data))  # ``encode`` compresses nothing
         return _built(json.loads(str(arrays["tree"])), arrays, classes)
     except ValueError:
         raise
-    except Exception as error:  # whatever damaged bytes cause: zip, JSON, a missing key, a wrong field
+    except Exception as error:  # caused by damaged bytes: zip, JSON, a missing key, a wrong field
         raise ValueError(f"no message: {type(error).__name__}: {error}") from error
 
 
 def _flat(value: object, arrays: list[NDArray[Any]]) -> object:
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in _KINDS:
-            raise TypeError(f"an array of {value.dtype} is no plain data")
+            raise TypeError(f"an array of {value.dtype} is not plain data")
         arrays.append(value)
         return {"array": len(arrays) - 1}
     if isinstance(value, np.generic):
@@ -372,7 +359,7 @@ def _flat(value: object, arrays: list[NDArray[Any]]) -> object:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: _flat(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
         return {"dataclass": type(value).__name__, "fields": fields}
-    raise TypeError(f"a {type(value).__name__} is no plain data")
+    raise TypeError(f"a {type(value).__name__} is not plain data")
 
 
 def _built(tree: Any, arrays: Mapping[str, NDArray[Any]], classes: Mapping[str, type]) -> Any:
@@ -396,7 +383,7 @@ def send(stream: BinaryIO, data: bytes) -> None:
 
 
 def receive(stream: BinaryIO) -> bytes | None:
-    """The next message; None at the end of the stream, or where what comes is no message."""
+    """The next message; None at the end of the stream or for anything else."""
     length = (
         int.from_bytes(head, "big") if len(head := stream.read(_LENGTH_BYTES)) == _LENGTH_BYTES else _LONGEST_BYTES
     )
@@ -410,7 +397,7 @@ def receive(stream: BinaryIO) -> bytes | None:
 
 
 def use_one_thread() -> None:
-    """For OpenCV what ``THREAD_VARIABLES`` are for the others."""
+    """Limit OpenCV, which does not read ``THREAD_VARIABLES``."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -446,7 +433,7 @@ def _start(factory: Callable[..., Server], arguments: tuple[object, ...]) -> Ser
 
 
 def _take_streams() -> tuple[BinaryIO, BinaryIO]:
-    """Streams to the parent, out of the way of whatever reads standard input or prints."""
+    """Streams to the parent, apart from standard input and output, which other code may use."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)

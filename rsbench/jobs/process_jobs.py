@@ -15,7 +15,7 @@ import queue
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, TypeVar
 
@@ -24,12 +24,12 @@ from rsbench.jobs.isolation import Cancelled, IsolatedWorker, Outcome, Server
 
 Job = TypeVar("Job")
 TRIES = 3
-"""Of a job whose process ended by itself or was killed by others."""
+"""Tries of a job whose process ended by itself or was killed by others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """A Dask scheduler, and how to reach it."""
+    """A Dask scheduler."""
 
     address: str
     """``tcp://host:8786``, or the path of a scheduler file, which ends in .json."""
@@ -41,7 +41,7 @@ Workers = int | Cluster
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerProcesses:
-    """Child processes that serve the jobs of one run; picklable, as ``IsolatedWorker`` wants its arguments."""
+    """How to start the child processes of one run; picklable."""
 
     factory: Callable[..., Server]
     arguments: tuple[object, ...]
@@ -68,13 +68,13 @@ class WorkerProcesses:
 
 
 _MOST_LOST = 10
-"""So many that the next ones will be too: each costs the start of two processes."""
+"""Lost jobs after which the next ones are not tried: each costs the start of two processes."""
 _NAMED = 3
 _Finished = tuple[Job, Outcome | BaseException]
 
 
 class LostJobsError(RsbenchError):
-    """Jobs whose process ended each time they were tried; what the others did is kept."""
+    """The process of some jobs ended at every try; results of the others are kept."""
 
     exit_code = 1
 
@@ -87,10 +87,10 @@ def finished_jobs(
     *arguments: object,
     name: Callable[[Job], str] = str,
 ) -> Generator[tuple[Job, Any], None, None]:
-    """Jobs with their answers, as of ``run_jobs``; ``name`` says in errors which job it was.
+    """Jobs with their answers, see ``run_jobs``; ``name`` names a job in errors.
 
     Raises:
-        LostJobsError: names jobs whose process ended ``TRIES`` times, when the others are done, or many are.
+        LostJobsError: names jobs whose process ended ``TRIES`` times, once the others are done or many are lost.
         RsbenchError: at once, for a job that failed.
     """
     lost = []
@@ -107,7 +107,7 @@ def finished_jobs(
     if lost:
         more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
         raise LostJobsError(
-            f"not done: {', '.join(lost[:_NAMED])}{more}; perhaps for want of memory: what is done is kept, and "
+            f"not done: {', '.join(lost[:_NAMED])}{more}; perhaps for lack of memory: what is done is kept, and "
             "the same command tries again"
         )
 
@@ -123,16 +123,16 @@ def run_jobs(
 ) -> Generator[tuple[Job, Outcome], None, None]:
     """Jobs with their outcomes, as they become ready.
 
-    A job whose process ended is tried ``TRIES`` times, in fresh ones; where there are limits, it fails. When the
-    iterator is closed or an exception passes through it, such as Ctrl-C, jobs that wait are dropped and all
-    processes end at once.
+    A job whose process ended is tried ``TRIES`` times in fresh processes, or once where there are limits. When the
+    iterator is closed or an exception such as Ctrl-C passes through it, waiting jobs are dropped and all processes
+    end at once.
 
     Args:
         factory: see ``IsolatedWorker``; what it returns is called with a job.
         jobs: picklable.
         workers: processes, or a cluster.
         environment, arguments: see ``IsolatedWorker``.
-        seconds_of: limit of time of a job, perhaps infinite; without one there is none.
+        seconds_of: time limit of a job, perhaps infinite; None for no limits.
         memory_mb: of a process; see ``IsolatedWorker``.
 
     Raises:
@@ -187,7 +187,7 @@ def _work(
     done: queue.SimpleQueue[_Finished[Job]],
     seconds_of: Callable[[Job], float] | None,
 ) -> None:
-    """Hand jobs to a process until none waits."""
+    """Let a process do jobs until none is left."""
     while True:
         try:
             job = waiting.get_nowait()
@@ -197,7 +197,7 @@ def _work(
             outcome = processes.done_by(worker, job, math.inf if seconds_of is None else seconds_of(job))
         except Cancelled:
             return
-        except BaseException as error:  # for whoever waits in the other thread
+        except BaseException as error:  # raised in the thread that waits
             done.put((job, error))
             return
         done.put((job, outcome))
@@ -223,7 +223,7 @@ def run_on_cluster(
         from distributed import CancelledError, KilledWorker, as_completed
 
         try:
-            # A task of its own: it is sent to each worker once, and made again where all that had it died.
+            # A task of its own: it is sent to each worker once, and repeated where all workers that had it died.
             shared = client.submit(bytes, content, key=f"rsbench-workers-{key[:16]}")
             futures = {}
             for job in jobs:
@@ -231,7 +231,7 @@ def run_on_cluster(
                 futures[client.submit(_do, key, shared, job, limit, pure=False)] = job
             for future in as_completed(list(futures)):
                 job = futures.pop(future)
-                try:  # it waits again where a worker dies with the result: the scheduler repeats the task then
+                try:  # waits again where a worker dies with the result: the scheduler repeats the task
                     outcome = future.result()
                 except KilledWorker as error:
                     reason = f"workers of the cluster died: {error.last_worker.address}"
@@ -277,82 +277,60 @@ def _connected(cluster: Cluster) -> Iterator[Any]:
 # On the machines of the cluster
 
 
-@dataclass
-class _Hired:
-    """A child process and the set of workers that it belongs to."""
-
-    processes: WorkerProcesses
-    worker: IsolatedWorker
+_IDLE: dict[str, list[tuple[WorkerProcesses, IsolatedWorker]]] = {}
+"""Idle children of this process, by the hash of the workers of their run."""
+_IDLE_LOCK = threading.Lock()
 
 
-@dataclass
-class _ClusterWorkers:
-    """The children of this process: idle ones by the set of workers that they belong to."""
-
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    idle: dict[str, list[_Hired]] = field(default_factory=dict)
-
-    def take(self, key: str, content: bytes, cancel: threading.Event) -> _Hired:
-        """An idle child of a set of workers, or a new one, for one job, which ``cancel`` stops.
-
-        Children of other sets, whose runs are over, end.
-        """
-        with self.lock:
-            others = [hired for name in list(self.idle) if name != key for hired in self.idle.pop(name)]
-            own = self.idle.get(key, [])
-            found = own.pop() if own else None
-        for hired in others:
-            hired.worker.close()
-        if found is not None:
-            found.worker.cancel = cancel
-            return found
-        processes = ForkingPickler.loads(content)
-        return _Hired(processes, processes.hire(cancel))
-
-    def give_back(self, key: str, hired: _Hired) -> None:
-        with self.lock:
-            self.idle.setdefault(key, []).append(hired)
-
-    def dismiss(self, key: str) -> None:
-        with self.lock:
-            idle = self.idle.pop(key, [])
-        for hired in idle:
-            hired.worker.close()
-
-
-_CREWS = _ClusterWorkers()
+def _take(key: str, content: bytes, cancel: threading.Event) -> tuple[WorkerProcesses, IsolatedWorker]:
+    """An idle child of a run, or a new one, for one job, which ``cancel`` stops; children of other runs end."""
+    with _IDLE_LOCK:
+        others = [worker for name in list(_IDLE) if name != key for _, worker in _IDLE.pop(name)]
+        own = _IDLE.get(key, [])
+        found = own.pop() if own else None
+    for worker in others:
+        worker.close()
+    if found is not None:
+        found[1].cancel = cancel
+        return found
+    processes = ForkingPickler.loads(content)
+    return processes, processes.hire(cancel)
 
 
 def _dismiss(key: str) -> None:
-    """End the idle children of a set of workers; those at work end when their task is cancelled."""
-    _CREWS.dismiss(key)
+    """End the idle children of a run; those at work end when their task is cancelled."""
+    with _IDLE_LOCK:
+        idle = _IDLE.pop(key, [])
+    for _, worker in idle:
+        worker.close()
 
 
-def _do(key: str, processes: bytes, job: object, limit_s: float) -> Outcome:
+def _do(key: str, content: bytes, job: object, limit_s: float) -> Outcome:
     """One job in a child of this worker of the cluster.
 
     Raises:
-        distributed.Reschedule: the job was stopped. If the scheduler wants it after all, it repeats the task.
+        distributed.Reschedule: the job was stopped. If the scheduler still needs it, it repeats the task.
     """
     from distributed import Reschedule
 
     cancel = threading.Event()  # of this job alone: the watch may set it when the child already does the next one
-    hired = _CREWS.take(key, processes, cancel)
+    processes, worker = _take(key, content, cancel)
     with _watched(cancel):
         try:
-            outcome = hired.processes.done_by(hired.worker, job, limit_s)
+            outcome = processes.done_by(worker, job, limit_s)
         except BaseException as error:
-            hired.worker.close()
+            worker.close()
             if isinstance(error, Cancelled):
                 raise Reschedule from error
             raise
-    _CREWS.give_back(key, hired)
+    with _IDLE_LOCK:
+        _IDLE.setdefault(key, []).append((processes, worker))
     return outcome
 
 
 @contextlib.contextmanager
 def _watched(cancel: threading.Event) -> Iterator[None]:
-    """Set an event when the scheduler no longer wants the task of this thread: its run was stopped, or died."""
+    """Set an event when the scheduler no longer needs the task of this thread: its run was stopped, or died."""
     from distributed import get_worker
 
     worker = get_worker()

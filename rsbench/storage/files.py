@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 MATCH_SETS = ("left", "right", "stereo_0", "stereo_1", "tracks")
 _SET = 255
-"""In a mask."""
+"""The value of set pixels of a mask."""
 POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
 
 
@@ -51,14 +51,14 @@ def sha256(path: Path) -> str:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write through a temporary file in the same folder, so the name never holds half of it.
+    """Write through a temporary file in the same folder, so that a file is complete or absent.
 
     Raises:
-        RsbenchError: one line with the file, the bytes that it needs, the reason and a remedy.
+        RsbenchError: one line with the file, its size, the reason and a remedy.
     """
     partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.unlink(missing_ok=True)  # of a run that was killed; a link there leads elsewhere
+        partial.unlink(missing_ok=True)  # left by a run that was killed, or a link to elsewhere
         with partial.open("xb") as stream:
             stream.write(data)
             stream.flush()
@@ -74,11 +74,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def check_out(out: Path) -> None:
-    """See that a folder of results can be made or written: before minutes of work, not after. Leaves nothing.
-
-    Raises:
-        RsbenchError: it cannot.
-    """
+    """Refuse a folder of results that cannot be written, with RsbenchError, before minutes of work."""
     refuse_url(out)
     try:
         place = next(path for path in (out, *out.absolute().parents) if path.exists() or path.is_symlink())
@@ -105,17 +101,21 @@ def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint
 
     Args:
         path: of an image file.
-        size: width and height that it must have; without them, it is of at most ``reading.PIXELS``.
+        size: required width and height; without it, the limit is ``untrusted_files.PIXELS``.
 
     Raises:
         RsbenchError: missing, not an image or of another size.
     """
-    data = read_bytes(path)
-    check_image_size(data, path, size)
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    pixels = _decoded(path, size, cv2.IMREAD_COLOR)
     if pixels is None:
         raise RsbenchError(f"{path}: cannot be decoded as an image")
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _decoded(path: Path, size: tuple[int, int] | None, mode: int) -> NDArray[Any] | None:
+    data = read_bytes(path)
+    check_image_size(data, path, size)
+    return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
 
 
 def write_png16(path: Path, image: NDArray[np.uint16]) -> None:
@@ -124,14 +124,12 @@ def write_png16(path: Path, image: NDArray[np.uint16]) -> None:
 
 
 def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal[8, 16] = 8) -> NDArray[Any]:
-    """Image (H, W) uint8 or uint16 of one channel; ``size`` as of ``read_png``.
+    """Image (H, W) uint8 or uint16 of one channel; ``size`` as in ``read_png``.
 
     Raises:
-        RsbenchError: missing, no such image or of another size.
+        RsbenchError: missing, not such an image, or of another size.
     """
-    data = read_bytes(path)
-    check_image_size(data, path, size)
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    pixels = _decoded(path, size, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.dtype(f"uint{bits}") or pixels.ndim != 2:
         raise RsbenchError(f"{path}: must be a grey image of {bits} bits")
     return np.asarray(pixels)
@@ -143,10 +141,10 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """Mask (H, W); ``size`` as of ``read_png``.
+    """Mask (H, W); ``size`` as in ``read_png``.
 
     Raises:
-        RsbenchError: as of ``read_grey_png``, or values other than 0 and 255.
+        RsbenchError: see ``read_grey_png``; or values other than 0 and 255.
     """
     values = read_grey_png(path, size)
     if not np.isin(values, (0, _SET)).all():
@@ -166,14 +164,14 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]], half: boo
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     kind = np.float16 if half else np.float32
     pixels = {name: np.ascontiguousarray(each, dtype=kind) for name, each in channels.items()}
-    content = io.BytesIO()  # OpenEXR does not tell of a full disk in one way, write_bytes does
+    content = io.BytesIO()  # ``write_bytes`` reports a full disk, OpenEXR in several forms
     with OpenEXR.File(header, pixels) as file:
         file.write(content)
     write_bytes(path, content.getvalue())
 
 
 def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """Channel Z (H, W) float32, metres, 0 = no surface; ``size`` as of ``read_png``.
+    """Channel Z (H, W) float32, metres, 0 = no surface; ``size`` as in ``read_png``.
 
     Raises:
         RsbenchError: see ``read_exr``; or negative or non-finite depth.
@@ -187,11 +185,11 @@ def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.fl
 def read_exr(
     path: Path, names: tuple[str, ...], size: tuple[int, int] | None = None, half: bool = False
 ) -> NDArray[np.float32]:
-    """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as of ``read_png``.
+    """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as in ``read_png``.
 
     Raises:
-        RsbenchError: missing, damaged, of another size, or with anything but these float32 channels in scanlines,
-            or float16 ones where ``half``.
+        RsbenchError: missing, damaged, of another size, or with other content than these channels in scanlines,
+            float32, or float16 where ``half``.
     """
     import OpenEXR
 
@@ -214,7 +212,7 @@ def read_exr(
 def _check_exr_header(
     headers: list[dict[str, Any]], path: Path, names: tuple[str, ...], size: tuple[int, int] | None
 ) -> None:
-    """Before pixels are decoded: one part, these channels, and not more of them than there should be."""
+    """Before pixels are decoded: refuse other parts, channels or sizes."""
     import OpenEXR
 
     found = sorted(channel.name for header in headers for channel in header["channels"])
@@ -244,11 +242,7 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
 
 
 def read_pose_table(path: Path) -> FloatArray:
-    """The numbers (H, 9) of a file of poses as they stand there, in the order of ``POSE_COLUMNS``.
-
-    Raises:
-        RsbenchError: see ``read_poses``.
-    """
+    """The numbers (H, 9) of a file of poses, in the order of ``POSE_COLUMNS``; RsbenchError as ``read_poses``."""
     lines = read_text(path).splitlines()
     try:
         table = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
@@ -262,13 +256,13 @@ def read_pose_table(path: Path) -> FloatArray:
 
 
 def save_matches(path: Path, matches: Correspondences) -> None:
-    """The sets of every matcher, and what few give where this one does."""
+    """The sets of all matchers, and the rare ones where the matcher gives them."""
     rare = {name: rows for name in ("lines", "affine") if len(rows := getattr(matches, name))}
     save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS} | rare)
 
 
 def load_matches(path: Path) -> Correspondences:
-    """Raises RsbenchError as ``load_arrays``, and for arrays that are no matches."""
+    """Matches of ``save_matches``; RsbenchError as ``load_arrays``, or for arrays that are not matches."""
     try:
         return Correspondences(**load_arrays(path))
     except (TypeError, ValueError) as error:
@@ -288,14 +282,15 @@ def read_table(
     """A CSV file; ``options`` are those of ``pandas.read_csv``.
 
     Raises:
-        RsbenchError: it cannot be read, is no table, lacks one of the ``columns`` or ``numbers``, or holds
-            something else among the numbers.
+        RsbenchError: it cannot be read, is not a table, lacks one of the ``columns`` or ``numbers``, or a column
+        of
+            ``numbers`` is not numeric.
     """
     import pandas as pd
 
     try:
         table = pd.read_csv(io.StringIO(read_text(path)), **options)
-    except ValueError as error:  # of pandas, all that a damaged table is
+    except ValueError as error:  # pandas raises it for every damaged table
         raise RsbenchError(f"{path}: not a table: {' '.join(str(error).split())}") from error
     for name in (*columns, *numbers):
         if name not in table:
@@ -307,7 +302,7 @@ def read_table(
 
 
 def write_table(path: Path, frame: pd.DataFrame) -> None:
-    """CSV with enough digits to compare runs and few enough to read."""
+    """CSV with six significant digits: enough to compare runs, few enough to read."""
     write_bytes(path, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode())
 
 
@@ -315,16 +310,16 @@ def write_table(path: Path, frame: pd.DataFrame) -> None:
 
 
 HASHES = f"{HIDDEN}/hashes.jsonl"
-"""Where a folder of results keeps hashes, below it."""
+"""File of the hashes of a folder of results, relative to it."""
 
 
 class HashedFile(NamedTuple):
-    """A file as it was when it was hashed."""
+    """State of a file when it was hashed."""
 
     size: int
     modified_ns: int
     changed_ns: int
-    """Of its content, name, owner or permissions; no tool can set it."""
+    """Last change of its content, name, owner or permissions; no tool can set it."""
     sha256: str
 
 
@@ -335,11 +330,11 @@ class FileHashes:
         """
         Args:
             root: the folder.
-            store: where hashes are kept; need not exist.
-            rehash: forget what is kept.
+            store: file of the kept hashes; need not exist.
+            rehash: forget the kept hashes.
 
         Raises:
-            RsbenchError: the store is there and is no regular file: a named pipe, a link, a folder.
+            RsbenchError: the store exists and is not a regular file.
         """
         self._root, self._store = root, store
         if os.path.lexists(store) and not stat.S_ISREG(store.lstat().st_mode):
@@ -350,7 +345,7 @@ class FileHashes:
         self._new: list[str] = []
 
     def of(self, name: str) -> HashedFile | None:
-        """A file by its path below the folder, with slashes; None when it is no file."""
+        """A file by its path below the folder, with slashes; None if it is not a regular file."""
         path = f"{self._root}/{name}"
         try:
             found = os.stat(path)
@@ -365,7 +360,7 @@ class FileHashes:
         return known
 
     def sha256(self, path: Path) -> str:
-        """Of a file below the folder, by its path."""
+        """Hash of a file below the folder, by its path."""
         found = self.of(path.relative_to(self._root).as_posix())
         return sha256(path) if found is None else found.sha256
 
@@ -375,11 +370,11 @@ class FileHashes:
         return self._keep(name, HashedFile(found.st_size, found.st_mtime_ns, found.st_ctime_ns, digest))
 
     def flush(self) -> None:
-        """Append what is new."""
+        """Append new hashes to the store."""
         self.append(self.taken())
 
     def taken(self) -> list[str]:
-        """What is new, for ``append`` of another process's: here it is not new any more."""
+        """New hashes as lines, for ``append`` in another process; here they are no longer new."""
         lines = self._new
         self._new = []
         return lines
@@ -389,7 +384,7 @@ class FileHashes:
         self._known |= _parsed_hashes(lines)
         if lines:
             with self._store.open("a", encoding="utf-8", newline="\n") as stream:
-                stream.write("\n" + "\n".join(lines) + "\n")  # the line before may have been cut by a kill
+                stream.write("\n" + "\n".join(lines) + "\n")  # a killed process may have cut the previous line
 
     def _keep(self, name: str, file: HashedFile) -> HashedFile:
         self._known[name] = file
@@ -408,7 +403,7 @@ def _read_hashes(store: Path) -> dict[str, HashedFile]:
 def _parsed_hashes(lines: Iterable[str]) -> dict[str, HashedFile]:
     known = dict[str, HashedFile]()
     for line in lines:
-        with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or not ours
+        with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or of another origin
             name, size, modified, changed, digest = json.loads(line)
             known[name] = HashedFile(size, modified, changed, digest)
     return known
@@ -420,17 +415,17 @@ def _parsed_hashes(lines: Iterable[str]) -> dict[str, HashedFile]:
 T = TypeVar("T")
 R = TypeVar("R")
 Later = Callable[..., "Future[Any]"]
-"""Called with a function and its arguments: it is called soon."""
+"""Takes a function and its arguments, and calls it on another thread."""
 _THREADS = 2
 _WAITING = 8
-"""Jobs at most that are not done: each may hold a frame's arrays, and a disk may be slower than the renderer."""
+"""Most unfinished jobs: each may hold a frame's arrays, and a disk may be slower than the renderer."""
 
 
 @contextmanager
 def background_writer() -> Iterator[Later]:
-    """Gives what hands work to other threads. At the end all of it is done.
+    """A function that runs work on other threads, such as writing beside the renderer; all is done at the end.
 
-    The first error is raised at the end, or when more work is handed over; results are kept by who asked alone.
+    The first error is raised at the end, or at a later call; the caller keeps the results that it needs.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         jobs: deque[Future[Any]] = deque()
@@ -447,7 +442,7 @@ def background_writer() -> Iterator[Later]:
 
 
 def begun(later: Later, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """``work`` on each item, in order. The first are begun now, the others as results are taken."""
+    """Results of ``work`` for each item, in order; the first begin now, the others as results are taken."""
     rest = iter(items)
     waiting = deque(later(work, item) for item in islice(rest, _THREADS))
 

@@ -1,7 +1,7 @@
 """Stores of objects by URL, through fsspec (the extra ``rsbench[cloud]``); nothing else imports it.
 
-A store knows whole objects and their names: no locks, no links, nothing renamed. An object that is being
-written is seen when it is whole, or not at all: so it is on S3 and its like.
+A store has whole objects with names: no locks, links or renaming. An object that is being written becomes visible
+when it is complete, as on S3 and similar stores.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from rsbench.storage.work_folder import temporary, user_cache
 _URL = re.compile(r"[a-z][a-z0-9+.:-]+://")
 _LOCAL = ("file", "local")
 _TOKENS = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "updated", "created")
-"""What listings of the kinds of stores call that which changes with an object's content."""
+"""Keys of listings, by kind of store, whose value changes with an object's content."""
 
 
 class Listed(NamedTuple):
-    """An object as a listing tells it."""
+    """An object in a listing."""
 
     size: int
     token: str
-    """Another one where the content is another; empty where the store tells none."""
+    """Changes with the content; empty where the store has none."""
 
     @property
     def state(self) -> str:
@@ -38,10 +38,10 @@ class Listed(NamedTuple):
 
 
 def path_or_url(out: str) -> Path | str:
-    """A folder of this machine, as which ``file:///...`` counts too, or the URL of a store.
+    """A folder of this machine (also as ``file:///...``) or the URL of a store.
 
     Raises:
-        RsbenchError: a URL of a kind that cannot be taken.
+        RsbenchError: a URL that is not supported.
     """
     if not _URL.match(out):
         return Path(out)
@@ -56,13 +56,13 @@ def path_or_url(out: str) -> Path | str:
 
 
 def shown(url: str) -> str:
-    """A URL as messages may show it: without a password."""
+    """A URL for messages, without a password."""
     return re.sub(r"(?<=://)[^/@]*@", "", url)
 
 
 class Store:
-    """The objects below a URL; paths are relative to it, with slashes. Every method raises RsbenchError, in one
-    line, for what the store refuses."""
+    """The objects below a URL; paths are relative to it, with slashes. All methods raise RsbenchError for errors
+    of the store."""
 
     def __init__(self, url: str) -> None:
         """
@@ -74,14 +74,14 @@ class Store:
             from fsspec.core import url_to_fs
         except ImportError as error:
             raise RsbenchError(f"{self.url}: needs fsspec: pip install 'rsbench[cloud]'") from error
-        with self._asked("open it"):
+        with self._errors("open it"):
             self._fs, root = url_to_fs(url)
         self._root = root.rstrip("/")
 
     def listing(self, folder: str = "") -> dict[str, Listed]:
         """All objects below a folder, by one listing."""
         top = f"{self._root}/{folder}".rstrip("/")
-        with self._asked("list it"):
+        with self._errors("list it"):
             self._fs.invalidate_cache()
             found: dict[str, dict[str, Any]] = self._fs.find(top, detail=True)
             self._fs.invalidate_cache()  # hundreds of MB
@@ -93,36 +93,36 @@ class Store:
         }
 
     def read(self, paths: Iterable[str], at_once: int = 256) -> Iterator[tuple[str, bytes]]:
-        """Objects with their contents; so many are asked for together."""
+        """Objects with their contents; ``at_once`` are requested together."""
         paths = list(paths)
         for first in range(0, len(paths), at_once):
             some = {self._full(path): path for path in paths[first : first + at_once]}
-            with self._asked(f"read {paths[first]}"):
+            with self._errors(f"read {paths[first]}"):
                 contents = self._fs.cat(list(some))
             for full, content in contents.items():
                 yield some[full], content
 
     def download(self, files: Mapping[str, Path]) -> None:
-        """Objects to files of this machine, which are not whole until this returns."""
-        with self._asked(f"read {next(iter(files), '')}"):
+        """Copy objects to files of this machine, which are complete when this returns."""
+        with self._errors(f"read {next(iter(files), '')}"):
             self._fs.get([self._full(path) for path in files], [str(file) for file in files.values()])
 
     def upload(self, files: Mapping[str, Path]) -> None:
-        """Files of this machine, in any order; what has their path is replaced."""
-        with self._asked(f"write {next(iter(files), '')}"):
+        """Copy files of this machine, in any order; objects of the same path are replaced."""
+        with self._errors(f"write {next(iter(files), '')}"):
             self._fs.put([str(path) for path in files.values()], [self._full(path) for path in files])
 
     def remove(self, path: str) -> None:
-        """Remove an object, if it is there."""
-        with self._asked(f"remove {path}"), suppress(FileNotFoundError):
+        """Remove an object, if it exists."""
+        with self._errors(f"remove {path}"), suppress(FileNotFoundError):
             self._fs.rm_file(self._full(path))
 
     def _full(self, path: str) -> str:
         return f"{self._root}/{path}"
 
     @contextmanager
-    def _asked(self, what: str) -> Iterator[None]:
-        """Each kind of store has errors of its own, which have no class in common."""
+    def _errors(self, what: str) -> Iterator[None]:
+        """Turn any error of a store into one line: the classes of different stores have no common base."""
         try:
             yield
         except Exception as error:
@@ -152,11 +152,11 @@ def _remedy(error: Exception) -> str:
         return "ask for the right to list, read and write there, or choose another URL"
     if isinstance(error, FileNotFoundError):
         return "make the bucket first, or choose another URL"
-    return "see that the store can be reached; the same command goes on there"
+    return "check that the store can be reached; the same command continues there"
 
 
 def cache_of(url: str) -> Path:
-    """Folder for what is known of a store: in the user's cache, else where temporary files go.
+    """Local folder for the files and records of a store: in the user's cache, else a temporary folder.
 
     Raises:
         RsbenchError: neither can be written.
@@ -166,9 +166,9 @@ def cache_of(url: str) -> Path:
             with suppress(RsbenchError):
                 check_out(base)
                 return base / "stores" / key_of(url)
-    raise RsbenchError("no folder for what is being made: set TMPDIR to one that can be written")
+    raise RsbenchError("no folder for files in progress; set TMPDIR to one that can be written")
 
 
 def key_of(url: str) -> str:
-    """A short name for what is kept of a store."""
+    """A short name for the records of a store."""
     return hashlib.sha256(url.encode()).hexdigest()[:16]

@@ -1,7 +1,7 @@
-"""Reading what others wrote: sizes are known before anything is decoded, and names lead nowhere else.
+"""Reading files of other origin: sizes are checked before decoding, and names cannot lead out of a folder.
 
-A small file can unfold to more than a machine holds. What no dataset states has a limit here, and the variable
-``RSBENCH_LIMITS`` is a factor that raises all of them. Faults are one line.
+A small file can decode to more than a machine's memory. Sizes that no dataset states are limited here; the
+environment variable ``RSBENCH_LIMITS`` is a factor for all limits. Errors are one line.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 
 LIMITS = "RSBENCH_LIMITS"
-"""Variable of the environment: what all limits are multiplied by."""
+"""Environment variable: factor for all limits."""
 MB = 1 << 20
 CARD_BYTES = MB
-"""Of a TOML card: its reader takes seconds for a MB."""
+"""Limit for a TOML card: its reader takes seconds for a MB."""
 FILE_BYTES = 256 * MB
-"""Of any other file that is read at once, and of the arrays in an npz file."""
+"""Limit for any other file that is read at once, and for the arrays of an npz file."""
 PIXELS = 1 << 21
-"""Of one frame, 1920 x 1080 and a little more: correcting four takes 0.5 to 0.7 kB for each."""
+"""Limit for one frame, slightly more than 1920 x 1080: correcting four takes 0.5 to 0.7 kB for each pixel."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
-"""Names that become folders: of sequences, in cards and in what they were rendered to."""
+"""Names of sequences, which become folders."""
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)
-"""What Windows takes for a device, with any ending, and names whose last dot it drops."""
+"""Names that are devices on Windows, with any suffix, and names whose last dot it drops."""
 _OPEN = re.compile(r"/dev/[^/]+|/dev/fd/\d+|/proc/[^/]+(/task/\d+)?/fd/\d+")
-"""Devices, and what a process has open; folders such as /dev/shm hold files of anybody."""
+"""Devices and open files of a process, which may be read; not files in folders such as /dev/shm."""
 _KINDS = "biufU"
 _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
 
 def check_amount(where: object, what: str, amount: int, limit: int) -> None:
-    """Refuse more than a limit.
+    """Refuse an amount above a limit.
 
     Raises:
         RsbenchError: one line with the amount, the limit and the variable that raises it.
@@ -68,7 +68,7 @@ def _factor() -> float:
 
 
 def check_name(name: str) -> None:
-    """Raises ValueError unless a name can be that of a folder on every system, and of nothing else."""
+    """Refuse a name that cannot be that of a folder on every system, with ValueError."""
     if not NAME.fullmatch(name):
         raise ValueError(
             f"name = {name!r}: must be a folder's name: a letter or digit, then at most 119 letters, digits, "
@@ -82,7 +82,7 @@ def inside(folder: Path, relative: str) -> Path:
     """A file or folder below ``folder``, by a path from data.
 
     Raises:
-        RsbenchError: the path, or what a link makes of it, leads out of the folder.
+        RsbenchError: the path leads out of the folder, itself or through a link.
     """
     path = folder / relative
     try:
@@ -90,7 +90,7 @@ def inside(folder: Path, relative: str) -> Path:
     except (OSError, ValueError, RuntimeError):  # a circle of links, a zero byte
         leads = False
     if not leads or ".." in Path(relative).parts:
-        raise RsbenchError(f"{folder}: {relative!r} leads out of the folder; copy there what it should hold")
+        raise RsbenchError(f"{folder}: {relative!r} leads out of the folder; copy the file into it")
     return path
 
 
@@ -98,10 +98,10 @@ def inside(folder: Path, relative: str) -> Path:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file, or what a process has open already (``_OPEN``), for reading bytes.
+    """Open a regular file, or an open file of a process (``_OPEN``), for reading bytes.
 
     Raises:
-        OSError: it cannot be opened, or is a named pipe, a socket or a device, on which a read may never end.
+        OSError: it cannot be opened, or is a named pipe, a socket or a device, where a read may never end.
     """
     file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  the caller closes it
     mode = os.fstat(file.fileno()).st_mode
@@ -130,7 +130,7 @@ def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
     """
     try:
         with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size  # 0 of a pipe
+            size = os.fstat(file.fileno()).st_size  # 0 for a pipe
             check_amount(path, "bytes", size, limit)
             data = file.read(size + 1 if size else round(limit * _factor()) + 1)
     except OSError as error:
@@ -164,7 +164,7 @@ def parse_json(text: str, where: object) -> dict[str, Any]:
         raise RsbenchError(
             f"{where}: not valid JSON: {error.msg} at line {error.lineno} column {error.colno}"
         ) from error
-    except ValueError as error:  # a number of thousands of digits, a key that stands there twice
+    except ValueError as error:  # a number of thousands of digits, a repeated key
         raise RsbenchError(f"{where}: not valid JSON: {error}") from error
     except RecursionError as error:
         raise RsbenchError(f"{where}: not valid JSON: nested too deeply") from error
@@ -174,7 +174,7 @@ def parse_json(text: str, where: object) -> dict[str, Any]:
 
 
 def _keyed(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object, of whose two values for one key none is silently dropped."""
+    """An object; refuses two values for one key, with ValueError."""
     found = dict(pairs)
     if len(found) < len(pairs):
         seen: set[str] = set()
@@ -199,7 +199,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def unpack_arrays(file: BinaryIO, where: object, limit: int = FILE_BYTES) -> dict[str, NDArray[Any]]:
     """The arrays of an open npz file, ``limit`` bytes at most; errors as ``load_arrays``, with ``where`` in front.
 
-    What the directory of the archive states is what is read at most: zipfile stops there, whatever the data are.
+    zipfile reads at most the sizes that the directory of the archive states, whatever the data are.
     """
     try:
         with zipfile.ZipFile(file) as archive:
@@ -208,7 +208,7 @@ def unpack_arrays(file: BinaryIO, where: object, limit: int = FILE_BYTES) -> dic
             return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
     except RsbenchError:
         raise
-    except Exception as error:  # zipfile, zlib and numpy raise what damaged bytes make them stumble over
+    except Exception as error:  # zipfile, zlib and numpy raise various exceptions for damaged bytes
         raise RsbenchError(
             f"{where}: not an npz file of plain arrays: {' '.join(str(error).split()) or type(error).__name__}"
         ) from error
@@ -216,7 +216,7 @@ def unpack_arrays(file: BinaryIO, where: object, limit: int = FILE_BYTES) -> dic
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     data = archive.read(member)
-    # numpy sets memory aside for what the array's own header states.
+    # numpy allocates what the array's own header states.
     stream = io.BytesIO(data)
     old = np.lib.format.read_magic(stream) == (1, 0)
     shape, _, dtype = (np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0)(stream)
@@ -232,18 +232,18 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = None, most: int = PIXELS) -> None:
-    """Refuse an image by its header: of another size than ``size`` (width, height), or of more than ``most``.
+    """Refuse an image by its header: another size than ``size`` (width, height), or more than ``most`` pixels.
 
     Raises:
-        RsbenchError: that, or not a PNG, JPEG, TIFF, BMP, WebP or PNM file.
+        RsbenchError: so, or not a PNG, JPEG, TIFF, BMP, WebP or PNM file.
     """
     from PIL import Image
 
-    own, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # the limit is ours
+    own, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # the limit here is ``most``
     try:
         with Image.open(io.BytesIO(data), formats=_IMAGE_FORMATS) as image:
             found = image.size
-    except Exception as error:  # Pillow raises what a damaged file makes it stumble over
+    except Exception as error:  # Pillow raises various exceptions for a damaged file
         raise RsbenchError(f"{where}: cannot be decoded as an image") from error
     finally:
         Image.MAX_IMAGE_PIXELS = own
@@ -253,11 +253,7 @@ def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = 
 def check_size(
     where: object, found: tuple[int, int], size: tuple[int, int] | None = None, most: int = PIXELS
 ) -> None:
-    """Refuse a size (width, height) that is not ``size``, or without one more than ``most`` pixels.
-
-    Raises:
-        RsbenchError: one line.
-    """
+    """Refuse a size (width, height) other than ``size``, or without that above ``most`` pixels (RsbenchError)."""
     if size is None:
         check_amount(where, f"{found[0]} x {found[1]} pixels", found[0] * found[1], most)
     elif found != size:

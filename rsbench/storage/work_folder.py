@@ -33,7 +33,7 @@ from rsbench.core.errors import RsbenchError
 
 
 def user_cache() -> Path | None:
-    """The user's cache folder for rsbench, which need not exist; None without a home folder."""
+    """The user's cache folder for rsbench, which may not exist yet; None without a home folder."""
     home = os.path.expanduser("~")
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "rsbench"
@@ -45,7 +45,7 @@ def user_cache() -> Path | None:
 
 
 def temporary() -> Path | None:
-    """A folder that only this user can write: whoever writes there decides what is run."""
+    """A temporary folder that only this user can write, since compiled code is loaded from it."""
     try:
         if sys.platform == "win32":
             return Path(tempfile.gettempdir()) / "rsbench"
@@ -60,7 +60,7 @@ def temporary() -> Path | None:
 
 
 def cpu_key() -> str:
-    """Names the CPU model: a home folder is often shared by machines that differ."""
+    """Identifies the CPU model: different machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         known = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
@@ -72,18 +72,18 @@ def cpu_key() -> str:
 HIDDEN = ".rsbench"
 """Name of the hidden folder; it may be deleted when no command runs."""
 WORK = "work"
-"""Name of the folder in it for what is not complete; fresh for each command."""
+"""Name of the folder in it for incomplete results; empty at the start of each command."""
 LOCK = "lock"
-"""Name of the file in it that is locked; without it the folder is not rsbench's."""
+"""Name of the locked file in it; a folder without it was not made by rsbench."""
 _BEAT_S = 15.0
 _TRIES = 100
 _DEAD_S = 90.0
-"""NFS shows a time of change up to 60 s late."""
+"""Age of the owner's record after which its process counts as dead; NFS shows changes up to 60 s late."""
 
 
 @contextmanager
 def work_folder(out: Path, hidden: Path | None = None) -> Iterator[Path]:
-    """Be the only command that writes to ``out``; yields the hidden folder, with a fresh folder ``WORK`` in it.
+    """Lock ``out`` for this command; yields the hidden folder, with an empty folder ``WORK`` in it.
 
     Args:
         out: folder of the results, made if missing when the hidden folder lies in it.
@@ -108,14 +108,14 @@ def work_folder(out: Path, hidden: Path | None = None) -> Iterator[Path]:
 
 
 def refuse_url(out: Path) -> None:
-    """Raise RsbenchError for what was a URL before it became a path: it would be a folder of a strange name."""
+    """Refuse a URL that was turned into a path, with RsbenchError."""
     if re.match(r"[a-z][a-z0-9+.-]+:/", out.as_posix()):
         url = out.as_posix().replace(":/", "://", 1)
         raise RsbenchError(f"{url}: is a URL, which this command does not take there; give a folder")
 
 
 def remove(path: Path) -> None:
-    """Remove what lies in a hidden folder, if it is there; a link is removed, not followed."""
+    """Remove a file or folder in a hidden folder, if it exists; a link is removed, not followed."""
     if path.is_symlink() or path.is_file():
         path.unlink()
     elif path.exists():
@@ -123,9 +123,9 @@ def remove(path: Path) -> None:
 
 
 def unknown_files(folder: Path, ours: Callable[[str], bool]) -> list[str]:
-    """Paths below a folder that are no plain files of ours, sorted; relative, with slashes.
+    """Paths below a folder that are not regular files of rsbench, sorted; relative, with slashes.
 
-    A link is an unknown file whatever its name is; an empty folder is none.
+    A link is always unknown; an empty folder is not listed.
     """
     found: list[str] = []
     for place, folders, files in os.walk(folder, onerror=_raise):
@@ -139,10 +139,10 @@ def unknown_files(folder: Path, ours: Callable[[str], bool]) -> list[str]:
 
 
 def listed(folder: Path, suffix: str = "") -> list[Path]:
-    """What lies in a folder, sorted, of names with this end; nothing where there is no such folder.
+    """Content of a folder with this suffix, sorted; empty for a missing folder.
 
     Raises:
-        OSError: the folder cannot be listed; ``Path.glob`` passes over it in silence.
+        OSError: the folder cannot be listed, which ``Path.glob`` would ignore.
     """
     try:
         return sorted(path for path in folder.iterdir() if path.name.endswith(suffix))
@@ -154,7 +154,7 @@ def files_below(folder: Path) -> list[str]:
     """Paths of all files below a folder, relative to it, with slashes, sorted.
 
     Raises:
-        OSError: a folder cannot be listed; ``Path.rglob`` passes over it in silence.
+        OSError: a folder cannot be listed, which ``Path.rglob`` would ignore.
     """
     walked = os.walk(folder, onerror=_raise)
     paths = [Path(place, name).relative_to(folder).as_posix() for place, _, names in walked for name in names]
@@ -166,13 +166,13 @@ def _raise(error: OSError) -> NoReturn:
 
 
 def named(paths: list[str], most: int = 3) -> str:
-    """A few of the paths, and how many more there are."""
+    """The first paths as text, and how many more there are."""
     more = f" and {len(paths) - most} more" if len(paths) > most else ""
     return ", ".join(paths[:most]) + more
 
 
 def _take(out: Path, hidden: Path) -> int:
-    """The descriptor of the locked file."""
+    """Lock the file and return its descriptor."""
     for tries in range(_TRIES, 0, -1):
         try:
             hidden.mkdir(parents=True, exist_ok=True)
@@ -181,7 +181,7 @@ def _take(out: Path, hidden: Path) -> int:
             descriptor = os.open(hidden / LOCK, flags, 0o644)
         except OSError as error:
             gone = isinstance(error, FileNotFoundError | FileExistsError) and not hidden.is_file()
-            if gone and tries > 1:  # its last owner removed it meanwhile
+            if gone and tries > 1:  # its last owner has just removed it
                 continue
             raise RsbenchError(f"{out}: cannot be written: {error.strerror}; choose another folder") from error
         try:
@@ -204,12 +204,12 @@ def _refuse_foreign(hidden: Path) -> None:
 
 
 def _claim(out: Path, descriptor: int) -> None:
-    """Lock the file and write whose it is."""
-    held = _lock(descriptor)
+    """Lock the open file and write the owner's record."""
+    locked = _lock(descriptor)
     owner, age = _owner(descriptor), time.time() - os.fstat(descriptor).st_mtime
     other_host = owner.get("host", platform.node()) != platform.node()
-    if held is False or (owner and age < _DEAD_S and (held is None or other_host)):
-        seen = "" if held is False else f", seen there {max(age, 0.0):.0f} s ago"
+    if locked is False or (owner and age < _DEAD_S and (locked is None or other_host)):
+        seen = "" if locked is False else f", seen there {max(age, 0.0):.0f} s ago"
         who = f"process {owner.get('pid', '?')} on {owner.get('host', 'this machine')}"
         raise RsbenchError(
             f"{out}: {who} is at work there since {owner.get('since', 'just now')}{seen} "
@@ -227,7 +227,7 @@ def _claim(out: Path, descriptor: int) -> None:
 
 
 def _lock(descriptor: int) -> bool | None:
-    """Whether the file is locked now, until its descriptor is closed; None where there are no locks."""
+    """Lock the file until its descriptor is closed; whether that succeeded, None where there are no locks."""
     if sys.platform == "win32":
         return None
     import fcntl
@@ -240,7 +240,7 @@ def _lock(descriptor: int) -> bool | None:
 
 
 def _owner(descriptor: int) -> dict[str, Any]:
-    """What the file says; nothing when its owner was done, or has yet to write."""
+    """The owner's record; empty when the owner has finished or has not written yet."""
     os.lseek(descriptor, 0, os.SEEK_SET)
     try:
         content = json.loads(os.read(descriptor, 4096))
@@ -250,7 +250,7 @@ def _owner(descriptor: int) -> dict[str, Any]:
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
-    """Whether the open file is still the one of this name."""
+    """Whether the open file still has this path."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:
@@ -264,8 +264,8 @@ def _beat(lock: Path, done: threading.Event) -> None:
 
 
 def _leave(hidden: Path, descriptor: int, fresh: list[Path]) -> None:
-    """Free the lock; the hidden folder goes when it holds nothing that a later run can use, and ``fresh`` ones, of
-    which each holds the one before it, when they are empty."""
+    """Free the lock; remove the hidden folder if it holds nothing for a later run, and then ``fresh`` folders, the
+    innermost first, if they are empty."""
     with contextlib.suppress(OSError):
         remove(hidden / WORK)
         os.ftruncate(descriptor, 0)

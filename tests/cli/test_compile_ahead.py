@@ -56,7 +56,7 @@ def test_the_second_process_ends_with_the_command(tmp_path: Path, monkeypatch: p
         started.append(popen(*words, **options))
         return started[-1]
 
-    monkeypatch.setattr(compile_ahead.subprocess, "Popen", noted)
+    monkeypatch.setattr(subprocess, "Popen", noted)
     monkeypatch.setattr(compile_ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))

@@ -44,7 +44,7 @@ def child(code: str, **environment: str | None) -> subprocess.CompletedProcess[s
     )
 
 
-def test_the_folder_is_the_one_asked_for_then_the_user_s(tmp_path: Path) -> None:
+def test_the_folder_of_the_environment_comes_before_the_user_s(tmp_path: Path) -> None:
     version = f"kernels/{compiled.source_version()[:16]}"
     own = child(FOLDER, NUMBA_CACHE_DIR=str(tmp_path / "own"), XDG_CACHE_HOME=str(tmp_path))
     assert own.stdout == str(tmp_path / "own" / version)
@@ -71,7 +71,7 @@ def test_where_nothing_can_be_written_functions_still_compile(tmp_path: Path) ->
     code = f"""
         import sys; sys.path.insert(0, {str(tmp_path)!r})
         from rsbench.components import compiled
-        compiled._asked_for = compiled.user_cache = compiled.temporary = lambda: None
+        compiled.config.CACHE_DIR = ""; compiled.user_cache = compiled.temporary = lambda: None
         import adds
         assert adds.quotient(3.0, 2.0) == 1.5
         assert compiled.cache_folder() is None
@@ -178,7 +178,7 @@ def test_a_warm_solver_compiles_nothing(name: str) -> None:
 
 def test_long_compiling_is_announced_in_one_line_and_once(tmp_path: Path) -> None:
     (tmp_path / "adds.py").write_text(textwrap.dedent(ADDS))
-    code = "from rsbench.components import compiled; compiled._WORTH_SAYING_S = 0.0" + USE.format(
+    code = "from rsbench.components import compiled; compiled._LONG_S = 0.0" + USE.format(
         folder=str(tmp_path)
     ).replace("\n    ", "\n")
     first, second = (child(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")) for _ in range(2))

@@ -54,7 +54,7 @@ def test_fastec_is_scored_against_its_truth(tmp_path: Path) -> None:
     folder = write_fastec(tmp_path / "data")
     run = run_here("evaluate", folder, "--from", "fastec-rs", "--out", tmp_path / "out")
     assert run.returncode == 0, run.stderr
-    assert "a focal length of 160 px, the width, and a readout ratio of 1 are taken" in run.stdout + run.stderr
+    assert "a focal length of 160 px, the width, and a readout ratio of 1 are assumed" in run.stdout + run.stderr
     table = pd.read_csv(tmp_path / "out" / "scores" / "correction.csv")
     # Every frame but the first, at the first and the middle row, by three methods.
     assert len(table) == 2 * 2 * 3

@@ -29,11 +29,11 @@ from rsbench.pipeline.footage import read_frame
 from rsbench.vision.features import Features, Gate, detect, match
 
 _ROWS = 30
-"""Steps to the row that sees a point; each leaves readout ratio times speed, rows per row, of the error."""
+"""Iterations to find the row that sees a point; each multiplies the error by readout ratio times speed."""
 _TOLERANCE = 0.01
-"""Relative difference of depths that agree: text has four decimals, and depth is interpolated between pixels."""
+"""Largest relative difference of equal depths: text has four decimals, and depth is interpolated."""
 _TYPICAL = 2e-3
-"""Median of the relative differences, at most: wrong poses, times or kinds of depth leave more."""
+"""Largest median of the relative differences: wrong poses, times or kinds of depth leave more."""
 _SHARE = 0.8
 _LEAST_DISPARITY_SHARE = 0.9
 
@@ -45,15 +45,15 @@ class Agreement:
     side: Side
     frames: tuple[int, int]
     pixels: int
-    """That the other frame sees, and nothing before them."""
+    """Compared pixels: the other frame sees them, and nothing hides them."""
     share: float
-    """Of them, that agree within a hundredth."""
+    """Share of these that agree within a hundredth."""
     typical: float
     """Median of the relative differences."""
 
     @property
     def fault(self) -> str:
-        """What is wrong with it; empty for nothing."""
+        """The fault in one sentence; empty if there is none."""
         if self.pixels == 0 or (self.share >= _SHARE and self.typical <= _TYPICAL):
             return ""
         return (
@@ -63,7 +63,7 @@ class Agreement:
 
 
 def file_faults(recording: Recording, progress: Callable[[str], object] = str) -> Iterator[str]:
-    """Images that are missing, unreadable, or not of their camera's size; ``progress`` gets their names."""
+    """Images that are missing, unreadable or of another size than their camera; ``progress`` gets each name."""
     for path, side in (
         *((path, side) for (side, _), path in recording.images.items()),
         *((path, side) for (side, *_), path in (*recording.truths.items(), *recording.masks.items())),
@@ -80,7 +80,7 @@ def file_faults(recording: Recording, progress: Callable[[str], object] = str) -
 
 
 def disparity_faults(recording: Recording) -> Iterator[str]:
-    """Disparities of another size, or that lead out of the other image."""
+    """Disparities of another size, or that point outside the other image."""
     for (side, frame), read in recording.disparities.items():
         found, camera = read(), recording.cameras[side]
         if found.shape != (camera.height, camera.width):
@@ -95,7 +95,7 @@ def disparity_faults(recording: Recording) -> Iterator[str]:
 
 
 def agreements(recording: Recording) -> Iterator[Agreement]:
-    """Of the depth maps of each camera, every two successive ones, as far as poses and row times are known."""
+    """Compare successive depth maps of each camera, where poses and row times are known."""
     for side in recording.cameras:
         frames = sorted(frame for each, frame in recording.depths if each == side)
         if side not in recording.poses or side not in recording.shutters:
@@ -121,7 +121,9 @@ def _agreement(recording: Recording, side: Side, first: int, second: int) -> Agr
     inside = camera.contains(landed) & (points[:, 2] > 0.0)
     there = _sampled(other, landed[inside])
     difference = (there - points[inside, 2]) / points[inside, 2]
-    difference = difference[np.isfinite(difference) & (difference > -10.0 * _TOLERANCE)]  # what hides it is nearer
+    difference = difference[
+        np.isfinite(difference) & (difference > -10.0 * _TOLERANCE)
+    ]  # leaves out points hidden by nearer surfaces
     sizes = np.abs(difference)
     return Agreement(
         side=side,
@@ -133,7 +135,7 @@ def _agreement(recording: Recording, side: Side, first: int, second: int) -> Agr
 
 
 def _sampled(depth: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Depth (n,) at pixels (n, 2), its inverse interpolated: exact on planes; NaN where a neighbour has none."""
+    """Depth (n,) at pixels (n, 2), by interpolating its inverse (exact on planes); NaN beside unknown depth."""
     with np.errstate(divide="ignore"):
         near = np.where(depth > 0.0, 1.0 / depth, np.nan)
     where = pixels.astype(np.float32)[None]
@@ -144,40 +146,40 @@ def _sampled(depth: FloatArray, pixels: FloatArray) -> FloatArray:
 
 Value = TypeVar("Value")
 NEAR_PX = 3.0
-"""Distance from line or pixel within which a match or a point agrees; features err by less than one."""
+"""Distance from line or pixel within which a match or a point agrees; features are accurate to one pixel."""
 LOOKS = 4
-"""Pairs of each kind, and images whose points are projected, at most; spread over the recording."""
+"""Most pairs of each kind, and most images whose points are projected; spread over the recording."""
 _FEWEST = 30
 _SIGHT_SHARE = 0.5
-"""Of matches and points, that agree at least: a quarter of all matches may be wrong."""
+"""Least share of matches or points that agree; a quarter of all matches may be wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sight:
-    """How what is seen in images agrees with cameras and poses."""
+    """Agreement of matches or points in images with cameras and poses."""
 
     what: str
     count: int
     """Matches or points."""
     share: float
-    """Of them, within ``NEAR_PX``."""
+    """Share of these within ``NEAR_PX``."""
     typical: float
     """Median distance, px."""
 
     @property
     def fault(self) -> str:
-        """What is wrong with it; empty for nothing, and for too little to tell."""
+        """The fault in one sentence; empty if there is none, or too few matches or points."""
         if self.count < _FEWEST or self.share >= _SIGHT_SHARE:
             return ""
         return (
             f"{self.what}: {100 * self.share:.0f} % within {NEAR_PX:g} px of where cameras and poses say, "
             f"typically {self.typical:.1f} px off: lens, extrinsics, poses or times are wrong, or rows are not "
-            "read as said"
+            "read as assumed"
         )
 
 
 def sights(recording: Recording) -> Iterator[Sight]:
-    """Of pairs of images whose poses are known, and of points that the layout says are seen."""
+    """Compare pairs of images whose poses are known, and the observed points of the layout."""
     for (side, frame), read in _spread(list(recording.sightings.items())):
         pixels, points = read()
         landed = recording.cameras[side].project(transform(_camera_pose(recording, side, frame, pixels), points))
@@ -185,7 +187,7 @@ def sights(recording: Recording) -> Iterator[Sight]:
     for a, b in _pairs(recording):
         try:
             pixels = _matches(recording.images[a], recording.images[b])
-        except RsbenchError:  # told by the check of files
+        except RsbenchError:  # reported by the check of files
             continue
         found = _relative(recording, a, b, pixels)
         if found is not None:
@@ -196,10 +198,10 @@ def sights(recording: Recording) -> Iterator[Sight]:
 def epipolar_distance(
     b_from_a: Pose, pixels: FloatArray, camera_a: PinholeCamera, camera_b: PinholeCamera
 ) -> FloatArray:
-    """Distance (n,) of matches (n, 4) x, y in a and in b from where they may be, px of images without lenses.
+    """Distance (n,) of matches (n, 4), x, y in a and in b, from epipolar half-lines, px of images without lenses.
 
-    That is half an epipolar line, on which points in front of both cameras lie: the Sampson distance from it, or
-    for a match on the other half the distance from its end, where points at infinity are seen.
+    Points in front of both cameras lie on a half-line: the distance is Sampson's from the line, or for a match on
+    its other half that from its end, where points at infinity are seen.
     """
     x0, x1 = camera_a.unproject(pixels[:, :2]), camera_b.unproject(pixels[:, 2:])
     E = essential_matrix(b_from_a)
@@ -210,7 +212,7 @@ def epipolar_distance(
     turned = (b_from_a.R @ x0[..., None])[..., 0]
     across = so3.cross(x1, turned)
     behind = np.sum(across * so3.cross(x1, np.broadcast_to(b_from_a.t, x1.shape)), axis=-1) > 0.0
-    with np.errstate(invalid="ignore", divide="ignore"):  # nothing moved: no line
+    with np.errstate(invalid="ignore", divide="ignore"):  # no motion: no line
         off = value / np.linalg.norm(np.concatenate(lines, axis=-1), axis=-1)
         from_end = np.linalg.norm((x1 - turned / turned[:, 2:])[:, :2] * focal_b, axis=-1)
     return np.where(behind, np.maximum(off, from_end), off)
@@ -225,7 +227,7 @@ def _sight(what: str, distances: FloatArray) -> Sight:
 
 
 def _pairs(recording: Recording) -> Iterator[tuple[View, View]]:
-    """Images to match: across the rig, and of successive times, where there are times."""
+    """Images to match: of the two cameras, and of successive times where times are known."""
     known = recording.images
     across = [k for side, k in known if side == "left" and ("right", k) in known]
     for k in _spread(across):
@@ -236,13 +238,13 @@ def _pairs(recording: Recording) -> Iterator[tuple[View, View]]:
 
 
 def _spread(values: list[Value]) -> list[Value]:
-    """At most ``LOOKS`` of them, the first and the last too."""
+    """At most ``LOOKS`` of the values, including the first and the last."""
     chosen = np.unique(np.linspace(0, len(values) - 1, min(LOOKS, len(values))).astype(int))
     return [values[k] for k in chosen]
 
 
 def _relative(recording: Recording, a: View, b: View, pixels: FloatArray) -> Pose | None:
-    """``b_from_a`` of matches, each of the times of its own rows; None where it is not known."""
+    """``b_from_a`` of matches, at the times of their rows; None where it is not known."""
     if {a[0], b[0]} <= recording.poses.keys():
         found = compose(
             _camera_pose(recording, *b, pixels[:, 2:]), inverse(_camera_pose(recording, *a, pixels[:, :2]))
@@ -253,7 +255,7 @@ def _relative(recording: Recording, a: View, b: View, pixels: FloatArray) -> Pos
 
 
 def _camera_pose(recording: Recording, side: Side, frame: int, pixels: FloatArray) -> Pose:
-    """Of a camera when it sees pixels (n, 2); all at once where nothing is said of rows."""
+    """Poses of a camera at the times of pixels (n, 2); one pose where the shutter is not known."""
     shutter = recording.shutters.get(side)
     tau = np.full(len(pixels), float(frame)) if shutter is None else shutter.pixel_time(pixels, frame, side)
     return recording.poses[side](tau)

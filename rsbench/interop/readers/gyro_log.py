@@ -2,7 +2,7 @@
 
 ``.gcsv`` (docs.gyroflow.xyz, GCSV format): a line GYROFLOW IMU LOG or CAMERA IMU LOG, lines ``key,value``, the
 names of the columns from ``t`` on, numbers. ``tscale`` and ``gscale`` make seconds and rad/s of them;
-``orientation`` says of which column, and with which sign (small: minus), each of their axes is: x up, y left, z
+``orientation`` gives the column and the sign (lower case: minus) of each of gyroflow's axes: x up, y left, z
 backwards.
 """
 
@@ -26,10 +26,10 @@ _CAMERA_FROM_THEIRS = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -
 
 
 class GyroLog(NamedTuple):
-    """What a gyroscope measured, in the order of time."""
+    """Measurements of a gyroscope, in the order of time."""
 
     times_s: FloatArray
-    """(n,) by its own clock, which grow."""
+    """(n,) by its own clock, increasing."""
     rates: FloatArray
     """(n, 3) rad/s, in the axes of the camera: x right, y down, z forward."""
 
@@ -37,17 +37,17 @@ class GyroLog(NamedTuple):
         """(n, 4) tau, w of ``Correspondences.gyro``, tau 0 the first row of the first frame.
 
         Args:
-            fps: frames a second.
-            offset_s: what the log's clock shows at that time.
+            fps: frames per second.
+            offset_s: time of the log's clock at tau 0.
         """
         return np.column_stack([(self.times_s - offset_s) * fps, -self.rates / fps])
 
 
 def read_gyro_log(path: Path) -> GyroLog:
-    """A log by its ending.
+    """Read a log, whose format is known by its suffix.
 
     Raises:
-        RsbenchError: missing, of another ending, not such a table, times that do not grow, or fewer than two.
+        RsbenchError: missing, another suffix, malformed, times that do not increase, or fewer than two samples.
     """
     suffix = path.suffix.lower()
     if suffix not in (".gcsv", ".csv"):
@@ -82,7 +82,7 @@ def _of_gcsv(text: Sequence[str], path: Path) -> tuple[FloatArray, FloatArray]:
     orientation = head.get("orientation", "XYZ").strip()
     if sorted(orientation.upper()) != ["X", "Y", "Z"]:
         raise RsbenchError(
-            f"{path}: orientation = {orientation!r}: must be X, Y and Z in some order, small for minus"
+            f"{path}: orientation = {orientation!r}: must be X, Y and Z in some order, lower case for minus"
         )
     values = _table(text, start, _THEIRS, path)
     theirs = [(1.0 if each.isupper() else -1.0) * values[:, 1 + "XYZ".index(each.upper())] for each in orientation]
@@ -90,7 +90,7 @@ def _of_gcsv(text: Sequence[str], path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def _table(text: Sequence[str], start: int, names: Sequence[str], path: Path) -> FloatArray:
-    """The columns of these names (n, k) below the line that names them; a last line may be cut off."""
+    """Columns (n, k) by their names in the line ``start``; an incomplete last line is ignored."""
     columns = [each.strip() for each in text[start].split(",")] if text else []
     if any(name not in columns for name in names):
         raise RsbenchError(f"{path}: must have the columns {','.join(names)}")

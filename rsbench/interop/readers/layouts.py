@@ -41,7 +41,7 @@ Neither Middlebury nor KITTI has times of rows, and no shutter is assumed.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache, partial
 from operator import attrgetter
 from pathlib import Path
@@ -66,7 +66,7 @@ from rsbench.storage.untrusted_files import inside, read_bytes, read_text
 
 
 def numbers(text: str, where: object, count: int | None = None) -> FloatArray:
-    """(n,) finite numbers apart by blanks or commas; RsbenchError for others, or another count."""
+    """(n,) finite numbers, separated by blanks or commas; RsbenchError for anything else or another count."""
     words = text.replace(",", " ").split()
     try:
         values = np.array([float(word) for word in words])
@@ -79,14 +79,14 @@ def numbers(text: str, where: object, count: int | None = None) -> FloatArray:
 
 
 def lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Lines that are not empty and no comment (#), each with where it stands."""
+    """Lines that are neither empty nor comments (#), each with file and line number."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield f"{path}:{number}", line
 
 
 def only_file(folder: Path, *names: str) -> Path:
-    """The first of some files that is there; RsbenchError for none."""
+    """The first of some files that exists; RsbenchError if none does."""
     for name in names:
         if (folder / name).is_file():
             return folder / name
@@ -94,11 +94,39 @@ def only_file(folder: Path, *names: str) -> Path:
 
 
 def rotation(q: FloatArray, where: object) -> FloatArray:
-    """(3, 3) of a quaternion (w, x, y, z), made of length one; RsbenchError where it is far from that."""
+    """(3, 3) of a quaternion (w, x, y, z), normalised; RsbenchError where its length is far from one."""
     length = float(np.linalg.norm(q))
     if not abs(length - 1.0) < 1e-2:
         raise RsbenchError(f"{where}: quaternion {q.tolist()} has length {length:g}, not 1")
     return from_quaternion(q)
+
+
+def _pinhole(
+    size: Iterable[float],
+    intrinsics: Iterable[float],
+    where: object,
+    lens_model: str | None = None,
+    coefficients: Mapping[str, float] | None = None,
+) -> PinholeCamera:
+    """A camera from (width, height), (fx, fy, cx, cy) and a lens; RsbenchError for impossible values."""
+    (width, height), (fx, fy, cx, cy) = map(int, size), intrinsics
+    try:
+        lens = Lens(model=lens_model, **(coefficients or {})) if lens_model else None  # pyrefly: ignore[bad-argument-type]
+        return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {error}") from error
+
+
+def _nanoseconds(stamp: str, where: str) -> int:
+    if not stamp.strip().isdigit():
+        raise RsbenchError(f"{where}: {stamp!r}: must be nanoseconds, a whole number")
+    return int(stamp)
+
+
+def _numbered_images(folder: Path, digits: int, kind: str) -> dict[int, Path]:
+    """Image files of one kind by frame, whose number has so many digits."""
+    found = sorted(folder.glob(f"{'[0-9]' * digits}_{kind}.*"))
+    return {int(path.name[:digits]): path for path in found if path.suffix in (".png", ".jpg")}
 
 
 _COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
@@ -111,12 +139,12 @@ _COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "kannala-brandt"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "kannala-brandt"),
 }
-"""Parameters in their order, and the lens that has them."""
+"""Parameters in their order, and the lens model."""
 _CORNER = 0.5
 
 
 class Shot(NamedTuple):
-    """An image: its name, its pose, and what gives pixels and points that are seen there."""
+    """An image: its name, its pose, and a function that returns observed pixels and points."""
 
     name: str
     pose: Pose
@@ -127,8 +155,8 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     """One recording of each camera, its images in the order of their names.
 
     Args:
-        folder: holds cameras.txt and images.txt.
-        images: folder to which names of images are relative; None: ``images`` in the folder, or one or two above.
+        folder: holds cameras.txt and images.txt. images: folder to which image names are relative; None:
+        ``images`` in the folder, or one or two levels above.
 
     Raises:
         RsbenchError: a file is missing or wrong, or a camera model has no counterpart.
@@ -143,7 +171,7 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     rows = [line for line in read_text(path).splitlines() if not line.lstrip().startswith("#")]
     while rows and not rows[-1].strip():
         rows.pop()
-    for number, line in enumerate(rows[::2]):  # every second one lists points, and may be empty
+    for number, line in enumerate(rows[::2]):  # every second line lists points, and may be empty
         where = f"{path}, image {number + 1}"
         name, camera, pose = _colmap_image(where, line)
         if camera not in cameras:
@@ -166,12 +194,7 @@ def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
     size = numbers(" ".join(words[2:4]), where, 2)
     fx, fy = values.pop("fx", values.get("f", 0.0)), values.pop("fy", values.pop("f", 0.0))
     cx, cy = values.pop("cx") - _CORNER, values.pop("cy") - _CORNER
-    try:
-        lens = None if model is None else Lens(model=model, **values)  # pyrefly: ignore[bad-argument-type]
-        camera = PinholeCamera(width=int(size[0]), height=int(size[1]), fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
-    return words[0], camera
+    return words[0], _pinhole(size, (fx, fy, cx, cy), where, model, values)
 
 
 def _colmap_image(where: str, line: str) -> tuple[str, str, Pose]:
@@ -183,7 +206,7 @@ def _colmap_image(where: str, line: str) -> tuple[str, str, Pose]:
 
 
 def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
-    """Pixels and points of a line of x, y and a point's number, -1 for none."""
+    """Pixels and points of a line of x, y and the number of a point, -1 for none."""
     known, values = _colmap_points(points), numbers(line, where)
     if len(values) % 3:
         raise RsbenchError(f"{where}: its points must be x, y and a number each")
@@ -194,7 +217,7 @@ def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray
 
 @lru_cache(maxsize=2)
 def _colmap_points(path: Path) -> dict[int, FloatArray]:
-    """Places by number."""
+    """Positions of points by number."""
     found = {}
     for where, line in lines(path):
         number, *place = numbers(" ".join(line.split()[:4]), where, 4)
@@ -216,7 +239,7 @@ def _colmap_recording(number: str, camera: PinholeCamera, shots: list[Shot], roo
 
 
 def _pose_of_image(R: FloatArray, t: FloatArray, tau: FloatArray) -> Pose:
-    """The pose of an image at its whole number; NaN between, where nothing is known."""
+    """The pose of an image at its whole number; NaN between."""
     tau = np.asarray(tau, dtype=np.float64)
     index = np.clip(np.rint(tau), 0, len(R) - 1).astype(np.int64)
     known = index == tau
@@ -233,13 +256,13 @@ _YAML_KEY = re.compile(r"^[ \t]*(\w+):[ \t]*(\[[^\]]*\]|[^\n#]*)", re.MULTILINE)
 
 
 def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) -> list[Recording]:
-    """The sequence of a folder that is, or holds, ``mav0`` (or the cameras themselves).
+    """The sequence of a folder that is or contains ``mav0``, or contains the cameras.
 
     Args:
-        line_delays_s: seconds between rows of the cameras that are known to roll, or 0 of a global one.
+        line_delays_s: seconds between rows of a rolling shutter, 0 for a global one; without it not known.
 
     Raises:
-        RsbenchError: files that are missing, or not what they should be.
+        RsbenchError: files that are missing or malformed.
     """
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     sensors = {side: root / f"cam{k}" for k, side in enumerate(SIDES) if (root / f"cam{k}").is_dir()}
@@ -285,27 +308,21 @@ def _yaml_numbers(fields: Mapping[str, str], key: str, path: Path, count: int) -
 
 
 def _euroc_camera(fields: Mapping[str, str], path: Path) -> PinholeCamera:
-    width, height = _yaml_numbers(fields, "resolution", path, 2)
-    fx, fy, cx, cy = _yaml_numbers(fields, "intrinsics", path, 4)
+    size = _yaml_numbers(fields, "resolution", path, 2)
+    centre = _yaml_numbers(fields, "intrinsics", path, 4)
     model = fields.get("distortion_model", "none").strip('"')
-    lens = None
-    if model in _LENSES:
-        name, keys = _LENSES[model]
-        values = _yaml_numbers(fields, "distortion_coefficients", path, len(keys))
-        lens = Lens(model=name, **dict(zip(keys, values.tolist(), strict=True)))  # pyrefly: ignore[bad-argument-type]
-    elif model != "none":
+    if model not in (*_LENSES, "none"):
         raise RsbenchError(f"{path}: distortion_model = {model!r}: must be one of {', '.join(_LENSES)}")
-    try:
-        return PinholeCamera(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
-    except ValueError as error:
-        raise RsbenchError(f"{path}: {error}") from error
+    name, keys = _LENSES.get(model, (None, ()))
+    values = _yaml_numbers(fields, "distortion_coefficients", path, len(keys)) if name else np.zeros(0)
+    return _pinhole(size, centre, path, name, dict(zip(keys, values.tolist(), strict=True)))
 
 
 def _euroc_extrinsics(fields: Mapping[str, str], path: Path) -> Pose:
     """``body_from_camera``."""
     T = _yaml_numbers(fields, "data", path, 16).reshape(4, 4)
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
-        raise RsbenchError(f"{path}: T_BS: its rotation is none")
+        raise RsbenchError(f"{path}: T_BS: is not a rotation")
     return Pose(T[:3, :3], T[:3, 3])
 
 
@@ -314,41 +331,37 @@ def _euroc_times(folder: Path) -> dict[int, Path]:
     out = {}
     for where, line in lines(folder / "data.csv"):
         stamp, _, name = line.partition(",")
-        if not stamp.strip().isdigit():
-            raise RsbenchError(f"{where}: {stamp!r}: must be nanoseconds, a whole number")
-        out[int(stamp)] = inside(folder / "data", name.strip())
+        out[_nanoseconds(stamp, where)] = inside(folder / "data", name.strip())
     return dict(sorted(out.items()))
 
 
 def _trajectory(root: Path, start_ns: int, period_s: float) -> PoseAt | None:
-    """``world_from_body`` by time in frame periods; None where there is none."""
+    """``world_from_body`` by time in frame periods; None without a file of poses."""
     path = next((root / name / "data.csv" for name in _EUROC_POSES if (root / name / "data.csv").is_file()), None)
     if path is None:
         return None
     stamps, rows = list[float](), list[tuple[FloatArray, FloatArray]]()
     for where, line in lines(path):
         stamp, _, rest = line.partition(",")
-        if not stamp.strip().isdigit():
-            raise RsbenchError(f"{where}: {stamp!r}: must be nanoseconds, a whole number")
-        values = numbers(rest, where)
+        ns, values = _nanoseconds(stamp, where), numbers(rest, where)
         if len(values) < 7:
             raise RsbenchError(f"{where}: must be a time, a position and a quaternion")
-        stamps.append((int(stamp) - start_ns) * 1e-9 / period_s)
+        stamps.append((ns - start_ns) * 1e-9 / period_s)
         rows.append((rotation(values[3:7], where), values[:3]))
     tau = np.array(stamps)
     if len(tau) < 2 or not np.all(np.diff(tau) > 0.0):
-        raise RsbenchError(f"{path}: must hold at least two times that grow")
+        raise RsbenchError(f"{path}: must hold at least two times, increasing")
     turns = Slerp(tau, Rotation.from_matrix(np.array([R for R, _ in rows])))
     return partial(_between, tau, turns, np.array([p for _, p in rows]))
 
 
 def _between(known: FloatArray, turns: Slerp, places: FloatArray, tau: FloatArray) -> Pose:
-    """Between two known poses, the way along a straight line and the turn at constant speed; NaN beyond them."""
+    """Interpolate poses: position linear, rotation at constant speed; NaN outside the known times."""
     tau = np.asarray(tau, dtype=np.float64)
-    held = np.clip(tau, known[0], known[-1])
-    R = turns(held.ravel()).as_matrix().reshape(*tau.shape, 3, 3)
-    p = np.stack([np.interp(held, known, places[:, axis]) for axis in range(3)], axis=-1)
-    beyond = held != tau
+    clipped = np.clip(tau, known[0], known[-1])
+    R = turns(clipped.ravel()).as_matrix().reshape(*tau.shape, 3, 3)
+    p = np.stack([np.interp(clipped, known, places[:, axis]) for axis in range(3)], axis=-1)
+    beyond = clipped != tau
     return Pose(np.where(beyond[..., None, None], np.nan, R), np.where(beyond[..., None], np.nan, p))
 
 
@@ -366,14 +379,14 @@ def _euroc_shutter(height: int, line_delay_s: float, period_s: float, root: Path
 
 
 _CARLA_FPS = 20.0
-"""Of the published data, where no rs_calib.txt says otherwise."""
+"""Frame rate of the published data, used without rs_calib.txt."""
 
 
 def read_carla(folder: Path) -> list[Recording]:
     """Every sequence below a folder, or the folder itself.
 
     Raises:
-        RsbenchError: no gt_vel.log, or a file that is not what it should be.
+        RsbenchError: no gt_vel.log, or a malformed file.
     """
     found = sorted(path.parent for path in [folder, *folder.glob("**")] for path in path.glob("gt_vel.log"))
     if not found:
@@ -382,7 +395,7 @@ def read_carla(folder: Path) -> list[Recording]:
 
 
 def _read_carla_sequence(folder: Path) -> Recording:
-    images: dict[View, Path] = {("left", frame): path for frame, path in _carla_pictures(folder, "rs").items()}
+    images: dict[View, Path] = {("left", frame): path for frame, path in _numbered_images(folder, 4, "rs").items()}
     if not images:
         raise RsbenchError(f"{folder}: holds no 0000_rs.png")
     height, width = read_frame(next(iter(images.values()))).shape[:2]
@@ -408,17 +421,11 @@ def _read_carla_sequence(folder: Path) -> Recording:
         truths={
             ("left", frame, row): path
             for kind, row in (("gs_f", 0), ("gs_m", height // 2))
-            for frame, path in _carla_pictures(folder, kind).items()
+            for frame, path in _numbered_images(folder, 4, kind).items()
         },
-        masks={("left", frame): path for frame, path in _carla_pictures(folder, "mask").items()},
+        masks={("left", frame): path for frame, path in _numbered_images(folder, 4, "mask").items()},
         notes=() if known else (assumed,),
     )
-
-
-def _carla_pictures(folder: Path, kind: str) -> dict[int, Path]:
-    """Files of images of one kind, by frame."""
-    found = sorted(folder.glob(f"[0-9][0-9][0-9][0-9]_{kind}.*"))
-    return {int(path.name[:4]): path for path in found if path.suffix in (".png", ".jpg")}
 
 
 def _carla_pose(w: FloatArray, v: FloatArray, tau: FloatArray) -> Pose:
@@ -428,7 +435,7 @@ def _carla_pose(w: FloatArray, v: FloatArray, tau: FloatArray) -> Pose:
 
 
 def _carla_timing(folder: Path, height: int) -> tuple[float, float, bool]:
-    """Frames a second, seconds a row, and whether a file says so: rs_calib.txt here or one folder up."""
+    """Frames per second, seconds per row, and whether they are from rs_calib.txt, here or one folder up."""
     for path in (folder / "rs_calib.txt", folder.parent / "rs_calib.txt"):
         if path.is_file():
             fields = dict(line.split(":", 1) for _, line in lines(path) if ":" in line)
@@ -461,16 +468,13 @@ def _read_carla_depth(path: Path, camera: PinholeCamera, radial: bool) -> FloatA
     return distance / np.linalg.norm(camera.unproject(np.stack([x, y], axis=-1)), axis=-1)
 
 
-_DIGITS = "[0-9][0-9][0-9]"
-
-
 def read_fastec(folder: Path) -> list[Recording]:
     """Every sequence below a folder, or the folder itself.
 
     Raises:
-        RsbenchError: no frame, or the first one of a sequence is no image.
+        RsbenchError: no frame, or the first one of a sequence is not an image.
     """
-    places = sorted({path.parent for path in folder.rglob(f"{_DIGITS}_rolling.png")})
+    places = sorted({path.parent for path in folder.rglob("[0-9][0-9][0-9]_rolling.png")})
     if not places:
         raise RsbenchError(f"{folder}: holds no 000_rolling.png, as sequences of Fastec-RS do")
     return [_read_fastec_sequence(place, folder) for place in places]
@@ -478,7 +482,7 @@ def read_fastec(folder: Path) -> list[Recording]:
 
 def _read_fastec_sequence(place: Path, folder: Path) -> Recording:
     images: dict[View, Path] = {
-        ("left", frame): path for frame, path in _fastec_pictures(place, "rolling").items()
+        ("left", frame): path for frame, path in _numbered_images(place, 3, "rolling").items()
     }
     height, width = read_frame(next(iter(images.values()))).shape[:2]
     focal = DEFAULT_FOCAL * width
@@ -491,22 +495,19 @@ def _read_fastec_sequence(place: Path, folder: Path) -> Recording:
         truths={
             ("left", frame, row): path
             for kind, row in kinds
-            for frame, path in _fastec_pictures(place, kind).items()
+            for frame, path in _numbered_images(place, 3, kind).items()
         },
-        notes=(f"no calibration: a focal length of {focal:g} px, the width, and a readout ratio of 1 are taken",),
+        notes=(
+            f"no calibration: a focal length of {focal:g} px, the width, and a readout ratio of 1 are assumed",
+        ),
     )
-
-
-def _fastec_pictures(place: Path, kind: str) -> dict[int, Path]:
-    """Files of images of one kind, by frame."""
-    return {int(path.name[:3]): path for path in sorted(place.glob(f"{_DIGITS}_{kind}.png"))}
 
 
 _MM = 1e-3
 
 
 def read_middlebury(folder: Path) -> list[Recording]:
-    """Every scene below a folder, or the folder itself."""
+    """Every scene below a folder, or the folder itself; RsbenchError if there is none or a file is malformed."""
     found = sorted(path.parent for path in folder.glob("**/calib.txt") if (path.parent / "im0.png").is_file())
     if not found:
         raise RsbenchError(f"{folder}: holds no scene of Middlebury: no calib.txt beside an im0.png")
@@ -522,7 +523,7 @@ def _middlebury(folder: Path) -> Recording:
     K0, K1 = (numbers(re.sub(r"[\[\];]", " ", fields[key]), path, 9).reshape(3, 3) for key in ("cam0", "cam1"))
     width, height, baseline = (float(numbers(fields[key], path, 1)[0]) for key in ("width", "height", "baseline"))
     offset = float(numbers(fields["doffs"], path, 1)[0]) if "doffs" in fields else float(K1[0, 2] - K0[0, 2])
-    left, right = (_pinhole(K, int(width), int(height), path) for K in (K0, K1))
+    left, right = (_pinhole((width, height), K[[0, 1, 0, 1], [0, 1, 2, 2]], path) for K in (K0, K1))
     images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
     disparities: dict[View, Callable[[], FloatArray]] = {}
     views: tuple[View, ...] = (("left", 0), ("right", 0))
@@ -538,37 +539,29 @@ def _middlebury(folder: Path) -> Recording:
     )
 
 
-def _pinhole(K: FloatArray, width: int, height: int, path: Path) -> PinholeCamera:
-    try:
-        return PinholeCamera(width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
-    except ValueError as error:
-        raise RsbenchError(f"{path}: {error}") from error
-
-
 def _apart(baseline: float) -> Pose:
     return Pose(np.eye(3), np.array([-baseline, 0.0, 0.0]))
 
 
 def _middlebury_disparities(path: Path, offset: float) -> FloatArray:
-    """Disparities (H, W) of a grey PFM, with the offset of the principal points; NaN where unknown."""
+    """Disparities (H, W) of a grey PFM, plus the offset of the principal points; NaN where unknown."""
     data = read_bytes(path)
     found = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+]+)\s", data)
     if found is None:
-        raise RsbenchError(f"{path}: is no grey PFM")
+        raise RsbenchError(f"{path}: is not a grey PFM")
     width, height, scale = int(found[1]), int(found[2]), float(found[3])
     values = data[found.end() :]
     if len(values) != 4 * width * height:
         raise RsbenchError(f"{path}: has {len(values)} bytes of numbers, not those of {width} x {height}")
-    # A negative scale says that the lowest byte comes first; the lowest row always does.
+    # A negative scale means little-endian; the lowest row always comes first.
     rows = np.frombuffer(values, dtype="<f4" if scale < 0.0 else ">f4").reshape(height, width)[::-1]
     return np.where(np.isfinite(rows) & (rows > 0.0), rows + offset, np.nan).astype(np.float64)
 
 
 def read_kitti(folder: Path) -> list[Recording]:
-    """Every pair that has disparities, and the pictures of the next time where they are there."""
-    images = next(
-        (names for names in (("image_2", "image_3"), ("image_0", "image_1")) if _has_folders(folder, names)), None
-    )
+    """Every pair that has disparities, and the images of the next time where they exist."""
+    pairs = (("image_2", "image_3"), ("image_0", "image_1"))
+    images = next((names for names in pairs if all((folder / name).is_dir() for name in names)), None)
     if images is None:
         raise RsbenchError(f"{folder}: holds no folders image_2 and image_3, or image_0 and image_1")
     truth = next((name for name in ("disp_occ_0", "disp_occ") if (folder / name).is_dir()), None)
@@ -579,10 +572,6 @@ def read_kitti(folder: Path) -> list[Recording]:
     if not firsts:
         raise RsbenchError(f"{folder / images[0]}: holds no 000000_10.png")
     return [_kitti(folder, images, truth, calib, path.name[:-7]) for path in firsts]
-
-
-def _has_folders(folder: Path, names: tuple[str, str]) -> bool:
-    return all((folder / name).is_dir() for name in names)
 
 
 def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, number: str) -> Recording:
@@ -601,21 +590,18 @@ def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, 
         for frame in (0, 1)
     }
     height, width = read_frame(files["left", 0]).shape[:2]
-    left, right = (_pinhole(P[:, :3], width, height, path) for P in matrices)
+    left, right = (_pinhole((width, height), P[[0, 1, 0, 1], [0, 1, 2, 2]], path) for P in matrices)
     baseline = matrices[0][0, 3] / matrices[0][0, 0] - matrices[1][0, 3] / matrices[1][0, 0]
     offset = right.cx - left.cx
-    found = None if truth is None else folder / truth / f"{number}_10.png"
-    read = (
-        None
-        if found is None or not found.is_file()
-        else partial(_kitti_disparities, found, (width, height), offset)
-    )
+    found = folder / (truth or "") / f"{number}_10.png"
+    known = truth is not None and found.is_file()
+    read = partial(_kitti_disparities, found, (width, height), offset)
     return Recording(
         name=number,
         cameras={"left": left, "right": right},
         images={view: file for view, file in files.items() if file.is_file()},
         right_from_left=_apart(float(baseline)),
-        disparities={} if read is None else {("left", 0): read},
+        disparities={("left", 0): read} if known else {},
     )
 
 
@@ -624,12 +610,8 @@ def _kitti_disparities(path: Path, size: tuple[int, int], offset: float) -> Floa
     return np.where(values > 0, values / 256.0 + offset, np.nan)
 
 
-_TUM_RSVI = {"left": 0.0, "right": 29.4737e-6}
+_TUM_RSVI: Mapping[Side, float] = {"left": 0.0, "right": 29.4737e-6}
 """Line delays, s: D. Schubert et al., Rolling-Shutter Modelling for Direct Visual-Inertial Odometry, IROS 2019."""
-
-
-def _read_tum_rsvi(folder: Path) -> list[Recording]:
-    return read_euroc(folder, _TUM_RSVI)  # pyrefly: ignore[bad-argument-type]
 
 
 FORMATS: Mapping[str, Callable[[Path], list[Recording]]] = {
@@ -639,18 +621,18 @@ FORMATS: Mapping[str, Callable[[Path], list[Recording]]] = {
     "fastec-rs": read_fastec,
     "kitti": read_kitti,
     "middlebury": read_middlebury,
-    "tum-rsvi": _read_tum_rsvi,
+    "tum-rsvi": partial(read_euroc, line_delays_s=_TUM_RSVI),
 }
 
 
 def read_others(folder: Path, format_name: str) -> list[Recording]:
-    """The recordings of a folder in some layout.
+    """The recordings of a folder.
 
     Raises:
-        RsbenchError: no such layout, or the folder does not have it.
+        RsbenchError: unknown layout, or the folder does not have it.
     """
     if format_name not in FORMATS:
-        raise RsbenchError(f"--from {format_name}: is no layout{choices(format_name, FORMATS)}")
+        raise RsbenchError(f"--from {format_name}: is not a layout{choices(format_name, FORMATS)}")
     if not folder.is_dir():
         raise RsbenchError(f"{folder}: no such folder")
     return FORMATS[format_name](folder)

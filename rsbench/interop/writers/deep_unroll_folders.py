@@ -148,9 +148,9 @@ _FASTEC_ABOUT = (
     "is what those who use the layout assume."
 )
 _META = "meta.log"
-"""By which the loader knows the folder of a sequence; it does not read it."""
+"""The loader recognises the folder of a sequence by this file, which it does not read."""
 _MOST = 1000
-"""Frames that three digits number."""
+"""Most frames, for numbers of three digits."""
 
 
 def _fastec_fault(sequence: Sequence, images: Images) -> str:

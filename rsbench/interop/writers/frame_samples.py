@@ -50,8 +50,8 @@ class FrameSamples:
 
     Args:
         folder: of the dataset; dataset.json and each sequence.json are read here, and not again.
-        frames: of a window; frames at the end of a sequence that fill none are left out.
-        parts: what is read.
+        frames: frames of a window; frames at the end of a sequence that do not fill one are left out.
+        parts: the parts that are read.
 
     Raises:
         RsbenchError: not a dataset, or sequences with fewer frames than a window.
@@ -111,7 +111,7 @@ _WEBDATASET_ABOUT = (
     "one."
 )
 SHARD_BYTES = 256 << 20
-"""A shard is closed when it holds more."""
+"""A shard with more bytes is closed."""
 SHARD_SAMPLES = 1000
 _LINE_FIELDS = ("camera", "baseline", "readout_ratio", "frame_period_s", "motion")
 _SAMPLE_FIELDS = (*_LINE_FIELDS, "readout_time_s", "conventions")
@@ -132,7 +132,7 @@ def _write_shards(sequences: list[Sequence], root: Path) -> Iterator[Note]:
 
 
 class _Shards:
-    """Tar files, each closed when it is full."""
+    """Tar files, each closed when full."""
 
     def __init__(self, root: Path) -> None:
         self._root, self._count, self._samples, self._bytes = root, 0, 0, 0
@@ -144,7 +144,7 @@ class _Shards:
         if self._shard is None or self._samples >= SHARD_SAMPLES or self._bytes > SHARD_BYTES:
             self._shard = self._next()
         for name, data in files.items():
-            header = tarfile.TarInfo(name)  # of nobody, in 1970: the same bytes whoever writes it, and when
+            header = tarfile.TarInfo(name)  # no owner, time 0: the same bytes at every run
             header.size = len(data)
             self._shard.addfile(header, io.BytesIO(data))
             self._bytes += len(data)

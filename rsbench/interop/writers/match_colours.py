@@ -1,4 +1,4 @@
-"""Matches of a sequence for a viewer: strips in colours that say whether they are right."""
+"""Matches of a sequence for a viewer: strips whose colours show whether they are correct."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.vision.feature_matcher import load_features
 
 _UNJUDGED, _RIGHT, _WRONG = (86, 180, 233), (0, 158, 115), (213, 94, 0)
-"""Colours that colour-blind readers tell apart."""
+"""Colours that colour-blind readers can distinguish."""
 _NAMES = {"left": "matches", "right": "matches", "stereo_0": "stereo", "stereo_1": "stereo"}
 
 
@@ -35,16 +35,16 @@ class Strips(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A sequence, and how much of it is shown."""
+    """A sequence and the parts that are shown."""
 
     sequence: Sequence
     strips: tuple[Strips, ...]
     points: int
-    """Of each depth map, at most."""
+    """Most points of each depth map."""
 
 
 def labelled_strips(sequence: Sequence) -> Iterator[Strips]:
-    """Of the channel ``matches``: right ones green, all others orange; ends beyond the last frame are missing.
+    """The channel ``matches``: correct ones green, others orange; matches beyond the last frame are missing.
 
     Raises:
         RsbenchError: the sequence has no such channel, or it cannot be read.
@@ -61,7 +61,7 @@ def labelled_strips(sequence: Sequence) -> Iterator[Strips]:
 
 
 def found_strips(sequence: Sequence, features: str) -> Iterator[Strips]:
-    """Of a feature matcher, in the first two frames; nobody says which are right.
+    """Matches of a feature matcher in the first two frames; which are correct is not known.
 
     Raises:
         RsbenchError: no such feature matcher.
@@ -76,5 +76,5 @@ def found_strips(sequence: Sequence, features: str) -> Iterator[Strips]:
 
 
 def line_seconds(sequence: Sequence, view: View) -> FloatArray:
-    """(lines,) s, when each line of a picture was read, in the order of the image."""
+    """(lines,) s, the times of an image's lines, in the order of the image."""
     return sequence.frame_period_s * sequence.shutter.line_times(view.frame, view.side)

@@ -1,12 +1,12 @@
 """A sequence for the Rerun viewer: the extra ``rsbench[view]``; nothing else imports rerun.
 
 The world is that of the sequence (metres, x right, y down, z forward), and the one timeline is ``time``, seconds:
-the rig stands where it was when a line was read. Pixels of Rerun are counted from the corner of the image.
+the rig is shown at its pose at that time. Pixels of Rerun are counted from the corner of the image.
 
     world/left, world/right               cameras, moved at the time of every line
     world/left/image                      the frame on their plane
-    world/lines/left_0                    where the lines of a frame were read from, yellow to blue in time
-    world/points/left_0                   what its depth shows, each pixel from the pose of its own line
+    world/lines/left_0                    camera positions of the lines of a frame, yellow to blue in time
+    world/points/left_0                   surface points of its depth, each pixel from the pose of its line
     frames/left/rs, gs, depth             frame, its global-shutter twin, and the depth of the frame
     frames/left/matches                   from the pixel in a frame to that in the next one
     frames/left/stereo                    from the pixel in the left frame to that in the right one
@@ -41,16 +41,16 @@ from rsbench.interop.writers.sequence_views import (
 from rsbench.storage.untrusted_files import inside, read_bytes
 
 _FIRST_LINE, _LAST_LINE = np.array([240, 228, 66]), np.array([0, 114, 178])
-"""Colours that colour-blind readers tell apart."""
+"""Colours that colour-blind readers can distinguish."""
 _PLANE = 0.8
 """Distance of the image from its camera, as drawn, in baselines."""
 _LINE_RADIUS, _POINT_RADIUS, _STRIP_RADIUS = 0.005, 1.5, 0.7
-"""In baselines; the others in pixels of the screen."""
+"""The first in baselines, the others in pixels of the screen."""
 Progress = Callable[[str], None]
 
 
 def log_scene(recording: rr.RecordingStream, scene: Scene, progress: Progress = lambda word: None) -> None:
-    """Send all that there is to see; ``progress`` is called with each picture that was sent."""
+    """Send the whole scene; ``progress`` is called after each image."""
     sequence = scene.sequence
     recording.log("world", rr.ViewCoordinates.RDF, static=True)
     for side in SIDES:
@@ -64,7 +64,7 @@ def log_scene(recording: rr.RecordingStream, scene: Scene, progress: Progress = 
 
 
 def blueprint() -> rrb.Blueprint:
-    """The world beside the frames of both cameras, with what belongs to them."""
+    """The world beside the tabs of both cameras."""
     cameras = [rrb.Tabs(*_tabs(side), name=f"{side} camera") for side in SIDES]
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -78,7 +78,7 @@ def _tabs(side: Side) -> list[rrb.Spatial2DView]:
     shown = {"frame": ["rs"], "matches": ["rs", "matches"], "stereo": ["rs", "stereo"]}
     shown |= {"global shutter": ["gs"], "depth": ["depth"]}
     if side == "right":
-        del shown["stereo"]  # those are drawn on the left frames
+        del shown["stereo"]  # these are drawn on the left frames
     return [
         rrb.Spatial2DView(
             origin=f"frames/{side}", contents=[f"$origin/{part}" for part in parts], name=f"{side} {name}"
@@ -88,7 +88,7 @@ def _tabs(side: Side) -> list[rrb.Spatial2DView]:
 
 
 def _log_camera(recording: rr.RecordingStream, sequence: Sequence, side: Side) -> None:
-    """Its image, and where it is at the time of every line of every frame."""
+    """A camera, and its pose at the time of every line of every frame."""
     camera = sequence.rig.camera
     recording.log(
         f"world/{side}",
@@ -123,7 +123,7 @@ def _log_frame(recording: rr.RecordingStream, sequence: Sequence, view: View) ->
 
 
 def _log_lines(recording: rr.RecordingStream, sequence: Sequence, view: View) -> None:
-    """Where a camera was while a frame was read."""
+    """The positions of a camera while a frame was read."""
     places, seconds = inverse(line_poses(sequence, view)).t, line_seconds(sequence, view)
     late = (seconds - seconds.min()) / max(float(np.ptp(seconds)), 1e-12)
     colours = (_FIRST_LINE + late[:, None] * (_LAST_LINE - _FIRST_LINE)).astype(np.uint8)
@@ -144,7 +144,7 @@ def _log_matches(recording: rr.RecordingStream, sequence: Sequence, strips: Iter
     names = set[str]()
     for each in strips:
         name = f"frames/{each.view.side}/{each.name}"
-        if name not in names:  # what the viewer shows of a time stays until the next
+        if name not in names:  # an entry stays visible until the next one
             for view in views_in_time(sequence):
                 recording.set_time("time", duration=first_second(sequence, view))
                 recording.log(name, rr.LineStrips2D([]))
@@ -163,7 +163,7 @@ def write_recording(scene: Scene, path: Path, progress: Progress) -> None:
 
 
 def open_viewer(scene: Scene, progress: Progress) -> None:
-    """The viewer with a sequence; one that is open gets it as another recording."""
+    """Open the viewer with a sequence; an open viewer gets another recording."""
     with rr.RecordingStream("rsbench", recording_id=scene.sequence.name) as recording:
         recording.spawn(default_blueprint=blueprint())
         log_scene(recording, scene, progress)

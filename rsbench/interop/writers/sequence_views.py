@@ -32,7 +32,7 @@ Note = tuple[list[str], dict[str, Any]]
 Images = Literal["rs", "gs"]
 """Rolling-shutter frames, or their global-shutter twins from the pose of the line that is read first."""
 CORNER_PX = 0.5
-"""Added to pixels where a format has the corner of the image at (0, 0); ours has the centre of a pixel there."""
+"""Added to pixels for formats with (0, 0) at the corner of the image; ours is the centre of the first pixel."""
 
 
 class Format(NamedTuple):
@@ -78,7 +78,7 @@ def line_poses(sequence: Sequence, view: View) -> Pose:
 
 
 def first_second(sequence: Sequence, view: View) -> float:
-    """When the line that is read first is read, s; 0 is row 0 of frame 0."""
+    """Time of the line that is read first, s; 0 is row 0 of frame 0."""
     return sequence.frame_period_s * float(sequence.shutter.start(view.frame, view.side))
 
 
@@ -120,18 +120,18 @@ def copy_image(sequence: Sequence, view: View, images: Images, path: Path) -> No
 
 
 def number(value: float) -> str:
-    """A decimal number that reads back as it was, with a point: YAML 1.1 takes 1e-05 for a word."""
+    """A decimal number that reads back exactly, with a point: YAML 1.1 reads 1e-05 as text."""
     text = repr(float(value))
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
 def numbers(values: object) -> str:
-    """Decimal numbers with blanks between, row by row."""
+    """Decimal numbers separated by blanks, row by row."""
     return " ".join(number(value) for value in np.ravel(np.asarray(values, dtype=np.float64)))
 
 
 def write_lines(path: Path, lines: list[str]) -> None:
-    """Text in UTF-8, each line with its end."""
+    """Text in UTF-8, every line terminated."""
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -149,12 +149,12 @@ def about_moving_objects(sequence: Sequence) -> list[str]:
 
 
 _POINTS = 50_000
-"""Of a sequence, nearly."""
+"""Points of a sequence, approximately."""
 _MOST_OF_AN_IMAGE = 2_000
 _AROUND = 4
-"""Frames before and after its own in which a point is looked for."""
+"""Frames before and after its own in which a point is searched."""
 _SAME = 2e-3
-"""Share by which the depth of a point may differ from that of the surface that is seen there."""
+"""Largest relative difference between the depths of a point and of the visible surface."""
 
 
 class Points(NamedTuple):
@@ -169,7 +169,7 @@ class Points(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """Which points of a list an image sees, and where."""
+    """The points of a list that an image sees, and their pixels."""
 
     index: NDArray[np.int64]
     """(m,)"""
@@ -178,7 +178,7 @@ class Observations(NamedTuple):
 
 
 class Surfaces(NamedTuple):
-    """Points of all images of a sequence, each seen by two at least."""
+    """Points of all images of a sequence, each seen by at least two."""
 
     world: FloatArray
     """(n, 3)"""
@@ -189,7 +189,7 @@ class Surfaces(NamedTuple):
 
 
 def world_points(sequence: Sequence, view: View, images: Images, step: int) -> Points:
-    """Points at the centres of every ``step``-th pixel in both directions, of what stands still and has depth."""
+    """Points at every ``step``-th pixel in both directions, where a static surface has depth."""
     depth = sequence.depth(images, view.side, view.frame)
     still = (depth > 0) & (numbers_of(sequence.labels(images, view.side, view.frame)) == 0)
     grid = np.zeros_like(still)
@@ -211,7 +211,7 @@ def pixel_poses(sequence: Sequence, view: View, images: Images, pixels: NDArray[
 
 
 def observe(sequence: Sequence, view: View, images: Images, world: FloatArray) -> Observations:
-    """Points (n, 3) that an image sees: inside it, not seen twice, and not behind what its depth shows."""
+    """Points (n, 3) that an image sees: inside it, seen once, and not behind the surface of its depth."""
     rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
     if images == "gs":
         start = shutter.start(view.frame, view.side)
@@ -266,7 +266,7 @@ def surfaces(sequence: Sequence, images: Images) -> Surfaces:
 
 
 def _seen_twice(found: Surfaces) -> Surfaces:
-    """Without the points that fewer than two images see."""
+    """The points that at least two images see."""
     counts = np.zeros(len(found.world), dtype=np.int64)
     for each in found.seen.values():
         np.add.at(counts, each.index, 1)
@@ -280,15 +280,15 @@ def _seen_twice(found: Surfaces) -> Surfaces:
 
 
 Law = Callable[[View, Points], FloatArray]
-"""Pixels (n, 2), in our convention, at which a format says that the lines of ``points.pixels`` see the points."""
+"""A format's motion model: pixels (n, 2), in our convention, where the lines of ``points.pixels`` see them."""
 _TRIED = 5_000
-"""Pixels of each image."""
+"""Pixels of each image that are compared."""
 
 
 def largest_row_error(sequence: Sequence, views: list[View], law: Law) -> float:
-    """The largest distance, px, between where frames see points of their depth, and where a format's law has them.
+    """The largest distance, px, between points of the depth in frames and by a format's motion model.
 
-    Each point is moved by the law's pose of the line that truly saw it. 0 where no image has depth.
+    Each point is projected with the model's pose of the line that saw it. 0 where no image has depth.
     """
     camera = sequence.rig.camera
     step = max(math.ceil(math.sqrt(camera.width * camera.height / _TRIED)), 1)
@@ -296,7 +296,7 @@ def largest_row_error(sequence: Sequence, views: list[View], law: Law) -> float:
     for view in views:
         points = world_points(sequence, view, "rs", step)
         away = np.linalg.norm(law(view, points) - points.pixels, axis=-1)
-        if len(away):  # NaN: behind the camera of the law, which is far off
+        if len(away):  # NaN: behind the camera, a large error
             worst = max(worst, float(np.max(np.nan_to_num(away, nan=math.inf))))
     return worst
 
@@ -317,7 +317,7 @@ def seen_by(sequence: Sequence, poses: Pose, world: FloatArray) -> FloatArray:
 
 
 def lines_of(sequence: Sequence, view: View, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many lines were read before those of pixels (n, 2)."""
+    """The number of lines that were read before those of pixels (n, 2)."""
     shutter = sequence.shutter
     lines = pixels[:, shutter.axis(view.side)]
     return np.abs(lines - shutter.first_line(view.side))
