@@ -288,20 +288,29 @@ def _fate(module: str, version: str) -> str:
     return "" if code == _IMPORTED else ending(code)
 
 
-def start_child(code: str, *arguments: str, line: int, **options: Any) -> subprocess.Popen[bytes]:
+def start_child(
+    code: str,
+    *arguments: str,
+    line: int,
+    stream: int = subprocess.DEVNULL,
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.Popen[bytes]:
     """Start Python code in a process group of its own, to which a terminal's Ctrl-C does not go.
 
     Args:
         code: its last argument is ``line``.
         line: see ``lifeline``.
-        options: of ``subprocess.Popen``; standard streams lead nowhere by default.
+        stream: ``subprocess.DEVNULL`` or ``PIPE``, for all three standard streams.
+        environment: that of this process when None.
     """
-    streams = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     return subprocess.Popen(
         [sys.executable, "-u", "-c", code, *arguments, str(line)],
+        stdin=stream,
+        stdout=stream,
+        stderr=stream,
         start_new_session=True,
+        env=environment,
         pass_fds=(line,) if _POSIX else (),
-        **(streams | options),
     )
 
 

@@ -195,9 +195,10 @@ class _Child:
         if _POSIX:
             lifeline_end, self._lifeline = os.pipe()
         try:
-            pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
             path = json.dumps([str(entry) for entry in sys.path])
-            self._process = start_child(_COMMAND, path, line=lifeline_end, env=environment, **pipes)
+            self._process = start_child(
+                _COMMAND, path, line=lifeline_end, stream=subprocess.PIPE, environment=environment
+            )
         finally:
             if _POSIX:
                 os.close(lifeline_end)
