@@ -64,7 +64,7 @@ from rsbench.core import so3
 from rsbench.core.arguments import check_number
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.epipolar import epipolar_gradient, in_front
+from rsbench.core.epipolar import epipolar_gradient
 from rsbench.core.projection import plane_basis
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
@@ -146,56 +146,8 @@ class Rows(NamedTuple):
         return np.column_stack([self.x[:, :2], self.y[:, :2], self.s0, self.s1])
 
 
-def constraint(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """y^T [T]x R x (n,) and its derivatives (n, 4) by the pixels: a row that moves is another pose too."""
-    x, y, s0, s1, camera, _ = rows
-    R, T = motion.between(s0, s1)
-    p, Rv0 = (R @ x[:, :, None])[:, :, 0], R @ motion.v0
-    gradient = epipolar_gradient(hat(T) @ R, x, y, camera)
-    spin0 = -(so3.exp(s1[:, None] * motion.w1) @ (motion.R @ motion.w0))  # dR/ds0 = [spin0]x R
-    for column, spin, rate in (
-        (1, spin0, -Rv0 - s0[:, None] * so3.cross(spin0, Rv0)),
-        (3, motion.w1, motion.v1 - s0[:, None] * so3.cross(motion.w1, Rv0)),
-    ):
-        change = so3.cross(rate, p) + so3.cross(T, so3.cross(spin, p))
-        gradient[:, column] += np.sum(y * change, axis=1) / camera.fy
-    return np.sum(y * so3.cross(T, p), axis=1), gradient
-
-
-def sampson(motion: FreeMotion, rows: Rows) -> FloatArray:
-    """Rolling-shutter Sampson errors (n,), px."""
-    value, gradient = constraint(motion, rows)
-    norm = np.linalg.norm(gradient, axis=1)
-    return np.where(norm > 0.0, value / np.where(norm > 0.0, norm, 1.0), 0.0)
-
-
-def sampson_jacobian(motion: FreeMotion, rows: Rows) -> FloatArray:
-    """(n, 18) by ``FreeMotion.moved``, such that J^T times the errors is the gradient of half their squares.
-
-    The constraint's derivative at the corrected measurement, over the norm: see ``engine.kernels``.
-    """
-    value, gradient = constraint(motion, rows)
-    norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-300)[:, None]
-    step = (value[:, None] / norm**2 * gradient).reshape(-1, 2, 2) / [rows.camera.fx, rows.camera.fy]
-    pad = np.zeros((len(step), 1))
-    x, y = rows.x - np.hstack([step[:, 0], pad]), rows.y - np.hstack([step[:, 1], pad])
-    s0, s1 = (rows.s0 - step[:, 0, 1])[:, None], (rows.s1 - step[:, 1, 1])[:, None]
-    R, T = motion.between(s0[:, 0], s1[:, 0])
-    A, p = so3.exp(s1 * motion.w1), (R @ x[:, :, None])[:, :, 0]
-    n = so3.cross(p, y)
-    by_turn = so3.cross(p, so3.cross(y, T)) - s0 * so3.cross(R @ motion.v0, n)  # of R, as [turn]x R
-
-    def back(M: FloatArray, rows_of: FloatArray) -> FloatArray:
-        return np.asarray((np.swapaxes(M, 1, 2) @ rows_of[:, :, None])[:, :, 0])
-
-    by_w0 = back(A @ motion.R @ so3.left_jacobian(-s0 * motion.w0), by_turn)
-    by_w1 = back(so3.left_jacobian(s1 * motion.w1), by_turn)
-    parts = [back(A, by_turn), n, -s0 * back(R, n), s1 * n, -s0 * by_w0, s1 * by_w1]
-    return np.concatenate(parts, axis=1) / norm
-
-
 def errors(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """``sampson`` (n,) and ``sampson_jacobian`` (n, 18), compiled."""
+    """Rolling-shutter Sampson errors (n,), px, and (n, 18) by ``FreeMotion.moved``: see ``free_terms``."""
     r, J = np.zeros(len(rows.x)), np.zeros((len(rows.x), 18))
     focal = np.array([rows.camera.fx, rows.camera.fy])
     free_terms(motion.R, np.stack(motion[1:]), rows.packed(), focal, r, J)
@@ -203,7 +155,7 @@ def errors(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
 
 
 def squares(motion: FreeMotion, rows: Rows) -> float:
-    """Sum of the squares of ``sampson``, compiled."""
+    """Sum of the squared Sampson errors, px^2."""
     r, focal = np.zeros(len(rows.x)), np.array([rows.camera.fx, rows.camera.fy])
     free_terms(motion.R, np.stack(motion[1:]), rows.packed(), focal, r, np.zeros((0, 18)))
     total = float(r @ r)
@@ -218,12 +170,6 @@ def signed(motion: FreeMotion, rows: Rows) -> tuple[FreeMotion, int]:
     """
     front, back = (free_in_front(each.R, np.stack(each[1:]), rows.packed()) for each in (motion, motion.flipped()))
     return (motion, front) if front >= back else (motion.flipped(), back)
-
-
-def in_front_of_both(motion: FreeMotion, rows: Rows) -> int:
-    """How many points lie in front of both cameras if T lies on the side of t."""
-    R, T = motion.between(rows.s0, rows.s1)
-    return int(np.count_nonzero(in_front(Pose(R, T * np.sign(T @ motion.t)[:, None]), rows.x, rows.y)))
 
 
 def from_row(motion: FreeMotion, s: float) -> FreeMotion:

@@ -433,9 +433,7 @@ class UprightSolver(Solver):
             variance = 2.0 * end.cost / freedom * (d @ inverse[3:, 3:] @ d)
             metric = bool(np.sqrt(variance) <= _MAX_SCALE_SIGMA * (d @ d))
         if not metric:
-            # Noise alone gives a sign to a length that is open.
-            front = [descent.packed.in_front(descent.packed.theta(w, each)) for each in (d, -d)]
-            d = d if front[0] >= front[1] else -d
+            d = descent.packed.signed(w, d)  # noise alone gives a sign to a length that is open
         reason = "" if metric else "the length of d is not determined by these matches"
         return MotionEstimate(w=w, d=d, success=True, metric=metric, reason=reason)
 

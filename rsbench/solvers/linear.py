@@ -208,7 +208,8 @@ class LinearSolver(Solver):
             return MotionEstimate.failed(
                 "no rotation about y or z: the scale of the translation is not determined"
             )
-        return MotionEstimate(w=w, d=self._signed(packed, w, d), success=True, metric=True)
+        d = d if self.sign == "scale" else packed.signed(w, d)
+        return MotionEstimate(w=w, d=d, success=True, metric=True)
 
     def _translation(self, X: FloatArray, w: FloatArray, unit: float, packed: Packed) -> FloatArray | None:
         """d (3,) in metres from X, which holds it times an unknown factor; None when that cannot be known."""
@@ -222,12 +223,6 @@ class LinearSolver(Solver):
         if by_constraint is None:
             return None
         return d * (float(np.linalg.norm(by_constraint)) / float(np.linalg.norm(d)))
-
-    def _signed(self, packed: Packed, w: FloatArray, d: FloatArray) -> FloatArray:
-        if self.sign == "scale":
-            return d
-        front, back = (packed.in_front(packed.theta(w, sign * d)) for sign in (1.0, -1.0))
-        return d if front >= back else -d
 
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -361,6 +356,5 @@ def with_scale_and_sign(packed: Packed, w: FloatArray, d: FloatArray, limit: flo
     metric = scaled is not None
     if scaled is not None:
         d = d / np.linalg.norm(d) * np.linalg.norm(scaled)
-    front, back = (packed.in_front(packed.theta(w, sign * d)) for sign in (1.0, -1.0))
     reason = "" if metric else "the length of d is not determined by these matches"
-    return MotionEstimate(w=w, d=d if front >= back else -d, success=True, metric=metric, reason=reason)
+    return MotionEstimate(w=w, d=packed.signed(w, d), success=True, metric=metric, reason=reason)

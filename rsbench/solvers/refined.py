@@ -268,7 +268,9 @@ class RefinedSolver(Solver):
 
     def _propose_pairs(self, packed: Packed, rig: StereoRig) -> list[MotionEstimate]:
         length = 0.5 * rig.baseline
-        return _finite(packed, [_signed(packed, w, length * d) for w, d in five_point(packed.pairs)])
+        return _finite(
+            packed, [packed.theta(w, packed.signed(w, length * d)) for w, d in five_point(packed.pairs)]
+        )
 
     def improve(
         self,
@@ -487,13 +489,7 @@ def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArra
     length = 0.5 * rig.baseline
     if scaled is not None:
         length = float(np.clip(np.linalg.norm(scaled), 0.1 * rig.baseline, _LONGEST_START * rig.baseline))
-    return _signed(packed, w, d / np.linalg.norm(d) * length)
-
-
-def _signed(packed: Packed, w: FloatArray, d: FloatArray) -> FloatArray:
-    """Parameters of (w, d) or (w, -d), whichever has more points in front of the cameras."""
-    front, back = packed.theta(w, d), packed.theta(w, -d)
-    return front if packed.in_front(front) >= packed.in_front(back) else back
+    return packed.theta(w, packed.signed(w, d / np.linalg.norm(d) * length))
 
 
 def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:

@@ -1,13 +1,16 @@
-"""The pinhole camera and the pixel convention."""
+"""The camera, the pixel convention, and lenses against OpenCV's, finite differences and their own inverse."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=510.0, cx=310.0, cy=250.0)
 
@@ -62,3 +65,123 @@ def test_bad_intrinsics_are_refused_by_name(field: str, value: float) -> None:
     good = {"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
     with pytest.raises(ValueError, match=f"camera {field} = "):
         PinholeCamera(**{**good, field: value})  # pyrefly: ignore[bad-argument-type]
+
+
+PLAIN = PinholeCamera(width=640, height=480, fx=420.0, fy=430.0, cx=310.0, cy=250.0)
+PHONE = Lens(model="brown-conrady", k1=0.12, k2=-0.35, p1=0.0011, p2=-0.0007, k3=0.28)
+ACTION = Lens(model="brown-conrady", k1=-0.26, k2=0.05, p1=0.0004, p2=0.0002, k3=-0.003)
+FISHEYE = Lens(model="kannala-brandt", k1=-0.02, k2=0.006, k3=-0.004, k4=0.0006)
+LENSES = [PHONE, ACTION, FISHEYE]
+IDS = ["phone", "action", "fisheye"]
+
+
+def _opencv(lens: Lens, X: np.ndarray) -> np.ndarray:
+    """OpenCV's pixels of points (n, 3)."""
+    still = np.zeros(3)
+    if lens.model == "brown-conrady":
+        k = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+        return cv2.projectPoints(X[:, None], still, still, PLAIN.K, k)[0][:, 0]
+    k = np.array([lens.k1, lens.k2, lens.k3, lens.k4])
+    return cv2.fisheye.projectPoints(X[:, None], still, still, PLAIN.K, k)[0][:, 0]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=IDS)
+def test_pixels_are_opencvs(lens: Lens) -> None:
+    camera = replace(PLAIN, lens=lens)
+    pixels = np.random.default_rng(0).uniform([-0.5, -0.5], [639.5, 479.5], size=(500, 2))
+    X = camera.unproject(pixels) * np.random.default_rng(1).uniform(0.1, 50, size=(500, 1))
+    # Two implementations of polynomials of order 9 in numbers near 1, times 420 px.
+    np.testing.assert_allclose(_opencv(lens, X), pixels, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(camera.project(X), pixels, rtol=0, atol=1e-10)
+
+
+@settings(max_examples=40)
+@given(
+    st.sampled_from(["brown-conrady", "kannala-brandt"]),
+    st.lists(st.floats(-0.25, 0.25), min_size=4, max_size=4),
+    st.lists(st.floats(-0.003, 0.003), min_size=2, max_size=2),
+    st.floats(300, 900),
+)
+def test_a_lens_is_inverted_over_the_whole_image_or_refused(
+    model: str, k: list[float], p: list[float], focal: float
+) -> None:
+    radial = dict(zip(("k1", "k2", "k3", "k4"), k, strict=True))
+    if model == "brown-conrady":
+        radial = {**radial, "p1": p[0], "p2": p[1]}
+        del radial["k4"]
+    try:
+        camera = replace(PLAIN, fx=focal, fy=focal, lens=Lens(model=model, **radial))  # pyrefly: ignore[bad-argument-type]
+    except ValueError as error:
+        assert "folds inside the image" in str(error)
+        return
+    grid = np.linspace([-0.5, -0.5], [639.5, 479.5], 21)
+    pixels = np.stack(np.meshgrid(grid[:, 0], grid[:, 1]), axis=-1)
+    rays = camera.unproject(pixels)
+    np.testing.assert_allclose(camera.project(3.0 * rays), pixels, rtol=0, atol=1e-9)
+    # Neighbours stay neighbours: an image that folded would swap some.
+    ideal = camera.ideal_pixels(pixels)
+    across, down = np.diff(ideal, axis=1)[:-1], np.diff(ideal, axis=0)[:, :-1]
+    assert np.all(across[..., 0] * down[..., 1] > across[..., 1] * down[..., 0])
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=IDS)
+def test_derivatives_are_those_of_differences(lens: Lens) -> None:
+    camera = replace(PLAIN, lens=lens)
+    pixels = np.random.default_rng(2).uniform([5, 5], [634, 474], size=(50, 2))
+    found, step = camera.ideal_by_pixel(pixels), 1e-3
+    for axis in (0, 1):
+        shift = step * np.eye(2)[axis]
+        numeric = (camera.ideal_pixels(pixels + shift) - camera.ideal_pixels(pixels - shift)) / (2 * step)
+        # Third derivatives times step^2 / 6, and rounding of 1e3 px over the step.
+        np.testing.assert_allclose(found[..., axis], numeric, rtol=0, atol=1e-8)
+    x, rate = camera.unproject(pixels) * 2.0, np.array([0.3, -0.2, 0.5])
+    numeric = (camera.project(x + 1e-5 * rate) - camera.project(x - 1e-5 * rate)) / 2e-5
+    np.testing.assert_allclose(camera.velocity(x, rate), numeric, rtol=0, atol=1e-5)
+
+
+def test_the_middle_of_a_lens_is_ideal() -> None:
+    near = np.array([[0.0, 0.0], [1e-9, 0.0], [3e-7, -2e-7], [1e-5, 1e-5]])
+    for lens in LENSES:
+        found, J = lens.distort(near)
+        np.testing.assert_allclose(found, near, rtol=1e-5, atol=1e-11)
+        np.testing.assert_allclose(J, np.broadcast_to(np.eye(2), J.shape), atol=3e-4)
+        np.testing.assert_allclose(lens.undistort(found), near, rtol=1e-12, atol=1e-20)
+
+
+@pytest.mark.parametrize("k1", [-0.6, -2.0])
+def test_a_lens_that_folds_inside_the_image_is_refused_by_name(k1: float) -> None:
+    # r (1 + k1 r^2) turns at r = 1 / sqrt(-3 k1): 0.75 and 0.41; the corners need more than 0.9.
+    with pytest.raises(ValueError, match="brown-conrady polynomial folds inside the image"):
+        replace(PLAIN, lens=Lens(model="brown-conrady", k1=k1))
+
+
+def test_beyond_the_fold_there_is_no_pixel_instead_of_a_wrong_one() -> None:
+    lens = Lens(model="brown-conrady", k1=-0.3)
+    turn = 1.0 / np.sqrt(0.9)
+    assert lens.reach == pytest.approx(turn, rel=1e-12)
+    # 1.6 (1 - 0.3 * 1.6^2) = 0.37: the polynomial alone would show this point in the image.
+    seen = lens.distort([[1.6, 0.0], [0.999 * turn, 0.0]]).xy
+    assert np.all(np.isnan(seen[0])) and np.all(np.isfinite(seen[1]))
+    # No ideal point is distorted further out than the turn.
+    most = turn * (1 - 0.3 * turn**2)
+    found = lens.undistort([[1.001 * most, 0.0], [0.999 * most, 0.0]])
+    assert np.all(np.isnan(found[0])) and np.all(np.isfinite(found[1]))
+
+
+def test_behind_a_fisheye_there_is_no_pixel() -> None:
+    camera = replace(PLAIN, lens=FISHEYE)
+    assert np.all(np.isnan(camera.project([[1.0, 0.0, -0.1], [100.0, 0.0, 1.0]])))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"model": "pinhole"}, "lens model = 'pinhole'"),
+        ({"model": "brown-conrady", "k4": 0.1}, "k4 = 0.1: brown-conrady has no"),
+        ({"model": "kannala-brandt", "p1": 0.1}, "p1 = 0.1: kannala-brandt has no"),
+        ({"model": "brown-conrady", "k1": float("nan")}, "k1 = nan: must be a number that is finite"),
+    ],
+)
+def test_wrong_lenses_are_refused_by_name(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Lens(**values)  # pyrefly: ignore[bad-argument-type]

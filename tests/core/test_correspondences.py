@@ -1,4 +1,4 @@
-"""What solvers are given: shapes, copies, and messages that name the bad match."""
+"""Sets of matches, and tracks joined of left-right matches, against the points that they were made from."""
 
 from __future__ import annotations
 
@@ -6,9 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rsbench.core.camera import Lens, PinholeCamera
-from rsbench.core.correspondences import Correspondences, lens_affine, without_lens
+from rsbench.core.correspondences import (
+    JOIN_TOLERANCE_PX,
+    Correspondences,
+    join_stereo,
+    lens_affine,
+    repeated,
+    temporal_pairs,
+    unlinked_pairs,
+    without_lens,
+)
 
 COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
 
@@ -83,3 +94,123 @@ def test_affine_frames_without_the_lens_are_those_of_ideal_pixels() -> None:
         np.testing.assert_allclose(ideal.affine.reshape(-1, 2, 2)[:, :, k], numeric, atol=1e-7)
     np.testing.assert_array_equal(ideal.gyro, given.gyro)
     np.testing.assert_allclose(lens_affine(ideal.affine, given.left, camera), given.affine, atol=1e-12)
+
+
+def points(count: int, seed: int = 0) -> np.ndarray:
+    """Tracks (n, 8) whose ends lie 20 tolerances or more apart in every image, so that joining them is a fact."""
+    rng = np.random.default_rng(seed)
+    grid = 20 * JOIN_TOLERANCE_PX * rng.permuted(np.tile(np.arange(4 * count), (8, 1)), axis=1)[:, :count].T
+    return grid + rng.uniform(0.0, JOIN_TOLERANCE_PX, grid.shape)
+
+
+def as_sets(tracks: np.ndarray, noise: float, rng: np.random.Generator) -> Correspondences:
+    """The tracks as pairwise matches, each set in an order and with an error of its own."""
+
+    def scattered(columns: list[int]) -> np.ndarray:
+        rows = tracks[:, columns]
+        return rng.permutation(rows + rng.uniform(-noise, noise, rows.shape))
+
+    return Correspondences(
+        left=scattered([0, 1, 4, 5]),
+        right=scattered([2, 3, 6, 7]),
+        stereo_0=scattered([0, 1, 2, 3]),
+        stereo_1=scattered([4, 5, 6, 7]),
+    )
+
+
+def in_order(tracks: np.ndarray) -> np.ndarray:
+    return tracks[np.argsort(tracks[:, 0])]
+
+
+@given(count=st.integers(0, 40), seed=st.integers(0, 1000), noise=st.sampled_from([0.0, 1e-9, 1e-6, 4e-3]))
+def test_neither_order_nor_rounding_matter(count: int, seed: int, noise: float) -> None:
+    rng = np.random.default_rng(seed)
+    tracks = points(count, seed)
+    joined = join_stereo(as_sets(tracks, noise, rng))
+    np.testing.assert_allclose(in_order(joined.correspondences.tracks), in_order(tracks), atol=noise)
+    assert joined.alone == {"stereo_0": 0, "stereo_1": 0} and joined.note == ""
+    # All of the pairwise matches are now halves of tracks: each is one measurement.
+    for side in ("left", "right"):
+        assert not np.any(unlinked_pairs(joined.correspondences, side))
+        assert len(temporal_pairs(joined.correspondences, side)) == count
+
+
+@given(seed=st.integers(0, 1000))
+def test_shared_ends_join_the_same_matches_in_any_order(seed: int) -> None:
+    """Points that several matches claim, up to rounding: each left-right match joins one of them."""
+    rng = np.random.default_rng(seed)
+    tracks = points(12, 1)
+    tracks[3:6, :2] = tracks[2, :2]
+    tracks[8:10, 4:6] = tracks[7, 4:6]
+    first, second = (join_stereo(as_sets(tracks, noise, rng)) for noise in (0.0, 1e-9))
+    a, b = (np.array(sorted(np.round(joined.correspondences.tracks, 6).tolist())) for joined in (first, second))
+    np.testing.assert_allclose(a, b, atol=2e-6)
+    for rows in (a[:, :4], a[:, 4:]):
+        assert len(np.unique(rows, axis=0)) == len(rows)
+
+
+def test_the_tolerance_is_where_it_is_said_to_be() -> None:
+    tracks = points(3)
+    near, far = 0.99 * JOIN_TOLERANCE_PX, 1.01 * JOIN_TOLERANCE_PX
+    for shift, count in ((near, 3), (-near, 3), (far, 0), (-far, 0)):
+        c = Correspondences(
+            left=tracks[:, [0, 1, 4, 5]], stereo_0=tracks[:, :4] + [shift, 0, 0, 0], stereo_1=tracks[:, 4:]
+        )
+        joined = join_stereo(c)
+        assert len(joined.correspondences.tracks) == count
+        assert joined.alone == {"stereo_0": 3 - count, "stereo_1": 3 - count}
+
+
+def test_what_joins_nothing_is_counted_and_named() -> None:
+    tracks = points(20)
+    c = Correspondences(
+        left=tracks[:10, [0, 1, 4, 5]],
+        right=tracks[8:12, [2, 3, 6, 7]],
+        stereo_0=tracks[5:, :4],
+        stereo_1=tracks[:15, 4:],
+    )
+    joined = join_stereo(c)
+    np.testing.assert_array_equal(
+        joined.correspondences.tracks, tracks[5:12]
+    )  # 5-9 by the left, 10-11 by the right
+    assert joined.alone == {"stereo_0": 8, "stereo_1": 8}
+    assert "8 of 15 stereo_0 and 8 of 15 stereo_1 matches join no match over time" in joined.note
+
+
+def test_tracks_that_are_given_stay_first_and_take_their_matches() -> None:
+    tracks = points(9)
+    c = as_sets(tracks, 1e-6, np.random.default_rng(0))
+    given_tracks = Correspondences(
+        left=c.left, right=c.right, stereo_0=c.stereo_0, stereo_1=c.stereo_1, tracks=tracks[::2]
+    )
+    joined = join_stereo(given_tracks).correspondences
+    np.testing.assert_array_equal(joined.tracks[:5], tracks[::2])
+    np.testing.assert_allclose(in_order(joined.tracks), in_order(tracks), atol=1e-6)
+    np.testing.assert_array_equal(join_stereo(joined).correspondences.tracks, joined.tracks)
+
+
+@given(seed=st.integers(0, 1000))
+def test_repeats_are_those_of_a_search_over_all(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # Steps of half the tolerance: many coordinates lie just within it, none on it.
+    rows, others = (0.5 * JOIN_TOLERANCE_PX * rng.integers(0, 6, (30, 4)).astype(np.float64) for _ in range(2))
+    rows += 1e-6
+    apart = np.max(np.abs(rows[:, None] - others[None]), axis=-1)
+    np.testing.assert_array_equal(repeated(rows, others), np.any(apart <= JOIN_TOLERANCE_PX, axis=1))
+
+
+@pytest.mark.parametrize("missing", ["left", "stereo_0", "stereo_1"])
+def test_nothing_to_join_is_no_track(missing: str) -> None:
+    tracks = points(5)
+    sets = {"left": tracks[:, [0, 1, 4, 5]], "stereo_0": tracks[:, :4], "stereo_1": tracks[:, 4:]}
+    del sets[missing]
+    joined = join_stereo(Correspondences(**sets))
+    assert len(joined.correspondences.tracks) == 0
+    assert joined.alone == {name: 5 if name in sets else 0 for name in ("stereo_0", "stereo_1")}
+
+
+def test_the_same_match_many_times_is_one_measurement() -> None:
+    tracks = np.repeat(points(1), 200, axis=0)
+    joined = join_stereo(as_sets(tracks, 0.0, np.random.default_rng(0)))
+    assert joined.alone == {"stereo_0": 0, "stereo_1": 0}
+    assert not np.any(unlinked_pairs(joined.correspondences, "left"))

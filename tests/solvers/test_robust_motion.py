@@ -1,13 +1,17 @@
-"""Robust motion from matches with outliers."""
+"""The robust loop on motions and on lines: outliers, thresholds, left-right matches, reasons of failure."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from rsbench.benchmark.simulated.simulation import (
@@ -19,9 +23,9 @@ from rsbench.benchmark.simulated.simulation import (
 )
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -34,7 +38,18 @@ from rsbench.solvers.engine.base import (
     list_solvers,
     load_solver,
 )
+from rsbench.solvers.engine.ransac import (
+    BoolArray,
+    IntArray,
+    RansacOptions,
+    all_inlier_probability,
+    log10_false_alarms,
+    msac_score,
+    ransac,
+    required_iterations,
+)
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, _moment, _quantile, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
@@ -309,3 +324,365 @@ def test_every_seed_finds_the_same_motion_in_noisy_frames(noisy_castle: Correspo
         found.append(np.concatenate([estimate.w, estimate.d]))
         assert np.all(np.abs(found[-1] - [*w, *d]) < 4.0 * sigma)
     assert np.all(np.std(found, axis=0) < 0.2 * sigma)
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class LinkedSolver(Solver):
+    """Needs left matches whose ends have left-right matches, in the same order; descends on them as tracks."""
+
+    stereo: int = 3
+    left: int = 4
+    samples: list[Correspondences] = field(default_factory=list)
+
+    @property
+    def spec(self) -> SolverSpec:
+        minimum: Mapping[MatchSet, int] = {"left": self.left, "stereo": self.stereo}
+        return replace(RefinedSolver().spec, needs={"left", "stereo"}, minimum=minimum)
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        c = correspondences
+        linked = min(len(c.left), len(c.stereo_0), len(c.stereo_1))
+        if len(c.stereo_0) < self.stereo or len(c.left) < self.left:
+            return MotionEstimate.failed(f"{len(c.left)} left and {len(c.stereo_0)} linked matches")
+        np.testing.assert_array_equal(c.left[:linked, :2], c.stereo_0[:linked, :2])
+        np.testing.assert_array_equal(c.left[:linked, 2:], c.stereo_1[:linked, :2])
+        tracks = np.concatenate([c.stereo_0, c.stereo_1], axis=1)
+        return RefinedSolver().estimate(Correspondences(left=c.left, tracks=tracks), rig, shutter)
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        self.samples.append(sample)
+        return [self.estimate(sample, rig, shutter)]
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class StubbornSolver(Solver):
+    """Finds nothing and says why; counts how often it was asked, and with how much."""
+
+    asked: list[int] = field(default_factory=list)
+    spec = RefinedSolver(use_tracks=False).spec
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        self.asked.append(len(correspondences.left))
+        return MotionEstimate.failed("it is Sunday" if len(self.asked) % 3 else "it is Monday")
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class OwnLoopSolver(Solver):
+    """Throws outliers out by itself, as far as the loop knows."""
+
+    asked: list[Correspondences] = field(default_factory=list)
+    spec = replace(
+        RefinedSolver().spec, needs={"left", "right", "tracks"}, minimum={"left": 1, "right": 1, "tracks": 3}
+    )
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        self.asked.append(correspondences)
+        return run_loop(RefinedSolver(), correspondences).estimate
+
+
+def simulated(pairs: int, tracks: int, outliers: float = 0.3, seed: int = 1) -> Simulation:
+    rng = np.random.default_rng(seed)
+    motion = random_motion(rng, np.radians(2.0), 0.3)
+    options = SimulationOptions(pairs=pairs, tracks=tracks, noise_px=0.5, outlier_ratio=outliers)
+    return simulate(RIG, SHUTTER, motion, options, rng)
+
+
+def run_loop(solver: Solver, c: Correspondences, **keywords: object) -> RobustEstimate:
+    options = RobustOptions(max_iterations=200)
+    return estimate_motion(c, RIG, SHUTTER, solver, options, np.random.default_rng(0), **keywords)  # pyrefly: ignore[bad-argument-type]
+
+
+def pairwise(c: Correspondences, shift: float = 0.0) -> Correspondences:
+    """Tracks as left matches and left-right matches, whose left ends are ``shift`` px off."""
+    t = c.tracks
+    off = np.array([shift, -shift, 0.0, 0.0])
+    return Correspondences(
+        left=np.concatenate([c.left, track_pairs(t, "left")]),
+        stereo_0=t[::-1, :4] + off,
+        stereo_1=t[:, 4:] + off,
+    )
+
+
+@pytest.mark.parametrize(("left", "linked"), [(4, 4), (40, 3)])
+def test_left_right_matches_reach_the_solver_that_needs_them(left: int, linked: int) -> None:
+    """Outliers among 30 tracks, and left matches of other points: samples of linked ones while these suffice."""
+    s = simulated(pairs=60, tracks=30)
+    solver = LinkedSolver(left=left)
+    result = run_loop(solver, pairwise(s.correspondences, 1e-6))
+    assert result.estimate.success, result.estimate.reason
+    assert solver.samples
+    for c in solver.samples:
+        assert len(c.left) == left
+        assert len(c.stereo_0) == len(c.stereo_1) == linked
+        assert len(c.right) == len(c.tracks) == 0
+    assert np.degrees(rotation_error(result.estimate.w, s.motion.w)) < 0.1
+    assert np.degrees(translation_error(result.estimate.d, s.motion.d)) < 1.5
+    assert scale_error(result.estimate.d, s.motion.d) < 0.05
+    wrong = s.outliers["tracks"]
+    halves = result.inliers["left"][60:]
+    # 1.2 % of good tracks lie beyond 2.5 sigma; a wrong one would have to meet five constraints.
+    assert np.mean(halves[~wrong]) > 0.9 and not np.any(halves[wrong])
+    assert result.counts["tracks"].matches == 30 and result.counts["left"].matches == 60
+    assert result.counts["right"].matches == 0 and len(result.inliers["tracks"]) == 0
+
+
+def test_too_few_linked_matches_is_a_failure_in_words() -> None:
+    s = simulated(pairs=60, tracks=2)
+    result = run_loop(LinkedSolver(), pairwise(s.correspondences))
+    assert not result.estimate.success
+    assert "2 matches over time with left-right matches at both ends, a sample needs 3" in result.estimate.reason
+
+
+def test_left_right_matches_a_hair_off_hold_the_scale() -> None:
+    """1e-6 px off the left end, they used to be dropped without a word: e_s .0011 became .030."""
+    s = simulated(pairs=0, tracks=200)
+    exact, off = (run_loop(RefinedSolver(), pairwise(s.correspondences, shift)) for shift in (0.0, 1e-6))
+    assert exact.counts["tracks"].matches == off.counts["tracks"].matches == 200
+    assert exact.estimate.reason == off.estimate.reason == ""
+    np.testing.assert_allclose(off.estimate.d, exact.estimate.d, atol=1e-6)  # metres; the data moved by 1e-6 px
+    assert scale_error(off.estimate.d, s.motion.d) < 0.01
+
+
+def test_what_did_not_join_is_said() -> None:
+    s = simulated(pairs=0, tracks=80)
+    c = pairwise(s.correspondences)
+    c = replace(c, stereo_0=np.concatenate([c.stereo_0, [[1.0, 2.0, 0.5, 2.0]] * 7]))
+    assert "7 of 87 stereo_0 matches join no match over time" in run_loop(RefinedSolver(), c).estimate.reason
+
+
+def test_the_reason_of_the_solver_is_in_that_of_the_loop() -> None:
+    s = simulated(pairs=40, tracks=0)
+    solver = StubbornSolver()
+    result = run_loop(solver, s.correspondences)
+    assert not result.estimate.success
+    assert result.estimate.reason.endswith("the solver said most often: it is Sunday")
+
+
+def test_an_own_loop_is_given_everything_once_and_not_wrapped() -> None:
+    s = simulated(pairs=100, tracks=100)
+    solver = OwnLoopSolver()
+    result = run_loop(solver, s.correspondences, loop="own")
+    (given,) = solver.asked
+    assert given is s.correspondences
+    assert result.estimate.success and result.iterations == 0 and result.seconds > 0.0
+    assert np.degrees(rotation_error(result.estimate.w, s.motion.w)) < 0.05
+    for name in ("left", "right", "tracks"):
+        inliers, wrong = result.inliers[name], s.outliers[name]
+        assert np.mean(inliers[~wrong]) > 0.9
+        assert np.count_nonzero(inliers & wrong) <= 0.15 * np.count_nonzero(wrong)
+    assert result.threshold_px == pytest.approx(2.5 * 0.5, rel=0.15)
+    assert result.inlier_count == sum(np.count_nonzero(mask) for mask in result.inliers.values())
+
+
+def test_an_own_loop_that_fails_has_its_own_reason() -> None:
+    solver = StubbornSolver()
+    result = run_loop(solver, simulated(pairs=40, tracks=0).correspondences, loop="own")
+    assert solver.asked == [40] and result.estimate.reason == "it is Sunday"
+    assert result.inlier_count == 0 and result.match_count == 80
+    assert not any(np.any(mask) for mask in result.inliers.values())
+
+
+def test_a_metric_left_camera_is_judged_by_its_own_pairs() -> None:
+    """A solver of the left camera that uses left-right matches: its d is not the body's, and no track is lost."""
+
+    @final
+    @dataclass(frozen=True, kw_only=True)
+    class LeftSolver(Solver):
+        inner: LinkedSolver = field(default_factory=LinkedSolver)
+
+        @property
+        def spec(self) -> SolverSpec:
+            return replace(self.inner.spec, reference_point="left")
+
+        def estimate(
+            self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+        ) -> MotionEstimate:
+            body = self.inner.estimate(correspondences, rig, shutter)
+            if not body.success:
+                return body
+            return replace(body, d=translation_of_offset(body.w, body.d, rig.offset("left")))
+
+    s = simulated(pairs=0, tracks=100)
+    result = run_loop(LeftSolver(), pairwise(s.correspondences))
+    assert result.estimate.success, result.estimate.reason
+    assert np.mean(result.inliers["left"][~s.outliers["tracks"]]) > 0.9
+
+
+Line = tuple[float, float]
+
+
+@dataclass
+class LineEstimator:
+    """y = a x + b through points, in groups that are sampled separately."""
+
+    points: FloatArray
+    num_data: tuple[int, ...]
+    sample_size: tuple[int, ...]
+    refines: int = 0
+    generates: int = 0
+
+    def generate(self, samples: IntArray) -> Iterator[list[Line]]:
+        for sample in samples:
+            self.generates += 1
+            (x0, y0), (x1, y1) = self.points[sample]
+            a = (y1 - y0) / (x1 - x0) if x0 != x1 else 0.0
+            yield [(a, y0 - a * x0)] if x0 != x1 else []
+
+    def residuals(self, model: Line) -> FloatArray:
+        return self.points[:, 1] - model[0] * self.points[:, 0] - model[1]
+
+    def refine(self, model: Line, inliers: BoolArray) -> Line | None:
+        self.refines += 1
+        a, b = np.polyfit(self.points[inliers, 0], self.points[inliers, 1], 1)
+        return float(a), float(b)
+
+
+def line_problem(outlier_ratio: float, seed: int = 0, n: int = 100) -> tuple[LineEstimator, BoolArray]:
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(0, 10, n)
+    y = 2.0 * x - 1.0 + rng.normal(0, 0.01, n)
+    bad = np.arange(n) < round(outlier_ratio * n)
+    y[bad] = rng.uniform(-20, 20, np.count_nonzero(bad))
+    return LineEstimator(np.column_stack([x, y]), (n,), (2,)), ~bad
+
+
+@pytest.mark.parametrize("outlier_ratio", [0.0, 0.3, 0.6])
+def test_finds_the_line(outlier_ratio: float) -> None:
+    estimator, good = line_problem(outlier_ratio)
+    report = ransac(estimator, RansacOptions(threshold=0.03), np.random.default_rng(1))
+    assert report.success and report.model is not None
+    # A hundred points of noise 0.01 over a range of 10 fix the slope to 0.001.
+    assert report.model == pytest.approx((2.0, -1.0), abs=0.02)
+    assert np.count_nonzero(report.inliers & good) >= 0.98 * np.count_nonzero(good)
+    assert np.count_nonzero(report.inliers & ~good) <= 2
+
+
+def test_report_speaks_about_its_own_model() -> None:
+    estimator, _ = line_problem(0.4)
+    options = RansacOptions(threshold=0.03)
+    report = ransac(estimator, options, np.random.default_rng(1))
+    assert report.model is not None
+    residuals = np.abs(estimator.residuals(report.model))
+    np.testing.assert_array_equal(report.inliers, residuals <= 0.03)
+    assert report.score == msac_score(residuals, 0.03)
+
+
+def test_local_optimisation_lowers_the_cost() -> None:
+    estimator, _ = line_problem(0.4)
+    scores = {
+        steps: ransac(
+            estimator, RansacOptions(threshold=0.03, lo_steps=steps, final_steps=0), np.random.default_rng(1)
+        ).score
+        for steps in (0, 4)
+    }
+    assert scores[4] < scores[0]
+
+
+def test_groups_are_sampled_separately() -> None:
+    estimator, _ = line_problem(0.0, n=50)
+    seen: list[IntArray] = []
+    original = estimator.generate
+
+    def generate(samples: IntArray) -> Iterator[list[Line]]:
+        seen.extend(samples)
+        return original(samples)
+
+    estimator.generate = generate  # pyrefly: ignore[method-assign]
+    estimator.num_data, estimator.sample_size = (20, 20, 10), (1, 1, 0)
+    ransac(estimator, RansacOptions(threshold=0.03, min_iterations=30), np.random.default_rng(0))
+    samples = np.array(seen)
+    assert len(samples) >= 30
+    assert np.all(samples[:, 0] < 20) and np.all((samples[:, 1] >= 20) & (samples[:, 1] < 40))
+
+
+def test_no_model_is_a_failure_with_a_reason() -> None:
+    estimator = LineEstimator(np.ones((10, 2)), (10,), (2,))
+    report = ransac(estimator, RansacOptions(threshold=1.0, max_iterations=20), np.random.default_rng(0))
+    assert not report.success and report.reason == "no sample gave a model" and report.iterations == 20
+
+
+def test_nan_residuals_count_as_outliers() -> None:
+    estimator, _ = line_problem(0.0)
+    estimator.points[3, 1] = np.nan
+    report = ransac(estimator, RansacOptions(threshold=0.05, lo_steps=0, final_steps=0), np.random.default_rng(0))
+    assert report.success and not report.inliers[3]
+
+
+def test_all_inlier_probability_by_hand() -> None:
+    # 3 of 5 good, samples of 2: 3/5 * 2/4.
+    assert all_inlier_probability((3,), (5,), (2,)) == pytest.approx(0.3)
+    # A second group, 2 of 4 good, samples of 1.
+    assert all_inlier_probability((3, 2), (5, 4), (2, 1)) == pytest.approx(0.15)
+    assert all_inlier_probability((1,), (5,), (2,)) == 0.0
+    assert all_inlier_probability((0, 5), (7, 5), (0, 3)) == 1.0
+
+
+def test_required_iterations_by_hand() -> None:
+    # 1 - (1 - 1/4)^k >= 0.99  ->  k >= ln 0.01 / ln 0.75 = 16.008
+    assert required_iterations(0.25, 0.99) == pytest.approx(16.008, abs=1e-3)
+    assert required_iterations(1.0, 0.99) == 1.0
+    assert required_iterations(0.0, 0.99) == math.inf
+    # (1 - p) rounds to 1: the logarithm must not.
+    assert required_iterations(1e-18, 0.5) == pytest.approx(math.log(2) * 1e18)
+
+
+def test_stops_after_the_required_iterations() -> None:
+    """Exactly half of 40 points are good: p = C(20, 2) / C(40, 2) = 0.2436, so 24.7 samples for 99.9 %."""
+    estimator, _ = line_problem(0.5, n=40)
+    report = ransac(
+        estimator, RansacOptions(threshold=0.05, confidence=0.999, min_iterations=1), np.random.default_rng(0)
+    )
+    good = np.count_nonzero(report.inliers)
+    expected = required_iterations(all_inlier_probability((int(good),), (40,), (2,)), 0.999)
+    assert 20 <= good <= 21
+    assert report.iterations == math.ceil(expected) == estimator.generates
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=20), st.floats(0.1, 3))
+@settings(max_examples=30)
+def test_msac_score_is_bounded_by_the_number_of_data(residuals: list[float], threshold: float) -> None:
+    score = msac_score(np.array(residuals), threshold)
+    assert 0.0 <= score <= len(residuals)
+    assert msac_score(np.array([*residuals, np.inf]), threshold) == pytest.approx(score + 1.0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"threshold": 0.0},
+        {"threshold": math.nan},
+        {"confidence": 1.0},
+        {"min_iterations": 0},
+        {"min_iterations": 20, "max_iterations": 10},
+        {"lo_steps": -1},
+    ],
+)
+def test_options_of_ransac_refuse_nonsense(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad)).split("_")[0]):
+        RansacOptions(**{"threshold": 1.0, **bad})  # pyrefly: ignore[bad-argument-type]
+
+
+def test_false_alarms_by_hand() -> None:
+    # C(10, 4) = 210 choices, two inliers beyond a sample of 2 at 1 in 100 each, 50 samples: 210 * 50 * 1e-4.
+    assert log10_false_alarms(4, 10, 2, 50, 0.01) == pytest.approx(math.log10(210 * 50 * 1e-4), abs=1e-12)
+
+
+def test_consensus_of_pure_noise_is_no_consensus() -> None:
+    points = np.random.default_rng(5).uniform(0.0, 1.0, (100, 2))
+    # A line band of +-0.01 in the unit square holds about 2 % of uniform points.
+    report = ransac(
+        LineEstimator(points, (100,), (2,)),
+        RansacOptions(threshold=0.01, max_iterations=500),
+        np.random.default_rng(0),
+    )
+    assert not report.success
+    assert "chance" in report.reason

@@ -1,6 +1,6 @@
 """Compiled inner loops of one camera with free velocities in both frames; see ``solvers.free_velocities``.
 
-The readable NumPy forms are there too, named in each function; the tests compare both. A motion is R (3, 3) and
+A motion is R (3, 3) and
 vectors (5, 3): t, v0, v1, w0, w1. The unknowns of a descent, 11 or 17, are a turn left of R, two steps of t on
 the unit sphere, v1 - R v0 and (v1 + R v0) / 2, and the same of w0 and w1.
 """
@@ -33,7 +33,8 @@ def free_terms(
 ) -> None:
     """Sampson errors, px, and what makes J^T times them the gradient of half their squares.
 
-    NumPy: ``free_velocities.sampson``, ``free_velocities.sampson_jacobian``.
+    The constraint y^T [T]x R x over the length of its derivative by the pixels, with that derivative at the
+    corrected measurement: see ``residuals``.
 
     Args:
         R: (3, 3); vectors: (5, 3) t, v0, v1, w0, w1.
@@ -110,7 +111,7 @@ def _constraint(
     A1: FloatArray,
     P: FloatArray,
 ) -> tuple[float, tuple[float, float, float, float]]:
-    """y^T [T]x R x and its derivatives by the pixels; NumPy: ``free_velocities.constraint``."""
+    """y^T [T]x R x and its derivatives by the pixels: a row that moves is another pose too."""
     T, Rv0 = _between(R, vectors, s0, s1, A0, A1, P)
     v1, w1 = _row(vectors, 2), _row(vectors, 4)
     p = apply(P, x)
@@ -161,7 +162,7 @@ def _derivatives(
 
 @compiled
 def free_in_front(R: FloatArray, vectors: FloatArray, rows: FloatArray) -> int:
-    """How many points lie in front of both cameras; NumPy: ``free_velocities.in_front_of_both``."""
+    """How many points lie in front of both cameras; T counts on the side of t."""
     A0, A1, P, t = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), _row(vectors, 0)
     count = 0
     for m in range(len(rows)):

@@ -76,7 +76,7 @@ class Packed:
         """Number of unknowns of the motion that the measurements feel."""
         return 5 if self.one_camera else 6
 
-    def held(self, theta: FloatArray, H: FloatArray) -> FloatArray:
+    def definite(self, theta: FloatArray, H: FloatArray) -> FloatArray:
         """H (6, 6), made definite along the length of v where nothing is felt there, which changes no step else.
 
         For kernels whose T is proportional to v, as of all motion models here.
@@ -113,16 +113,10 @@ class Packed:
         return self._of(self.pairs[pairs], self.tracks[tracks], self.row_checks[tracks])
 
     def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
-        # In one piece, as they came: of other arrays the kernels would need another compilation.
-        return Packed(
-            pairs=np.ascontiguousarray(pairs),
-            tracks=np.ascontiguousarray(tracks),
-            row_checks=row_checks,
-            focal=self.focal,
-            h=self.h,
-            baseline=self.baseline,
-            kernel=self.kernel,
-        )
+        # Contiguous: other arrays would need another compilation of the kernels.
+        same = {name: getattr(self, name) for name in ("focal", "h", "baseline", "kernel")}
+        pairs, tracks = np.ascontiguousarray(pairs), np.ascontiguousarray(tracks)
+        return Packed(pairs=pairs, tracks=tracks, row_checks=row_checks, **same)
 
     def normal_equations(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Half the sum of squares in px^2, its gradient (6,) and Gauss-Newton Hessian (6, 6)."""
@@ -130,31 +124,18 @@ class Packed:
         H, gradient = np.zeros((6, 6)), np.zeros(6)
         pair_terms(theta, self.law, self.pairs, self.focal, self.h, residuals, H, gradient, True)
         track_terms(theta, self.law, self.tracks, self.focal, self.h, self.baseline, squares, H, gradient, True)
-        return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, self.held(theta, H)
+        return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, self.definite(theta, H)
 
     def pair_residuals(self, theta: FloatArray) -> FloatArray:
         """Sampson errors (n,) of the pairs, px."""
-        residuals = np.zeros(len(self.pairs))
-        pair_terms(
-            theta, self.law, self.pairs, self.focal, self.h, residuals, np.zeros((6, 6)), np.zeros(6), False
-        )
+        residuals, unused = np.zeros(len(self.pairs)), (np.zeros((6, 6)), np.zeros(6))
+        pair_terms(theta, self.law, self.pairs, self.focal, self.h, residuals, *unused, False)
         return residuals
 
     def track_squares(self, theta: FloatArray) -> FloatArray:
         """Squared whitened errors (m,) of the tracks with their row checks, px^2, 5 degrees of freedom."""
-        squares = np.zeros(len(self.tracks))
-        track_terms(
-            theta,
-            self.law,
-            self.tracks,
-            self.focal,
-            self.h,
-            self.baseline,
-            squares,
-            np.zeros((6, 6)),
-            np.zeros(6),
-            False,
-        )
+        squares, unused = np.zeros(len(self.tracks)), (np.zeros((6, 6)), np.zeros(6))
+        track_terms(theta, self.law, self.tracks, self.focal, self.h, self.baseline, squares, *unused, False)
         return np.where(squares >= BEHIND, BEHIND, squares + self.row_checks)
 
     def pair_costs(self, theta: FloatArray) -> FloatArray:
@@ -176,6 +157,11 @@ class Packed:
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
         return count_in_front(theta, self.law, self.pairs)
+
+    def signed(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        """d or -d (3,), whichever has more pairs in front of the cameras."""
+        front, back = (self.in_front(self.theta(w, each)) for each in (d, -d))
+        return d if front >= back else -d
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
         """Parameters (6,) of the motion (w, d)."""
@@ -322,20 +308,11 @@ def each_term(packed: Packed, theta: FloatArray) -> Each:
     """What ``Packed.normal_equations`` sums up, and with the row checks of the tracks in their squares."""
     pairs, count = len(packed.pairs), len(packed.pairs) + len(packed.tracks)
     squares, g, H = np.zeros(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
-    _each_pair(theta, packed.law, packed.pairs, packed.focal, packed.h, squares[:pairs], H[:pairs], g[:pairs])
-    squares[:pairs] **= 2
-    _each_track(
-        theta,
-        packed.law,
-        packed.tracks,
-        packed.focal,
-        packed.h,
-        packed.baseline,
-        squares[pairs:],
-        H[pairs:],
-        g[pairs:],
-    )
-    squares[pairs:] += packed.row_checks
+    first, last, camera = slice(pairs), slice(pairs, None), (packed.focal, packed.h)
+    _each_pair(theta, packed.law, packed.pairs, *camera, squares[first], H[first], g[first])
+    squares[first] **= 2
+    _each_track(theta, packed.law, packed.tracks, *camera, packed.baseline, squares[last], H[last], g[last])
+    squares[last] += packed.row_checks
     return Each(squares, g, H)
 
 
@@ -369,18 +346,8 @@ def _each_track(
 ) -> None:
     want = len(tracks) > 0
     for k in range(len(tracks)):
-        track_terms(
-            theta,
-            kernel,
-            tracks[k : k + 1],
-            focal,
-            h,
-            baseline,
-            squares[k : k + 1],
-            H[k],
-            gradients[k],
-            want,
-        )
+        one = tracks[k : k + 1]
+        track_terms(theta, kernel, one, focal, h, baseline, squares[k : k + 1], H[k], gradients[k], want)
 
 
 _FEWEST = 30
@@ -432,7 +399,7 @@ class HeavyTailed(Packed):
         weights = self.weights(each.squares)
         gradient = weights @ each.gradients
         H = np.tensordot(np.maximum(self.slopes(each.squares), _LEAST_SLOPE * weights), each.hessians, 1)
-        return self.scale**2 * float(np.sum(costs)), gradient, self.held(theta, H)
+        return self.scale**2 * float(np.sum(costs)), gradient, self.definite(theta, H)
 
     def pair_costs(self, theta: FloatArray) -> FloatArray:
         """Twice what each of the pairs (n,) adds to the cost, px^2."""
@@ -456,7 +423,7 @@ class HeavyTailed(Packed):
         weights = self.weights(each.squares)
         bend = 2.0 * weights / (self.nu * self.scale**2 + each.squares)
         A = np.tensordot(weights, each.hessians, 1) - (bend[:, None] * each.gradients).T @ each.gradients
-        inverse = inverse_definite(self.held(theta, A))
+        inverse = inverse_definite(self.definite(theta, A))
         if inverse is None:
             return None
         kept = 1.0 - np.minimum(_leverages(self, theta, each, weights), 0.5)
@@ -520,7 +487,7 @@ def _likelihood(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> 
 
 def _leverages(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray) -> FloatArray:
     """(n,) traces of H^-1 H_i: each one's share of the sum H of the H_i; in sum 6, or 5 of one camera."""
-    inverse = inverse_definite(packed.held(theta, np.tensordot(weights, each.hessians, 1)))
+    inverse = inverse_definite(packed.definite(theta, np.tensordot(weights, each.hessians, 1)))
     if inverse is None:
         return np.zeros(len(weights))
     return weights * (each.hessians.reshape(-1, _PARAMETERS**2) @ inverse.ravel())

@@ -315,14 +315,8 @@ class RobustOptions:
 
     def ransac(self) -> RansacOptions:
         """As the loop wants it; checks the values."""
-        return RansacOptions(
-            threshold=self.threshold_px,
-            confidence=self.confidence,
-            min_iterations=self.min_iterations,
-            max_iterations=self.max_iterations,
-            lo_steps=self.lo_steps,
-            final_steps=self.final_steps,
-        )
+        same = ("confidence", "min_iterations", "max_iterations", "lo_steps", "final_steps")
+        return RansacOptions(threshold=self.threshold_px, **{name: getattr(self, name) for name in same})
 
     def __post_init__(self) -> None:
         self.ransac()
@@ -388,7 +382,6 @@ def estimate_motion(
     if len(given.tracks) == 0 and len(given.stereo_0) + len(given.stereo_1) > 0:
         joined = join_stereo(given)
         given, note = joined.correspondences, joined.note
-    run = _own if loop == "own" else _search
     start = time.perf_counter()
     try:
         ideal = without_lens(given, rig.camera)
@@ -399,7 +392,8 @@ def estimate_motion(
         return _refused(correspondences, refusal, solver, options)
     if solver.spec.shutter == "global":
         given, rig, shutter = ideal, rig.ideal, shutter if shutter.plain else shutter.at_once()
-    found = run(given, rig, shutter, solver, options, rng)
+    task = _Task(given, rig, shutter, solver, options)
+    found = task.by_solver() if loop == "own" else task.by_ransac(rng)
     seconds = time.perf_counter() - start
     problem, estimate = found.problem, found.estimate
     if note:
@@ -441,63 +435,49 @@ class _Found(NamedTuple):
     iterations: int
 
 
-def _search(
-    correspondences: Correspondences,
-    rig: StereoRig,
-    shutter: RollingShutter,
-    solver: Solver,
-    options: RobustOptions,
-    rng: np.random.Generator,
-) -> _Found:
-    """By RANSAC around the solver."""
-    failed, iterations = None, 0
-    for problem, threshold in _attempts(correspondences, rig, shutter, solver, options):
-        report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
-        iterations += report.iterations
-        if report.model is not None:
-            return _Found(
-                problem, *_conclude(problem, report.model, report.inliers, threshold, options), iterations
-            )
-        reason = problem.failure(report.reason)
-        failed = _Found(problem, MotionEstimate.failed(reason), report.inliers, threshold, iterations)
-    assert failed is not None, "one attempt is always made"
-    return failed
+class _Task(NamedTuple):
+    """Matches, cameras, the solver and the options of its search."""
 
+    matches: Correspondences
+    rig: StereoRig
+    shutter: RollingShutter
+    solver: Solver
+    options: RobustOptions
 
-def _own(
-    correspondences: Correspondences,
-    rig: StereoRig,
-    shutter: RollingShutter,
-    solver: Solver,
-    options: RobustOptions,
-    rng: np.random.Generator,
-) -> _Found:
-    """By the solver alone."""
-    problem, threshold = RobustProblem(correspondences, rig, shutter, solver), options.threshold_px
-    estimate = problem.on_all()
-    if not estimate.success:
-        return _Found(problem, estimate, np.zeros(sum(problem.num_data), dtype=np.bool_), threshold, 0)
-    if options.adapt_threshold:
-        threshold = _adapted(problem, estimate, threshold, options)
-    return _Found(problem, estimate, np.abs(problem.residuals(estimate)) <= threshold, threshold, 0)
+    def by_ransac(self, rng: np.random.Generator) -> _Found:
+        """By RANSAC around the solver."""
+        failed, iterations, options = None, 0, self.options
+        for problem, threshold in self._attempts():
+            report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
+            iterations += report.iterations
+            if report.model is not None:
+                concluded = _conclude(problem, report.model, report.inliers, threshold, options)
+                return _Found(problem, *concluded, iterations)
+            reason = problem.failure(report.reason)
+            failed = _Found(problem, MotionEstimate.failed(reason), report.inliers, threshold, iterations)
+        assert failed is not None, "one attempt is always made"
+        return failed
 
+    def by_solver(self) -> _Found:
+        """By the solver alone, which rejects outliers itself."""
+        problem, threshold = RobustProblem(*self[:4]), self.options.threshold_px
+        estimate = problem.on_all()
+        if not estimate.success:
+            return _Found(problem, estimate, np.zeros(sum(problem.num_data), dtype=np.bool_), threshold, 0)
+        if self.options.adapt_threshold:
+            threshold = _adapted(problem, estimate, threshold, self.options)
+        return _Found(problem, estimate, np.abs(problem.residuals(estimate)) <= threshold, threshold, 0)
 
-def _attempts(
-    correspondences: Correspondences,
-    rig: StereoRig,
-    shutter: RollingShutter,
-    solver: Solver,
-    options: RobustOptions,
-) -> Iterator[tuple[RobustProblem, float]]:
-    """Problems and thresholds to try until one gives a motion."""
-    problem = RobustProblem(correspondences, rig, shutter, solver)
-    yield problem, options.threshold_px
-    if problem.linked and len(problem.packed.pairs) > len(problem.packed.tracks):
-        # Left-right matches that are mostly wrong: those over time may still be right.
-        yield RobustProblem(correspondences, rig, shutter, solver, linked=False), options.threshold_px
-    if options.adapt_threshold and not problem.shortage:
-        # Noise far above the threshold scatters the inliers of any model.
-        yield problem, _SECOND_TRY * options.threshold_px
+    def _attempts(self) -> Iterator[tuple[RobustProblem, float]]:
+        """Problems and thresholds to try until one gives a motion."""
+        problem, threshold = RobustProblem(*self[:4]), self.options.threshold_px
+        yield problem, threshold
+        if problem.linked and len(problem.packed.pairs) > len(problem.packed.tracks):
+            # Left-right matches that are mostly wrong: those over time may still be right.
+            yield RobustProblem(*self[:4], linked=False), threshold
+        if self.options.adapt_threshold and not problem.shortage:
+            # Noise far above the threshold scatters the inliers of any model.
+            yield problem, _SECOND_TRY * threshold
 
 
 def _conclude(

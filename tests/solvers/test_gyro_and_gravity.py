@@ -1,4 +1,4 @@
-"""Solvers that know where down is."""
+"""Solvers whose rotation a gyroscope gives, or whose vertical is known."""
 
 from __future__ import annotations
 
@@ -11,26 +11,139 @@ import pytest
 
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
-from rsbench.components.motion_models import LinearMotion
+from rsbench.components.motion_models import AcceleratedMotion, LinearMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
+from rsbench.core.imu import GyroMotion
 from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.core.spline_motion import SplineMotion
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
 from rsbench.solvers.engine.base import load_solver
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
-from rsbench.solvers.gyro_and_gravity import Uprights, UprightSolver
+from rsbench.solvers.gyro_and_gravity import GyroSolver, Uprights, UprightSolver
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
+MONO, STEREO = load_solver("rs-gyro-5pt"), load_solver("rs-gyro-stereo")
+
+
+def trial(seed: int, *, stereo: bool, **options: float) -> Simulation:
+    motion = random_motion(np.random.default_rng(seed), np.radians(3.0), 0.3)
+    rig = RIG if stereo else RIG.about("left")
+    chosen = SimulationOptions(**{"pairs": 60, "gyro_rate": 20, **options})  # pyrefly: ignore[bad-argument-type]
+    return simulate(rig, SHUTTER, motion, chosen, np.random.default_rng(seed))
+
+
+def test_rotations_are_those_of_the_motion_that_was_sampled() -> None:
+    tau = np.linspace(0.0, 1.9, 50)
+    turning = AcceleratedMotion(np.array([0.1, -0.2, 0.3]), np.ones(3), acceleration=0.5)
+    at = np.linspace(-0.5, 2.5, 31)
+    samples = np.column_stack([at, turning.velocity(at)[0]])[::-1]  # in any order
+    gyro = GyroMotion(samples, turning.d)
+    # Rates that change linearly about one axis are integrated exactly.
+    np.testing.assert_allclose(gyro.body_from_world(tau).R, turning.body_from_world(tau).R, atol=1e-14)
+    np.testing.assert_allclose(gyro.w, turning.w, atol=1e-14)
+    shaking = SplineMotion(np.array([0.1, -0.2, 0.3]), np.ones(3), preset="handheld", seed=1)
+    errors = []
+    for count in (60, 120):
+        at = np.linspace(0.0, 2.0, count + 1)
+        gyro = GyroMotion(np.column_stack([at, shaking.velocity(at)[0]]), shaking.d)
+        errors.append(np.max(np.abs(gyro.body_from_world(tau).R - shaking.body_from_world(tau).R)))
+    assert errors[0] < 1e-3 and 3.0 < errors[0] / errors[1] < 5.0  # the trapezoidal rule's second order
+
+
+def test_the_descent_keeps_the_side_of_a_translation_without_a_length() -> None:
+    """Its errors are the same for every length: a step may be as long as to the other side of zero."""
+    for seed in range(40):
+        s = trial(seed, stereo=False)
+        found = GyroSolver().estimate(s.correspondences, RIG, SHUTTER)
+        assert translation_error(found.d, s.motion.d) < 1e-8, seed
+
+
+def test_points_give_the_side_of_a_translation_whose_length_is_open() -> None:
+    """About the baseline no camera moves against the other: a wrong rotation gives d a length of any sign."""
+    motion = LinearMotion(np.array([0.03, 0.0, 0.0]), np.array([0.1, -0.2, 0.2]))
+    options = SimulationOptions(pairs=60, noise_px=0.3, gyro_rate=20, gyro_bias_deg=0.05)
+    for seed in range(10):
+        s = simulate(RIG, SHUTTER, motion, options, np.random.default_rng(seed))
+        found = STEREO.estimate(s.correspondences, RIG, SHUTTER)
+        assert translation_error(found.d, s.motion.d) < np.radians(5.0), seed
+
+
+@pytest.mark.parametrize("how", ["none", "sampson"])
+def test_the_translation_of_exact_data_is_exact_and_metric_on_the_rig(how: str) -> None:
+    for seed in range(3):
+        s = trial(seed, stereo=False)
+        found = GyroSolver(refinement=how).estimate(s.correspondences, RIG, SHUTTER)  # pyrefly: ignore[bad-argument-type]
+        assert found.success and not found.metric and rotation_error(found.w, s.motion.w) < 1e-12
+        assert translation_error(found.d, s.motion.d) < 1e-8
+        s = trial(seed, stereo=True)
+        found = GyroSolver(cameras_used="both", refinement=how).estimate(  # pyrefly: ignore[bad-argument-type]
+            s.correspondences, RIG, SHUTTER
+        )
+        # The length comes from w x baseline, a hundredth of the flow.
+        assert found.metric and scale_error(found.d, s.motion.d) < 1e-6
+
+
+@pytest.mark.parametrize("stereo", [False, True])
+def test_minimal_samples_suffice(stereo: bool) -> None:
+    s, solver = trial(1, stereo=stereo), STEREO if stereo else MONO
+    c = replace(s.correspondences, left=s.correspondences.left[:2], right=s.correspondences.right[: int(stereo)])
+    (found,) = solver.propose(c, RIG, SHUTTER)
+    assert found.success and found.metric == stereo
+    np.testing.assert_allclose(found.d / np.linalg.norm(found.d), s.motion.d / 0.3, atol=1e-5)
+
+
+def test_it_is_at_the_bound_of_a_known_rotation() -> None:
+    distances = []
+    for seed in range(25):
+        s, exact = trial(seed, stereo=False, noise_px=0.3), trial(seed, stereo=False)
+        rig, left = RIG.about("left"), Correspondences(left=exact.correspondences.left)
+        F = motion_bound(left, rig, SHUTTER, s.motion, 0.3).information[3:, 3:]
+        error = 0.3 * MONO.estimate(s.correspondences, RIG, SHUTTER).d - s.motion.d
+        distances.append(error @ F @ error)
+    # Chi-squared with two degrees of freedom: its mean of 25 scatters by sqrt(4 / 25) = 0.4.
+    assert np.mean(distances) == pytest.approx(2.0, abs=1.2)
+
+
+def test_errors_grow_with_the_bias_and_the_delay_of_the_gyroscope() -> None:
+    """A bias is an error of the rotation as it is; a delay none of a constant rotation."""
+    s = trial(2, stereo=False, gyro_bias_deg=0.1)
+    assert np.degrees(rotation_error(MONO.estimate(s.correspondences, RIG, SHUTTER).w, s.motion.w)) == (
+        pytest.approx(0.1, rel=0.1)
+    )
+    s = trial(2, stereo=False, gyro_delay=0.2)
+    assert rotation_error(MONO.estimate(s.correspondences, RIG, SHUTTER).w, s.motion.w) < 1e-12
+    noisy = [trial(2, stereo=False, gyro_noise_deg=noise).correspondences.gyro for noise in (0.0, 1.0)]
+    assert 0.8 < np.std(np.degrees(noisy[1] - noisy[0])[:, 1:]) < 1.2
+
+
+@pytest.mark.parametrize("stereo", [False, True])
+def test_it_stands_outliers_in_the_loop(stereo: bool) -> None:
+    s = trial(3, stereo=stereo, pairs=150, noise_px=0.3, outlier_ratio=0.5)
+    solver = STEREO if stereo else MONO
+    found = estimate_motion(s.correspondences, RIG, SHUTTER, solver, RobustOptions(), np.random.default_rng(0))
+    assert found.estimate.success and rotation_error(found.estimate.w, s.motion.w) < 1e-12
+    assert np.degrees(translation_error(found.estimate.d, s.motion.d)) < 1.0
+
+
+def test_without_a_gyroscope_it_fails_by_value() -> None:
+    c = replace(trial(0, stereo=True).correspondences, gyro=np.zeros((0, 4)))
+    assert "0 samples of a gyroscope, need 2" in MONO.estimate(c, RIG, SHUTTER).reason
+    still = replace(c, gyro=np.array([[0.0, 0.1, 0.0, 0.0]] * 3))
+    assert "one time" in STEREO.estimate(still, RIG, SHUTTER).reason
+
+
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 NAMES = ("gs-upright-3pt", "gs-upright-4pt")
 
 
-def trial(seed: int, degrees: float = 3.0, **options: Any) -> Simulation:
+def upright_trial(seed: int, degrees: float = 3.0, **options: Any) -> Simulation:
     motion = random_motion(np.random.default_rng(seed), np.radians(degrees), 0.3)
     chosen = replace(SimulationOptions(pairs=60, gravity=True), **options)
     return simulate(RIG, GLOBAL, motion, chosen, np.random.default_rng(seed))
@@ -45,7 +158,7 @@ def true_d(name: str, s: Simulation) -> FloatArray:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_motion_of_exact_matches_is_exact(name: str) -> None:
     for seed in range(5):
-        s = trial(seed, 3.0 if seed else 40.0)
+        s = upright_trial(seed, 3.0 if seed else 40.0)
         found = load_solver(name).estimate(s.correspondences, RIG, GLOBAL)
         assert found.success and rotation_error(found.w, s.motion.w) < 1e-10
         assert translation_error(found.d, true_d(name, s)) < 1e-9
@@ -58,7 +171,7 @@ def test_one_of_the_motions_of_a_minimal_sample_is_the_true_one(name: str, sizes
     """Turns of 20 degrees: of small ones the length of the rig's d is nearly open in four matches."""
     nearest = []
     for seed in range(5):
-        s = trial(seed, 20.0)
+        s = upright_trial(seed, 20.0)
         c = s.correspondences
         sample = replace(c, left=c.left[: sizes[0]], right=c.right[: sizes[1]])
         assert dict(load_solver(name).sample_sizes(c)) == {
@@ -74,7 +187,7 @@ def test_one_of_the_motions_of_a_minimal_sample_is_the_true_one(name: str, sizes
     assert np.max(nearest) < (1e-3 if sizes[1] else 1e-8)
 
 
-def test_points_give_the_side_of_a_translation_whose_length_is_open() -> None:
+def test_points_give_the_side_of_a_translation_of_known_gravity() -> None:
     """Without rotation no camera moves against the other."""
     motion = LinearMotion(np.zeros(3), np.array([0.0, 0.0, 0.3]))
     options = SimulationOptions(pairs=60, gravity=True, noise_px=0.3)
@@ -92,7 +205,7 @@ def test_it_is_at_the_bound_of_two_known_angles(name: str) -> None:
     solver = replace(solver, refinement="upright")
     distances = []
     for seed in range(16):
-        s, exact = trial(seed, noise_px=0.3), trial(seed)
+        s, exact = upright_trial(seed, noise_px=0.3), upright_trial(seed)
         rig = RIG.about("left") if name == "gs-upright-3pt" else RIG
         c, d = exact.correspondences, true_d(name, s)
         sets = {"left": c.left, "right": c.right} if name == "gs-upright-4pt" else {"left": c.left}
@@ -114,7 +227,7 @@ def test_wrong_gravity_stays_wrong_unless_all_angles_are_free() -> None:
     """Then the end is PoseLib's least squares."""
     bound, free = (UprightSolver(cameras_used="both", refinement=how) for how in ("upright", "free"))
     for seed in range(3):
-        c = trial(seed, noise_px=0.3, gravity_noise_deg=0.2).correspondences
+        c = upright_trial(seed, noise_px=0.3, gravity_noise_deg=0.2).correspondences
         theirs = load_solver("gs-poselib-stereo").estimate(c, RIG, GLOBAL)
         ours, wrong = (solver.estimate(c, RIG, GLOBAL) for solver in (free, bound))
         assert np.degrees(rotation_error(ours.w, theirs.w)) < 1e-5
@@ -123,8 +236,8 @@ def test_wrong_gravity_stays_wrong_unless_all_angles_are_free() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_stands_outliers_in_the_loop(name: str) -> None:
-    s = trial(3, pairs=150, noise_px=0.3, outlier_ratio=0.5)
+def test_known_gravity_stands_outliers_in_the_loop(name: str) -> None:
+    s = upright_trial(3, pairs=150, noise_px=0.3, outlier_ratio=0.5)
     rng = np.random.default_rng(0)
     found = estimate_motion(s.correspondences, RIG, GLOBAL, load_solver(name), RobustOptions(), rng)
     assert found.estimate.success and np.degrees(rotation_error(found.estimate.w, s.motion.w)) < 0.05
@@ -132,12 +245,14 @@ def test_it_stands_outliers_in_the_loop(name: str) -> None:
 
 
 def test_gravity_turns_with_the_camera_and_has_its_noise() -> None:
-    s = trial(0)
+    s = upright_trial(0)
     first, second = s.correspondences.gravity
     np.testing.assert_allclose(so3.exp(s.motion.w) @ first[1:], second[1:], atol=1e-14)
     angles = []
     for seed in range(40):
-        noisy, exact = (trial(seed, pairs=0, gravity_noise_deg=g).correspondences.gravity for g in (0.5, 0.0))
+        noisy, exact = (
+            upright_trial(seed, pairs=0, gravity_noise_deg=g).correspondences.gravity for g in (0.5, 0.0)
+        )
         np.testing.assert_allclose(np.linalg.norm(noisy[:, 1:], axis=1), 1.0, atol=1e-14)
         angles.append(np.linalg.norm(np.cross(noisy[:, 1:], exact[:, 1:]), axis=1))
     # Two angles of 0.5 degrees each; the root of 160 squares is 6 % off.
@@ -145,7 +260,7 @@ def test_gravity_turns_with_the_camera_and_has_its_noise() -> None:
 
 
 def test_what_is_no_gravity_is_told_by_value() -> None:
-    c, solver = trial(0).correspondences, load_solver("gs-upright-3pt")
+    c, solver = upright_trial(0).correspondences, load_solver("gs-upright-3pt")
     found = solver.estimate(replace(c, gravity=np.array([[0.0, 0.0, 1.0, 0.0]] * 2)), RIG, GLOBAL)
     assert not found.success and "no direction of gravity" in found.reason
     assert (

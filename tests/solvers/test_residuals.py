@@ -1,0 +1,489 @@
+"""Compiled residuals against their NumPy forms, bundle adjustment and differences; errors with heavy tails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.stats import chi2, t
+
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core import so3
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.epipolar import in_front, row_pair_pose, rs_sampson_error, rs_stereo_transfer
+from rsbench.core.motion import Motion
+from rsbench.core.projection import back_project, project_at, rs_project_near
+from rsbench.core.rig import FRAMES, SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
+from rsbench.solvers.engine.packed import (
+    HeavyTailed,
+    Packed,
+    _distribution,
+    damped_step,
+    each_term,
+    heavy_tailed,
+    pack,
+    solve_triples,
+)
+from rsbench.solvers.refined import RefinedSolver
+
+# Unequal focal lengths, so that no two of them can be mistaken for one another.
+RIG = StereoRig(camera=PinholeCamera(width=900, height=700, fx=810.0, fy=760.0, cx=440.0, cy=355.0), baseline=0.5)
+SHUTTER = RollingShutter(height=700, readout_ratio=0.8)
+EACH_MODEL = pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
+
+
+def problem(model: str, noise_px: float) -> tuple[Correspondences, Motion, Packed]:
+    rng = np.random.default_rng(3)
+    motion = random_motion(rng, 0.05, 0.3, model)
+    options = SimulationOptions(pairs=40, tracks=40, noise_px=noise_px)
+    c = simulate(RIG, SHUTTER, motion, options, rng).correspondences
+    return c, motion, pack(c, RIG, SHUTTER, model)
+
+
+def middle(tracks: FloatArray) -> FloatArray:
+    """x, y, disparity (n, 3) of stereo matches (n, 4)."""
+    return np.column_stack([0.5 * (tracks[:, :2] + tracks[:, 2:]), tracks[:, 0] - tracks[:, 2]])
+
+
+@EACH_MODEL
+def test_pair_residuals_equal_the_numpy_sampson_error(model: str) -> None:
+    c, motion, packed = problem(model, noise_px=2.0)
+    expected = [rs_sampson_error(RIG, SHUTTER, motion, side, getattr(c, side)) for side in SIDES]
+    np.testing.assert_allclose(
+        packed.pair_residuals(packed.theta(motion.w, motion.d)), np.concatenate(expected), atol=1e-10
+    )
+
+
+@EACH_MODEL
+def test_track_errors_equal_the_whitened_numpy_transfer(model: str) -> None:
+    c, motion, packed = problem(model, noise_px=1.0)
+
+    def transfer(tracks: FloatArray) -> FloatArray:
+        return rs_stereo_transfer(RIG, SHUTTER, motion, middle(tracks[:, :4]), middle(tracks[:, 4:]))
+
+    # Derivative by all eight coordinates; the row differences are the two equations that the motion leaves alone.
+    step = 1e-3
+    D = np.stack(
+        [(transfer(c.tracks + step * e) - transfer(c.tracks - step * e)) / (2 * step) for e in np.eye(8)], axis=-1
+    )
+    rows = np.zeros((2, 8))
+    rows[0, [1, 3]], rows[1, [5, 7]] = (1, -1), (1, -1)
+    D = np.concatenate([D, np.broadcast_to(rows, (len(D), 2, 8))], axis=1)
+    error = np.concatenate([transfer(c.tracks), c.tracks @ rows.T], axis=1)
+    expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(D @ np.swapaxes(D, 1, 2)), error)
+    # 1e-6: the central differences.
+    np.testing.assert_allclose(packed.track_squares(packed.theta(motion.w, motion.d)), expected, rtol=1e-6)
+
+
+@EACH_MODEL
+def test_track_errors_are_those_of_the_best_point(model: str) -> None:
+    c, motion, packed = problem(model, noise_px=0.3)
+    squares = packed.track_squares(packed.theta(motion.w, motion.d))
+    for track, square in zip(c.tracks[:10], squares, strict=False):
+
+        def reprojection(X: FloatArray, track: FloatArray = track) -> FloatArray:
+            views: list[FloatArray] = []
+            for frame in (0, 1):
+                y = track[4 * frame + 1]
+                for _ in range(8):  # the row equation: image points move much slower than the readout
+                    y = project_at(RIG, motion, "left", SHUTTER.row_time(y, frame), X)[1]
+                views += [project_at(RIG, motion, side, SHUTTER.row_time(y, frame), X)[:2] for side in SIDES]
+            return np.concatenate(views) - track
+
+        disparity = track[[0]] - track[[2]]
+        start = back_project(RIG, SHUTTER, motion, "left", 0, track[None, :2], RIG.depth(disparity))[0]
+        best = least_squares(reprojection, start, xtol=1e-14, ftol=1e-14)
+        # Equal to first order in the noise, which is 0.5 % of the disparity.
+        assert square == pytest.approx(2 * best.cost, rel=0.01, abs=1e-4)
+
+
+@EACH_MODEL
+def test_gradient_and_hessian_against_finite_differences(model: str) -> None:
+    c, motion, _ = problem(model, noise_px=0.0)
+    for part in (Correspondences(left=c.left, right=c.right), Correspondences(tracks=c.tracks)):
+        packed = pack(part, RIG, SHUTTER, model)
+        # Move the measurements onto the motion: at zero residuals the Hessian is exact.
+        shift = np.array([2.0, -3.0, 1.0, 4.0, -2.0, 3.0]) * 1e-6
+        exact = packed.theta(motion.w, motion.d)
+        gradient = packed.normal_equations(exact + shift)[1]
+        hessian = packed.normal_equations(exact)[2]
+        np.testing.assert_allclose(gradient, hessian @ shift, rtol=2e-4, atol=1e-4 * np.max(np.abs(gradient)))
+        step = 1e-6
+        numeric = [
+            (
+                packed.normal_equations(exact + shift + step * e)[0]
+                - packed.normal_equations(exact + shift - step * e)[0]
+            )
+            / (2 * step)
+            for e in np.eye(6)
+        ]
+        np.testing.assert_allclose(gradient, numeric, rtol=2e-4, atol=1e-4 * np.max(np.abs(gradient)))
+        for angle in (0.0, 1e-4, 0.5):
+            turned = packed.theta(motion.w * angle / 0.05, motion.d)
+            assert np.all(np.isfinite(packed.normal_equations(turned)[2]))
+
+
+@EACH_MODEL
+def test_gradient_is_that_of_the_sampson_cost_under_noise(model: str) -> None:
+    """With the weights frozen it would be off by tens of percent."""
+    c, motion, _ = problem(model, noise_px=0.5)
+    for part in (Correspondences(left=c.left, right=c.right), Correspondences(tracks=c.tracks)):
+        packed = pack(part, RIG, SHUTTER, model)
+        theta = packed.theta(motion.w, motion.d)
+        step = 1e-6
+        numeric = np.array(
+            [
+                (packed.normal_equations(theta + step * e)[0] - packed.normal_equations(theta - step * e)[0])
+                / (2 * step)
+                for e in np.eye(6)
+            ]
+        )
+        scale = np.sqrt(np.diagonal(packed.normal_equations(theta)[2]))
+        # In units of a standard deviation of each parameter.
+        np.testing.assert_allclose(packed.normal_equations(theta)[1] / scale, numeric / scale, atol=2e-2)
+
+
+@EACH_MODEL
+def test_cheirality_equals_the_numpy_one(model: str) -> None:
+    c, motion, packed = problem(model, noise_px=0.5)
+    for candidate in (motion, motion.with_endpoint(motion.w, -motion.d)):
+        expected = 0
+        for side in SIDES:
+            matches = getattr(c, side)
+            pose = row_pair_pose(RIG, SHUTTER, candidate, side, matches[:, 1], matches[:, 3])
+            x0, x1 = RIG.camera.unproject(matches[:, :2]), RIG.camera.unproject(matches[:, 2:])
+            expected += int(np.count_nonzero(in_front(pose, x0, x1)))
+        assert packed.in_front(packed.theta(candidate.w, candidate.d)) == expected
+
+
+@EACH_MODEL
+def test_no_motion_explains_only_matches_that_stay(model: str) -> None:
+    """Without translation the constraint vanishes; the residual must not."""
+    c, _, _ = problem(model, noise_px=0.0)
+    moved = pack(Correspondences(left=c.left), RIG, SHUTTER, model).pair_residuals(np.zeros(6))
+    distance = np.linalg.norm(c.left[:, 2:] - c.left[:, :2], axis=1)
+    np.testing.assert_allclose(moved, distance / np.sqrt(2.0), rtol=1e-12)
+    still = np.hstack([c.left[:, :2], c.left[:, :2]])
+    assert np.max(pack(Correspondences(left=still), RIG, SHUTTER, model).pair_residuals(np.zeros(6))) < 1e-9
+
+
+WIDE_RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+WIDE_SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
+
+
+def trial(model: str, noise_px: float) -> Simulation:
+    rng = np.random.default_rng(3)
+    motion = random_motion(rng, np.radians(2.0), 0.3, model)
+    return simulate(WIDE_RIG, WIDE_SHUTTER, motion, SimulationOptions(tracks=60, noise_px=noise_px), rng)
+
+
+@settings(max_examples=50)
+@given(seed=st.integers(0, 10**6), damping=st.sampled_from([0.0, 1e-4, 1.0]))
+def test_step_solves_the_damped_normal_equations(seed: int, damping: float) -> None:
+    rng = np.random.default_rng(seed)
+    J, gradient, step = rng.standard_normal((9, 6)), rng.standard_normal(6), np.zeros(6)
+    H = J.T @ J
+    assert damped_step(H, gradient, damping, step)
+    expected = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
+    # Rounding grows with the condition of H.
+    np.testing.assert_allclose(step, expected, rtol=1e-13 * np.linalg.cond(H), atol=1e-12)
+
+
+def test_no_step_from_a_singular_matrix() -> None:
+    column = np.arange(1.0, 7.0)
+    for H in (np.zeros((6, 6)), np.outer(column, column), np.full((6, 6), np.nan)):
+        assert not damped_step(H, np.ones(6), 0.0, np.zeros(6))
+
+
+@pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
+def test_exact_samples_give_the_motion(model: str) -> None:
+    s = trial(model, 0.0)
+    packed = pack(s.correspondences, WIDE_RIG, WIDE_SHUTTER, model)
+    samples = np.arange(60).reshape(20, 3)
+    thetas = solve_triples(packed, samples, iterations=20)
+    truth = packed.theta(s.motion.w, s.motion.d)
+    # Three points in almost one direction leave a motion weakly determined: a few samples may not arrive.
+    assert np.median(np.abs(thetas - truth)) < 1e-9
+    assert np.mean(np.max(np.abs(thetas - truth), axis=1) < 1e-6) >= 0.9
+
+
+def test_a_sample_ends_where_the_general_descent_does() -> None:
+    s = trial("linear", 0.3)
+    packed = pack(s.correspondences, WIDE_RIG, WIDE_SHUTTER)
+    samples = np.arange(60).reshape(20, 3)
+    thetas = solve_triples(packed, samples, iterations=60)
+    for theta, sample in zip(thetas, samples, strict=True):
+        alone = pack(Correspondences(tracks=s.correspondences.tracks[sample]), WIDE_RIG, WIDE_SHUTTER)
+        minimum = levenberg_marquardt(alone.normal_equations, np.zeros(6), 60, 50.0)
+        cost, _, _ = alone.normal_equations(theta)
+        assert cost == pytest.approx(minimum.cost, rel=1e-6, abs=1e-9)
+
+
+IDEAL = StereoRig(
+    camera=PinholeCamera(width=900, height=700, fx=610.0, fy=580.0, cx=440.0, cy=355.0), baseline=0.5
+)
+PLAIN = RollingShutter(height=700, width=900, readout_ratio=0.8)
+BARREL = Lens(model="brown-conrady", k1=-0.2, k2=0.04, p1=0.001, p2=-0.0005)
+FISHEYE = Lens(model="kannala-brandt", k1=-0.03, k2=0.01)
+CASES = {
+    "barrel": (BARREL, PLAIN),
+    "fisheye": (FISHEYE, PLAIN),
+    "late": (None, replace(PLAIN, right_delay=0.3)),
+    "opposite": (BARREL, replace(PLAIN, right_scan="bottom")),
+    "columns": (None, replace(PLAIN, scan="left", right_scan="right", right_delay=-0.1)),
+    "up": (None, replace(PLAIN, scan="bottom")),
+}
+EACH_CASE = pytest.mark.parametrize("case", CASES)
+
+
+def timed_problem(case: str, noise_px: float, tracks: int = 30, pairs: int = 0) -> Simulation:
+    lens, shutter = CASES[case]
+    rig = replace(IDEAL, camera=replace(IDEAL.camera, lens=lens))
+    rng = np.random.default_rng(3)
+    motion = random_motion(rng, 0.04, 0.2, "linear")
+    options = SimulationOptions(tracks=tracks, pairs=pairs, noise_px=noise_px)
+    return simulate(rig, shutter, motion, options, rng)
+
+
+def packed_of(s: Simulation) -> tuple[Packed, FloatArray]:
+    packed = pack(s.correspondences, s.rig, s.shutter)
+    return packed, packed.theta(s.motion.w, s.motion.d)
+
+
+@EACH_CASE
+def test_the_truth_explains_exact_matches(case: str) -> None:
+    s = timed_problem(case, 0.0, pairs=20)
+    packed, theta = packed_of(s)
+    # 1e-9 px of the row equation, and two Gauss-Newton steps to the point.
+    assert np.max(packed.track_squares(theta)) < 1e-14
+    assert np.max(np.abs(packed.pair_residuals(theta))) < 1e-7
+    assert packed.in_front(theta) == len(packed.pairs) == 40
+
+
+@EACH_CASE
+def test_pair_errors_are_those_of_numpy(case: str) -> None:
+    s = timed_problem(case, 1.0, tracks=0, pairs=20)
+    packed, theta = packed_of(s)
+    matches = {side: getattr(s.correspondences, side) for side in SIDES}
+    expected = [rs_sampson_error(s.rig, s.shutter, s.motion, side, matches[side]) for side in SIDES]
+    np.testing.assert_allclose(packed.pair_residuals(theta), np.concatenate(expected), atol=1e-10)
+
+
+@EACH_CASE
+def test_errors_of_timed_tracks_are_those_of_the_best_point(case: str) -> None:
+    s = timed_problem(case, 0.3, tracks=2)
+    packed, theta = packed_of(s)
+    for track, square in zip(s.correspondences.tracks, packed.track_squares(theta), strict=True):
+
+        def reprojection(X: FloatArray, track: FloatArray = track) -> FloatArray:
+            found = []
+            for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
+                line = track[2 * k + s.shutter.axis(side)]
+                found.append(rs_project_near(s.rig, s.shutter, s.motion, side, frame, X, line).pixels)
+            return np.concatenate(found) - track
+
+        x = s.rig.camera.ideal_pixels(track[:4].reshape(2, 2))
+        depth = s.rig.depth(x[0, 0] - x[1, 0])
+        start = back_project(s.rig, s.shutter, s.motion, "left", 0, track[:2], np.abs(depth))
+        best = least_squares(reprojection, start, xtol=1e-14, ftol=1e-14)
+        # Equal to first order in the noise, of which the velocity that weighs an end is 1 % uncertain.
+        assert square == pytest.approx(2 * best.cost, rel=0.01, abs=1e-4)
+
+
+@EACH_CASE
+def test_equations_of_timed_tracks_against_finite_differences(case: str) -> None:
+    s = timed_problem(case, 0.0, pairs=15)
+    c = s.correspondences
+    for part in (Correspondences(left=c.left, right=c.right), Correspondences(tracks=c.tracks)):
+        packed = pack(part, s.rig, s.shutter)
+        theta = packed.theta(s.motion.w, s.motion.d)
+        shift, step = np.array([2.0, -3.0, 1.0, 4.0, -2.0, 3.0]) * 1e-6, 1e-6
+        gradient, hessian = packed.normal_equations(theta + shift)[1], packed.normal_equations(theta)[2]
+        costs = [
+            [packed.normal_equations(theta + shift + sign * step * e)[0] for sign in (1, -1)] for e in np.eye(6)
+        ]
+        numeric = (np.array(costs) @ [1, -1]) / (2 * step)
+        # A shift of 1e-6 leaves 3e-4 of second order in the errors of pairs.
+        np.testing.assert_allclose(gradient, hessian @ shift, rtol=0, atol=1e-3 * np.max(np.abs(gradient)))
+        np.testing.assert_allclose(gradient, numeric, rtol=2e-4, atol=1e-4 * np.max(np.abs(gradient)))
+
+
+@EACH_CASE
+@pytest.mark.parametrize("tracks", [True, False])
+def test_the_solver_finds_the_motion(case: str, tracks: bool) -> None:
+    s = timed_problem(case, 0.0, tracks=40) if tracks else timed_problem(case, 0.0, tracks=0, pairs=60)
+    found = RefinedSolver(use_tracks=tracks).estimate(s.correspondences, s.rig, s.shutter)
+    assert found.success and found.metric
+    # Exact data: what is left is where the descent stops.
+    assert so3.angle(so3.exp(found.w) @ so3.exp(-s.motion.w)) < 1e-8
+    np.testing.assert_allclose(found.d, s.motion.d, atol=1e-6)
+
+
+@EACH_CASE
+def test_stated_deviations_hold(case: str) -> None:
+    s = timed_problem(case, 0.5, tracks=60)
+    found = RefinedSolver().estimate(s.correspondences, s.rig, s.shutter)
+    assert found.covariance is not None and found.noise_px == pytest.approx(0.5, rel=0.2)
+    error = np.concatenate([found.w - s.motion.w, found.d - s.motion.d])
+    # Chi-squared with 6 degrees of freedom: above 22.5 once in 1000.
+    assert error @ np.linalg.solve(found.covariance, error) < 22.5
+
+
+TAILS_RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
+TAILS_SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
+MOTION = LinearMotion(np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18]))
+TRUTH = MotionEstimate(w=MOTION.w, d=MOTION.d, success=True)
+
+
+def exact(pairs: int, tracks: int, seed: int = 0, depth: tuple[float, float] = (2.0, 10.0)) -> Simulation:
+    options = SimulationOptions(pairs=pairs, tracks=tracks, depth=depth)
+    return simulate(TAILS_RIG, TAILS_SHUTTER, MOTION, options, np.random.default_rng(seed))
+
+
+def heavy(points: FloatArray, scale: float, nu: float, rng: np.random.Generator) -> FloatArray:
+    """Points (n, k) with errors of a multivariate t distribution: each row has a variance of its own."""
+    spread = np.sqrt(nu / rng.chisquare(nu, (len(points), 1)))
+    return points + scale * spread * rng.standard_normal(points.shape)
+
+
+def tailed_problem(noise: float = 0.3, pairs: int = 30, tracks: int = 40) -> tuple[Packed, FloatArray]:
+    rng, c = np.random.default_rng(1), exact(pairs, tracks).correspondences
+    sets = {name: heavy(getattr(c, name), noise, 3.0, rng) for name in ("left", "right", "tracks")}
+    packed = pack(Correspondences(**sets), TAILS_RIG, TAILS_SHUTTER)
+    return packed, packed.theta(MOTION.w, MOTION.d)
+
+
+def test_the_terms_of_each_sum_to_the_normal_equations() -> None:
+    packed, theta = tailed_problem()
+    each = each_term(packed, theta)
+    cost, gradient, H = packed.normal_equations(theta)
+    np.testing.assert_allclose(0.5 * np.sum(each.squares), cost + 0.5 * np.sum(packed.row_checks), rtol=1e-12)
+    np.testing.assert_allclose(np.sum(each.gradients, axis=0), gradient, rtol=1e-10, atol=1e-10 * np.abs(H).max())
+    np.testing.assert_allclose(np.sum(each.hessians, axis=0), H, rtol=1e-10, atol=1e-12 * np.abs(H).max())
+    expected = np.concatenate([packed.pair_residuals(theta) ** 2, packed.track_squares(theta)])
+    np.testing.assert_allclose(each.squares, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("nu", [3.0, 5.0])
+def test_the_distribution_is_that_of_scipy(nu: float) -> None:
+    """Of one residual each; the six parameters of a motion are 0.15 % of 2000, and the scale feels twice that."""
+    x = 0.2 * np.random.default_rng(0).standard_t(nu, 2000)
+    found, scale = _distribution(x**2, np.ones(2000), 1.0)
+    assert found == nu
+    assert scale == pytest.approx(t.fit(x, fdf=nu, floc=0.0)[2], rel=4e-3)
+
+
+def test_normal_errors_have_no_tails() -> None:
+    rng = np.random.default_rng(0)
+    nu, scale = _distribution(0.04 * rng.chisquare(5, 1000), np.full(1000, 5.0), 1.0)
+    # A t distribution of 30 degrees is wider by sqrt(30 / 28); the standard error of 5000 residuals is 1 %.
+    assert nu == 30.0 and scale * np.sqrt(30 / 28) == pytest.approx(0.2, rel=0.03)
+
+
+def test_equations_of_heavy_tails_against_finite_differences() -> None:
+    """With noise of 3e-3 px and a scale of 0.05: the Sampson errors' own curvature is then 1e-4 of the Hessian."""
+    packed, theta = tailed_problem(noise=3e-3)
+    count = len(packed.pairs) + len(packed.tracks)
+    trust = np.random.default_rng(0).uniform(0.2, 1.0, count)
+    tailed = HeavyTailed(**vars(packed), nu=3.0, scale=0.05, trust=trust)
+    unit = 1e-6
+    above = [tailed.normal_equations(theta + unit * e) for e in np.eye(6)]
+    below = [tailed.normal_equations(theta - unit * e) for e in np.eye(6)]
+    _, gradient, H = tailed.normal_equations(theta)
+    slope = np.array([(a[0] - b[0]) / (2 * unit) for a, b in zip(above, below, strict=True)])
+    np.testing.assert_allclose(gradient, slope, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())
+    curvature = np.array([(a[1] - b[1]) / (2 * unit) for a, b in zip(above, below, strict=True)])
+    np.testing.assert_allclose(H, curvature, atol=0.01 * np.abs(H).max())
+
+
+def normalised(found: MotionEstimate) -> float:
+    assert found.covariance is not None
+    error = np.concatenate([found.w - MOTION.w, found.d - MOTION.d])
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+def with_errors(kind: str, seed: int) -> Correspondences:
+    rng, tracks = np.random.default_rng([2, seed]), exact(0, 300, seed).correspondences.tracks
+    if kind == "heavy":
+        return Correspondences(tracks=heavy(tracks, 0.2, 3.0, rng))
+    noise = 0.3 * rng.standard_normal((len(tracks), 4))  # both cameras see a point wrongly alike
+    return Correspondences(tracks=tracks + noise[:, [0, 1, 0, 1, 2, 3, 2, 3]])
+
+
+@pytest.mark.parametrize("kind", ["heavy", "shared"])
+def test_covariance_holds_whatever_the_errors(kind: str) -> None:
+    """40 trials: the 99.9 % band of the mean of chi-squared, and a tenth more as the covariance is estimated.
+
+    Least squares takes the errors of two cameras, which one track shares, for independent, and misses the band.
+    """
+    squares, plain = list[float](), list[float]()
+    for seed in range(40):
+        c = with_errors(kind, seed)
+        found = RefinedSolver().weigh(TRUTH, c, TAILS_RIG, TAILS_SHUTTER, 0.3)
+        assert found is not None and found.success
+        squares.append(normalised(found))
+        if kind == "shared":
+            plain.append(normalised(RefinedSolver().improve(TRUTH, c, TAILS_RIG, TAILS_SHUTTER)))
+    low, high = np.asarray(chi2.ppf([0.0005, 0.9995], 6 * len(squares))) / len(squares)
+    assert low / 1.1 < np.mean(squares) < 1.1 * high
+    assert kind == "heavy" or np.mean(plain) > high
+
+
+@pytest.fixture(scope="module")
+def bent() -> tuple[Correspondences, Packed, FloatArray]:
+    """Far tracks, a wrong pair of great parallax, and where least squares ends: the pair's residual vanishes.
+
+    Far points fix the direction of d weakly, and the pair, 8 px off, counts for hundreds of them.
+    """
+    rng, c = np.random.default_rng(0), exact(0, 300, depth=(60.0, 100.0)).correspondences
+    near = exact(1, 0, seed=3, depth=(3.0, 3.0)).correspondences.left + np.array([0.0, 0.0, 0.0, 8.0])
+    tracks = c.tracks + 0.2 * rng.standard_normal(c.tracks.shape)
+    matches = Correspondences(tracks=tracks, left=near)
+    packed = pack(matches, TAILS_RIG, TAILS_SHUTTER)
+    start = packed.theta(MOTION.w, MOTION.d)
+    return matches, packed, levenberg_marquardt(packed.normal_equations, start, 60, 50.0).theta
+
+
+def test_a_wrong_pair_of_great_leverage_does_not_bend_the_motion(
+    bent: tuple[Correspondences, Packed, FloatArray],
+) -> None:
+    matches, packed, theta = bent
+    assert np.abs(packed.pair_residuals(theta)[0]) < 0.5  # an inlier, among 300
+    w, d = packed.motion(theta)
+    start = MotionEstimate(w=w, d=d, success=True)
+    assert normalised(RefinedSolver().improve(start, matches, TAILS_RIG, TAILS_SHUTTER)) > 100.0
+    found = RefinedSolver().weigh(start, matches, TAILS_RIG, TAILS_SHUTTER, 0.2)
+    assert found is not None and found.covariance is not None
+    error = np.concatenate([found.w - MOTION.w, found.d - MOTION.d])
+    assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)))
+
+
+def test_leverages_are_bounded(bent: tuple[Correspondences, Packed, FloatArray]) -> None:
+    _, packed, theta = bent
+
+    def share_of_the_pair(tailed: HeavyTailed) -> float:
+        each = each_term(tailed, theta)
+        H = np.einsum("n,nij->nij", tailed.weights(each.squares), each.hessians)
+        return float(np.trace(np.linalg.solve(np.sum(H, axis=0), H[0])))
+
+    tailed = heavy_tailed(packed, theta, 0.2)
+    assert tailed is not None
+    assert share_of_the_pair(replace(tailed, trust=np.ones(len(tailed.trust)))) > 0.7
+    # The other leverages move as its weight falls: to a tenth.
+    assert share_of_the_pair(tailed) == pytest.approx(0.2, rel=0.1)
+
+
+def test_few_measurements_are_left_to_least_squares() -> None:
+    c = exact(0, 29).correspondences
+    assert RefinedSolver().weigh(TRUTH, c, TAILS_RIG, TAILS_SHUTTER, 0.3) is None
