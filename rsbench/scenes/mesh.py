@@ -479,12 +479,7 @@ def _check_names(text: bytes, libraries: list[bytes], path: Path) -> None:
 
 
 def _scene_mesh(
-    name: str,
-    part: Any,
-    axes: FloatArray,
-    transform: FloatArray,
-    look: _Look,
-    path: Path,
+    name: str, part: Any, axes: FloatArray, transform: FloatArray, look: _Look, path: Path
 ) -> SceneMesh:
     where = f"mesh file {path}: part {name!r}"
     linear = axes @ transform[:3, :3]

@@ -184,10 +184,7 @@ def profile(surface: str, section: Sequence[Point], length: float, *, turned: bo
 
 
 def revolve(
-    surface: str,
-    outline: Sequence[Point],
-    segments: int = 32,
-    sweep_deg: tuple[float, float] = (0.0, 360.0),
+    surface: str, outline: Sequence[Point], segments: int = 32, sweep_deg: tuple[float, float] = (0.0, 360.0)
 ) -> Piece:
     """An outline of (radius, z) from bottom to top turned about z: towers, cones, barrels, basins.
 

@@ -161,15 +161,7 @@ def _covered(a: float, b: float, c: float, d: float, size: int) -> tuple[int, in
 
 @compiled(error_model="numpy", inline="always")
 def _quad(
-    upper: F64,
-    lower: F64,
-    near: int,
-    far: int,
-    y: int,
-    first: bool,
-    second: bool,
-    source_map: F32,
-    buffer: F32,
+    upper: F64, lower: F64, near: int, far: int, y: int, first: bool, second: bool, source_map: F32, buffer: F32
 ) -> None:
     """Draw two triangles of the quad of source columns ``near`` and ``far``, rows y and y + 1.
 

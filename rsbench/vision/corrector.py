@@ -36,17 +36,17 @@ class CorrectorSpec:
     """What a corrector declares, checked when it is made. Raises ValueError on what does not exist."""
 
     needs: Set[Knowledge]
-    """What the chain must find for it first; what nobody needs is not looked for. Samples of a gyroscope cannot be
-    found: they are given, or the frames are refused."""
+    """What the chain must estimate for it first; what is not needed is not estimated. Gyroscope samples cannot be
+    estimated: without them the frames are refused."""
     reference: str
     """Where it was published."""
     assumes: str
     """What must hold for it to work, in words."""
     cameras: Cameras = "ideal"
-    """``ideal``: without a lens, rows read from the top by both at once; others are refused by name. ``any``."""
+    """``ideal``: no lens, and both cameras read rows from the top at one time; others are refused. ``any``."""
     sees: Set[OtherFrames] = frozenset(get_args(OtherFrames))
-    """Which other frames it works on beside the corrected one, by itself or in what it needs: of the other camera
-    (``stereo``), of the other ``time``. Matches of the chain are checked in both."""
+    """Which other frames it uses, itself or through what it needs: the other camera's (``stereo``), those of the
+    other ``time``. The chain's matches are checked in both."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "needs", frozenset(self.needs))
@@ -54,7 +54,7 @@ class CorrectorSpec:
         allowed = get_args(Knowledge)
         for value in self.needs:
             if value not in allowed:
-                raise ValueError(f"needs: {value!r} is nothing that is known; there are: {', '.join(allowed)}")
+                raise ValueError(f"needs: {value!r} does not exist; there are: {', '.join(allowed)}")
         others = set(get_args(OtherFrames))
         if not self.sees <= others or (self.needs - {"gyro"} and self.sees < others):
             raise ValueError(f"sees = {sorted(self.sees)}: of stereo and time; what the chain finds needs both")
@@ -74,7 +74,7 @@ class CorrectionProblem:
     rig: StereoRig
     shutter: RollingShutter
     target_row: float
-    """A corrected frame shows the time at which its camera had read so many lines: this row, from the top."""
+    """A corrected frame shows the time at which its camera had read this many lines: a row, from the top."""
     motion: Motion | None
     """Of the rig's body, metres; None when the corrector does not need it."""
     depth: Depths | None
@@ -155,11 +155,7 @@ def _check_spec(corrector: Corrector) -> None:
 
 
 CORRECTORS: Kind[Corrector, RunOptions] = Kind(
-    singular="corrector",
-    cards="correctors",
-    base=Corrector,
-    options=RunOptions,
-    check=_check_spec,
+    singular="corrector", cards="correctors", base=Corrector, options=RunOptions, check=_check_spec
 )
 
 
@@ -201,7 +197,7 @@ def find_corrected_rows(
 
 
 def demand_corrected(frames: Mapping[View, Fused], corrector: str) -> None:
-    """For whoever can do nothing with a part of the frames.
+    """Refuse frames of which some have no correction, for callers that need all of them.
 
     Raises:
         NotCorrectedError: one of them has failed; names the corrector, the first such frame and the reason.

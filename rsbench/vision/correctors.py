@@ -215,7 +215,7 @@ def _other(view: View) -> View:
 _NEAREST_SHARE = 0.999
 _PLANE_ROUNDS = 8
 _NEARER = 0.5
-"""What has no depth may be nearer than the nearest that has: down to this share of its depth."""
+"""Pixels without depth may be nearer than the nearest with one: down to this share of its depth."""
 _FUSION_BYTES = 150.0
 """Per pixel of a frame: what is carried over from the four, float32 and float64."""
 
@@ -230,7 +230,7 @@ class FusionCorrector(Corrector):
     guess_depth: bool = True
     """Where no depth was found, take that of the farther neighbour in the row."""
     moving: bool = True
-    """Whether what moves by itself is looked for, and goes its flow."""
+    """Whether to find things that move by themselves, and to move them by their flow."""
     warp: WarpOptions = field(default_factory=WarpOptions)
     """How pixels are taken from the source image."""
 
@@ -275,7 +275,10 @@ class FusionCorrector(Corrector):
         if self.guess_depth:
             order.append((view, Origin.GUESSED))
         return [
-            replace(_source(problem, source, poses[source], origin), camera=problem.camera(source[0], side))
+            replace(
+                _source(problem, source, poses[source], _depths(problem, origin)[source], origin),
+                camera=problem.camera(source[0], side),
+            )
             for source, origin in order
         ]
 
@@ -302,12 +305,16 @@ def _standing(problem: CorrectionProblem, moving: Mapping[View, Moving]) -> Corr
     return replace(problem, depth=still(problem.depth), guess=still(problem.guess))
 
 
-def _source(problem: CorrectionProblem, view: View, poses: Pose, origin: Origin) -> SourceView:
+def _source(problem: CorrectionProblem, view: View, poses: Pose, depth: F32, origin: Origin) -> SourceView:
+    columns = problem.shutter.axis(view[0]) == 0
+    return SourceView(image=problem.images[view], depth=depth, poses=poses, origin=origin, columns=columns)
+
+
+def _depths(problem: CorrectionProblem, origin: Origin = Origin.HERE) -> Depths:
     depth = problem.guess if origin is Origin.GUESSED else problem.depth
     if depth is None:
         raise ValueError("the depth is not known: 'depth' must be among the needs of the corrector")
-    columns = problem.shutter.axis(view[0]) == 0
-    return SourceView(image=problem.images[view], depth=depth[view], poses=poses, origin=origin, columns=columns)
+    return depth
 
 
 @final
@@ -345,9 +352,7 @@ class PlaneCorrector(Corrector):
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        if problem.depth is None:
-            raise ValueError("the depth is not known: 'depth' must be among the needs of the corrector")
-        depth = problem.depth
+        depth = _depths(problem)
         return {
             view: _alone(problem, view, plane_depth(depth[view], problem.rig.camera), self.warp) for view in views
         }
@@ -386,11 +391,5 @@ def turned(problem: CorrectionProblem, view: View, options: WarpOptions) -> Fuse
 
 
 def _alone(problem: CorrectionProblem, view: View, depth: F32, options: WarpOptions) -> Fused:
-    source = SourceView(
-        image=problem.images[view],
-        depth=depth,
-        poses=problem.row_poses(view),
-        origin=Origin.HERE,
-        columns=problem.shutter.axis(view[0]) == 0,
-    )
+    source = _source(problem, view, problem.row_poses(view), depth, Origin.HERE)
     return fuse([source], problem.rig.camera, problem.target_pose(view), options)

@@ -257,14 +257,7 @@ def _fill_costs(
 
 
 @compiled(error_model="numpy")
-def _keep_agreeing(
-    rho: F32,
-    other: F32,
-    wanted: Mask,
-    maps: Reprojection,
-    tolerance: float,
-    depth: F32,
-) -> None:
+def _keep_agreeing(rho: F32, other: F32, wanted: Mask, maps: Reprojection, tolerance: float, depth: F32) -> None:
     """Write the depth of ``wanted`` pixels whose inverse depth the other frame confirms where it sees them."""
     height, width = rho.shape
     for y in range(height):
@@ -323,17 +316,17 @@ class SweepOptions:
     """The search along the curves."""
 
     shrink: int = 2
-    """Part of the frames' size at which they are compared: a half, a third."""
+    """Factor by which frames are shrunk before they are compared."""
     step_px: float = 1.0
     """Parallax between two planes at that size."""
     planes: int = 128
-    """At most so many."""
+    """Largest number of planes."""
     window: int = 3
     """Side, px, of the square over which costs are averaged."""
     p1: int = 48
-    """What a step to the next plane costs, of 255."""
+    """Cost of a step to the next plane, of 255."""
     p2: int = 255
-    """Of larger steps."""
+    """Cost of larger steps."""
     agree_px: float = 1.0
     """Largest difference of parallax to the other frame's, at that size."""
 
@@ -398,17 +391,12 @@ def sweep_frames(
 
 
 def largest_seen(
-    greys: Sequence[U8],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    options: SweepOptions,
+    greys: Sequence[U8], rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, options: SweepOptions
 ) -> float:
     """Largest inverse depth of textured places that both frames show, with a margin; arguments: ``sweep_frames``.
 
     By a search at a quarter of the size, as far as things are expected to move: where flow lost a near thing, its
-    depth would not be looked for. 0 where there is none.
+    depth would not be searched. 0 where there is none.
     """
     poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
     maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]

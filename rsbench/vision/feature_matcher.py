@@ -46,10 +46,7 @@ class FeatureMatcher(ABC):
 
 FeatureEntry = Entry[FeatureMatcher, RunOptions]
 FEATURE_MATCHERS: Kind[FeatureMatcher, RunOptions] = Kind(
-    singular="feature matcher",
-    cards="features",
-    base=FeatureMatcher,
-    options=RunOptions,
+    singular="feature matcher", cards="features", base=FeatureMatcher, options=RunOptions
 )
 
 

@@ -387,14 +387,14 @@ class MatchOptions:
     edge_threshold: float = 10.0
     """OpenCV's threshold of SIFT: features more edge-like than this are dropped."""
     ratio: float = 0.8
-    """Best over second-best distance, at most."""
+    """Largest ratio of the best to the second-best distance."""
     max_distance: float = 300.0
-    """Largest distance of a match; the ratio says nothing where there is only one candidate."""
+    """Largest distance of a match; the ratio does not apply where there is only one candidate."""
     search_radius: float | None = None
     """Temporal matches move by at most this many px in x and in y; None searches the whole image."""
     row_tolerance: float | None = ROW_TOLERANCE_PX
-    """Left-right matches differ by at most this many rows: both cameras read a row at the same time. None: they do
-    not, and a partner may lie anywhere."""
+    """Left-right matches differ by at most this many rows: both cameras read a row at the same time. None, where
+    they do not: a partner may lie anywhere."""
     max_disparity: float | None = None
     """Largest disparity of left-right matches, px; None is the image width."""
     drop_contradicted: bool = True
@@ -402,11 +402,11 @@ class MatchOptions:
     refine: bool = False
     """Align the ends of matches by the grey levels around them, see ``refine_matches``."""
     enough_tracks: int = 0
-    """Give tracks alone where there are as many as that, which is sooner done; 0 gives all matches."""
+    """Return tracks alone where there are at least this many, which is faster; 0 returns all matches."""
     half: bool = False
-    """Find features at half the size: sooner, and fewer of them; for ends that are aligned (``refine``)."""
+    """Find features at half the size: faster, and fewer; meant for matches that are aligned (``refine``)."""
     affine: bool = False
-    """Give left matches affine frames: the similarity of the keypoints' sizes and orientations."""
+    """Add affine frames to left matches: the similarity of the keypoints' sizes and orientations."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -461,7 +461,7 @@ class Gate:
 _DETECTED, _PAIRED = Recent[Features](28), Recent[Indices](42)
 """A sequence asks for each image in two windows, and again after its shutter is known: of 12 windows at most."""
 _REMEMBERED = 10_000
-"""Features of an image, at most, that are kept: 6 MB."""
+"""Images with more features are not cached: 6 MB."""
 
 
 def forget_features() -> None:

@@ -96,7 +96,7 @@ class Fused:
 _AGREE = 0.03
 """Relative difference of depth below which two views show the same surface."""
 _DIFFERENT = 0.06
-"""Of the full range: colours that differ by more do not show one surface."""
+"""Share of the full range: colours that differ by more show different surfaces."""
 _ROW_STEPS = 6
 """Rounds until the row that sees a point is found; each leaves a share of the error below the readout ratio times
 the motion over the height of the image."""
@@ -158,9 +158,9 @@ def _close_tears(
 ) -> None:
     """Fill in place the holes that lie in one surface, GUESSED, by what the views show there, the first one first.
 
-    A view past an edge opens between two surfaces. A hole between two places of one, in its row or its column, is
-    a tear: of pixels whose depth is unknown or off. It has the depth of its sides, and a view shows it unless that
-    view knows something nearer there.
+    A gap past an edge opens between two surfaces. A hole between two places of one surface, in a row or a column,
+    is a tear, made by pixels whose depth is unknown or wrong. It has the depth of its sides, and a view shows it
+    unless that view knows something nearer there.
     """
     rho, interpolation = _of_both_sides(inverse_depth(depth)), (options or WarpOptions()).interpolation
     for view in views:
@@ -384,7 +384,7 @@ def _even_seams(fused: Fused) -> Fused:
 
 
 def _beside(between: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """(H, W) pixels on either side of what holds between neighbours: (H - 1, W) of columns, (H, W - 1) of rows."""
+    """(H, W) pixels beside a border between neighbours, (H - 1, W) down columns and (H, W - 1) along rows."""
     down, across = (
         np.pad(each, [(1, 1) if k == axis else (0, 0) for k in (0, 1)]) for axis, each in enumerate(between)
     )

@@ -220,7 +220,7 @@ def _border_pixel(image: F32, px: np.float32, py: np.float32, values: F32, y: in
 T = TypeVar("T")
 R = TypeVar("R")
 _BYTES = 1e9
-"""What frames that are worked on at once may take: correcting four of full HD stays below 2 GB."""
+"""Memory for frames that are processed at once: correcting four of full HD stays below 2 GB."""
 
 
 def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_per_pixel: float) -> list[R]:

@@ -65,13 +65,13 @@ class LabelOptions:
     window: int = 5
     """Side, px, of the window in which frames are compared."""
     full_levels: float = 30.0
-    """Grey levels of 256; pixels that differ by more are as unlike as can be."""
+    """Difference of grey levels, of 256, from which pixels count as entirely unlike."""
     p1: int = 24
-    """What a step to the next layer costs, of 255, which the worst likeness costs."""
+    """Cost of a step to the next layer; the worst likeness costs 255."""
     p2: int = 96
-    """What a step to any other layer costs."""
+    """Cost of a step to any other layer."""
     unseen: float = 0.2
-    """What a pixel that the other frame does not see costs, 0 to 1, the worst likeness."""
+    """Cost of a pixel that the other frame does not see, from 0 to 1, the worst likeness."""
     rounds: int = 2
     """Rounds of finding hidden pixels from the layers of both frames."""
 
@@ -249,7 +249,7 @@ class PlaneOptions:
     """How many layers there are."""
 
     most: int = 24
-    """Layers, beside that at infinity."""
+    """Largest number of layers, beside that at infinity."""
     thickness_px: float = 0.25
     """Layers are split until their matches scatter by no more parallax over a frame period (root mean square)."""
 

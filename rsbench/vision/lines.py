@@ -49,13 +49,13 @@ class LineOptions:
     max_lines: int = 500
     """Longest segments kept per image."""
     min_length: float = 25.0
-    """Of a segment, px."""
+    """Length of the shortest segment, px."""
     spacing: float = 10.0
-    """Between the descriptors along a segment, px."""
+    """Distance between the descriptors along a segment, px."""
     patch: float = 6.0
     """Size of a descriptor's keypoint, px: it sees about three times as far to either side."""
     ratio: float = 0.9
-    """Best over second-best distance, at most."""
+    """Largest ratio of the best to the second-best distance."""
     max_distance: float = 300.0
     """Largest distance of a match: the mean over a segment's descriptors, each to the nearest of the other."""
     max_turn_deg: float = 20.0

@@ -91,7 +91,7 @@ _RETURNS_PX = 1.0
 _ON_CURVE_PX = 1.5
 """Distance between the end of the flow and the epipolar curve, below which the flow is that of a still point."""
 _SIGMA_PX = 0.3
-"""What neither check of a flow sees: its standard deviation on rendered frames where both agree."""
+"""Error of a flow that neither check detects: its standard deviation on rendered frames where both agree."""
 _RANGE_QUANTILE, _RANGE_MARGIN, _RANGE_PX = 0.999, 1.5, 2.0
 """Range of the search along the curves, from the inverse depths of consistent flow: times, and px of parallax."""
 _SAME_PX = 2.0
@@ -123,11 +123,11 @@ class MonoFusionOptions:
     sweep: SweepOptions = field(default_factory=SweepOptions)
     """The search along the epipolar curves."""
     warp: WarpOptions = field(default_factory=WarpOptions)
-    """How pixels are taken from the source image; of ``tear_px`` no use is made."""
+    """How pixels are taken from the source image; ``tear_px`` is not used."""
     fill: bool = True
     """Whether the other frame fills what the corrected one does not see."""
     inpaint: bool = True
-    """Whether what no frame shows is invented from its surroundings; it stays marked as seen by nobody."""
+    """Whether to inpaint what no frame shows; it stays marked as seen by nobody."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,9 +140,9 @@ class OwnMotion:
     """Reads rows."""
     side: Side
     motion: Motion | None
-    """In its own unit of length; None: unknown, and everything goes its flow."""
+    """In its own unit of length; None: unknown, and every pixel is moved by its flow."""
     far: bool = False
-    """Whether everything is infinitely far, whatever the flow says."""
+    """Whether to treat everything as infinitely far, whatever the flow."""
 
 
 def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
@@ -188,7 +188,7 @@ class MonoFusion:
     def corrected(self, frame: int, target_tau: float, beyond: Beyond | None = None) -> Fused:
         """The frame at a time, in frame periods; its depth is in the motion's unit.
 
-        ``beyond``: another pair that the frame is one of, whose other frame may show what neither here does.
+        ``beyond``: another pair that contains the frame, whose other frame may show what neither frame here does.
         """
         image, buffer, origin = self._drawn(frame, target_tau)
         others = [Beyond(self, frame, target_tau)] + ([] if beyond is None else [beyond])
@@ -303,7 +303,7 @@ def _picked(shape: tuple[int, ...], size: tuple[int, int]) -> tuple[NDArray[np.i
 
 
 def _range(offs: Sequence[F32], met: Sequence[tuple[F32, F32]], gain: float) -> float:
-    """Largest inverse depth that is looked for."""
+    """Largest inverse depth that is searched."""
     believed = [
         rho[(off < _RETURNS_PX) & (miss < _ON_CURVE_PX)] for off, (rho, miss) in zip(offs, met, strict=True)
     ]

@@ -165,9 +165,7 @@ GAUSSIAN = Window(_blur)
 
 
 def _pair(
-    estimate: NDArray[Any] | Picture,
-    truth: NDArray[Any] | Picture,
-    masks: Sequence[NDArray[np.bool_] | None],
+    estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, masks: Sequence[NDArray[np.bool_] | None]
 ) -> tuple[Picture, Picture]:
     a, b = picture_of(estimate), picture_of(truth)
     shape = b.image.shape

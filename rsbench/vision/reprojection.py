@@ -28,8 +28,8 @@ Table = FloatArray | None
 class Optics(NamedTuple):
     """What ``optics_of`` makes of a camera and its scan.
 
-    The lens of an ideal camera is None: the compiler then leaves the branches away that would look at it. Rows and
-    columns share one compilation: telling them apart costs less than a second one.
+    The lens of an ideal camera is None: the compiler then drops the branches that would use it. Rows and columns
+    share one compilation: a branch costs less than a second one.
     """
 
     ideal: Table
@@ -73,7 +73,7 @@ def _ideal_pixels(camera: PinholeCamera) -> FloatArray:
     return np.ascontiguousarray(camera.ideal_pixels(camera.pixel_grid()))
 
 
-# Not inlined by Numba, which would then not leave out the branch of what is None: LLVM inlines them.
+# Not inlined by Numba, which would then keep the branch for None: LLVM inlines them.
 @compiled(error_model="numpy")
 def look(ideal: Table, x: int, y: int) -> tuple[float, float]:
     """Ideal pixel of a pixel of the image."""

@@ -56,17 +56,29 @@ class GyroCorrector(Corrector):
         return {view: turned(known, view, self.warp) for view in views}
 
 
+@dataclass(frozen=True, kw_only=True)
 class ImageRotationCorrector(Corrector):
-    """Everything at infinity, turned as the one image tells; no second image."""
+    """Everything at infinity, turned by a rotation estimated from the frame's own curves; no second image."""
 
-    @property
-    @abstractmethod
-    def options(self) -> WarpOptions:
-        """Of the warp."""
+    seed: int = 0
+    """Seed of the random samples."""
+    warp: WarpOptions = field(default_factory=WarpOptions)
+    """How pixels are taken from the source image."""
 
     @abstractmethod
+    def turn(self, points: Points | None, rng: np.random.Generator) -> tuple[Turn | str, float]:
+        """The rotation that the curves determine, or why there is none; and its expected size, rad."""
+
     def rotation(self, problem: CorrectionProblem, view: View) -> LinearMotion | str:
         """The rotation of one frame by its own curves, or why there is none."""
+        camera = problem.rig.camera
+        curves = image_curves(problem.images[view], _SHORTEST * camera.height)
+        points = Points.of(curves, camera, problem.shutter, view) if curves else None
+        turn, prior = self.turn(points, np.random.default_rng(self.seed))
+        if isinstance(turn, str):
+            return turn
+        w = turn.determined(prior)
+        return "the lines leave the rotation open" if w is None else LinearMotion(w, np.zeros(3))
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         return self.correct_rows(problem, views, (problem.target_row,))[0]
@@ -80,7 +92,7 @@ class ImageRotationCorrector(Corrector):
             motion = motions[view]
             if isinstance(motion, str):
                 return Fused.failed(problem.images[view], motion)
-            return turned(replace(problem, motion=motion, target_row=row), view, self.options)
+            return turned(replace(problem, motion=motion, target_row=row), view, self.warp)
 
         return [{view: corrected(view, row) for view in views} for row in rows]
 
@@ -92,10 +104,6 @@ class LinesCorrector(ImageRotationCorrector):
 
     lines: LineOptions = field(default_factory=LineOptions)
     """Search for the rotation from curves."""
-    seed: int = 0
-    """Seed of the random samples."""
-    warp: WarpOptions = field(default_factory=WarpOptions)
-    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs=set(),
@@ -105,13 +113,8 @@ class LinesCorrector(ImageRotationCorrector):
         assumes="constant rotation without translation; straight lines in space across many rows, some slanted",
     )
 
-    @property
-    def options(self) -> WarpOptions:
-        return self.warp
-
-    def rotation(self, problem: CorrectionProblem, view: View) -> LinearMotion | str:
-        rng = np.random.default_rng(self.seed)
-        return _told(rotation_of_lines(_points(problem, view), self.lines, rng), self.lines.prior)
+    def turn(self, points: Points | None, rng: np.random.Generator) -> tuple[Turn | str, float]:
+        return rotation_of_lines(points, self.lines, rng), self.lines.prior
 
 
 @final
@@ -121,10 +124,6 @@ class ManhattanCorrector(ImageRotationCorrector):
 
     manhattan: ManhattanOptions = field(default_factory=ManhattanOptions)
     """Search for rotation and directions from curves."""
-    seed: int = 0
-    """Seed of the random samples."""
-    warp: WarpOptions = field(default_factory=WarpOptions)
-    """How pixels are taken from the source image."""
 
     spec = CorrectorSpec(
         needs=set(),
@@ -133,24 +132,5 @@ class ManhattanCorrector(ImageRotationCorrector):
         assumes="constant rotation without translation; lines in space along three orthogonal directions",
     )
 
-    @property
-    def options(self) -> WarpOptions:
-        return self.warp
-
-    def rotation(self, problem: CorrectionProblem, view: View) -> LinearMotion | str:
-        rng = np.random.default_rng(self.seed)
-        return _told(rotation_of_directions(_points(problem, view), self.manhattan, rng), self.manhattan.prior)
-
-
-def _points(problem: CorrectionProblem, view: View) -> Points | None:
-    """Of the curves in an image; None where there are none."""
-    camera = problem.rig.camera
-    curves = image_curves(problem.images[view], _SHORTEST * camera.height)
-    return Points.of(curves, camera, problem.shutter, view) if curves else None
-
-
-def _told(turn: Turn | str, prior: float) -> LinearMotion | str:
-    if isinstance(turn, str):
-        return turn
-    w = turn.determined(prior)
-    return "the lines leave the rotation open" if w is None else LinearMotion(w, np.zeros(3))
+    def turn(self, points: Points | None, rng: np.random.Generator) -> tuple[Turn | str, float]:
+        return rotation_of_directions(points, self.manhattan, rng), self.manhattan.prior

@@ -285,11 +285,7 @@ class SgmMatcher(SgmOptions, StereoMatcher):
 
 
 def stereo_disparity(
-    left: NDArray[Any],
-    right: NDArray[Any],
-    rig: StereoRig,
-    side: Side = "left",
-    options: SgmOptions | None = None,
+    left: NDArray[Any], right: NDArray[Any], rig: StereoRig, side: Side = "left", options: SgmOptions | None = None
 ) -> F32:
     """Disparity (H, W), px, on the pixels of one image; NaN where it is unknown. ``rig.depth`` makes it metres.
 

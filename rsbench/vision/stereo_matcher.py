@@ -59,11 +59,7 @@ class MotionMatcher(StereoMatcher):
 
     @abstractmethod
     def depths(
-        self,
-        images: Mapping[View, NDArray[np.uint8]],
-        rig: StereoRig,
-        shutter: RollingShutter,
-        motion: Motion,
+        self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter, motion: Motion
     ) -> Mapping[View, NDArray[Any]]:
         """Depth (H, W), metres, of the pixels of each of the images, in the camera of the pixel's own line.
 
@@ -97,10 +93,7 @@ class MotionMatcher(StereoMatcher):
 
 MatcherEntry = Entry[StereoMatcher, RunOptions]
 STEREO_MATCHERS: Kind[StereoMatcher, RunOptions] = Kind(
-    singular="matcher",
-    cards="matchers",
-    base=StereoMatcher,
-    options=RunOptions,
+    singular="matcher", cards="matchers", base=StereoMatcher, options=RunOptions
 )
 
 

@@ -155,7 +155,7 @@ def _parabolas(chain: FloatArray, least_length: float) -> Curves:
 
 
 FARTHEST = 4.0
-"""Standard deviations of a component of the rotation within which it is looked for."""
+"""Standard deviations of a component of the rotation within which it is searched."""
 _ALIKE_PX = 8.0
 """Length along a curve over which the errors of its places are one: the surface beside it makes them."""
 _STEPS, _DONE = 30, 1e-3
@@ -187,7 +187,7 @@ class Points:
     def of(
         cls, curves: Sequence[FloatArray], camera: PinholeCamera, shutter: RollingShutter, view: View
     ) -> Points:
-        """Of one curve (n, 2), px, or more of a frame without a lens whose rows are read from the top."""
+        """The points of curves (n, 2), px, one or more, of a frame without a lens with rows read from the top."""
         side, frame = view
         pixels = np.concatenate(curves)
         lines = shutter.line_times(frame, side)
@@ -208,7 +208,7 @@ class Points:
         return int(self.curve[-1]) + 1
 
     def chosen(self, curves: NDArray[np.bool_]) -> Points:
-        """Those of the curves of a mask (K,)."""
+        """The points of the curves in a mask (K,)."""
         keep, number = curves[self.curve], np.cumsum(curves) - 1
         parts = {name: getattr(self, name)[keep] for name in ("rays", "time", "upright")}
         return Points(**parts, curve=number[self.curve[keep]], focal=self.focal, row_time=self.row_time)
@@ -225,7 +225,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """Points at a rotation w, and what lines of normals (K, 3) there mean."""
+    """Points at a rotation w, and their errors from lines of normals (K, 3)."""
 
     points: Points
     w: FloatArray
@@ -409,7 +409,7 @@ _ROUNDS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class LineOptions:
-    """Of the search."""
+    """Search for the rotation from lines."""
 
     threshold_px: float = 0.2
     """Root mean square by which the points of a curve may miss a line."""

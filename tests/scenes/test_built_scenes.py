@@ -205,12 +205,7 @@ def write(folder: Path, name: str, old: str, new: str) -> Path:
 @pytest.mark.parametrize(
     ("card", "old", "new", "message"),
     [
-        (
-            "castle",
-            'builder = "castle"',
-            'builder = "castel"',
-            "'castel' does not exist (did you mean 'castle'?)",
-        ),
+        ("castle", 'builder = "castle"', 'builder = "castel"', "'castel' does not exist (did you mean 'castle'?)"),
         ("castle", 'builder = "castle"', "", "'builder' is required"),
         ("castle", 'builder = "castle"', "builder = 3", "builder = 3: input should be a valid string"),
         ("castle", "trees = 26", "treees = 26", "parameters: unknown key 'treees' (did you mean 'trees'?)"),
@@ -221,26 +216,11 @@ def write(folder: Path, name: str, old: str, new: str) -> Path:
         ("castle", "sun_elevation_deg = 48.0", "sun_elevation_deg = -3.0", "sun_elevation_deg = -3.0: allowed"),
         ("castle", "[viewpoints.default]", "[viewpoints.first]", "[viewpoints.default] is required"),
         ("castle", "[viewpoints.default]", "[viewpoints.default]\nup = 1", "unknown key 'viewpoints.default.up'"),
-        (
-            "old-town",
-            "storeys = [2, 3]",
-            "storeys = [3, 2]",
-            "storeys = (3, 2): allowed are 1 to 5",
-        ),
+        ("old-town", "storeys = [2, 3]", "storeys = [3, 2]", "storeys = (3, 2): allowed are 1 to 5"),
         ("old-town", "eye = [0.6, -8.0, 3.6]", "eye = [0.6, inf, 3.6]", "viewpoints.default.eye.1"),
-        (
-            "old-town",
-            "eye = [0.6, -8.0, 3.6]",
-            "eye = [0.0, 14.0, 3.6]",
-            "viewpoints.default: viewpoint looks",
-        ),
+        ("old-town", "eye = [0.6, -8.0, 3.6]", "eye = [0.0, 14.0, 3.6]", "viewpoints.default: viewpoint looks"),
         ("room", "chairs = 3 ", "chairs = 9 ", "chairs = 9: allowed are 0 to 4"),
-        (
-            "room",
-            "ceiling_height = 2.7",
-            "ceiling_height = 1",
-            "ceiling_height = 1.0: allowed are 2.5 to 4",
-        ),
+        ("room", "ceiling_height = 2.7", "ceiling_height = 1", "ceiling_height = 1.0: allowed are 2.5 to 4"),
     ],
 )
 def test_bad_cards_are_refused_in_one_line(tmp_path: Path, card: str, old: str, new: str, message: str) -> None:

@@ -32,10 +32,7 @@ def test_colours_sit_at_their_corners(tmp_path: Path, suffix: str) -> None:
         assert colour_at(mesh, uv + 0.5 * (middle - uv)) == colour
 
 
-@pytest.mark.parametrize(
-    ("axis", "where"),
-    [("z", (2, 1, 0)), ("y", (2, 0, 1)), ("x", (1, 0, 2))],
-)
+@pytest.mark.parametrize(("axis", "where"), [("z", (2, 1, 0)), ("y", (2, 0, 1)), ("x", (1, 0, 2))])
 def test_up_axis_and_units(tmp_path: Path, axis: str, where: tuple[float, float, float]) -> None:
     textured_quad().export(tmp_path / "quad.glb")
     parameters = f'file = "quad.glb"\nup_axis = "{axis}"\nmetres_per_unit = 0.25'

@@ -23,12 +23,7 @@ Build = Callable[..., Any]
 def _correct(world: Any, side: Any = "left", frame: int = 1, tau: float | None = None, **options: Any) -> Any:
     image, depth = world.rolling(side, frame)
     return correct_frame(
-        image.astype(np.float32),
-        depth.astype(np.float32),
-        world,
-        (side, frame),
-        target_tau=tau,
-        **options,
+        image.astype(np.float32), depth.astype(np.float32), world, (side, frame), target_tau=tau, **options
     )
 
 

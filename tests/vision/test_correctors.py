@@ -216,7 +216,7 @@ def test_views_must_be_those_asked_for(world: Build, shapes: Any) -> None:
         def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Any]:
             return super().correct(problem, views[1:])
 
-    with pytest.raises(RsbenchError, match="views asked for"):
+    with pytest.raises(RsbenchError, match="requested views"):
         find_corrected(wrap(CORRECTORS, Forgets(_changed())), problem, VIEWS)
 
 

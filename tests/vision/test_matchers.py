@@ -22,13 +22,7 @@ from rsbench.vision.feature_matcher import FeatureMatcher, find_correspondences,
 from rsbench.vision.features import MatchOptions, SiftMatcher
 from rsbench.vision.plane_sweep import SweepMatcher
 from rsbench.vision.stereo_depth import SgmMatcher, SgmOptions
-from rsbench.vision.stereo_matcher import (
-    MotionMatcher,
-    StereoMatcher,
-    find_depths,
-    find_disparities,
-    load_matcher,
-)
+from rsbench.vision.stereo_matcher import MotionMatcher, StereoMatcher, find_depths, find_disparities, load_matcher
 
 RIG = StereoRig(camera=PinholeCamera.centred(40, 30, 50.0), baseline=0.2)
 SHUTTER, MOTION = RollingShutter(height=30, readout_ratio=0.5), LinearMotion(np.zeros(3), np.ones(3))

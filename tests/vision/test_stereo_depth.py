@@ -328,11 +328,7 @@ def seen(rig: StereoRig, shutter: RollingShutter, side: Side) -> tuple[NDArray[n
 
 @pytest.mark.parametrize(
     ("lens", "scanning"),
-    [
-        (None, {"right_delay": 0.3}),
-        (None, {"scan": "top", "right_scan": "bottom"}),
-        (BARREL, {"scan": "left"}),
-    ],
+    [(None, {"right_delay": 0.3}), (None, {"scan": "top", "right_scan": "bottom"}), (BARREL, {"scan": "left"})],
     ids=["late", "opposite", "columns through a lens"],
 )
 def test_depth_is_that_of_the_planes(lens: Lens | None, scanning: dict[str, Any]) -> None:
