@@ -2,8 +2,8 @@
 # make demo       render, solve, correct and score one sequence; ends with the path of its report
 # make test       format, lint, types, layers and tests; SLOW=1 adds those marked slow, as CI does
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
-# make test-gpu   tests of what renders, on an NVIDIA GPU
-# make attack     kills, failing files, mutated inputs, hostile surroundings, faults for verify: hours
+# make test-gpu   tests of the renderers, on an NVIDIA GPU
+# make attack     kills, failing file operations, damaged inputs, faults for verify: takes hours
 # make sample     the release's sample of data, build/rsbench-sample.zip
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
@@ -29,8 +29,8 @@ help:
 demo: $(STAMP)
 	@$(BIN)/rsbench demo
 
-# Types are checked while the kernels are compiled and the first tests run, two processes, the long ones first. Bytecode
-# is kept whatever the environment says: of the processes that tests start, each would compile it anew.
+# Types are checked while kernels are compiled and the first tests run, in two processes, the longest tests first.
+# Bytecode is kept whatever the environment says, since each process that a test starts would compile it again.
 test: $(STAMP)
 	@echo "== format"; $(BIN)/ruff format --check .
 	@echo "== lint";   $(BIN)/ruff check .
@@ -41,11 +41,11 @@ test: $(STAMP)
 	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder $(if $(SLOW),,-m "not slow"); tests=$$?; \
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
 
-# Not locked: of these the newest that pyproject.toml allows.
+# Not locked: the newest versions that pyproject.toml allows.
 test-extras: $(STAMP)
 	@$(PIP) install --quiet -e '.[view,torch]' datasets --no-build-isolation
 	@NO_SKIPS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/interop/test_view.py \
-	  tests/interop/test_export_training.py tests/interop/test_export_colmap.py tests/test_learn_flow.py \
+	  tests/interop/test_export_training.py tests/interop/test_export_layouts.py tests/test_learn_flow.py \
 	  tests/jobs/test_dask_jobs.py tests/storage/test_s3.py
 
 test-gpu: $(STAMP)
@@ -66,7 +66,7 @@ docs: $(STAMP)
 reference: $(STAMP)
 	@$(BIN)/python docs/make_reference.py
 
-# A venv without a working pip is what a killed `python -m venv` leaves: it is made anew.
+# A killed `python -m venv` leaves a venv without a working pip: it is made again.
 $(STAMP): constraints.txt pyproject.toml
 	@if ! $(PIP) --version >/dev/null 2>&1; then \
 	  for python in $(CANDIDATES); do \

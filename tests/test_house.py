@@ -147,9 +147,9 @@ def test_make_help_lists_every_target() -> None:
     text = (ROOT / "Makefile").read_text("utf-8")
     (phony,) = re.findall(r"^\.PHONY: (.*)$", text, re.MULTILINE)
     listed = subprocess.run(["make", "-s", "help"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    told = [re.fullmatch(r"make ([a-z-]+) +(\S.*)", line) for line in listed.splitlines()]
-    assert sorted(match.group(1) for match in told if match) == sorted(phony.split())
-    assert len(told) == len(phony.split())
+    listing = [re.fullmatch(r"make ([a-z-]+) +(\S.*)", line) for line in listed.splitlines()]
+    assert sorted(match.group(1) for match in listing if match) == sorted(phony.split())
+    assert len(listing) == len(phony.split())
 
 
 # Cards

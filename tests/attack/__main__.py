@@ -106,7 +106,7 @@ def _attacks(
 ) -> Iterator[tuple[str, Tally, float]]:
     import numpy as np
 
-    from attack import files, fuzz, kills
+    from attack import fuzz, kills
     from attack.cases import cases, undisturbed
     from attack.loaders import loaders
 
@@ -124,7 +124,9 @@ def _attacks(
         if "kills" in wanted:
             yield _timed(f"kills of {name}", partial(kills.attack, *given, extent.kills))
         if "files" in wanted:
-            yield _timed(f"file operations of {name}", partial(files.attack, *given, extent.files, extent.sizes))
+            yield _timed(
+                f"file operations of {name}", partial(kills.attack_files, *given, extent.files, extent.sizes)
+            )
     if "fuzz" in wanted:
         every = loaders(arena.inputs, results, arena.root.parent / "fuzz")
         yield _timed(f"inputs of {len(every)} loaders", partial(fuzz.attack, every, extent.inputs, seed, keep))

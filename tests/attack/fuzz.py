@@ -27,8 +27,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from attack.cases import Tally
-from attack.loaders import Loader
-from attack.mutations import broken
+from attack.loaders import Loader, broken
 
 HANG_S = 20.0
 MEMORY_MB = 2048

@@ -15,11 +15,11 @@ import frame_faults
 import numpy as np
 from numpy.typing import NDArray
 
-from attack.planted_faults import scene_of_victim, twin_at
-from attack.planted_gloss import GLOSS_FAULTS
-from attack.planted_sensors import CAMERA, SENSOR_FAULTS
+from attack.planted_faults import depth_faults, image_faults, scene_of_victim, twin_at
 from attack.planting import (
+    RNG,
     VICTIM,
+    WET_CASTLE,
     Fault,
     Plant,
     depth_of,
@@ -30,12 +30,12 @@ from attack.planting import (
     other_geometry,
     poses_of,
     put,
+    removed,
     renumbered,
     shifted,
     swapped,
     times,
 )
-from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import load_card
 from rsbench.core.camera import Lens
 from rsbench.core.projection import row_poses
@@ -44,10 +44,208 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.timing import write_timing
+from rsbench.dataset.views import IMAGE_VIEWS, ImageView
+from rsbench.renderers.image import Sensor, compressed, expose, linear_of_codes, processed, rows_needed
 from rsbench.renderers.options import RendererOptions
-from rsbench.storage.files import read_depth, read_png, write_depth, write_exr, write_png, write_poses
+from rsbench.storage.files import (
+    read_depth,
+    read_mask,
+    read_png,
+    write_depth,
+    write_exr,
+    write_mask,
+    write_png,
+    write_poses,
+)
 
 Pixels = NDArray[Any]
+CAMERA = Sensor(
+    full_well=6000,
+    gain=4,
+    photon_noise=True,
+    read_noise=2.5,
+    bit_depth=10,
+    mosaic="RGGB",
+    right_mosaic="none",
+    right_jpeg_quality=80,
+)
+
+
+def _made_by(view: str, **changes: Any) -> Plant:
+    """A frame as another sensor makes it of the clean twin, with noise of its own."""
+
+    def plant(folder: Path) -> None:
+        home, (side, _, frame) = folder / VICTIM, view.partition("_")
+        sensor = replace(read_sequence(home).sensor or Sensor(), **changes).of(side, int(frame))
+        clean = read_png(home / f"rs_clean/{view}.png")
+        rows = range(len(clean))
+        needed = rows_needed(sensor, rows, len(clean))
+        read = expose(linear_of_codes(clean).astype(np.float32), sensor, RNG, len(clean), needed)
+        write_png(home / f"rs/{view}.png", processed(read, sensor, len(clean), needed, rows))
+
+    return plant
+
+
+def _everywhere(key: str, value: Any) -> Plant:
+    """Another sensor in sequence.json and in the card."""
+
+    def plant(folder: Path) -> None:
+        manifest_of(f"{VICTIM}/sequence.json", put("sensor", key, value))(folder)
+        manifest_of("dataset.json", put("card", "sensor", key, value))(folder)
+
+    return plant
+
+
+def _in_rows(change: Callable[[Pixels], Pixels]) -> Callable[[Pixels], Pixels]:
+    def changed(image: Pixels) -> Pixels:
+        image[40:60] = change(image.copy())[40:60]
+        return image
+
+    return changed
+
+
+def _smooth(image: Pixels) -> Pixels:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7), dtype=np.uint8)
+
+
+def _sensor_faults() -> Iterator[Fault]:
+    left, right = "rs/left_1.png", "rs/right_0.png"
+    mosaic, jpeg = "mosaic RGGB", "no JPEG image of quality 80"
+    for name, plant, words in (
+        ("no mosaic", _made_by("left_1", mosaic="none"), "looks like no mosaic"),
+        ("another mosaic", _made_by("left_1", mosaic="GBRG"), "looks like GBRG"),
+        ("shifted by a row", image_of("rs", "left_1", lambda image: np.roll(image, 1, axis=0)), mosaic),
+        ("compressed", image_of("rs", "left_1", lambda image: compressed(image, 90)), mosaic),
+        ("three times the gain", _made_by("left_1", gain=12), "the variance of the sensor's"),
+        ("upside down", image_of("rs", "left_1", np.flipud), "beyond 5 sigma"),
+        ("smoothed rows", image_of("rs", "left_1", _in_rows(_smooth)), mosaic),
+    ):
+        yield Fault(f"{left} {name}", plant, (left, words))
+    for name, plant, words in (
+        ("not compressed", _made_by("right_0", right_jpeg_quality=0), jpeg),
+        ("of quality 60", _made_by("right_0", right_jpeg_quality=60), "looks like quality 60"),
+        ("shifted by a row", image_of("rs", "right_0", lambda image: np.roll(image, 1, axis=0)), ""),
+        ("upside down", image_of("rs", "right_0", np.flipud), "beyond 5 sigma"),
+        ("rows of every fourth code", image_of("rs", "right_0", _in_rows(lambda image: image // 4 * 4)), jpeg),
+    ):
+        yield Fault(f"{right} {name}", plant, (right, words))
+    yield Fault("another mosaic everywhere", _everywhere("mosaic", "BGGR"), ("rs/left_0.png", "looks like RGGB"))
+    yield Fault(
+        "another quality everywhere", _everywhere("right_jpeg_quality", 90), ("rs/right_0.png", "quality 80")
+    )
+    no = _everywhere("right_jpeg_quality", None)
+    yield Fault("no compression everywhere", no, ("rs/right_0.png", "variance of the sensor's"))
+    own = manifest_of(f"{VICTIM}/sequence.json", put("sensor", "mosaic", "none"))
+    yield Fault("no mosaic in sequence.json", own, ("sequence.json", "sensor"))
+
+
+SENSOR_FAULTS = tuple(_sensor_faults())
+"""In a dataset like ``smoke`` whose sensor is ``CAMERA``."""
+
+
+Mask = NDArray[np.bool_]
+BAND = slice(30, 66)
+"""Rows behind which a fault hides."""
+ONE = ImageView("rs", "left", 1)
+
+
+def _masks(change: Callable[[Mask, Mask], Mask], *views: ImageView) -> Plant:
+    """``change`` takes a mask, and where there is a surface."""
+
+    def plant(folder: Path) -> None:
+        sequence = read_sequence(folder / VICTIM)
+        for view in views:
+            path, solid = sequence.folder / view.gloss, sequence.depth(*view) > 0
+            write_mask(path, change(read_mask(path), solid) & solid)
+
+    return plant
+
+
+def _band(mask: Mask, solid: Mask) -> Mask:
+    mask[BAND] = True
+    return mask
+
+
+def _everything(mask: Mask, solid: Mask) -> Mask:
+    return solid
+
+
+def _all(*plants: Plant) -> Plant:
+    def plant(folder: Path) -> None:
+        for each in plants:
+            each(folder)
+
+    return plant
+
+
+def _noise(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    image[BAND] = np.random.default_rng(RNG).integers(0, 256, image[BAND].shape, dtype=np.uint8)
+    return image
+
+
+def _noise_on_gloss(folder: Path) -> None:
+    gloss = read_sequence(folder / VICTIM).gloss(*ONE)
+
+    def change(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        noise = np.random.default_rng(RNG).integers(0, 256, image.shape, dtype=np.uint8)
+        return np.where(gloss[..., None], noise, image)
+
+    image_of(ONE.shutter, f"{ONE.side}_{ONE.frame}", change)(folder)
+
+
+def _written(values: Callable[[Mask], NDArray[Any]]) -> Plant:
+    def plant(folder: Path) -> None:
+        path = folder / VICTIM / ONE.gloss
+        write_png(path, values(read_mask(path)))
+
+    return plant
+
+
+def _mask_faults() -> Iterator[Fault]:
+    file, every = ONE.gloss, tuple(IMAGE_VIEWS)
+    for name, change, words in (
+        ("emptied", lambda mask, solid: mask & False, "marks other surfaces"),
+        ("of all", _everything, "leaves 0 %"),
+        ("of a band of rows", _band, "rows"),
+        ("upside down", lambda mask, solid: mask[::-1], ""),
+        ("left to right", lambda mask, solid: mask[:, ::-1], ""),
+        ("shifted by 6 pixels", lambda mask, solid: np.roll(mask, 6, axis=1), ""),
+    ):
+        yield Fault(f"{file} {name}", _masks(change, ONE), (file, words))
+    for other in (ONE.other_side, ONE.frame_before):
+        yield Fault(f"{file} exchanged with {other.gloss}", swapped((file, other.gloss)), (file,))
+    yield Fault(
+        f"{file} in the sky", _written(lambda mask: np.full(mask.shape, 255, np.uint8)), (file, "no surface")
+    )
+    yield Fault(f"{file} of other values", _written(lambda mask: mask.astype(np.uint8)), (file, "0 and 255"))
+    yield Fault(f"{file} of one row less", _written(lambda mask: 255 * mask[1:].astype(np.uint8)), (file,))
+    yield Fault(f"{file} gone", removed(f"{VICTIM}/{file}"), (file,))
+    yield Fault("every mask of all", _masks(_everything, *every), ("_gloss/", "leaves 0 %"))
+    yield Fault("every mask of all, rays", _masks(_everything, *every), (file, "rays meet"), rendered=True)
+    hidden = _all(_masks(_band, *every), image_of(ONE.shutter, f"{ONE.side}_{ONE.frame}", _noise))
+    yield Fault("noise behind every mask", hidden, (file, "rays meet"), rendered=True)
+    yield Fault("noise behind every mask, seen", hidden, (ONE.image, "other colours"), rendered=True)
+    yield Fault("noise on gloss", _noise_on_gloss, (ONE.image,), rendered=True)
+    unsaid = manifest_of(f"{VICTIM}/sequence.json", drop("glossy"))
+    yield Fault("gloss unsaid", unsaid, ("sequence.json", "glossy"), rendered=True)
+
+
+def _others() -> Iterator[Fault]:
+    """Of those planted into ``smoke`` all that need no second sequence.
+
+    Where so much is glossy, too little is compared to tell left from right images.
+    """
+    for fault in (*depth_faults(), *image_faults()):
+        if fault.name == "all left and right images exchanged":
+            yield replace(fault, words=(ONE.image, "rendered again"), rendered=True)
+        elif "another sequence" not in fault.name:
+            yield fault
+
+
+GLOSS_FAULTS = (*_mask_faults(), *_others())
+"""In a dataset like ``smoke`` whose victim is of the scene ``wet-castle``."""
+
+
 BROWN = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.004)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.05, k2=0.01)
 CAMERAS: dict[str, dict[str, Any]] = {
@@ -124,14 +322,6 @@ def _flipped(name: str, shutter: str, view: str) -> Iterator[Fault]:
     yield Fault(f"{shutter}/{view}.png flipped", image, (f"{shutter}/{view}.png", words))
     yield Fault(f"{shutter}_depth/{view}.exr flipped", depth, (f"{shutter}_depth/{view}.exr", words))
     yield Fault(f"{shutter} {view} flipped", _all(image, depth), (f"{shutter}_depth/{view}.exr", words))
-
-
-def _all(*plants: Plant) -> Plant:
-    def plant(folder: Path) -> None:
-        for each in plants:
-            each(folder)
-
-    return plant
 
 
 def _seen_without_lens(sequence: Sequence, values: NDArray[Any], way: int, border: int) -> NDArray[Any]:

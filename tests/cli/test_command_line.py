@@ -1,8 +1,10 @@
-"""The command as users meet it: exit codes, one-line errors, nothing half-written, quick help."""
+"""The command line: help, answers, refusals in one line, and unexpected errors with a log."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -10,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, run_here, sweep_card
+from small_scenes import write_box_scene, write_small_card
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
+from rsbench.cli import exits, main
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -185,3 +190,202 @@ def test_evaluate_writes_scores_and_a_page_without_links(smoke_dataset: Path, tm
     assert "http://" not in page and "https://" not in page, "the page must open without a network"
     for table in ("pose", "depth", "correction"):
         assert len((out / "scores" / f"{table}.csv").read_text().splitlines()) > 2
+
+
+def run_failing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException
+) -> tuple[int, str]:
+    def fail(**options: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(main, "app", fail)
+    with pytest.raises(SystemExit) as caught:
+        main.run()
+    assert isinstance(caught.value.code, int)
+    (line,) = capsys.readouterr().err.splitlines()
+    return caught.value.code, line
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(sys, "argv", ["rsbench", "list"])
+    return tmp_path / "cache"
+
+
+def test_an_unknown_error_is_one_line_with_a_log(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(cache.parent)
+    code, line = run_failing(monkeypatch, capsys, ZeroDivisionError("a bug\nof ours"))
+    assert code == 70
+    assert "a fault of rsbench, not yours: ZeroDivisionError: a bug of ours; what led to it: " in line
+    log = Path(line.rpartition("what led to it: ")[2])
+    assert log.is_relative_to(cache)
+    text = log.read_text("utf-8")
+    assert "Traceback" in text and "in fail" in text and "['rsbench', 'list']" in text
+    assert [path.name for path in cache.parent.iterdir()] == ["cache"]
+
+
+@pytest.mark.parametrize(
+    ("number", "place"),
+    [(errno.ENOSPC, "standard output: "), (errno.ENOENT, "the working folder, which must exist: ")],
+)
+def test_what_has_no_name_is_named(
+    number: int, place: str, cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A full disk behind standard output, or a working folder that was removed: a user's, and no log."""
+    code, line = run_failing(monkeypatch, capsys, OSError(number, os.strerror(number)))
+    assert (code, line) == (2, f"rsbench: error: {place}{os.strerror(number)}")
+    assert not cache.exists()
+
+
+def test_logs_do_not_pile_up(cache: Path) -> None:
+    for _ in range(25):
+        exits.describe(ValueError())
+    assert len(list((cache / "rsbench" / "faults").iterdir())) == 20
+
+
+def test_without_a_place_for_a_log_the_line_stays(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache.write_text("no folder")
+    monkeypatch.setattr(exits, "temporary", lambda: None)
+    code, line = run_failing(monkeypatch, capsys, RecursionError("too deep"))
+    assert code == 70 and "RecursionError: too deep; no log of it could be written" in line
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (MemoryError(), 1, "not enough memory"),
+        (PermissionError(errno.EACCES, "Permission denied", "/x"), 2, "rsbench: error: /x: Permission denied"),
+        (OSError(errno.EBADF, "Bad file descriptor"), 70, "the system refused: OSError: [Errno 9] Bad file"),
+    ],
+)
+def test_errors_of_the_system(
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: Exception,
+    code: int,
+    words: str,
+) -> None:
+    found, line = run_failing(monkeypatch, capsys, error)
+    assert found == code and words in line and "file system:" not in line
+
+
+def test_a_long_message_keeps_its_file_and_its_remedy(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main._fail("x.toml: " + "long " * 10_000 + "do this instead")
+    line = capsys.readouterr().err
+    assert len(line) < 2100 and line.startswith("rsbench: error: x.toml: ") and line.endswith("do this instead\n")
+
+
+@pytest.mark.parametrize(
+    "command", [("generate", "smoke"), ("reproduce", "fig4"), ("simulate", "noise"), ("demo",)], ids=lambda c: c[0]
+)
+def test_a_folder_that_cannot_be_written_is_said_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    def work(*arguments: object, **options: object) -> None:
+        raise AssertionError("the work had begun")
+
+    monkeypatch.setattr("rsbench.renderers.backend.start_backend", work)
+    monkeypatch.setattr("rsbench.dataset.generation.load_scene", work)
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        result = run_here(*command, "--out", out)
+        assert_refused(result, "file")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("evaluate", "--out-of"), "No such option: --out-of"),
+        (("generate",), "Missing argument 'card'; see rsbench generate --help"),
+        (("simulate", "noise", "--trials", "x"), "Invalid value for '--trials'"),
+        (("leaderboard", "submit"), "see rsbench leaderboard submit --help"),
+        (("bogus",), "No such command 'bogus'; see rsbench --help"),
+    ],
+)
+def test_wrong_words_are_refused_in_one_line_with_the_help_to_read(words: tuple[str, ...], said: str) -> None:
+    result = run_here(*words)
+    (line,) = result.stderr.splitlines()
+    assert result.returncode == 2 and line.startswith("rsbench: error: ") and said in line
+
+
+@pytest.fixture
+def card(tmp_path: Path) -> Path:
+    """Of a camera with a lens."""
+    path = write_small_card(tmp_path, [write_box_scene(tmp_path, "a")])
+    path.write_text(
+        path.read_text().replace("focal = 80", 'focal = 80\nlens = { model = "brown-conrady", k1 = -0.1 }')
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--shard", ""], "--shard : must be I/N"),
+        (["--shard", "1"], "--shard 1: must be I/N"),
+        (["--shard", "2/1"], "shard 2/1: the first number"),
+        (["--shard", "2/2"], "shard 2/2: is empty"),
+        (["--channels", ""], "--channels : ''"),
+        (["--channels", "nix"], "--channels nix: 'nix'"),
+        (["--channels", "timing,timing"], "each once"),
+        (["--channels", "all"], "dataset small: channels: 'disparity' is made of cameras without a lens"),
+        (["--only", "b"], "no sequence 'b'"),
+        (["--estimate", "--full-frames"], "--estimate: not with --full-frames"),
+    ],
+)
+def test_options_that_cannot_be_are_one_line(card: Path, tmp_path: Path, options: list[str], words: str) -> None:
+    result = run_here("generate", card, "--out", tmp_path / "out", *options)
+    assert result.returncode == 2
+    (line,) = result.stderr.strip().splitlines()
+    assert words in line
+    assert not (tmp_path / "out").exists()
+
+
+CARD = sweep_card(["gs-8pt"], noise_px=[0.0, 0.5], trials=3)
+
+
+def test_a_users_own_sweep(tmp_path: Path) -> None:
+    card = tmp_path / "mine.toml"
+    card.write_text(CARD)
+    out = tmp_path / "results"
+    result = run_here(
+        "simulate", card, "--out", out, "--solver", "rs-stereo-linear", "--set", "points=40", "--workers", 1
+    )
+    assert result.returncode == 0, result.stderr
+    assert "rs-stereo-linear" in result.stdout
+    assert f"table: {out / 'summary.csv'}" in result.stdout
+    table = pd.read_csv(out / "summary.csv")
+    assert list(table.solver) == ["rs-stereo-linear"] * 2 and list(table.value) == [0.0, 0.5]
+    assert table.e_R_median[0] < table.e_R_median[1]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "bounds",
+        "provenance.json",
+        "seconds",
+        "summary.csv",
+        "sweep.json",
+        "trials",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nois"], ["did you mean 'noise'?"]),
+        (["noise", "--set", "pints=9"], ["unknown key 'pints'", "did you mean 'points'?"]),
+        (["noise", "--set", "points"], ["--set points", "FIELD=VALUE"]),
+        (["noise", "--set", "shape=ball"], ["shape = 'ball'"]),
+        (["noise", "--set", "x=" + "[" * 3000], ["--set x", "not a value of TOML"]),
+        (["noise", "--solver", "nobody"], ["solver 'nobody' does not exist"]),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    assert_refused(run_here("simulate", *arguments, "--out", tmp_path / "results"), *words)
+    assert not (tmp_path / "results").exists()

@@ -1,7 +1,8 @@
-"""Trajectories, calibrations and folders of others, each read back as those who use them do."""
+"""Exports to COLMAP, trajectories, calibrations, layouts and splatting, read back by others' conventions."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from analytic_dataset import PLANES
 from evo.tools import file_interface
-from exported_data import LENSES, MOTION, SAME_PX, dataset, exported, only, opencv_pixels, seen
-from scipy.spatial.transform import Rotation
+from exported_data import HEIGHT, LENSES, MOTION, SAME_PX, WIDTH, dataset, exported, only, opencv_pixels, seen
+from scipy.spatial.transform import Rotation, Slerp
 
 from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.rig import SIDES, views_of
@@ -251,3 +253,256 @@ def test_a_motion_that_a_format_only_approximates_is_measured(tmp_path: Path) ->
         data = dataset(tmp_path / motion.name, motion=motion)
         _, note = exported(data, "gsplat", tmp_path / f"{motion.name}-out")
         assert (note["largest_row_error_px"] < SAME_PX) == exact == (not note["told"]), SIDES
+
+
+MODELS = {"none": "PINHOLE", "brown": "OPENCV", "brown-k3": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}
+
+
+@pytest.fixture(scope="module", params=["none", "brown", "brown-k3", "fisheye"])
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
+    """Name of the lens, dataset and export: the scan must not matter to global-shutter twins."""
+    folder = tmp_path_factory.mktemp("colmap")
+    scanning: dict[str, Any] = (
+        {} if request.param == "none" else {"scan": "bottom", "right_scan": "top", "right_delay": 0.1}
+    )
+    data = dataset(folder / "data", request.param, **scanning)
+    return request.param, data, exported(data, "colmap", folder / "out")[0] / "planes"
+
+
+def _table(path: Path) -> list[list[str]]:
+    return [line.split() for line in path.read_text().splitlines()]
+
+
+def test_our_points_fall_on_their_pixels(made: tuple[str, Path, Path]) -> None:
+    lens, data, out = made
+    left, right = _table(out / "sparse/cameras.txt")
+    assert left[1:] == right[1:] and left[1:4] == [MODELS[lens], "64", "49"]
+    fx, fy, cx, cy = (float(value) for value in left[4:8])
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    poses = {row[-1]: np.array(row[1:8], dtype=float) for row in _table(out / "sparse/images.txt")[::2]}
+    for side, frame in views_of(2):
+        pose, shown = poses[f"{side}_{frame:04d}.png"], seen(only(data), side, frame, "gs")
+        x = shown.world @ Rotation.from_quat(pose[[1, 2, 3, 0]]).as_matrix().T + pose[4:]
+        np.testing.assert_allclose(opencv_pixels(x, K, lens), shown.pixels + 0.5, atol=SAME_PX)
+
+
+def test_pycolmap_reads_every_observation_where_it_projects(made: tuple[str, Path, Path]) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    _, data, out = made
+    model = pycolmap.Reconstruction(out / "sparse")
+    assert len(model.images) == 4 and len(model.points3D) > 1000
+    for image in model.images.values():
+        side, frame = image.name.removesuffix(".png").split("_")
+        shown = seen(only(data), side, int(frame), "gs")
+        for world, pixel in zip(shown.world, shown.pixels, strict=True):
+            np.testing.assert_allclose(image.project_point(world), pixel + 0.5, atol=SAME_PX)
+        for point in list(image.points2D)[::20]:
+            found = image.project_point(model.points3D[point.point3D_id].xyz)
+            np.testing.assert_allclose(found, point.xy, atol=SAME_PX)
+    for point in list(model.points3D.values())[::20]:
+        for element in point.track.elements:  # both lists say the same
+            assert model.images[element.image_id].points2D[element.point2D_idx].has_point3D()
+
+
+def test_points_lie_on_the_surfaces_and_nothing_hides_them(made: tuple[str, Path, Path]) -> None:
+    """The floor and the wall: no point is on the other side of one."""
+    _, _, out = made
+    rows = _table(out / "sparse/points3D.txt")
+    world = np.array([row[1:4] for row in rows], dtype=float)
+    gaps = np.stack([world @ normal - offset for normal, offset in PLANES], axis=-1)
+    # Depth is float32: 6e-8 of 10 m.
+    assert np.max(np.min(np.abs(gaps), axis=-1)) < 1e-5
+    assert np.max(gaps) < 1e-5
+    assert min(len(row[8:]) for row in rows) >= 4, "image and place of two observations at least"
+    colours = np.array([row[4:7] for row in rows], dtype=int)
+    waves = np.array([[5.0, 4.0, 3.0], [-4.0, 5.0, 2.0], [3.0, -5.0, 4.0]])
+    np.testing.assert_allclose(colours, 128 + 50 * np.sin(world @ waves.T), atol=0.51)  # rounded once
+
+
+def test_rolling_frames_have_the_first_rows_pose_and_say_so(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data")
+    out, note = exported(data, "colmap", tmp_path / "out", "rs")
+    assert "the pose of the line that is read first" in note["told"][0]
+    images = _table(out / "planes/sparse/images.txt")
+    twins = exported(data, "colmap", tmp_path / "gs")[0] / "planes/sparse/images.txt"
+    assert [row[:8] for row in images[::2]] == [row[:8] for row in _table(twins)[::2]]
+    assert (out / "planes/images/left_0001.png").read_bytes() == (data / "planes/rs/left_1.png").read_bytes()
+    # Observations are where the rolling shutter sees the points: those of row 24 are pixels of it.
+    points = {row[0]: np.array(row[1:4], dtype=float) for row in _table(out / "planes/sparse/points3D.txt")}
+    world, pixels = _observations(images[1], points)
+    shown = seen(only(data), "left", 0, "rs", rows=tuple(range(49)))
+    near = np.linalg.norm(world[:, None] - shown.world, axis=-1)
+    same = np.nonzero(near < 1e-9)
+    assert len(same[0]) > 20
+    np.testing.assert_allclose(pixels[same[0]], shown.pixels[same[1]] + 0.5, atol=SAME_PX)
+
+
+def _observations(row: list[str], points: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3) and pixels (n, 2) of a second line of images.txt."""
+    table = np.array(row).reshape(-1, 3)
+    return np.array([points[name] for name in table[:, 2]]), table[:, :2].astype(float)
+
+
+# gsplat
+
+
+def _relative_times(pixels: FloatArray, shutter: str) -> FloatArray:
+    """``shutter_relative_frame_time`` of gsplat/cuda/_torch_cameras.py, in its pixels."""
+    x, y = pixels.T
+    return {
+        "ROLLING_TOP_TO_BOTTOM": np.floor(y) / (HEIGHT - 1),
+        "ROLLING_LEFT_TO_RIGHT": np.floor(x) / (WIDTH - 1),
+        "ROLLING_BOTTOM_TO_TOP": (HEIGHT - np.ceil(y)) / (HEIGHT - 1),
+        "ROLLING_RIGHT_TO_LEFT": (WIDTH - np.ceil(x)) / (WIDTH - 1),
+        "GLOBAL": np.zeros(len(x)),
+    }[shutter]
+
+
+def _gsplat_pixels(start: FloatArray, end: FloatArray, world: FloatArray, K: FloatArray, about: Any) -> FloatArray:
+    """Project with the first pose, then ten times with that of the line found: as gsplat does."""
+    turn = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
+    t = np.zeros(len(world))
+    pixels = np.zeros((len(world), 2))
+    for _ in range(11):
+        shift = (1.0 - t)[:, None] * start[:3, 3] + t[:, None] * end[:3, 3]
+        pixels = opencv_pixels(turn(np.clip(t, 0.0, 1.0)).apply(world) + shift, K, about["lens"])
+        t = _relative_times(pixels, about["rolling_shutter"])
+    return pixels
+
+
+@pytest.mark.parametrize(
+    ("lens", "scanning", "shutters"),
+    [
+        ("none", {}, ("TOP_TO_BOTTOM", "TOP_TO_BOTTOM")),
+        (
+            "brown-k3",
+            {"scan": "bottom", "right_scan": "top", "right_delay": 0.1},
+            ("BOTTOM_TO_TOP", "TOP_TO_BOTTOM"),
+        ),
+        ("fisheye", {"scan": "left", "right_scan": "right"}, ("LEFT_TO_RIGHT", "RIGHT_TO_LEFT")),
+    ],
+)
+def test_gsplat_sees_our_points_in_their_pixels(
+    tmp_path: Path, lens: str, scanning: dict[str, Any], shutters: tuple[str, str]
+) -> None:
+    data = dataset(tmp_path / "data", lens, **scanning)
+    out, note = exported(data, "gsplat", tmp_path / "out")
+    assert note["largest_row_error_px"] < SAME_PX and note["told"] == []
+    for side, frame in views_of(2):
+        with np.load(out / f"planes/{side}.npz") as arrays:
+            held = {name: arrays[name] for name in arrays}
+        about = json.loads((out / f"planes/{side}.json").read_text())
+        assert about["rolling_shutter"] == f"ROLLING_{shutters[SIDES.index(side)]}"
+        assert about["camera_model"] == ("fisheye" if lens == "fisheye" else "pinhole")
+        assert {name: array.shape[1:] for name, array in held.items()} == {
+            "viewmats": (4, 4),
+            "viewmats_rs": (4, 4),
+            "Ks": (3, 3),
+            **({} if lens == "none" else {"radial_coeffs": (4,) if lens == "fisheye" else (6,)}),
+            **({"tangential_coeffs": (2,)} if lens == "brown-k3" else {}),
+        }
+        shown = seen(only(data), side, frame, "rs", rows=(1, 24, 47))
+        inside = np.ptp(np.stack([held["viewmats"][frame], held["viewmats_rs"][frame]]), axis=0)
+        assert np.max(inside) > 0.01, "the camera moves"
+        start, end = held["viewmats"][frame], held["viewmats_rs"][frame]
+        found = _gsplat_pixels(start, end, shown.world, held["Ks"][frame], about | {"lens": lens})
+        # A pixel's centre is half a pixel from where the time of its line would be another's.
+        np.testing.assert_allclose(found, shown.pixels + 0.5, atol=SAME_PX)
+        image = out / "planes" / about["images"][frame]
+        assert image.read_bytes() == (data / f"planes/rs/{side}_{frame}.png").read_bytes()
+
+
+def test_gsplat_gets_global_shutter_twins_where_they_are_asked_for(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", "brown")
+    out, note = exported(data, "gsplat", tmp_path / "out", "gs")
+    about = json.loads((out / "planes/right.json").read_text())
+    with np.load(out / "planes/right.npz") as arrays:
+        assert "viewmats_rs" not in arrays and about["rolling_shutter"] == "GLOBAL" and note["told"] == []
+        shown, pose = seen(only(data), "right", 1, "gs"), arrays["viewmats"][1]
+        found = _gsplat_pixels(pose, pose, shown.world, arrays["Ks"][1], about | {"lens": "brown"})
+    np.testing.assert_allclose(found, shown.pixels + 0.5, atol=SAME_PX)
+
+
+# nerfstudio and 3dgs-deblur
+
+
+def _in_camera(frame: dict[str, Any], world: FloatArray) -> FloatArray:
+    """Points in camera axes x right, y down, z forward, as nerfstudio's splatfacto turns its own."""
+    world_from_camera = np.array(frame["transform_matrix"])
+    world_from_camera[:3, 1:3] *= -1
+    camera_from_world = np.linalg.inv(world_from_camera)
+    return world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+
+
+def _calibration(content: dict[str, Any]) -> FloatArray:
+    return np.array([[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1.0]])
+
+
+def _pixel_velocities(frame: dict[str, Any], x: FloatArray, K: FloatArray) -> FloatArray:
+    """``compute_pix_velocity`` of SpectacularAI/gsplat, px/s."""
+    flip = np.array([1.0, -1.0, -1.0])
+    linear, angular = (flip * frame[f"camera_{kind}_velocity"] for kind in ("linear", "angular"))
+    v, z = linear + np.cross(angular, x), x[:, 2]
+    across = -K[0, 0] * (v[:, 0] - v[:, 2] * x[:, 0] / z) / z
+    return np.stack([across, -K[1, 1] * (v[:, 1] - v[:, 2] * x[:, 1] / z) / z], axis=-1)
+
+
+def test_3dgs_deblur_sees_the_middle_row_in_its_pixels_and_the_rows_move_as_the_camera(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", right_delay=0.1)
+    out, note = exported(data, "nerfstudio", tmp_path / "out")
+    content, sequence = json.loads((out / "planes/transforms.json").read_text()), only(data)
+    assert content["exposure_time"] == 0.0
+    np.testing.assert_allclose(content["rolling_shutter_time"], 0.08)
+    frames, K, worst = {frame["file_path"]: frame for frame in content["frames"]}, _calibration(content), 0.0
+    for side, number in views_of(2):
+        frame = frames[f"images/{side}_{number:04d}.png"]
+        middle = seen(sequence, side, number, "rs", rows=(24,))
+        x = _in_camera(frame, middle.world)
+        np.testing.assert_allclose(opencv_pixels(x, K, "none"), middle.pixels + 0.5, atol=SAME_PX)
+        # Each row's delay, from the poses of the rows around: the error of the difference is below 1e-7 px.
+        _, poses = sequence.poses(side, number)
+        ends = (opencv_pixels(middle.world @ poses.R[k].T + poses.t[k], K, "none") for k in (23, 25))
+        before, after = ends
+        rates = _pixel_velocities(frame, x, K)
+        np.testing.assert_allclose(rates * content["rolling_shutter_time"] / 49, (after - before) / 2, atol=1e-7)
+        shown = seen(sequence, side, number, "rs", rows=tuple(range(49)))
+        x = _in_camera(frame, shown.world)
+        roll = content["rolling_shutter_time"] * ((shown.lines + 0.5) / 49 - 0.5)
+        law = opencv_pixels(x, K, "none") + roll[:, None] * _pixel_velocities(frame, x, K)
+        worst = max(worst, float(np.max(np.linalg.norm(law - shown.pixels - 0.5, axis=-1))))
+    # Told, of more columns than these: the law is of first order.
+    assert 0.001 < worst < note["largest_row_error_px"] + 1e-9 < 0.5
+    assert "first order in pixels" in note["told"][0]
+
+
+@pytest.mark.parametrize(
+    ("lens", "model"), [("none", "OPENCV"), ("brown-k3", "OPENCV"), ("fisheye", "OPENCV_FISHEYE")]
+)
+def test_nerfstudio_sees_global_shutter_twins_in_their_pixels(tmp_path: Path, lens: str, model: str) -> None:
+    data = dataset(tmp_path / "data", lens, scan="right")
+    out, note = exported(data, "nerfstudio", tmp_path / "out", "gs")
+    content, sequence = json.loads((out / "planes/transforms.json").read_text()), only(data)
+    assert content["camera_model"] == model and note["told"] == []
+    assert "rolling_shutter_time" not in content and "camera_linear_velocity" not in content["frames"][0]
+    coefficients = {name: content[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2") if name in content}
+    shape = sequence.rig.camera.lens
+    assert coefficients == {name: getattr(shape, name, 0.0) for name in coefficients}
+    for (side, number), frame in zip([(s, k) for k in (0, 1) for s in SIDES], content["frames"], strict=True):
+        shown = seen(sequence, side, number, "gs")
+        found = opencv_pixels(_in_camera(frame, shown.world), _calibration(content), lens)
+        np.testing.assert_allclose(found, shown.pixels + 0.5, atol=SAME_PX)
+        image = out / "planes" / frame["file_path"]
+        assert image.read_bytes() == (data / f"planes/gs/{side}_{number}.png").read_bytes()
+
+
+def test_one_exposure_time_is_written_and_two_are_refused(tmp_path: Path) -> None:
+    from rsbench.core.errors import RsbenchError
+
+    data = dataset(tmp_path / "data")
+    path, sensor = data / "planes/sequence.json", {"exposure_s": 0.01, "full_well": 6000.0, "gain": 4.0}
+    write_json(path, read_json(path) | {"sensor": sensor})
+    out, _ = exported(data, "nerfstudio", tmp_path / "out")
+    assert json.loads((out / "planes/transforms.json").read_text())["exposure_time"] == 0.01
+    write_json(path, read_json(path) | {"sensor": sensor | {"right_exposure_s": 0.005}})
+    with pytest.raises(RsbenchError, match="exposures differ, and exposure_time is one for all; take --images gs"):
+        exported(data, "nerfstudio", tmp_path / "two")

@@ -1,7 +1,6 @@
-"""Layouts of others, written here by hand as their own documents have them, and read in place.
+"""Others' layouts: read, checked against themselves, and corrected frames scored against their truth."""
 
-Truth: closed forms written with matrix exponentials and homogeneous matrices, not with rsbench's geometry.
-"""
+from __future__ import annotations
 
 import csv
 from pathlib import Path
@@ -9,22 +8,33 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 from carla_frames import FPS, HEIGHT, SEEN, WIDTH, V, W, skew, write, write_carla, write_image
 from commands import run_here
+from exported_data import HEIGHT as LINES
+from exported_data import dataset, exported, only
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from rsbench.benchmark.recorded_corrections import correction_scores, pairs_with_truth
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.interop.readers.check import agreements
+from rsbench.core.rig import SIDES
+from rsbench.core.se3 import Pose
+from rsbench.interop.readers.check import agreements, epipolar_distance, file_faults, sights
 from rsbench.interop.readers.layouts import (
     read_carla,
     read_colmap,
     read_euroc,
+    read_fastec,
     read_kitti,
     read_middlebury,
     read_others,
 )
+from rsbench.vision.corrector import load_corrector
 
 Array = NDArray[Any]
 
@@ -282,3 +292,183 @@ def test_an_image_of_another_size_is_a_fault(tmp_path: Path) -> None:
     run = run_here("verify", tmp_path, "--from", "euroc")
     assert run.returncode == 1
     assert "64 x 40" in run.stderr
+
+
+def write_points(folder: Path, shift: float = 0.0) -> Path:
+    """A model of one camera, two images and 40 points, each image ``shift`` m beside where it says."""
+    write(folder / "cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n")
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-1.0, -1.0, 4.0], [1.0, 1.0, 6.0], (40, 3))
+    write(
+        folder / "points3D.txt", "".join(f"{7 + k} {x} {y} {z} 0 0 0 0.5\n" for k, (x, y, z) in enumerate(points))
+    )
+    text = ""
+    for number, x in enumerate((0.0, 0.3)):
+        at = points + np.array([x + shift, 0.0, 0.0])
+        seen = at[:, :2] / at[:, 2:] * [500, 510] + [320, 240]
+        rest = "".join(f" {u} {v} {7 + k}" for k, (u, v) in enumerate(seen))
+        text += f"{number + 1} 1 0 0 0 {x} 0 0 1 {number}.png\n3.5 4.5 -1{rest}\n"
+    write(folder / "images.txt", text)
+    for number in range(2):
+        write_image(folder / "images" / f"{number}.png", np.zeros((480, 640), dtype=np.uint8))
+    return folder
+
+
+def test_colmap_points_are_seen_where_its_poses_say(tmp_path: Path) -> None:
+    found = list(sights(read_colmap(write_points(tmp_path))[0]))
+    assert [(each.count, each.fault) for each in found] == [(40, ""), (40, "")]
+    assert max(each.typical for each in found) < 1e-9  # the half pixel of the corner on both sides
+
+
+def test_colmap_images_that_stand_elsewhere_are_faults(tmp_path: Path) -> None:
+    run = run_here("verify", write_points(tmp_path, shift=0.1), "--from", "colmap")
+    assert run.returncode == 1 and run.stderr.count("points of left image") == 2
+
+
+def test_matches_of_rolling_frames_lie_where_poses_of_their_rows_say(tmp_path: Path) -> None:
+    (right,) = sights(read_carla(write_carla(tmp_path / "right"))[0])
+    (still,) = sights(read_carla(write_carla(tmp_path / "still", row_ms=0.0))[0])
+    assert right.count > 100 and right.share > 0.95 and right.typical < 0.15  # features err by a tenth of a pixel
+    assert still.typical > 3.0 * right.typical
+
+
+seconds, thirds = st.floats(-0.2, 0.2), st.floats(-1.0, 1.0)
+
+
+@given(w=st.tuples(seconds, seconds, seconds), t=st.tuples(thirds, thirds, thirds), seed=st.integers(0, 100))
+def test_exact_matches_are_on_their_half_of_the_line(
+    w: tuple[float, float, float], t: tuple[float, float, float], seed: int
+) -> None:
+    """With the other sign of the translation they are as far from it as they moved since infinity."""
+    assume(np.linalg.norm(t) > 0.05)
+    camera = PinholeCamera.centred(640, 480, 500.0)
+    points = np.random.default_rng(seed).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 8.0], (20, 3))
+    pose = Pose(scipy.linalg.expm(skew(np.array(w))), np.array(t))
+    there, far = points @ pose.R.T + pose.t, points @ pose.R.T
+    matches = np.concatenate([camera.project(points), camera.project(there)], axis=1)
+    # 1e-6: where the epipole is near, both sides of the quotient are rounding of small numbers.
+    assert np.max(epipolar_distance(pose, matches, camera, camera)) < 1e-6
+    moved = np.linalg.norm(camera.project(there) - camera.project(far), axis=1)
+    found = epipolar_distance(Pose(pose.R, -pose.t), matches, camera, camera)
+    np.testing.assert_allclose(found, moved, rtol=1e-6, atol=1e-6)
+
+
+WIDE, HIGH, PX = 160, 120, 9.0
+"""Size of the panning camera's frames, and how far the picture moves in a frame period."""
+
+
+def panned(times: NDArray[Any]) -> NDArray[np.uint8]:
+    """What rows (h,) that are read at these times show, frame periods."""
+    blots = cv2.GaussianBlur(np.random.default_rng(5).uniform(size=(HIGH, 240)), (0, 0), 2.0)
+    blots = (255 * (blots - blots.min()) / np.ptp(blots)).astype(np.float32)
+    x, y = np.meshgrid(np.arange(WIDE), np.arange(HIGH))
+    where = (x + 20.0 + PX * times[:, None]).astype(np.float32)
+    drawn = cv2.remap(blots, where, y.astype(np.float32), cv2.INTER_CUBIC)
+    return np.asarray(np.clip(np.rint(drawn), 0, 255), dtype=np.uint8)
+
+
+def write_fastec(root: Path, frames: int = 3) -> Path:
+    rows = np.arange(HIGH) / HIGH
+    for frame in range(frames):
+        for name, times in (
+            ("rolling", frame + rows),
+            ("global_first", np.full(HIGH, float(frame))),
+            ("global_middle", np.full(HIGH, frame + 0.5)),
+        ):
+            write_image(root / "drive" / f"{frame:03d}_{name}.png", panned(times))
+    return root
+
+
+def test_fastec_is_scored_against_its_truth(tmp_path: Path) -> None:
+    folder = write_fastec(tmp_path / "data")
+    run = run_here("evaluate", folder, "--from", "fastec-rs", "--out", tmp_path / "out")
+    assert run.returncode == 0, run.stderr
+    assert "a focal length of 160 px, the width, and a readout ratio of 1 are assumed" in run.stdout + run.stderr
+    table = pd.read_csv(tmp_path / "out" / "scores" / "correction.csv")
+    # Every frame but the first, at the first and the middle row, by three methods.
+    assert len(table) == 2 * 2 * 3
+    assert table["success"].all()
+    scores = table.set_index(["frame", "row", "method"])["psnr"]
+    for frame in (1, 2):
+        for row in (0, 60):
+            rolling, truth = (
+                panned(times).astype(np.float64)
+                for times in (frame + np.arange(HIGH) / HIGH, np.full(HIGH, frame + row / HIGH))
+            )
+            expected = 10.0 * np.log10(255.0**2 / np.mean((rolling - truth) ** 2))
+            assert scores[frame, row, "uncorrected"] == pytest.approx(expected, abs=1e-4)  # six digits in the file
+            # A pan of 9 px leaves at most 4.5 px of a column that no frame shows: 10 dB are left far above noise.
+            assert min(scores[frame, row, name] for name in ("flow-scaled", "mono-fusion")) > expected + 5.0
+
+
+def test_what_is_exported_to_fastec_and_carla_reads_back(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", frames=3)
+    sequence = only(data)
+    for name, read, ends in (
+        ("fastec-rs", read_fastec, {side: f"planes_{side}" for side in SIDES}),
+        ("carla-rs", read_carla, {side: f"seq_{side}" for side in SIDES}),
+    ):
+        out, _ = exported(data, name, tmp_path / name)
+        recordings = {each.name: each for each in read(out)}
+        for side in SIDES:
+            found = recordings[ends[side]]
+            assert set(found.images) == {("left", frame) for frame in range(3)}
+            assert set(found.truths) == {("left", frame, row) for frame in range(3) for row in (0, LINES // 2)}
+            for frame in range(3):
+                twin = data / "planes" / "gs_twin" / f"{LINES // 2:04d}" / f"{side}_{frame}.png"
+                assert found.truths["left", frame, LINES // 2].read_bytes() == twin.read_bytes()
+                shown = cv2.imread(str(found.truths["left", frame, 0]))[..., ::-1]
+                np.testing.assert_array_equal(shown, sequence.image("gs", side, frame))
+
+
+def test_the_mask_of_carla_weighs_pixels(tmp_path: Path) -> None:
+    """Only its lower half counts there, and of that the right half half as much: PSNR written out."""
+    (seq,) = [path.parent for path in write_carla(tmp_path).rglob("gt_vel.log")]
+    frame = cv2.imread(str(seq / "0001_rs.png"), cv2.IMREAD_GRAYSCALE)
+    truth = np.clip(frame.astype(int) + np.random.default_rng(0).integers(-20, 20, frame.shape), 0, 255)
+    weights = np.zeros(frame.shape, dtype=np.uint8)
+    weights[frame.shape[0] // 2 :] = 200
+    weights[:, frame.shape[1] // 2 :] //= 2
+    write_image(seq / "0001_gs_m.png", truth.astype(np.uint8))
+    write_image(seq / "0001_mask.png", weights)
+    (row,) = correction_scores(pairs_with_truth(read_carla(tmp_path)), []).to_dict("records")
+    squares, weights = ((frame.astype(np.float64) - truth) / 255.0) ** 2, weights.astype(np.float64)
+    expected = -20.0 * np.log10(np.sqrt(np.sum(squares * weights) / np.sum(weights)))
+    assert row["psnr_mask"] == pytest.approx(expected, abs=1e-9)
+    assert row["psnr"] == pytest.approx(-10.0 * np.log10(np.mean(squares)), abs=1e-9)
+    write_image(seq / "0001_mask.png", weights[1:])
+    with pytest.raises(RsbenchError, match=r"0001_mask.png: is 160 x 119 pixels, its frame 160 x 120"):
+        correction_scores(pairs_with_truth(read_carla(tmp_path)), [])
+
+
+def test_what_is_equal_scores_100_as_published(tmp_path: Path) -> None:
+    folder = write_fastec(tmp_path, frames=2)
+    for name in ("global_first", "global_middle"):
+        (folder / "drive" / f"001_{name}.png").write_bytes((folder / "drive" / "001_rolling.png").read_bytes())
+    table = correction_scores(pairs_with_truth(read_fastec(folder)), [])
+    assert list(table["psnr"]) == [100.0, 100.0]
+
+
+def test_a_frame_that_is_not_corrected_counts_as_it_was_read(tmp_path: Path) -> None:
+    for frame in range(2):
+        for name in ("rolling", "global_middle"):
+            write_image(tmp_path / f"{frame:03d}_{name}.png", panned(np.zeros(HIGH)))
+    table = correction_scores(pairs_with_truth(read_fastec(tmp_path)), [load_corrector("mono-fusion")])
+    assert list(table["success"]) == [True, False]
+    assert "still camera" in table["reason"][1]
+    assert table["psnr"][1] == 100.0
+
+
+def test_bad_recordings_are_refused_in_one_line(tmp_path: Path) -> None:
+    folder = write_fastec(tmp_path / "data")
+    run = run_here("evaluate", folder, "--from", "fastec-rs", "--out", tmp_path / "a", "--corrector", "zhuang")
+    assert run.returncode == 2
+    assert "--corrector zhuang: needs matches, the other camera" in run.stderr
+    write_image(folder / "drive" / "001_global_middle.png", panned(np.zeros(HIGH))[:-1])
+    (recording,) = read_fastec(folder)
+    assert [str(fault) for fault in file_faults(recording)] == [
+        f"{folder / 'drive' / '001_global_middle.png'}: is 160 x 119 pixels, its camera 160 x 120"
+    ]
+    run = run_here("evaluate", folder, "--from", "fastec-rs", "--out", tmp_path / "b")
+    assert run.returncode == 2
+    assert "001_global_middle.png: is 160 x 119" in run.stderr

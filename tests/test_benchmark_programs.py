@@ -1,0 +1,316 @@
+"""Programs in benchmarks/: how they count errors, their intervals and tables, and their committed results."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pandas as pd
+import programs
+import pytest
+from programs import ROOT
+
+from rsbench.benchmark.leaderboard.track import PUBLIC_SEED
+from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.shutter import RollingShutter
+from rsbench.solvers.engine.base import load_solver_entry
+
+
+@pytest.fixture(scope="module")
+def lines() -> ModuleType:
+    return programs.program("benchmarks/line_triplets.py")
+
+
+def test_failures_err_by_half_a_turn_and_exact_features_by_nothing(lines: ModuleType) -> None:
+    motion = random_motion(np.random.default_rng(0), np.radians(2.0), 0.3)
+    still = RollingShutter(height=900, readout_ratio=0.0)
+    c = simulate(lines.RIG, still, motion, SimulationOptions(tracks=20), np.random.default_rng(0)).correspondences
+    row = lines.errors(c, lines.RIG, motion)
+    assert row["e_R_lines"] == row["e_T_lines"] == 180.0
+    assert row["e_R_both"] == row["e_R_points"] < 1e-8
+    assert lines.errors(Correspondences(), lines.RIG, motion)["e_R_both"] == 180.0
+
+
+def test_the_table_has_a_row_for_each_thing_with_medians_and_the_share_that_is_right(lines: ModuleType) -> None:
+    kinds = {f"{e}_{kind}": 1.0 for e in ("e_R", "e_T") for kind in ("points", "lines", "both")}
+    rows = [
+        {"of": "room", "tracks": 10 * k, "lines": 20, "right": 19, "ms_both": 7.0, **kinds, "e_R_both": 0.1 * k}
+        for k in range(1, 12)
+    ]
+    head, rule, line = lines.told(pd.DataFrame(rows)).split("\n")
+    cells = line.strip("| ").split(" | ")
+    assert cells[:3] == ["room", "11", "60, 20"] and cells[3].startswith("0.95 [")
+    assert cells[6].startswith("0.6 [") and cells[-1] == "7"
+    assert head.count("|") == rule.count("|") == line.count("|") == 12
+
+
+SWEEP_FOLDER = ROOT / "results/trajectory"
+
+
+@pytest.fixture
+def sweep(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))  # whose programs find each other in their folder
+    return importlib.import_module("trajectory_sweep")
+
+
+def test_points_are_seen_where_their_rows_are_read(sweep: ModuleType) -> None:
+    """Each pixel is the pinhole image from the pose at its own row's time, whatever order found it."""
+    rng, setting = np.random.default_rng(0), sweep.Setting()
+    law, ratio = sweep.hand(setting, rng), 0.015 * 30.0
+    points = rng.uniform([-2.0, -1.5, 4.0], [2.0, 1.5, 9.0], (50, 3))
+    for frame, side, shift in ((0, 0, 0.1), (1, 1, -0.1)):
+        pixels = sweep.seen(law, setting.shutter, points, frame, side)
+        for point, (x, y) in zip(points, pixels, strict=True):
+            R, t = (each[0] for each in law.body(np.array([frame + ratio * y / 480.0])))
+            X = R @ point + t + [shift, 0.0, 0.0]
+            np.testing.assert_allclose([x, y], 520.0 * X[:2] / X[2] + [319.5, 239.5], atol=1e-6)
+
+
+def test_the_truth_errs_by_nothing_and_a_still_rig_by_the_motion(sweep: ModuleType) -> None:
+    from rsbench.benchmark.trajectory_methods import along
+    from rsbench.components.motion_models import LinearMotion
+
+    setting = sweep.Setting(shake=0.0)
+    law = sweep.hand(setting, np.random.default_rng(1))
+    still = along(LinearMotion(np.zeros(3), np.zeros(3)), setting.length - 1)
+    turned, shifted = sweep.error(law, setting, still)
+    # Rows go on evenly from the first: the root mean square of k / 20 of the readout, k from 0 to 19.
+    part = 0.45 * np.sqrt(np.mean((np.arange(20) / 20.0) ** 2))
+    assert turned == pytest.approx(part * 1.0, rel=1e-9)
+    assert shifted == pytest.approx(part * 50.0, rel=1e-9)
+
+
+def test_committed_rows_say_what_the_page_concludes() -> None:
+    rows = pd.read_csv(SWEEP_FOLDER / "rows.csv").set_index(["sweep", "entry", "value"])
+    ours = rows.xs("rs-trajectory", level="entry")
+    for windows in ("windows-auto", "windows-linear"):
+        beside = rows.xs(windows, level="entry")
+        clear = ours.rotation_deg_high < beside.rotation_deg_low
+        shaken = [key for key in clear.index if key[0] != "shake of two frames" and key[1] != 0.0]
+        assert all(clear[key] for key in shaken if key != ("rate", 7.5))
+        assert not clear["shake of two frames", 0.0] and not clear["rate", 7.5]
+    assert not np.any(rows.failed)
+
+
+REPOSITORY = Path(__file__).parents[1]
+TUNING_FOLDER = REPOSITORY / "results/tuning"
+
+
+@pytest.fixture(scope="module")
+def tuning() -> ModuleType:
+    return programs.program("benchmarks/tune_solvers.py")
+
+
+def test_one_option_at_a_time_differs_and_the_house_s_loop_is_for_those_in_it(tuning: ModuleType) -> None:
+    for name, own in (("rs-r6p", True), ("rs-zhuang-8pt", False)):
+        entry = load_solver_entry(name)
+        assert (entry.options.robust == "own") == own
+        card, *others = tuning.settings_of(entry.solver, own)
+        assert card.option == "card" and card.solver == entry.solver
+        assert any(each.option.startswith("loop.") for each in others) != own
+        for each in others:
+            changed = {k for k, v in vars(each.solver).items() if v != vars(card.solver)[k]}
+            assert len(changed) + (each.loop != card.loop) == 1
+
+
+def test_intervals_hold_for_all_settings_together(tuning: ModuleType) -> None:
+    """Of gains of nothing, one in twenty tables may show one beyond 0."""
+    rng, beyond = np.random.default_rng(0), 0
+    for _ in range(60):
+        low, high = tuning.gain_intervals(rng.normal(0.0, 0.1, (40, 5)))
+        beyond += bool(np.any((low > 0.0) | (high < 0.0)))
+    assert beyond <= 9  # 3 expected; the bootstrap of 40 is somewhat narrow
+    low, high = tuning.gain_intervals(np.full((40, 2), 0.25))
+    assert np.allclose([low, high], 0.25, rtol=0.0, atol=1e-12)
+
+
+def test_the_card_stands_unless_another_setting_is_better_beyond_its_interval(tuning: ModuleType) -> None:
+    card = tuning.Setting("card", "", load_solver_entry("rs-r6p").solver, tuning.RobustOptions())
+    rng = np.random.default_rng(1)
+    errors = rng.uniform(0.5, 4.5, 40)
+    settings = [(card, errors), (card, errors + rng.normal(-0.02, 0.5, 40)), (card, errors + 1.0)]
+    assert [row["best"] for row in tuning.rows_of("rs-r6p", settings)] == [True, False, False]
+    settings.append((card, errors - 0.4))
+    rows = tuning.rows_of("rs-r6p", settings)
+    assert [row["best"] for row in rows] == [False, False, False, True]
+    assert rows[-1]["gain"] == pytest.approx(0.08, abs=1e-12)
+
+
+def test_what_is_committed_is_of_a_seed_of_its_own_and_the_cards_stand(tuning: ModuleType) -> None:
+    assert tuning.SEED != PUBLIC_SEED
+    table = pd.read_csv(TUNING_FOLDER / "tuning.csv", keep_default_na=False)
+    assert set(table["solver"]) == set(tuning.CARDS)
+    for name, rows in table.groupby("solver"):
+        entry = load_solver_entry(str(name))
+        settings = list(tuning.settings_of(entry.solver, entry.options.robust == "own"))
+        assert list(rows["option"]) == [each.option for each in settings]
+        assert list(rows["value"].astype(str)) == [each.value for each in settings]
+        assert list(rows["option"][rows["best"]]) == ["card"], f"{name}: its card does not have what is best"
+
+
+ROOT = Path(__file__).parents[1]
+GYRO_FOLDER = ROOT / "results/gyro"
+
+
+@pytest.fixture(scope="module")
+def crossing() -> ModuleType:
+    return programs.program("benchmarks/gyro_crossing.py")
+
+
+VALUES = np.array([0.0, 1.0, 3.0, 10.0])
+
+
+def test_errors_that_add_in_squares_cross_where_they_do(crossing: ModuleType) -> None:
+    a, b = 0.2, 0.5
+    gyro = np.sqrt(a**2 + (b * VALUES) ** 2)
+    for vision in (0.21, 0.6, 1.7, 5.0):
+        found = float(crossing.crossing(VALUES, gyro, np.full(4, vision)))
+        assert found == pytest.approx(np.sqrt(vision**2 - a**2) / b, rel=1e-12)
+    assert crossing.crossing(VALUES, gyro, np.full(4, 0.1)) == 0.0
+    assert crossing.crossing(VALUES, gyro, np.full(4, 6.0)) == np.inf
+
+
+def test_a_length_that_is_not_found_is_the_larger_error(crossing: ModuleType) -> None:
+    gyro = np.array([0.1, 0.2, np.inf, np.inf])
+    assert crossing.crossing(VALUES, gyro, np.full(4, 0.5)) == 3.0
+    assert crossing.crossing(VALUES, gyro, np.full(4, np.inf)) == np.inf
+
+
+def test_the_interval_holds_the_crossing_of_what_was_drawn_from(crossing: ModuleType) -> None:
+    """Rayleigh errors: those of two Gaussian parts, whose squares add."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((2, 2, 200))
+    gyro = np.stack([np.hypot(0.2, 0.5 * x) * np.hypot(*noise[0]) for x in VALUES])
+    vision = np.stack([1.0 * np.hypot(*noise[1])] * len(VALUES))
+    row = crossing.crossing_row(VALUES, gyro, vision, 0)
+    truth = np.sqrt(1.0 - 0.2**2) / 0.5
+    assert row["low"] < truth < row["high"] and row["high"] / row["low"] < 2.0
+
+
+def test_committed_crossings_are_those_of_the_committed_medians(crossing: ModuleType) -> None:
+    medians = pd.read_csv(GYRO_FOLDER / "medians.csv")
+    crossings = pd.read_csv(GYRO_FOLDER / "crossings.csv")
+    assert set(crossings["sweep"]) == set(crossing.SWEEPS)
+    for row in crossings.to_dict("records"):
+        here = medians[(medians["sweep"] == row["sweep"]) & (medians["variant"] == row["variant"])]
+        here = here[here["measure"] == row["measure"]]
+        gyro, vision = (here[here["solver"] == row[kind]] for kind in ("gyro", "vision"))
+        curves = [each["median"].to_numpy(float) for each in (gyro, vision)]
+        found = float(crossing.crossing(gyro["value"].to_numpy(float), *curves))
+        # Tables have six digits; where curves run along each other that moves a crossing by more.
+        assert found == pytest.approx(row["crossing"], rel=1e-3)
+        assert row["low"] <= row["crossing"] <= row["high"]
+
+
+def test_the_document_has_the_committed_crossings(crossing: ModuleType) -> None:
+    text = (ROOT / "docs/explanation/monocular.md").read_text("utf-8")
+    rows = crossing.shown(pd.read_csv(GYRO_FOLDER / "crossings.csv"))
+    assert len(rows) == 8 and [row for row in rows if row not in text] == []
+
+
+def test_the_rotation_of_a_biased_gyroscope_errs_by_its_bias() -> None:
+    medians = pd.read_csv(GYRO_FOLDER / "medians.csv")
+    of_bias = medians[(medians["sweep"] == "gyro-bias") & (medians["measure"] == "e_R_deg")]
+    rows = of_bias[of_bias["solver"] == "rs-gyro-stereo"]
+    # deg/s over 30 frames/s; a rotation of 2 deg turns the bias on the way, by at most its sine, 0.035.
+    np.testing.assert_allclose(rows["median"], rows["value"] / 30.0, rtol=1e-3, atol=1e-9)
+
+
+CHECKOUT = Path(__file__).parents[1]
+F, BASELINE, DEPTH, STEP = 200.0, 0.5, 10.0, 6
+
+
+@pytest.fixture(scope="module")
+def kitti() -> ModuleType:
+    return programs.program("examples/score_kitti.py")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A wall 10 m away; the rig moves 6 px, 0.3 m, to the right in each of two windows."""
+    rng = np.random.default_rng(0)
+    wall = cv2.GaussianBlur(rng.integers(0, 256, (120, 300)).astype(np.float32), (0, 0), 1.5)
+    wall = cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    disparity = round(F * BASELINE / DEPTH)
+    for number, side in enumerate(("image_0", "image_1")):
+        (tmp_path / side).mkdir()
+        for frame in range(3):
+            start = 20 + frame * STEP + number * disparity
+            cv2.imwrite(str(tmp_path / side / f"{frame:06d}.png"), wall[:, start : start + 200])
+    projection = "{0} 0 99.5 {1} 0 {0} 59.5 0 0 0 1 0"
+    names = (projection.format(F, 0.0), projection.format(F, -F * BASELINE))
+    (tmp_path / "calib.txt").write_text("".join(f"P{k}: {line}\n" for k, line in enumerate(names)))
+    metres = STEP * DEPTH / F
+    (tmp_path / "poses.txt").write_text("".join(f"1 0 0 {k * metres} 0 1 0 0 0 0 1 0\n" for k in range(3)))
+    return tmp_path
+
+
+def test_a_known_motion_scores_well(kitti: ModuleType, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whole pixels of motion: SIFT's keypoints repeat to 0.05 px, which is 0.01 deg and 1 % of 6 px."""
+    assert kitti.main([str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rotation, direction, length = map(float, re.findall(r"[-+]?\d+\.\d+", lines[-3]))
+    assert rotation < 0.05 and direction < 1.0 and abs(length) < 1.0
+    off, path, share = map(float, re.findall(r"\d+\.?\d*", lines[-2]))
+    assert off < 0.02 and path == 1.0 and share < 2.0  # 0.6 m, rounded
+    assert lines[-1] == "0 of 2 windows refused"
+
+
+def test_the_drift_is_the_distance_at_the_end(kitti: ModuleType) -> None:
+    """A quarter turn on the spot, then a metre ahead: to the right of the first frame, or to the left."""
+    turn = so3.exp(np.array([0.0, np.pi / 2, 0.0]))
+    ahead = (np.eye(3), np.array([0.0, 0.0, -1.0]))  # the world comes nearer
+    right, left = ([(each, np.zeros(3)), ahead] for each in (turn.T, turn))
+    np.testing.assert_allclose(kitti.end_of(right), (1.0, 0.0, 0.0), atol=1e-12)
+    assert kitti.drift(list(zip(left, right, strict=True))) == "drift 2.00 m over 1 m, 200.0%"
+
+
+def test_exchanged_cameras_are_refused_in_every_window(
+    kitti: ModuleType, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kitti.main([str(folder), "--left", "image_1", "--right", "image_0"])
+    out = capsys.readouterr().out
+    assert "exchanged" in out and "2 of 2 windows refused" in out
+
+
+def test_a_wrong_focal_length_leaves_the_baseline(kitti: ModuleType, folder: Path) -> None:
+    rig = kitti.read_rig(folder, folder / "image_0" / "000000.png", 1.1)
+    np.testing.assert_allclose([rig.camera.fx, rig.camera.fy, rig.baseline], [1.1 * F, 1.1 * F, BASELINE])
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "poses.txt"])
+def test_what_is_missing_is_named(
+    kitti: ModuleType, folder: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / name).unlink()
+    assert kitti.main([str(folder)]) == 2
+    assert name in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", [("--ratio", "nan"), ("--ratio", "half"), ("--ratio", "1.5"), ("--every", "0"), ("--focal", "3")]
+)
+def test_options_that_mean_nothing_are_refused(
+    kitti: ModuleType, folder: Path, words: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        kitti.main([str(folder), *words])
+    assert end.value.code == 2 and f"argument {words[0]}: {words[1]!r} must be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "poses.txt"])
+@pytest.mark.parametrize("damage", ["nan", "one", ""])
+def test_damaged_numbers_are_one_line(
+    kitti: ModuleType, folder: Path, name: str, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / name
+    path.write_text(path.read_text().replace(" 0 ", f" {damage} ", 1))
+    assert kitti.main([str(folder)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{name}: every line must hold twelve numbers" in line
