@@ -64,7 +64,7 @@ LONG = (
     "test_compiled.py",
     "test_interrupted.py",
     "test_attack.py",
-    "test_scoring_workers.py",
+    "test_running.py",
     "test_lens_sequences.py",
     "test_bound.py",
     "test_isolation.py",

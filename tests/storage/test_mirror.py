@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from commands import assert_refused, run_here, sweep_card
 from evaluations import contents
-from leaderboards import small_split
+from leaderboards import jobs_here, small_split
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.benchmark.leaderboard import running
@@ -102,15 +102,9 @@ def test_an_evaluation_goes_to_a_store(memory: Any, tmp_path: Path) -> None:
     assert before == {path: memory.info(f"/bucket/mine/{path}")["created"] for path in before}, "made again"
 
 
-def _here(serve: Any, jobs: Any, workers: int, environment: object, *arguments: object) -> Any:
-    """``finished_jobs`` without a child."""
-    run = serve(*arguments)
-    yield from ((job, run(job)) for job in jobs)
-
-
 @pytest.mark.slow
 def test_a_board_goes_to_a_store(memory: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "finished_jobs", _here)
+    monkeypatch.setattr(running, "finished_jobs", jobs_here)
     monkeypatch.setattr("rsbench.cli.leaderboard.split_of", lambda *options: small_split(3))
     command = ("leaderboard", "run", "points", "--entry", "gs-8pt", "--board")
     assert run_here(*command, tmp_path / "board").returncode == 0

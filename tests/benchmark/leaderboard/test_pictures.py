@@ -1,23 +1,30 @@
-"""The tracks depth and correction: what scores, what is told of slips, and boards."""
+"""Submitted pictures: their scores against counts and formulas, faults, and parts of the pixels."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 import random
 import shutil
+import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
 from analytic_dataset import write_analytic_dataset
-from leaderboards import ASK_PICTURES, PLANES, lines_of, pictures_of, write
+from leaderboards import ASK_PICTURES, PLANES, Line, files_below, lines_of, named, pictures_of, write
 
-from rsbench.benchmark.leaderboard.board import add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.board import add, entries_of, merge, place, rescore
+from rsbench.benchmark.leaderboard.picture_track import PictureTrack
+from rsbench.benchmark.leaderboard.pictures import PARTINGS, WINDOW, columns, texture
 from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import (
     check_submission,
@@ -30,7 +37,10 @@ from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.files import read_depth, read_png, write_depth, write_png
+from rsbench.report.board_entry import entry_context
+from rsbench.report.board_pictures import albums
+from rsbench.report.board_splits import read_split
+from rsbench.storage.files import read_depth, read_png, read_table, write_depth, write_exr, write_png
 
 RIG, SHUTTER, MOTION = PLANES
 
@@ -315,3 +325,322 @@ def test_cameras_of_other_kinds_are_refused(planes: Path, tmp_path: Path) -> Non
     path.write_text(json.dumps({**json.loads(path.read_text("utf-8")), "scan": "bottom"}), "utf-8")
     with pytest.raises(RsbenchError, match="is of cameras without a lens that read rows together"):
         TRACKS["depth"].split(tmp_path / "copy")
+
+
+def _png(
+    width: int, height: int, bits: int, colour: int, body: bytes = b"", more: tuple[tuple[bytes, bytes], ...] = ()
+) -> bytes:
+    """``more``: chunks between the header and the pixels."""
+    chunks = (
+        (b"IHDR", _header(width, height, bits, colour)),
+        *more,
+        (b"IDAT", zlib.compress(body)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+def _header(width: int, height: int, bits: int, colour: int) -> bytes:
+    return struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+
+
+def _with_hole(value: float) -> Callable[[Path], None]:
+    def damage(picture: Path) -> None:
+        depth = np.full((80, 96), 5.0, dtype=np.float32)
+        depth[3, 4] = value
+        write_depth(picture, depth)
+
+    return damage
+
+
+def _with_window(x: int, y: int) -> Callable[[Path], None]:
+    """Of an EXR file, from (x, y) on where that leaves the size as it is, else up to there."""
+
+    def damage(picture: Path) -> None:
+        key = b"dataWindow\0box2i\0\x10\0\0\0"
+        data = picture.read_bytes()
+        place = data.index(key) + len(key)
+        window = (0, 0, x, y) if x > 1000 else (x, y, x + 95, y + 79)
+        picture.write_bytes(data[:place] + struct.pack("<4i", *window) + data[place + 16 :])
+
+    return damage
+
+
+def _link(picture: Path) -> None:
+    other = picture.parents[3] / "secret"
+    picture.rename(other)
+    picture.symlink_to(other)
+
+
+def _circle(picture: Path) -> None:
+    picture.unlink()
+    picture.symlink_to(picture)
+
+
+def _linked_folder(picture: Path) -> None:
+    other = picture.parents[3] / "secret"
+    picture.parent.rename(other)
+    picture.parent.symlink_to(other)
+
+
+def _pipe(picture: Path) -> None:
+    picture.unlink()
+    os.mkfifo(picture)
+
+
+def _fault_folder(picture: Path) -> None:
+    picture.unlink()
+    picture.mkdir()
+
+
+DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "missing": (lambda p: p.unlink(), "left_1.exr: is missing"),
+    "two": (
+        lambda p: p.with_suffix(".png").write_bytes(p.read_bytes()),
+        "2 of left_1.exr and left_1.png are there",
+    ),
+    "another name": (lambda p: p.rename(p.with_name("left_0.exr")), "left_0.exr: does not belong here"),
+    "another problem": (lambda p: p.parent.rename(p.parent.with_name("castle")), "castle: is no problem of"),
+    "a file too many": (lambda p: p.with_name("evil.sh").write_text("x"), "evil.sh: does not belong here"),
+    "a hidden file": (lambda p: p.with_name(".x").write_text("x"), ".x: does not belong here"),
+    "a file among folders": (lambda p: (p.parents[1] / "planes.1x").write_text("x"), "planes.1x: is no problem"),
+    "a link": (_link, "left_1.exr: must be a file of its own, no link"),
+    "a linked folder": (_linked_folder, "planes.0: must be a folder of its own, no link"),
+    "a circle": (_circle, "must be a file of its own, no link"),
+    "a pipe": (_pipe, "must be a file of its own"),
+    "a folder": (_fault_folder, "must be a file of its own"),
+    "1 GB": (lambda p: os.truncate(p, 1 << 30), "bytes: 1073741824 is more than"),
+    "no EXR": (lambda p: p.write_bytes(b"PK\x03\x04" + bytes(100)), "damaged or not an EXR file"),
+    "half a file": (lambda p: os.truncate(p, 500), "left_1.exr: "),
+    "channels of colour": (
+        lambda p: write_exr(p, {c: np.ones((80, 96), np.float32) for c in "RGB"}),
+        "must hold one part of scanlines with one channel, Z, of float32",
+    ),
+    "channel Y": (lambda p: write_exr(p, {"Y": np.ones((80, 96), np.float32)}), "with one channel, Z"),
+    "half floats": (lambda p: write_exr(p, {"Z": np.ones((80, 96), np.float32)}, half=True), "float32 channel Z"),
+    "another size": (
+        lambda p: write_depth(p, np.ones((96, 80), np.float32)),
+        "is 80 x 96 pixels, the camera 96 x 80",
+    ),
+    "huge by its header": (_with_window(2**31 - 1, 2**31 - 1), "left_1.exr: "),
+    "a window elsewhere": (_with_window(5, 3), "left_1.exr: "),
+    "NaN": (_with_hole(np.nan), "1 pixels are NaN; unknown depth and sky are 0"),
+    "infinity": (_with_hole(np.inf), "1 pixels are infinite"),
+    "negative": (_with_hole(-1.0), "1 pixels are negative"),
+    "beyond the universe": (_with_hole(1e30), "1 pixels are above 1e+09 m"),
+}
+FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "a JPEG": (lambda p: p.write_bytes(cv2.imencode(".jpg", np.ones((80, 96, 3)))[1].tobytes()), "is no PNG file"),
+    "16 bits": (
+        lambda p: cv2.imwrite(str(p), np.ones((80, 96, 3), np.uint16)),
+        "is RGB of 16 bits: must be RGB or",
+    ),
+    "grey": (lambda p: cv2.imwrite(str(p), np.ones((80, 96), np.uint8)), "is grey of 8 bits: must be RGB or RGBA"),
+    "a palette": (lambda p: p.write_bytes(_png(96, 80, 8, 3)), "is palette of 8 bits"),
+    "no colour type": (lambda p: p.write_bytes(_png(96, 80, 8, 77)), "is unknown of 8 bits"),
+    "another size": (lambda p: write_png(p, np.zeros((80, 95, 3), np.uint8)), "is 95 x 80 pixels"),
+    "a huge image": (
+        lambda p: p.write_bytes(_png(2**31 - 1, 2**31 - 1, 8, 2)),
+        "is 2147483647 x 2147483647 pixels",
+    ),
+    # 64 million pixels pass Pillow's own limit.
+    "a second header": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"IHDR", _header(8000, 8000, 8, 2)),))),
+        "its headers differ: 8000 x 8000 pixels",
+    ),
+    "a second kind": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, bytes(97 * 80), ((b"IHDR", _header(96, 80, 8, 0)),))),
+        "is RGB of 8 bits, and holds something else",
+    ),
+    "a text that unfolds": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"zTXt", b"x\0\0" + zlib.compress(bytes(1 << 22))),))),
+        "is a damaged PNG file: Decompressed data too large",
+    ),
+    "a profile that unfolds": (
+        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"iCCP", b"x\0\0" + zlib.compress(bytes(1 << 22))),))),
+        "is a damaged PNG file: Decompressed data too large",
+    ),
+    "a film of huge pictures": (
+        lambda p: p.write_bytes(
+            _png(
+                96,
+                80,
+                8,
+                2,
+                more=(
+                    (b"acTL", struct.pack(">II", 2, 0)),
+                    (b"fcTL", struct.pack(">IIIIIHHBB", 0, 60000, 60000, 0, 0, 1, 1, 0, 0)),
+                ),
+            )
+        ),
+        "is a damaged PNG file",
+    ),
+    "another check sum": (lambda p: p.write_bytes(p.read_bytes()[:29] + b"abcd" + p.read_bytes()[33:]), "damaged"),
+    "no pixels": (lambda p: p.write_bytes(_png(96, 80, 8, 2)), "is a damaged PNG file"),
+    "only a header": (lambda p: p.write_bytes(_png(96, 80, 8, 2)[:30]), "is no PNG file"),
+    "nothing": (lambda p: p.write_bytes(b""), "is no PNG file"),
+    "the middle is missing": (
+        lambda p: p.with_name("left_1_middle.png").unlink(),
+        "left_1_middle.png: is missing",
+    ),
+}
+ANSWER_FAULTS: dict[str, tuple[Callable[[list[Line]], list[Line]], str]] = {
+    "no line": (lambda lines: lines[:-1], "planes.1: has pictures, but no line"),
+    "a failure with pictures": (lambda lines: [*lines[:-1], {**lines[-1], "success": False}], "has pictures, but"),
+    "a motion": (lambda lines: [*lines[:-1], {**lines[-1], "w": [0, 0, 0]}], "w: does not belong here"),
+    "path for a problem": (lambda lines: [*lines, {"name": "../truth"}], "is no problem of"),
+    "a unit of kilometres": (
+        lambda lines: [{**lines[0], "png_unit_m": 1000.0}, *lines[1:]],
+        "png_unit_m = 1000.0",
+    ),
+    "matches": (lambda lines: [{**lines[0], "uses": ["left"]}, *lines[1:]], "'left' is not given by depth-1"),
+}
+
+
+@pytest.mark.parametrize("case", [*DEPTH_FAULTS, *(f"frame: {name}" for name in FRAME_FAULTS)])
+def test_faults_are_lines_and_nothing_is_kept(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    name = case.removeprefix("frame: ")
+    split, faults = (splits["depth"], DEPTH_FAULTS) if name == case else (splits["correction"], FRAME_FAULTS)
+    damage, words = faults[name]
+    (tmp_path / "in").mkdir()
+    path = write_truth(split, tmp_path / "in")
+    damage(pictures_of(path)[0])
+    before = files_below(tmp_path)
+    told = check_submission(path, split).faults
+    assert any(words in fault for fault in told), told
+    assert all("\n" not in fault and len(fault) < 400 + 2 * len(str(path)) for fault in told)
+    with pytest.raises(RsbenchError):
+        add(tmp_path / "board", path, split, {})
+    assert files_below(tmp_path) == before and not (tmp_path / "board").exists()
+
+
+@pytest.mark.parametrize("case", ANSWER_FAULTS)
+def test_faults_of_answers_are_lines(case: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    change, words = ANSWER_FAULTS[case]
+    path = write_truth(splits["depth"], tmp_path)
+    (fault,) = check_submission(write(path, change(lines_of(path))), splits["depth"]).faults
+    assert words in fault
+
+
+ROWS, TEXTURE = PARTINGS
+
+
+def test_texture_is_the_deviation_in_a_window() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (30, 40, 3)).astype(np.uint8)
+    image[:, 25:] = 90
+    found, half = texture(image), WINDOW // 2
+    for y, x in ((4, 4), (15, 20), (25, 23)):
+        window = image[y - half : y + half + 1, x - half : x + half + 1].astype(np.float64).mean(axis=-1)
+        # The difference of two squares of some 100 levels: rounding of 1e-12 of them, below a root.
+        assert found[y, x] == pytest.approx(window.std(), abs=1e-5)
+    assert np.all(found[:, 30:] < 1e-5)
+
+
+def _by_hand(values: np.ndarray, of: np.ndarray, image: np.ndarray, row: int) -> dict[str, list[float]]:
+    """The ``values`` (H, W) of the pixels ``of`` (H, W) in each part, one after the other."""
+    deviation, found = texture(image.astype(np.uint8)), dict[str, list[float]]()
+    for (y, x), value in np.ndenumerate(values):
+        for parting, at in ((ROWS, abs(y - row) / len(values)), (TEXTURE, deviation[y, x])):
+            number = max(k for k, start in enumerate(parting.starts) if at >= start) + 1
+            if of[y, x]:
+                found.setdefault(f"{parting.name}_{number}", []).append(float(value))
+    return found
+
+
+def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
+    """Off by 1.5 px below the middle row, and unknown in a column: of rows the first parts are right."""
+    split = splits["depth"]
+    path, product = write_truth(split, tmp_path), RIG.camera.fx * RIG.baseline
+    for picture in pictures_of(path):
+        z = read_depth(picture).astype(np.float64)
+        z[40:] = product / (product / z[40:] + 1.5)
+        z[:, 7] = 0.0
+        write_depth(picture, z.astype(np.float32))
+    scores = mark(read_submission(path, split), split)
+    assert np.all(scores["bad_1_rows_1"] == 1 / 96) and np.all(scores["bad_1_rows_5"] == 1.0)
+    for number, truth in enumerate(split.truths):
+        assert truth.pictures is not None
+        wrong = np.zeros((80, 96))
+        wrong[40:], wrong[:, 7] = 1.0, 1.0
+        parts = _by_hand(wrong, truth.pictures.depth() > 0, truth.pictures.rolling(), 0)
+        for name in (*columns("bad_1", ROWS), *columns("bad_1", TEXTURE)):
+            expected = parts.get(name.removeprefix("bad_1_"), [math.nan])
+            assert scores[name][number] == pytest.approx(np.mean(expected), nan_ok=True)
+        assert scores["bad_1"][number] == pytest.approx(wrong.mean())
+
+
+def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
+    """Each pixel of both frames off by a level of its own; a part holds what either frame has of it."""
+    split = splits["correction"]
+    path, off = write_truth(split, tmp_path), np.random.default_rng(1).integers(0, 3, (80, 96, 3))
+    off[50:] *= 9
+    for picture in pictures_of(path):
+        write_png(picture, ((read_png(picture) + off) % 256).astype(np.uint8))
+    scores = mark(read_submission(path, split), split)
+    for number, truth in enumerate(split.truths):
+        assert truth.pictures is not None
+        parts = dict[str, list[float]]()
+        for each, common in zip(truth.pictures.requested, truth.pictures.commons(), strict=True):
+            frame = truth.pictures.frame(each.row)
+            squares = np.mean(((frame + off) % 256 - frame.astype(np.float64)) ** 2, axis=-1)
+            for name, values in _by_hand(squares, common, frame, each.row).items():
+                parts.setdefault(name, []).extend(values)
+        for name in (*columns("rms", ROWS), *columns("rms", TEXTURE)):
+            expected = parts.get(name.removeprefix("rms_"), [math.nan])
+            assert scores[name][number] == pytest.approx(np.sqrt(np.mean(expected)), nan_ok=True)
+
+
+def _folder(path: Path) -> Path:
+    """Without pictures."""
+    path.mkdir()
+    return path
+
+
+@pytest.mark.parametrize(("track", "worst"), [("depth", 1.0), ("correction", 255.0)])
+def test_a_failure_is_the_worst_in_the_same_parts(
+    track: str, worst: float, splits: dict[str, Split], tmp_path: Path
+) -> None:
+    split = splits[track]
+    path = write_truth(split, tmp_path)
+    right = mark(read_submission(path, split), split)
+    failed = mark(read_submission(write(_folder(tmp_path / "none") / "x.jsonl", lines_of(path)[:1]), split), split)
+    for parting in PARTINGS:
+        for name in columns(cast(PictureTrack, split.track).part_score, parting):
+            assert list(right[name].isna()) == list(failed[name].isna())
+            assert set(right[name].dropna()) <= {0.0} and set(failed[name].dropna()) <= {worst}
+    assert failed[columns(cast(PictureTrack, split.track).part_score, ROWS)[0]].notna().all()
+
+
+@pytest.mark.parametrize("track", ASK_PICTURES)
+def test_the_page_of_an_entry_draws_them(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
+    """Medians of the problems, as stored; none of a secret split, and none of scores that were stored before."""
+    split = splits[track]
+    lines = lines_of(write_truth(split, tmp_path / "in"))
+    failed = [{"name": line["name"], "success": False} for line in lines[1:]]
+    path = write(_folder(tmp_path / "none") / "x.jsonl", named([lines[0], *failed], "none", ("images",)))
+    scored = add(tmp_path / "board", path, split, {})
+    names = (tmp_path / "board", split.track.id, split.name)
+
+    def drawn() -> list[dict[str, str]]:
+        board = read_split(*names)
+        (album,) = albums([board], tmp_path / "out", ())
+        found: list[dict[str, str]] = entry_context(board, board.lines[0], album)["figures_within"]["drawn"]
+        return found
+
+    rows, by_texture = drawn()
+    worst = "1" if track == "depth" else "255"
+    assert f"median errors at 0, 0.2, 0.4, 0.6, 0.8: none: {', '.join([worst] * 5)}" in rows["svg"]
+    assert rows["title"] == ROWS.title and by_texture["title"] == TEXTURE.title
+    table = scored.folder / "scores.csv"
+    kept = read_table(table)
+    write_csv = kept.drop(columns=[name for name in map(str, kept) if "_rows_" in name or "_texture_" in name])
+    write_csv.to_csv(table, index=False)
+    assert drawn() == []
+    kept.to_csv(table, index=False)
+    add(tmp_path / "secret", path, replace(split, public=False), {})
+    names = (tmp_path / "secret", split.track.id, split.name)
+    assert place(*names).is_dir() and drawn() == []
