@@ -1,4 +1,4 @@
-"""``rsbench leaderboard``: methods of anybody on the same problems, ranked as far as the data tell."""
+"""``rsbench leaderboard``: methods of anybody on the same problems, ranked as far as the data decide."""
 
 from __future__ import annotations
 
@@ -36,6 +36,18 @@ EPILOG = """[bold]Examples[/bold]
 
 More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]"""
 
+SMOKE_EPILOG = """[bold]Examples[/bold]
+
+  rsbench leaderboard smoke                                [dim](all tracks; a minute on two cores)[/dim]
+
+  rsbench leaderboard smoke --track depth --track correction
+
+  rsbench leaderboard smoke --track points --entry rs-stereo-refined --entry mine.toml --problems 2
+
+  rsbench leaderboard smoke --track pose --write           [dim](its new scores are right: store them)[/dim]
+
+More: [bold]rsbench docs submit[/bold]"""
+
 _SHOWN = (
     *("e_R_deg", "e_T_deg", "e_readout", "abs_rel", "psnr", "epe_px"),
     *("way_median_deg", "rows_median_deg", "ate_mm", "jitter_px"),
@@ -58,7 +70,7 @@ Secret = Annotated[
     Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")
 ]
 Hidden = Annotated[
-    bool, typer.Option("--secret", help="The dataset's truth is not to be told: not exported, not used by check.")
+    bool, typer.Option("--secret", help="The dataset's truth is secret: not exported, and not used by check.")
 ]
 
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
@@ -106,7 +118,7 @@ def template(
     track: Track,
     data: Data = None,
     seed_file: Secret = None,
-    out: Annotated[Path | None, typer.Option(help="New folder for it; needed where pictures are asked.")] = None,
+    out: Annotated[Path | None, typer.Option(help="New folder for it; needed on tracks of pictures.")] = None,
 ) -> None:
     """Print a file of predictions that is in order: fill in your own."""
     import tempfile
@@ -116,7 +128,7 @@ def template(
     split = split_of(track, data, seed_file)
     if out is None:
         if split.track.pictures:
-            raise RsbenchError(f"--out: the track {track!r} asks for pictures; name a new folder for the example")
+            raise RsbenchError(f"--out: the track {track!r} needs pictures; name a new folder for the example")
         with tempfile.TemporaryDirectory() as folder:
             write_template(split, path := Path(folder) / "predictions.jsonl")
             echo(path.read_text("utf-8"), nl=False)
@@ -130,7 +142,7 @@ def template(
 
 @board_app.command()
 def check(file: _File, data: Data = None, seed_file: Secret = None, secret: Hidden = False) -> None:
-    """Say all that is wrong with a file of predictions. Exit code 2: it cannot be scored; 1: it can, but look."""
+    """List all faults of a file of predictions. Exit code 2: it cannot be scored; 1: it can, but has notes."""
     from rsbench.benchmark.leaderboard.submissions import check_submission
 
     found = check_submission(file, split_of(_track_of(file), data, seed_file, secret))
@@ -317,6 +329,68 @@ def rescore(
         raise typer.Exit(1)
 
 
+@board_app.command(epilog=SMOKE_EPILOG)
+def smoke(
+    stored: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the stored scores.")] = Path(
+        "results/leaderboard/smoke"
+    ),
+    track: Annotated[list[str] | None, typer.Option(help="Only this track; repeatable. Default: all.")] = None,
+    entry: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this entry; repeatable. Default: all of our solvers on points, a few of the others.",
+            autocompletion=complete("solvers"),
+        ),
+    ] = None,
+    problems: Annotated[
+        int | None, typer.Option(min=1, help="Only the first ones; default: 6 of points, all 3 of the others.")
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="The dataset leaderboard-smoke, if you have it. Default: render it."),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    write: Annotated[bool, typer.Option("--write", help="Store the scores instead of comparing.")] = False,
+) -> None:
+    """Run a few entries of each track on small problems again, and name each score that is not the stored one.
+
+    Exit code 1: there is one.
+    """
+    import os
+
+    from rsbench.benchmark.leaderboard import smoke as smoke_run
+    from rsbench.cli.console import progress_bar
+    from rsbench.storage.files import check_out
+
+    jobs = smoke_run.chosen_jobs(track, entry)
+    tracks = list(dict.fromkeys(job.track for job in jobs))
+    if write:
+        check_out(stored)
+    known = {} if write else {name: smoke_run.read_scores(stored, name) for name in tracks}
+    with smoke_run.smoke_frames(data, tracks, problems, progress_bar, lambda line: echo(line, err=True)) as folder:
+        count = workers or min(os.cpu_count() or 1, len(jobs))
+        with progress_bar("smoke", len(jobs)) as step:
+            found = smoke_run.run_smoke(jobs, folder, problems, count, step)
+        frames = {} if folder is None else smoke_run.hashes_of_frames(folder)
+    if write:
+        for path in smoke_run.store_scores(stored, found, frames, "rsbench leaderboard smoke --write"):
+            echo(f"scores: {path}")
+        return
+    lines = list[str]()
+    for name, scores in found.items():
+        others = list[str]() if name == "points" else smoke_run.other_frames(stored, name, frames)
+        if others:
+            echo(f"note: {name}: other frames than those of the stored scores: {', '.join(others)}")
+        lines += smoke_run.differences(name, scores, known[name], others)
+    for line in lines:
+        echo(line)
+    answers = sum(len(scores) for scores in found.values())
+    entries = sum(scores["method"].nunique() for scores in found.values())
+    echo(f"{answers} answers of {entries} entries of {len(found)} tracks, {len(lines)} differ from {stored}")
+    if lines:
+        raise typer.Exit(1)
+
+
 # Of the keeper of a board
 
 
@@ -481,10 +555,6 @@ def _number(value: float) -> str:
 
 
 def register(app: typer.Typer) -> None:
-    from rsbench.cli.leaderboard_smoke import EPILOG as SMOKE
-    from rsbench.cli.leaderboard_smoke import smoke
-
-    board_app.command(epilog=SMOKE)(smoke)
     app.add_typer(
         board_app,
         name="leaderboard",

@@ -26,8 +26,8 @@ _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
     """Run what has not run, score, add the oracles, and publish; entries of others on that board are shown too."""
-    from rsbench.cli.leaderboard import oracles, run
-    from rsbench.cli.leaderboard_smoke import own_solvers, smoke
+    from rsbench.benchmark.leaderboard.smoke import own_solvers
+    from rsbench.cli.leaderboard import oracles, run, smoke
 
     board = data / BOARD
     run("points", own_solvers(), str(board), workers=workers or os.cpu_count() or 1)
@@ -87,7 +87,7 @@ def entries_of_frames() -> dict[str, list[str]]:
 
     ``readout`` has those that look for a ratio: the maximum-likelihood ones of both cameras, which it takes alone.
     """
-    from rsbench.cli.leaderboard_smoke import own_solvers
+    from rsbench.benchmark.leaderboard.smoke import own_solvers
     from rsbench.components.plugins import Kind, offers
     from rsbench.vision.corrector import CORRECTORS, load_corrector
     from rsbench.vision.stereo_matcher import STEREO_MATCHERS

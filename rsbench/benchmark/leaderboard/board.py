@@ -1,10 +1,10 @@
 """A board: a folder of scored entries, kept with their predictions, that two people can merge.
 
-    board.json                                    the format
-    <protocol>/<split>/split.json                 which split it is; facts of its problems where those are public
+    board.json                                    the format <protocol>/<split>/split.json                 which
+    split it is; facts of its problems where those are public
     <protocol>/<split>/entries/<method>/predictions.jsonl, scores.csv, entry.json
-    <protocol>/<split>/entries/<method>/pictures/<problem>/NAME   depth maps or corrected frames, where asked
-    <protocol>/<split>/entries/<method>/matches/NAME              matches of its own, where it has some
+    <protocol>/<split>/entries/<method>/pictures/<problem>/NAME   depth maps or corrected frames, on tracks of
+    pictures <protocol>/<split>/entries/<method>/matches/NAME              matches of its own, where it has some
 
 An entry is written under another name and renamed, so that it is there whole or not at all.
 """
@@ -42,17 +42,17 @@ from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
 RUN = "rsbench leaderboard run"
-"""Entries that were made by it may be made again; what people handed in is not replaced in silence."""
+"""Its entries may be made again; submitted ones are never replaced silently."""
 ORACLES = "rsbench leaderboard oracles"
 OWN = (RUN, ORACLES)
-"""Commands whose entries a board makes itself."""
+"""Commands that make entries without a submission."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
-"""Of an entry; the last one says of the others what they are."""
+"""Of an entry; the last one describes the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """What entry.json must hold; it holds more."""
+    """The keys of entry.json that are read."""
 
     format: int
     header: Header
@@ -62,16 +62,16 @@ class Recorded:
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
     doubt: str = ""
-    """Why it is not believed, see ``doubt.doubt_about``; empty where nothing speaks against it."""
+    """Why it is in doubt, see ``doubt.doubt_about``; empty where it is not."""
     accepted: str = ""
-    """Why the keeper of the board ranks it all the same."""
+    """Why the keeper of the board ranks it although it is in doubt."""
     made: dict[str, Any] = field(default_factory=dict)
-    """How it came about; ``command`` tells."""
+    """By which ``command``, version and machine it was made."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class About:
-    """What split.json must hold; it holds more."""
+    """The keys of split.json that are read."""
 
     protocol: str
     split: str
@@ -94,7 +94,7 @@ class Scored:
     doubt: str
     """Why it has no rank; empty where it has one."""
     handed_in: bool
-    """Whether the answers came as a file; else the board ran the method itself."""
+    """Whether the answers were submitted as a file; otherwise the board ran the method itself."""
 
 
 def made_by(board: Path, split: Split, method: str) -> str:
@@ -107,7 +107,7 @@ def made_by(board: Path, split: Split, method: str) -> str:
 
 
 def move_entry(new: Path, folder: Path) -> None:
-    """Rename what was made aside to its place; what was there goes aside."""
+    """Rename a finished entry from its work folder to its place; the old one is moved into the work folder."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.is_symlink() or folder.exists():
         os.replace(folder, new.with_name(f"{new.name}~"))  # no name of an entry
@@ -209,7 +209,7 @@ def entries_of(board: Path, protocol: str, split: str) -> list[Scored]:
 
 
 def _folders(folder: Path) -> Iterator[Path]:
-    """Folders below one whose names can be those of ours, sorted; links are none."""
+    """Folders below one that have valid names, sorted; links are left out."""
     if folder.is_dir() and not folder.is_symlink():
         for path in sorted(folder.iterdir()):
             if NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
@@ -231,7 +231,7 @@ def read_entry(folder: Path) -> Scored:
 
 
 def _read_record(folder: Path) -> Recorded:
-    """What an entry says of itself, which must be true of where it lies and of its predictions."""
+    """The record of an entry, checked against its folder and its predictions."""
     for name in FILES:
         if (folder / name).is_symlink() or not (folder / name).is_file():
             raise RsbenchError(
@@ -268,7 +268,7 @@ def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
 
 
 def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> None:
-    """Raises RsbenchError where the SHA-256 ``found`` of an entry's files are not those that it says."""
+    """Raises RsbenchError where the SHA-256 ``found`` of an entry's files are not the recorded ones."""
     for name, digest in files.items():
         if found[name] != digest:
             raise RsbenchError(
@@ -292,7 +292,7 @@ def rescore(
     with work_folder(board):
         folders = list(_folders(place(board, split.track.id, split.name) / "entries"))
         stored = [_stored(folder, split) for folder in folders]
-        for folder, scores in zip(folders, split.track.mark(stored, split, workers, step), strict=True):
+        for folder, scores in zip(folders, split.track.mark(stored, split, workers, step, None), strict=True):
             if isinstance(scores, RsbenchError):
                 raise scores
             old = pd.DataFrame()
@@ -307,7 +307,7 @@ def rescore(
 
 
 def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> str:
-    """Rank an entry that is in doubt, because the keeper of the board says so; returns the doubt.
+    """Rank an entry that is in doubt, by decision of the board's keeper; returns the doubt.
 
     Raises:
         RsbenchError: there is no such entry, or nothing speaks against it.
@@ -371,12 +371,12 @@ def add(
     """Score a file of predictions and keep both.
 
     Args:
-        made: how it came about, for entry.json.
+        made: provenance for entry.json.
         replace: whether an entry of that name may be replaced.
         workers, step: see ``Track.mark``.
 
     Raises:
-        RsbenchError: the file is at fault; an entry of that name has other predictions; the board cannot be
+        RsbenchError: the file has a fault; an entry of that name has other predictions; the board cannot be
             written, or another command is at work there.
     """
     (scored,) = add_all(
@@ -395,7 +395,7 @@ def add_all(
     workers: Workers = 1,
     step: Step = lambda word: None,
 ) -> list[Scored]:
-    """``add`` for several files, which share what is found of the truth; ``replace`` is asked by the method.
+    """``add`` for several files, which share what is found of the truth; ``replace`` decides by the method's name.
 
     Raises:
         RsbenchError: as ``add``; where there are other files, after they are on the board.
@@ -465,7 +465,7 @@ def _record(taken: _Taken, split: Split, made: dict[str, Any]) -> dict[str, Any]
 
 
 def _put(taken: _Taken, scores: pd.DataFrame, record: dict[str, Any], entries: Path) -> Scored:
-    """Write an entry aside, and rename it to its place."""
+    """Write an entry into a work folder, and rename it to its place."""
     new, folder = taken.submission.folder, entries / taken.submission.header.method
     new.mkdir(parents=True, exist_ok=True)
     write_bytes(new / FILES[0], taken.data)
@@ -475,13 +475,13 @@ def _put(taken: _Taken, scores: pd.DataFrame, record: dict[str, Any], entries: P
     return read_entry(folder)
 
 
-# Merge two boards.
+# Merging
 
 
 def merge(other: Path, board: Path) -> list[str]:
     """Copy the entries of another board that are not here yet; returns what was copied.
 
-    Scores are copied as they are: ``rescore`` tells whether the truth agrees. What the keeper of the other board
+    Scores are copied as they are: ``rescore`` checks them against the truth. What the keeper of the other board
     accepted is in doubt again: the keeper of this one decides.
 
     Raises:
@@ -492,7 +492,7 @@ def merge(other: Path, board: Path) -> list[str]:
         for protocol, split in splits_of(other)
         for scored in entries_of(other, protocol, split)
     ]
-    told = {scored.folder.parents[1]: about_split(scored.folder.parents[1]) for scored, _ in theirs}
+    splits = {scored.folder.parents[1]: about_split(scored.folder.parents[1]) for scored, _ in theirs}
     copied = []
     with work_folder(board) as hidden:
         open_board(board)
@@ -505,7 +505,7 @@ def merge(other: Path, board: Path) -> list[str]:
                 about = folder.parents[1] / "split.json"
                 if not about.exists():
                     about.parent.mkdir(parents=True, exist_ok=True)
-                    write_json(about, asdict(told[scored.folder.parents[1]]))
+                    write_json(about, asdict(splits[scored.folder.parents[1]]))
                 move_entry(new, folder)
                 copied.append("/".join(folder.parts[-4:-2]) + f"/{folder.name}")
     return copied
@@ -521,7 +521,7 @@ def _copy(scored: Scored, new: Path) -> None:
     check_files(scored.folder, scored.files, copy_files(scored.folder, scored.files, new))
 
 
-# Predictions of a board's entries, compressed, so that anybody can score them again without running a method.
+# Stored predictions: compressed, so that anybody can score them again without running a method
 
 SUFFIX = ".jsonl.xz"
 

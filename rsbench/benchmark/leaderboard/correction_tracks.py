@@ -76,16 +76,16 @@ _WORST_FRAME: Numbers = {
     "ssim_uniform": 0.0,
 }
 _SMALLER = 0.25
-"""The squared error of another reading must be below this part of that of what stands there."""
+"""A mistake is noted where undoing it reduces the squared error below this share."""
 _FRAMES = (
-    Score(key="ssim", title="SSIM", hint="of the common pixels, at least 0", kind="share", better="higher"),
-    Score(key="ssim_covered", title="SSIM covered", hint="of what it drew itself", kind="share", better="higher"),
-    Score(key="ssim_all", title="SSIM all", hint="of the whole image", kind="share", better="higher"),
-    Score(key="coverage", title="drawn", hint="share of the common pixels drawn", kind="share", better="higher"),
+    Score("ssim", "SSIM", "of the common pixels, at least 0", "share", "higher"),
+    Score("ssim_covered", "SSIM covered", "of what it drew itself", "share", "higher"),
+    Score("ssim_all", "SSIM all", "of the whole image", "share", "higher"),
+    Score("coverage", "drawn", "share of the common pixels drawn", "share", "higher"),
     FAILED,
-    Score(key="psnr", title="PSNR (dB)", hint="median, of the common pixels", kind="median", better="higher"),
+    Score("psnr", "PSNR (dB)", "median, of the common pixels", "median", "higher"),
     *(
-        Score(key=f"psnr_{part}", title=f"PSNR {part}", hint=words, kind="median", better="higher")
+        Score(f"psnr_{part}", f"PSNR {part}", words, "median", "higher")
         for part, words in (
             ("covered", "of what it drew itself"),
             ("all", "of the whole image"),
@@ -94,23 +94,19 @@ _FRAMES = (
         )
     ),
     *(
-        Score(key=f"flip_{part}", title=f"FLIP {part}", hint=f"median, of {words}", kind="median")
+        Score(f"flip_{part}", f"FLIP {part}", f"median, of {words}", "median")
         for part, words in (("common", "the common pixels"), ("covered", "what it drew"), ("all", "all pixels"))
     ),
-    Score(key="epe_px", title="EPE (px)", hint="median flow to the truth, common and drawn pixels", kind="median"),
+    Score("epe_px", "EPE (px)", "median flow to the truth, common and drawn pixels", "median"),
     Score(
-        key="ssim_deepunroll",
-        title="SSIM DeepUnrollNet",
-        hint="of the whole image as DeepUnrollNet, RSSR, CVR and QRSC compute it",
-        kind="median",
-        better="higher",
+        "ssim_deepunroll",
+        "SSIM DeepUnrollNet",
+        "of the whole image as DeepUnrollNet, RSSR, CVR and QRSC compute it",
+        "median",
+        "higher",
     ),
     Score(
-        key="ssim_uniform",
-        title="SSIM uniform",
-        hint="of the whole image with scikit-image's default window",
-        kind="median",
-        better="higher",
+        "ssim_uniform", "SSIM uniform", "of the whole image with scikit-image's default window", "median", "higher"
     ),
     SECONDS,
 )
@@ -333,10 +329,10 @@ def _mistakes(
         "red and blue are swapped; PNG files hold RGB": image[..., ::-1],
         "it is upside down": image[::-1],
         "it is mirrored": image[:, ::-1],
-        "it stands a row too low": np.roll(image, -1, axis=0),
-        "it stands a row too high": np.roll(image, 1, axis=0),
-        "it stands a column too far right": np.roll(image, -1, axis=1),
-        "it stands a column too far left": np.roll(image, 1, axis=1),
+        "it is a row too low": np.roll(image, -1, axis=0),
+        "it is a row too high": np.roll(image, 1, axis=0),
+        "it is a column too far right": np.roll(image, -1, axis=1),
+        "it is a column too far left": np.roll(image, 1, axis=1),
     }
     for words, reading in readings.items():
         if _squared(reading, truth) < limit:
@@ -363,7 +359,7 @@ def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
 # by as much as a corrected frame is off; nor would phase correlation, which undoes the blur.
 
 LIMIT_PX = 2.0
-"""A window that stands farther off has no part in the score."""
+"""A window that is farther off scores 0."""
 WINDOW_PX, _STEP_PX, _REACH_PX = 64, 32, 4
 """Side of a window, from one to the next, and how far it is looked for."""
 _BLUR_PX = 3.0
@@ -373,7 +369,7 @@ _LOOK_PX = 2.0
 _LOOK_CONSTANTS = 0.1
 """Factor of SSIM's constants: the blur takes contrast away, and beside the whole ones a tenth of it would do."""
 _TEXTURE = 5.0
-"""Grey levels by which the truth must deviate around a pixel that counts: elsewhere nothing tells where it is."""
+"""Grey levels by which the truth must deviate around a pixel that counts: elsewhere its place cannot be found."""
 _LEAST = 0.25
 """Share of a window's pixels that must count."""
 
@@ -528,7 +524,7 @@ class OneCameraTrack(CorrectionTrack):
 
 
 def _needs_rig(spec: CorrectorSpec) -> bool:
-    """Whether a corrector asks for more than one camera: for depth, or by itself for frames of the other one."""
+    """Whether a corrector needs both cameras: for depth, or for frames of the other one."""
     return "depth" in spec.needs or ("stereo" in spec.sees and not spec.needs & {"motion", "matches"})
 
 
@@ -574,11 +570,11 @@ _ONE_CAMERA: dict[str, Any] = _RIG | {
 }
 _SSIM: dict[str, Any] = {"error": "error", "error_title": "1 - SSIM"}
 _PLACED = Score(
-    key="placed",
-    title="placed",
-    hint="1 where textured common pixels stand right, 0 from 2 px on and where they are not drawn",
-    kind="share",
-    better="higher",
+    "placed",
+    "placed",
+    "1 where textured common pixels stand right, 0 from 2 px on and where they are not drawn",
+    "share",
+    "higher",
 )
 _WITHOUT_FLIP = tuple(score for score in _FRAMES if not score.key.startswith("flip_"))
 TRACKS: tuple[Track, ...] = (
@@ -589,19 +585,19 @@ TRACKS: tuple[Track, ...] = (
         title="Corrected frames, by where things stand and how they look",
         scores=(
             Score(
-                key="corrected",
-                title="placed x picture",
-                hint="the product of the two: what stands in its place and looks like the scene there",
-                kind="share",
-                better="higher",
+                "corrected",
+                "placed x picture",
+                "the product of the two: what stands in its place and looks like the scene there",
+                "share",
+                "higher",
             ),
             _PLACED,
             Score(
-                key="picture",
-                title="picture",
-                hint="SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
-                kind="share",
-                better="higher",
+                "picture",
+                "picture",
+                "SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
+                "share",
+                "higher",
             ),
             *_WITHOUT_FLIP,
         ),

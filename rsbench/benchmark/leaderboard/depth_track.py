@@ -56,31 +56,21 @@ _NEAR = 0.1
 _RIGHT = 0.01
 """Depth that is so near needs no other reading."""
 _SMALLER = 0.25
-"""Another reading's error must be below this part of that of what stands there."""
+"""A mistake is noted where undoing it reduces the error below this share."""
 _FAR_M = 300.0
 """A larger median depth is hardly in metres."""
 _DEPTH = (
-    Score(
-        key="bad_1",
-        title="bad@1",
-        hint="share of surface wrong by over 1 px of disparity or unknown",
-        kind="share",
-    ),
-    *(
-        Score(key=f"bad_{limit}", title=f"bad@{limit}", hint=f"the same beyond {limit} px", kind="share")
-        for limit in (2, 3)
-    ),
-    Score(key="bad_1_visible", title="bad@1 visible", hint="bad@1 of what the right camera sees", kind="share"),
-    Score(key="bad_1_occluded", title="bad@1 occluded", hint="bad@1 of what it does not see", kind="share"),
-    Score(key="coverage", title="known", hint="share of surface with a depth", kind="share", better="higher"),
-    Score(key="on_sky", title="on sky", hint="share of pixels without a surface that have a depth", kind="share"),
+    Score("bad_1", "bad@1", "share of surface wrong by over 1 px of disparity or unknown", "share"),
+    *(Score(f"bad_{limit}", f"bad@{limit}", f"the same beyond {limit} px", "share") for limit in (2, 3)),
+    Score("bad_1_visible", "bad@1 visible", "bad@1 of what the right camera sees", "share"),
+    Score("bad_1_occluded", "bad@1 occluded", "bad@1 of what it does not see", "share"),
+    Score("coverage", "known", "share of surface with a depth", "share", "higher"),
+    Score("on_sky", "on sky", "share of pixels without a surface that have a depth", "share"),
     FAILED,
-    Score(key="abs_rel", title="AbsRel", hint="median of the mean relative error, where known", kind="median"),
-    Score(
-        key="rmse_m", title="RMSE (m)", hint="median of the root mean squared error, where known", kind="median"
-    ),
+    Score("abs_rel", "AbsRel", "median of the mean relative error, where known", "median"),
+    Score("rmse_m", "RMSE (m)", "median of the root mean squared error, where known", "median"),
     *(
-        Score(key=f"{key}_{part}", title=f"{title} {part}", hint=f"{title} of the {part} part", kind="median")
+        Score(f"{key}_{part}", f"{title} {part}", f"{title} of the {part} part", "median")
         for part in ("visible", "occluded")
         for key, title in (("abs_rel", "AbsRel"), ("rmse_m", "RMSE"))
     ),
@@ -252,26 +242,30 @@ def _mistakes(depth: NDArray[np.float32], pictures: TruePictures) -> Iterator[st
     both = (depth > 0.0) & (true > 0.0)
     if not np.any(both):
         return
-    given, z, product = depth[both].astype(np.float64), true[both].astype(np.float64), rig.camera.fx * rig.baseline
-    stands = _error(given, z)
-    if stands < _RIGHT:
+    submitted, z, product = (
+        depth[both].astype(np.float64),
+        true[both].astype(np.float64),
+        rig.camera.fx * rig.baseline,
+    )
+    error = _error(submitted, z)
+    if error < _RIGHT:
         return
     readings: dict[str, Callable[[], FloatArray]] = {
-        "it is in millimetres; depth is in metres": lambda: given / 1000.0,
-        "it is in centimetres; depth is in metres": lambda: given / 100.0,
-        "it is disparity in px; depth is fx * baseline / disparity": lambda: product / given,
-        "it is inverse depth, 1 / m, not depth": lambda: 1.0 / given,
-        "it is the distance along the ray; depth is z of the camera": lambda: given / along[both],
+        "it is in millimetres; depth is in metres": lambda: submitted / 1000.0,
+        "it is in centimetres; depth is in metres": lambda: submitted / 100.0,
+        "it is disparity in px; depth is fx * baseline / disparity": lambda: product / submitted,
+        "it is inverse depth, 1 / m, not depth": lambda: 1.0 / submitted,
+        "it is the distance along the ray; depth is z of the camera": lambda: submitted / along[both],
     }
     for words, reading in readings.items():
-        if _error(reading(), z) < min(_NEAR, _SMALLER * stands):
+        if _error(reading(), z) < min(_NEAR, _SMALLER * error):
             yield words
             return
     before = sequence.depth("rs", "left", 0)
     there = (depth > 0.0) & (before > 0.0)
-    if _error(depth[there].astype(np.float64), before[there].astype(np.float64)) < _SMALLER * stands:
+    if _error(depth[there].astype(np.float64), before[there].astype(np.float64)) < _SMALLER * error:
         yield "it is that of frame 0, not of frame 1"
-    elif _error(given * np.median(z / given), z) < min(_NEAR, _SMALLER * stands):
+    elif _error(submitted * np.median(z / submitted), z) < min(_NEAR, _SMALLER * error):
         yield "it is right up to a factor; depth is in metres"
 
 

@@ -1,4 +1,5 @@
-"""Entries nearer to the truth than their data allow are marked, and have no rank until the board's keeper says so.
+"""Entries nearer to the truth than their data allow are in doubt: they have no rank until the board's keeper
+accepts.
 
 Two signs: an error that is exact in a tenth of the problems, and errors below what the Cramer-Rao bound of the
 data that a method names allows. An unbiased method errs by less than the median at the bound in at most half of
@@ -21,7 +22,7 @@ from rsbench.components.cards import list_cards
 from rsbench.core.errors import RsbenchError
 
 COVERAGE = 0.999
-"""Of the interval that must leave out one half: one honest method in two thousand at the bound is asked about."""
+"""Of the interval that must leave out one half: one honest method in two thousand at the bound is put in doubt."""
 _EXACT_SHARE = 0.1
 """Of the problems in which an error of a method may be exact but for rounding."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
@@ -35,7 +36,7 @@ def outline(name: str) -> str:
 
 
 def refuse_reserved(header: Header, where: str) -> None:
-    """What comes from outside takes neither the name of a method of rsbench nor the truth.
+    """A submission uses neither the name of a method of rsbench nor the truth.
 
     Raises:
         RsbenchError: the name reads like one of rsbench's own, or ``uses`` names the truth.

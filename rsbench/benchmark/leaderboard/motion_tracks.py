@@ -120,34 +120,28 @@ _LARGEST_PX = 1e6
 _MOTION = (
     *(
         Score(
-            key=f"auc_{limit}",
-            title=f"AUC@{limit}",
-            hint=f"area under the curve of max(e_R, e_T) to {limit} deg",
-            kind="share",
-            better="higher",
+            f"auc_{limit}",
+            f"AUC@{limit}",
+            f"area under the curve of max(e_R, e_T) to {limit} deg",
+            "share",
+            "higher",
         )
         for limit in (5, 1, 10)
     ),
-    Score(
-        key="within", title="success", hint="share with e_R < 1 deg and e_T < 5 deg", kind="share", better="higher"
-    ),
-    Score(key="flip", title="flips", hint="share with e_T above 90 deg", kind="share"),
+    Score("within", "success", "share with e_R < 1 deg and e_T < 5 deg", "share", "higher"),
+    Score("flip", "flips", "share with e_T above 90 deg", "share"),
     FAILED,
-    Score(key="e_R_deg", title="e_R (deg)", hint="median angle of the rotation", kind="median"),
-    Score(key="e_T_deg", title="e_T (deg)", hint="median angle of the translation", kind="median"),
-    Score(key="e_row_deg", title="e_row (deg)", hint="median of the largest angle of a row's pose", kind="median"),
-    Score(key="e_s", title="e_s", hint="median |log| of the length, where metres are claimed", kind="median"),
-    Score(key="metres", title="metres", hint="median distance of d from the truth, where claimed", kind="median"),
+    Score("e_R_deg", "e_R (deg)", "median angle of the rotation", "median"),
+    Score("e_T_deg", "e_T (deg)", "median angle of the translation", "median"),
+    Score("e_row_deg", "e_row (deg)", "median of the largest angle of a row's pose", "median"),
+    Score("e_s", "e_s", "median |log| of the length, where metres are claimed", "median"),
+    Score("metres", "metres", "median distance of d from the truth, where claimed", "median"),
     SECONDS,
 )
 _OWN_MATCHES = (
-    Score(key="matches", title="matches", hint="median number of own matches", kind="median", better="higher"),
+    Score("matches", "matches", "median number of own matches", "median", "higher"),
     Score(
-        key="matches_1px",
-        title="right matches",
-        hint="median share of own matches within 1 px of the truth",
-        kind="median",
-        better="higher",
+        "matches_1px", "right matches", "median share of own matches within 1 px of the truth", "median", "higher"
     ),
 )
 
@@ -231,12 +225,7 @@ class SolverTrack(Track):
         return rows
 
     def mark(
-        self,
-        submissions: Sequence[Submission],
-        split: Split,
-        workers: Workers = 1,
-        step: Step = lambda word: None,
-        kept: Path | None = None,
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
     ) -> list[pd.DataFrame | RsbenchError]:
         return [pd.DataFrame(self.rows(submission, split)) for submission in submissions]
 
@@ -420,7 +409,7 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
         tracks, motion = problem.correspondences.tracks, smooth(draws.motion(seed, number))
         given = Correspondences(left=track_pairs(tracks, "left")) if seen == "left" else problem.correspondences
         bound = motion_bound(given, problem.rig, problem.shutter, motion, noise_px, views)
-        if seen == "left":  # one camera tells the direction of its own translation, not that of the body
+        if seen == "left":  # one camera determines the direction of its own translation, not the body's
             bound = bound_of_point(bound, motion, problem.rig.offset("left"))
         bounds.append(bound)
     return medians_of(bounds)
@@ -691,20 +680,16 @@ TRACKS: tuple[Track, ...] = (
         inputs=SimulatedPoints(POINTS_2),
         scores=(
             Score(
-                key="near_bound",
-                title="near bound",
-                hint="1 where e_R and e_T are at the Cramer-Rao bound, 0 from 100 times that on; mean of both",
-                kind="share",
-                better="higher",
+                "near_bound",
+                "near bound",
+                "1 where e_R and e_T are at the Cramer-Rao bound, 0 from 100 times that on; mean of both",
+                "share",
+                "higher",
             ),
-            Score(key="near_R", title="near in R", hint="the same of e_R alone", kind="share", better="higher"),
-            Score(key="near_T", title="near in T", hint="the same of e_T alone", kind="share", better="higher"),
-            Score(
-                key="over_R", title="e_R / bound", hint="median of e_R over its median at the bound", kind="median"
-            ),
-            Score(
-                key="over_T", title="e_T / bound", hint="median of e_T over its median at the bound", kind="median"
-            ),
+            Score("near_R", "near in R", "the same of e_R alone", "share", "higher"),
+            Score("near_T", "near in T", "the same of e_T alone", "share", "higher"),
+            Score("over_R", "e_R / bound", "median of e_R over its median at the bound", "median"),
+            Score("over_T", "e_T / bound", "median of e_T over its median at the bound", "median"),
             *_SHOWN_TOO,
         ),
         more_columns=_add_bound_columns,
@@ -725,20 +710,10 @@ TRACKS: tuple[Track, ...] = (
         title="Motion from given matches of rendered frames, under several laws of motion",
         scores=(
             Score(
-                key="auc_apart",
-                title="AUC apart",
-                hint="mean of AUC of e_R to 0.1 deg and of e_T to 1 deg",
-                kind="share",
-                better="higher",
+                "auc_apart", "AUC apart", "mean of AUC of e_R to 0.1 deg and of e_T to 1 deg", "share", "higher"
             ),
             *(
-                Score(
-                    key=key,
-                    title=title,
-                    hint=f"area under the curve of {title[4:]}",
-                    kind="share",
-                    better="higher",
-                )
+                Score(key, title, f"area under the curve of {title[4:]}", "share", "higher")
                 for key, title in (("auc_R", "AUC e_R to 0.1 deg"), ("auc_T", "AUC e_T to 1 deg"))
             ),
             *_SHOWN_TOO,

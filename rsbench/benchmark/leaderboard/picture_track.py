@@ -216,12 +216,7 @@ class PictureTrack(Track):
     # Scores
 
     def mark(
-        self,
-        submissions: Sequence[Submission],
-        split: Split,
-        workers: Workers = 1,
-        step: Step = lambda word: None,
-        kept: Path | None = None,
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
     ) -> list[pd.DataFrame | RsbenchError]:
         marked, names = dict[str, list[Row | str]](), list(split.by_name)
         for name in names:

@@ -1,7 +1,7 @@
 """Secret test splits of rendered frames: inputs for everybody, a commitment, and the truth from the secret text.
 
 Announced are a hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset. So
-whoever is told the text afterwards can see that it is the announced one, that it makes the same motions, and, by
+whoever gets the text afterwards can see that it is the announced one, that it makes the same motions, and, by
 rendering again, the same frames and depth.
 """
 
@@ -35,7 +35,7 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Announcement:
-    """What is told of a secret split before anybody hands in."""
+    """What is published of a secret split before anybody submits."""
 
     format: int
     card: str
@@ -55,8 +55,8 @@ class Announcement:
 
 
 def secret_of(track: Track, text: Secret) -> Secret:
-    """What a split is drawn from. One track asks for the readout ratio, which the inputs of others tell: it has
-    another split."""
+    """What a split is drawn from. A track of the readout ratio has a split of its own,
+    because the inputs of other tracks reveal the ratio."""
     return text if track.gives_readout else Secret(text.digest("track", track.name).hex())
 
 
@@ -64,7 +64,7 @@ def drawn_split(track: Track, card: str, text: Secret) -> Split:
     """The split that ``publish`` makes, from the text alone; nothing is rendered.
 
     Raises:
-        RsbenchError: as ``secret_card``; or the track asks for what only rendering tells.
+        RsbenchError: as ``secret_card``; or the truth of the track has to be rendered.
     """
     if track.pictures or track.inputs.whole:
         raise RsbenchError(f"track {track.name!r}: its truth is rendered; name the keeper's folder with --keep")

@@ -51,16 +51,16 @@ _WORST = 1.0
 _READOUT = (
     *(
         Score(
-            key=key,
-            title=f"AUC@{limit:g}",
-            hint=f"area under the curve of the error of the readout ratio to {limit:g}",
-            kind="share",
-            better="higher",
+            key,
+            f"AUC@{limit:g}",
+            f"area under the curve of the error of the readout ratio to {limit:g}",
+            "share",
+            "higher",
         )
         for key, limit in AUC_READOUT.items()
     ),
     FAILED,
-    Score(key="e_readout", title="error", hint="median error of the readout ratio", kind="median"),
+    Score("e_readout", "error", "median error of the readout ratio", "median"),
     SECONDS,
 )
 
@@ -207,25 +207,14 @@ TRACKS: tuple[Track, ...] = (
         title="Readout ratio with its deviation, drawn for each sequence, from given matches of rendered frames",
         scores=(
             Score(
-                key="skill",
-                title="skill",
-                hint="1 - CRPS over that of knowing only how the ratios are spread: 1 exact, 0 a refusal",
-                kind="mean",
-                better="higher",
+                "skill",
+                "skill",
+                "1 - CRPS over that of knowing only how the ratios are spread: 1 exact, 0 a refusal",
+                "mean",
+                "higher",
             ),
-            Score(
-                key="right",
-                title="right",
-                hint="share of problems with a ratio within 0.1",
-                kind="share",
-                better="higher",
-            ),
-            Score(
-                key="wrong",
-                title="wrong",
-                hint="share of problems with a ratio off by more than 0.1",
-                kind="share",
-            ),
+            Score("right", "right", "share of problems with a ratio within 0.1", "share", "higher"),
+            Score("wrong", "wrong", "share of problems with a ratio off by more than 0.1", "share"),
             *(score for score in _READOUT if score.key != "auc_r02"),
         ),
         beside=("right", "wrong", "failure"),

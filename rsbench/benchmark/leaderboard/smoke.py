@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import math
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -18,31 +18,37 @@ from rsbench.benchmark.leaderboard.inputs import prepare_inputs
 from rsbench.benchmark.leaderboard.running import run_cards
 from rsbench.benchmark.leaderboard.splits import FEATURES
 from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
-from rsbench.benchmark.leaderboard.track import ORACLE, Split, mark
-from rsbench.benchmark.leaderboard.tracks import TRACKS
+from rsbench.benchmark.leaderboard.track import ORACLE, Row, Split, mark
+from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_name
+from rsbench.benchmark.provenance import provenance
+from rsbench.components.plugins import offers
 from rsbench.core.errors import RsbenchError
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset_manifest
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.storage.files import read_table
+from rsbench.renderers.backend import start_backend
+from rsbench.solvers.engine.base import BESIDE, SOLVERS, load_solver_entry
+from rsbench.storage.files import read_table, write_json, write_table
 
 CARD = "leaderboard-smoke"
 """The dataset's, for the tracks of frames."""
 ENTRIES = {track.name: track.smoke for track in TRACKS.values() if track.inputs.rendered and track.smoke}
 """By track of frames."""
 PROBLEMS = 6
-"""Of points; a minute for all solvers of ours."""
+"""Of points; a minute for all of rsbench's solvers."""
 _NAMES = ("method", "problem", "success")
 _SAME, _NOTHING = 1e-4, 1e-7
 """Relative and absolute difference of equal scores. The same code on the same machine gives the same digits; a
 processor that sums in another order changes the last ones, and now and then a choice of RANSAC: with OpenBLAS and
-Numba told to use no AVX, 113 of 114 answers agreed so far, and one was another."""
+Numba set to use no AVX, 113 of 114 answers agreed so far, and one differed."""
 OTHER_FRAMES = 0.15
 """Relative difference of equal scores where the frames are others: twice the largest that was seen. Rendered
 with AVX2 in place of AVX-512, up to 0.09 % of the values of these frames were others, by up to 26 codes, and no
 depth: 56 of 57 answers kept their scores to 7.3 %. One, of the corrector zhuang, was better by 4 dB, by another
 choice of RANSAC."""
-Row = dict[str, Any]
+Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
 
 class Job(NamedTuple):
@@ -61,8 +67,63 @@ def file_of(track: str) -> str:
 
 
 def record_of(track: str) -> str:
-    """Where is stored how they came about."""
+    """Where their provenance is stored."""
     return "provenance.json" if track == "points" else f"{track}.json"
+
+
+def own_solvers() -> list[str]:
+    """Names of the solvers that come with rsbench and need no more than ``points`` gives, each once."""
+    own = [offer.name for offer in offers(SOLVERS) if offer.origin == "rsbench"]
+    return [name for name in own if not BESIDE.keys() & load_solver_entry(name).solver.spec.minimum]
+
+
+def chosen_jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[Job]:
+    """Jobs, those that take longest first; of points a job for each solver.
+
+    Raises:
+        RsbenchError: no such track, or an entry that none of the tracks has.
+    """
+    chosen = [track_of_name(track).name for track in dict.fromkeys(tracks or TRACKS)]
+    jobs, taken = list[Job](), set[str]()
+    for track in (*reversed(ENTRIES), "points"):
+        if track not in chosen:
+            continue
+        known = own_solvers() if track == "points" else list(ENTRIES[track])
+        if track == "points" and entries is not None:
+            others = {name for names in ENTRIES.values() for name in names} - set(known)
+            known = [name for name in entries if name not in others]  # cards of anybody
+        names = tuple(name for name in known if entries is None or name in entries)
+        taken |= set(names)
+        jobs += [Job(track, (name,)) for name in names] if track == "points" else [Job(track, names)][: len(names)]
+    if not jobs and entries is None:
+        raise RsbenchError(
+            f"--track {', '.join(chosen)}: has no smoke run; there are: {', '.join(('points', *ENTRIES))}"
+        )
+    for name in entries or ():
+        if name not in taken:
+            raise RsbenchError(f"--entry {name}: is not run on {', '.join(chosen)}")
+    return jobs
+
+
+@contextmanager
+def smoke_frames(
+    data: Path | None, tracks: Collection[str], problems: int | None, bar: Bar, note: Callable[[str], None]
+) -> Iterator[Path | None]:
+    """The dataset of the tracks of frames, if any: ``data``, or rendered into a folder that is removed afterwards.
+
+    ``bar`` makes a progress bar of a title and a number of steps; ``note`` prints a line.
+    """
+    if data is not None or set(tracks) <= {"points"}:
+        yield data
+        return
+    card = load_dataset_card(CARD)
+    card = card.only([sequence.name for sequence in card.sequence[:problems]])
+    if (backend := start_backend()).message:
+        note(backend.message)
+    with tempfile.TemporaryDirectory() as folder:
+        with bar(f"rendering {card.name}", steps_of(card) * len(card.sequence)) as advance:
+            generate_dataset(card, Path(folder) / CARD, progress=advance)
+        yield Path(folder) / CARD
 
 
 def run_smoke(
@@ -89,10 +150,10 @@ def run_smoke(
     """
     rows: dict[str, list[Row]] = {job.track: [] for job in jobs}
     if workers == 1:
-        run = _serve(data, problems)
-        done = ((job, run(job)) for job in jobs)
+        use_one_thread()
+        done = ((job, _rows_of(job, data, problems)) for job in jobs)
     else:
-        done = finished_jobs(_serve_child, jobs, workers, dict.fromkeys(THREAD_VARIABLES, "1"), data, problems)
+        done = finished_jobs(_serve, jobs, workers, dict.fromkeys(THREAD_VARIABLES, "1"), data, problems)
     with closing(done) as found:
         for job, scores in found:
             rows[job.track] += scores
@@ -108,23 +169,17 @@ def _serve(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]
     use_one_thread()
 
     def run(job: Job) -> list[Row]:
-        given = None if job.track == "points" else data
-        table = track_scores(job.track, given, job.entries, problems)
-        return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
+        try:
+            return _rows_of(job, data, problems)
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
 
     return run
 
 
-def _serve_child(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]]:
-    run = _serve(data, problems)
-
-    def run_or_fail(job: Job) -> list[Row]:
-        try:
-            return run(job)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
-
-    return run_or_fail
+def _rows_of(job: Job, data: Path | None, problems: int | None) -> list[Row]:
+    table = track_scores(job.track, None if job.track == "points" else data, job.entries, problems)
+    return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
 
 
 def track_scores(track: str, data: Path | None, entries: Sequence[str], problems: int | None) -> pd.DataFrame:
@@ -176,18 +231,34 @@ def hashes_of_frames(data: Path) -> dict[str, str]:
 
 
 def read_scores(folder: Path, track: str = "points") -> pd.DataFrame:
-    """What ``run_smoke`` gave of a track when it was stored.
+    """What ``run_smoke`` returned for a track when it was stored.
 
     Raises:
-        RsbenchError: it is not there, or damaged.
+        RsbenchError: it is missing or damaged.
     """
-    return read_table(
-        folder / file_of(track), _NAMES, TRACKS[track].smoke_metrics, dtype={"method": str, "problem": str}
-    )
+    path = folder / file_of(track)
+    if not path.is_file():
+        raise RsbenchError(
+            f"{path}: there are no stored scores; a checkout of rsbench has some (--stored names their folder), "
+            "and --write stores those of this code"
+        )
+    return read_table(path, _NAMES, TRACKS[track].smoke_metrics, dtype={"method": str, "problem": str})
+
+
+def store_scores(
+    folder: Path, found: Mapping[str, pd.DataFrame], frames: dict[str, str], command: str
+) -> list[Path]:
+    """Write what ``run_smoke`` returned, with the ``command`` that made it; returns the files of scores."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for track, table in found.items():
+        inputs = {} if track == "points" else {"frames": frames}
+        write_table(folder / file_of(track), table)
+        write_json(folder / record_of(track), provenance(command, **inputs))
+    return [folder / file_of(track) for track in found]
 
 
 def other_frames(folder: Path, track: str, frames: dict[str, str]) -> list[str]:
-    """Problems whose pictures are not those of the stored scores; ``frames`` is of ``hashes_of_frames``."""
+    """Problems whose frames are not those of the stored scores; ``frames`` is of ``hashes_of_frames``."""
     inputs = (read_record(folder / record_of(track)) or {}).get("inputs")
     stored = inputs.get("frames") if isinstance(inputs, dict) else None
     return [name for name, digest in frames.items() if not isinstance(stored, dict) or stored.get(name) != digest]

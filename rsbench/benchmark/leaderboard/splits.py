@@ -73,7 +73,7 @@ class Draws:
         return _motion(self, seed, number)
 
 
-@lru_cache(maxsize=512)  # a hand-held one takes a tenth of a second
+@lru_cache(maxsize=512)  # a spline takes a tenth of a second
 def _motion(draws: Draws, seed: int, number: int) -> Motion:
     return draws.setting(seed, number).motion(draws.rng(seed, "motion", number))
 
@@ -104,7 +104,7 @@ def points_setting(seed: int, number: int) -> Setting:
 POINTS_1 = Draws(scope=("leaderboard",), problems=250, setting=points_setting, outlier_images="frame 1")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RigKind:
     """Sizes of a kind of rig of points-2; docs/reference/protocols.md has the sources."""
 
@@ -118,53 +118,16 @@ class RigKind:
     translation: Range
     """Metres in a frame period."""
     shake: str
-    """Preset of its hand-held motion."""
+    """Preset of its spline motion."""
     drives: bool = False
     """Whether it moves forward and turns about the vertical, up to a few degrees."""
 
 
 KINDS = {
-    "phone": RigKind(
-        width=1280,
-        height=720,
-        focal=925.0,
-        baseline=(0.01, 0.02),
-        depth=(0.5, 8.0),
-        rotation_deg=(0.05, 3.0),
-        translation=(0.003, 0.05),
-        shake="handheld",
-    ),
-    "headset": RigKind(
-        width=640,
-        height=480,
-        focal=370.0,
-        baseline=(0.06, 0.14),
-        depth=(0.5, 8.0),
-        rotation_deg=(0.1, 6.0),
-        translation=(0.003, 0.05),
-        shake="steady",
-    ),
-    "car": RigKind(
-        width=1242,
-        height=375,
-        focal=721.0,
-        baseline=(0.12, 0.54),
-        depth=(4.0, 40.0),
-        rotation_deg=(0.02, 1.0),
-        translation=(0.1, 0.9),
-        shake="driving",
-        drives=True,
-    ),
-    "drone": RigKind(
-        width=752,
-        height=480,
-        focal=458.0,
-        baseline=(0.06, 0.2),
-        depth=(2.0, 20.0),
-        rotation_deg=(0.2, 8.0),
-        translation=(0.02, 0.5),
-        shake="drone",
-    ),
+    "phone": RigKind(1280, 720, 925.0, (0.01, 0.02), (0.5, 8.0), (0.05, 3.0), (0.003, 0.05), "handheld"),
+    "headset": RigKind(640, 480, 370.0, (0.06, 0.14), (0.5, 8.0), (0.1, 6.0), (0.003, 0.05), "steady"),
+    "car": RigKind(1242, 375, 721.0, (0.12, 0.54), (4.0, 40.0), (0.02, 1.0), (0.1, 0.9), "driving", True),
+    "drone": RigKind(752, 480, 458.0, (0.06, 0.2), (2.0, 20.0), (0.2, 8.0), (0.02, 0.5), "drone"),
 }
 MODELS_DRAWN = ("linear", "twist", "inertial", "accelerated", "spline")
 """Motion models, each of a fifth of the problems of each kind of rig."""
@@ -266,7 +229,7 @@ class SimulatedPoints(Inputs):
 
 
 def seed_of(path: Path | None) -> int:
-    """The seed that the text of a file stands for; without one, that of the public split.
+    """The seed made from the text of a file; without one, that of the public split.
 
     Raises:
         RsbenchError: the file cannot be read, or its text is too short to be a secret.
@@ -452,7 +415,7 @@ def _true_pictures(folder: Path, sequences: Iterable[Sequence], track: Track) ->
         if sequence.rig.camera.lens is not None or not sequence.shutter.plain or sequence.moving:
             raise RsbenchError(
                 f"{folder}: {sequence.name}: {track.id} is of cameras without a lens that read rows together "
-                "from the top, and of scenes that stand still; choose another dataset"
+                "from the top, and of scenes without motion; choose another dataset"
             )
         requested, files = track.requested(sequence), dict[str, str]()
         views = [(side, frame + sequence.first) for side, frame in VIEWS]

@@ -78,14 +78,14 @@ def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True
 def better(means: FloatArray) -> NDArray[np.bool_]:
     """Whether entry i is better than entry j (n, n): of means (n, k) of entries and scenes, higher is better.
 
-    All that is said holds at once with ``statistics.COVERAGE``.
+    All comparisons hold at once with ``statistics.COVERAGE``.
     """
     i, j = np.triu_indices(len(means), 1)
     differences = means[i] - means[j]
-    told = _holm(_chances(differences))
+    decided = _holm(_chances(differences))
     i_first = np.mean(differences, axis=1) > 0.0
     out = np.zeros((len(means), len(means)), dtype=np.bool_)
-    out[i, j], out[j, i] = told & i_first, told & ~i_first
+    out[i, j], out[j, i] = decided & i_first, decided & ~i_first
     return out
 
 
@@ -128,7 +128,7 @@ def ranks(scores: FloatArray, beats: NDArray[np.bool_], uses: Sequence[frozenset
 
 
 def ties(beats: NDArray[np.bool_], i: int) -> list[Any]:
-    """Entries that the data do not tell from entry i."""
+    """Entries that the data do not distinguish from entry i."""
     return [j for j in range(len(beats)) if j != i and not beats[i, j] and not beats[j, i]]
 
 
@@ -162,15 +162,15 @@ def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
     """Of the scores of an entry, whose answers have so many unknowns; None where no covariance was stated."""
     if "nees" not in scores:
         return None
-    told = scores[scores["nees"].notna()]
-    if told.empty:
+    stated = scores[scores["nees"].notna()]
+    if stated.empty:
         return None
-    nees, scenes = told["nees"].to_numpy(dtype=np.float64), list(told["scene"])
+    nees, scenes = stated["nees"].to_numpy(dtype=np.float64), list(stated["scene"])
     ratio = nees / _chi_squared(0.5, unknowns)
     alone = len(set(scenes)) == len(scenes)
     low, high = median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)
     return Calibration(
-        stated=len(told),
+        stated=len(stated),
         spread=(float(np.median(ratio)), low, high),
         covers=tuple(
             score_interval((nees <= _chi_squared(level, unknowns)).astype(np.float64), scenes) for level in LEVELS
@@ -207,7 +207,7 @@ class Standing:
     peers: int
     """How many those are, itself included."""
     ties: tuple[str, ...]
-    """Of those, the ones that the data do not tell from it."""
+    """Of those, the ones that the data do not distinguish from it."""
     means: dict[str, tuple[float, float, float]]
     """Of the shares and means of its protocol: the mean over scenes, and the ends of its interval."""
     medians: dict[str, float]
@@ -215,13 +215,13 @@ class Standing:
     calibration: Calibration | None
     """Of the covariances that it states."""
     parts: dict[str, tuple[float, float, float]]
-    """Of the primary score in the parts of the problems that its track tells apart, by their names."""
+    """Of the primary score in the parts into which its track divides the problems, by name."""
     worst: dict[str, tuple[str, float]]
     """The problem of each part with the largest error, and that error; "all" where there are no parts."""
 
     @property
     def track(self) -> Track:
-        """Of the table that it stands in."""
+        """The track of its table."""
         return track_of_id(self.scored.header.protocol)
 
     @property
@@ -240,7 +240,7 @@ class Standing:
 
     @property
     def name(self) -> str:
-        """As tables show it: they tell entries that were handed in from those that the board ran itself."""
+        """As tables show it: submitted entries are marked."""
         return self.scored.header.method + (" (handed in)" if self.scored.handed_in else "")
 
     @property

@@ -1,6 +1,6 @@
-"""Predictions that anybody hands in: JSON lines, a header and an answer for each problem. A fault is a line.
+"""Submitted predictions: JSON lines, a header and an answer for each problem. A fault is a line.
 
-Nothing that stands there is believed: sizes are limited before anything is decoded, names are looked up among
+Nothing in it is trusted: sizes are limited before anything is decoded, names are looked up among
 those of the split and are never paths, and numbers are finite. docs/how-to/submit.md is the format.
 """
 
@@ -28,7 +28,7 @@ _OF_SOLVE = (
     *("solver", "d_unit", "d_body", "motion_model", "shutter", "assumes", "inliers", "matches", "stereo_alone"),
     *("threshold_px", "iterations", "noise_px", "inlier_indices", "model_choice"),
 )
-"""Keys that an answer of ``rsbench solve --json`` has beside those that are read."""
+"""Further keys of an answer of ``rsbench solve --json``, which are ignored."""
 _NAMED = 3
 
 
@@ -41,7 +41,7 @@ class Findings:
     faults: tuple[str, ...]
     """Each a line with file, line, field, value and remedy."""
     notes: tuple[str, ...]
-    """What may be meant: it is scored as it stands."""
+    """Likely mistakes: the file is scored as it is."""
 
 
 def read_submission(path: Path, split: Split) -> Submission:
@@ -152,7 +152,7 @@ def _answer(text: str, where: str, split: Split) -> Answer:
     return parse_card(split.track.answers, data, where)
 
 
-# What may be meant
+# Likely mistakes
 
 
 def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:

@@ -75,7 +75,7 @@ Step = Callable[[str], None]
 Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Score:
     """A column of scores.csv that tables show."""
 
@@ -94,8 +94,8 @@ class Score:
         return 1.0 if self.better == "higher" else -1.0
 
 
-FAILED = Score(key="failure", title="failed", hint="share of problems without an answer", kind="share")
-SECONDS = Score(key="seconds", title="s", hint="median time of a problem, as stated", kind="median")
+FAILED = Score("failure", "failed", "share of problems without an answer", "share")
+SECONDS = Score("seconds", "s", "median time of a problem, as stated", "median")
 
 
 class Limits(NamedTuple):
@@ -183,7 +183,7 @@ class Answer:
     direction_known: bool = True
     """Whether the direction of ``d`` means anything."""
     readout_ratio: float | None = None
-    """Estimated readout ratio, 0 to 1, where the track asks it instead of a motion."""
+    """Estimated readout ratio, 0 to 1, on tracks of the readout ratio, which ask for no motion."""
     readout_sigma: float | None = None
     """Standard deviation of ``readout_ratio``, where it is stated."""
     covariance: tuple[tuple[float, ...], ...] | None = None
@@ -513,12 +513,7 @@ class Track(ABC):
 
     @abstractmethod
     def mark(
-        self,
-        submissions: Sequence[Submission],
-        split: Split,
-        workers: Workers = 1,
-        step: Step = lambda word: None,
-        kept: Path | None = None,
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
     ) -> list[pd.DataFrame | RsbenchError]:
         """Scores of submissions, which share what is found of the truth; an error is that of one submission.
 
@@ -530,7 +525,7 @@ class Track(ABC):
             split: the truth.
             workers: processes that score pictures; the rest takes no time.
             step: called with the name of each problem whose pictures are scored.
-            kept: folder where an interrupted run keeps the scores of pictures, and finds them again.
+            kept: folder where an interrupted run keeps the scores of pictures, and finds them again; None: none.
 
         Raises:
             RsbenchError: the truth has changed since the split was read.
@@ -573,7 +568,7 @@ def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataF
     Raises:
         RsbenchError: a picture is at fault, or the truth has changed since the split was read.
     """
-    (found,) = split.track.mark([submission], split, workers)
+    (found,) = split.track.mark([submission], split, workers, lambda word: None, None)
     if isinstance(found, RsbenchError):
         raise found
     return found

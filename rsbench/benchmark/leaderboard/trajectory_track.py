@@ -59,7 +59,7 @@ _UNIT = 1e-3
 _REACH = 1e-6
 """Frame periods by which the first and the last pose may miss the starts of the first and the last frame."""
 _INVERTED = 10.0
-"""Times as near to the truth as it stands, at least, is a trajectory whose poses are inverted by mistake."""
+"""Poses are noted as inverted where inverting them reduces the error by at least this factor."""
 _FAILURE = {
     **{f"{name}_{part}_deg": 180.0 for name in ("rows", "way") for part in ("median", "95")},
     **dict.fromkeys(AUC_DEG, 0.0),
@@ -68,36 +68,36 @@ _FAILURE = {
 }
 _SCORES = (
     Score(
-        key="auc_way",
-        title="AUC way",
-        hint="area to 0.1 deg under the curve of the rotation of lines against the sequence's first one",
-        kind="share",
-        better="higher",
+        "auc_way",
+        "AUC way",
+        "area to 0.1 deg under the curve of the rotation of lines against the sequence's first one",
+        "share",
+        "higher",
     ),
     Score(
-        key="auc_rows",
-        title="AUC rows",
-        hint="area to 0.02 deg, of lines against the first one of their frame",
-        kind="share",
-        better="higher",
+        "auc_rows",
+        "AUC rows",
+        "area to 0.02 deg, of lines against the first one of their frame",
+        "share",
+        "higher",
     ),
     FAILED,
     *(
-        Score(key=f"{name}_{part}_deg", title=f"{name} {part} (deg)", hint=hint, kind="median")
+        Score(f"{name}_{part}_deg", f"{name} {part} (deg)", hint, "median")
         for name, words in (("way", "of the sequence"), ("rows", "of its frame"))
         for part, hint in (
             ("median", f"median angle of lines against the first one {words}"),
             ("95", f"95 % quantile of the angle of lines against the first one {words}"),
         )
     ),
-    Score(key="ate_mm", title="ATE (mm)", hint="of the starts of frames, rigidly aligned, as evo", kind="median"),
-    Score(key="rpe_mm", title="RPE (mm)", hint="from frame to frame, as evo", kind="median"),
-    Score(key="rpe_deg", title="RPE (deg)", hint="from frame to frame, as evo", kind="median"),
+    Score("ate_mm", "ATE (mm)", "of the starts of frames, rigidly aligned, as evo", "median"),
+    Score("rpe_mm", "RPE (mm)", "from frame to frame, as evo", "median"),
+    Score("rpe_deg", "RPE (deg)", "from frame to frame, as evo", "median"),
     Score(
-        key="jitter_px",
-        title="jitter (px)",
-        hint="mean acceleration of what true points are off in corrected frames, per squared frame period",
-        kind="median",
+        "jitter_px",
+        "jitter (px)",
+        "mean acceleration of what true points are off in corrected frames, per squared frame period",
+        "median",
     ),
     SECONDS,
 )
@@ -109,7 +109,7 @@ class TrajectoryAnswer(Answer):
     """A trajectory, or a failure."""
 
     poses: Poses | None = None
-    """Rows ``tau, tx, ty, tz, qx, qy, qz, qw``: frame periods, and the body in a world that stands still."""
+    """Rows ``tau, tx, ty, tz, qx, qy, qz, qw``: frame periods, and the pose of the body in a fixed world."""
     metric: bool = False
     """Whether positions are known, in metres."""
 
@@ -220,12 +220,7 @@ class TrajectoryTrack(Track):
     # Scores
 
     def mark(
-        self,
-        submissions: Sequence[Submission],
-        split: Split,
-        workers: Workers = 1,
-        step: Step = lambda word: None,
-        kept: Path | None = None,
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
     ) -> list[pd.DataFrame | RsbenchError]:
         rows: list[list[Row]] = [[] for _ in submissions]
         for truth in split.truths:

@@ -282,7 +282,7 @@ def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp
     split = splits["depth"]
     broken, whole = (read_submission(write_truth(split, tmp_path / name), split) for name in ("broken", "whole"))
     pictures_of(broken.folder / "predictions.jsonl")[0].unlink()
-    fault, table = split.track.mark([broken, whole], split, workers)
+    fault, table = split.track.mark([broken, whole], split, workers, lambda word: None, None)
     assert isinstance(fault, RsbenchError) and "left_1.exr: is missing" in str(fault)
     assert isinstance(table, pd.DataFrame) and np.all(table["bad_1"] == 0.0)
 
