@@ -1,4 +1,4 @@
-"""What compiled residuals need of a motion model: its kernel as Numba sees it, and vector algebra for kernels.
+"""Kernels of motion models as Numba sees them, and the compiled vector algebra that they may call.
 
 Vectors are tuples, which need no memory; rotations are (3, 3) arrays. The readable NumPy forms of the vector
 functions are in ``rsbench.core.so3``.
@@ -200,7 +200,7 @@ class KernelType(types.Type):
 
 
 _kernel_type = functools.cache(KernelType)
-"""Asked at every call of a compiled function: making the type anew would cost more than some of the calls."""
+"""Cached because Numba needs it at every call of a compiled function, and making it costs more than some calls."""
 
 
 @typeof_impl.register(MotionKernel)

@@ -390,7 +390,7 @@ def inertial_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A:
 def inertial_translation_jacobian(
     theta: FloatArray, tau0: float, tau1: float, T_w: FloatArray, T_v: FloatArray
 ) -> None:
-    """Of ``inertial_move``."""
+    """dT/dw and dT/dv of ``inertial_move``."""
     a, phi = tau1 - tau0, times(tau1, (theta[0], theta[1], theta[2]))
     ahead = turned(phi, (theta[3], theta[4], theta[5]))
     _, c1, c2, _, _ = coefficients(dot(phi, phi))
@@ -464,7 +464,7 @@ def accelerated_translation_jacobian(
     T_w: FloatArray,
     T_v: FloatArray,
 ) -> None:
-    """Of ``accelerated_move``."""
+    """dT/dw and dT/dv of ``accelerated_move``."""
     beta0, beta1 = beta(k, tau0)[0], beta(k, tau1)[0]
     linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
 
@@ -506,7 +506,7 @@ def twist_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: Fl
 def twist_translation_jacobian(
     theta: FloatArray, tau0: float, tau1: float, A: FloatArray, T_w: FloatArray, T_v: FloatArray
 ) -> None:
-    """Of ``twist_move``."""
+    """dT/dw and dT/dv of ``twist_move``."""
     a = tau1 - tau0
     twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
     for i in range(3):
@@ -564,7 +564,7 @@ def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
 
 
 _NUMBERS: dict[type[MotionKernel], float] = {LinearKernel: 0.0, TwistKernel: 1.0, InertialKernel: 2.0}
-"""Of the laws without parameters; an accelerated one has 3."""
+"""Numbers of the laws without parameters; ``AcceleratedKernel`` has 3."""
 
 
 @final

@@ -87,7 +87,7 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def _plain(value: float) -> float:
-    """As Python's float: NumPy's short ones overflow where they are compared with large numbers."""
+    """The value as Python's float: NumPy's short floats overflow where they are compared with large numbers."""
     try:
         return float(value)
     except OverflowError:  # a whole number of hundreds of digits
@@ -166,7 +166,7 @@ def world_points(points: ArrayLike) -> FloatArray:
 
 
 def items(name: str, value: Any) -> Any:
-    """What has a length and can be indexed; raises ValueError on anything else, a text included."""
+    """The value; raises ValueError unless it has a length and can be indexed, and on a text."""
     listed = isinstance(value, Sequence) and not isinstance(value, str)
     if not listed and not (isinstance(value, np.ndarray) and value.ndim > 0):
         raise ValueError(f"{name}: must be a list, got {shown(value)}")

@@ -31,7 +31,7 @@ class Correspondences:
     """Matches in pixels of the images, distorted as they are, one row each; sets that do not exist are empty.
 
     The sets may hold the same points: ``tracks`` are seen in all four images, and their halves may be
-    repeated in the pairwise sets, where ``JOIN_TOLERANCE_PX`` tells them. The order of matches means nothing.
+    repeated in the pairwise sets, where ``JOIN_TOLERANCE_PX`` finds them. The order of matches has no meaning.
     """
 
     left: FloatArray = field(default_factory=lambda: _none(4))
@@ -52,10 +52,10 @@ class Correspondences:
     point of frame 0 lie in frame 1, to first order; of the images as they are, which a rolling shutter has
     distorted. Empty where it is not known."""
     gyro: FloatArray = field(default_factory=lambda: _none(4))
-    """(n, 4) tau, w: what a gyroscope says of the rotation between the rows, dR/dtau = [w]x R, rad per period."""
+    """(n, 4) tau, w: samples of a gyroscope, dR/dtau = [w]x R, rad per period."""
 
     gravity: FloatArray = field(default_factory=lambda: _none(4))
-    """(n, 4) tau, g: which way things fall at that time, in the axes of the body as it is then; of any length."""
+    """(n, 4) tau, g: direction of gravity at that time, in the body's axes at that time; of any length."""
 
     def __post_init__(self) -> None:
         for name, columns in SET_COLUMNS.items():
@@ -130,7 +130,7 @@ def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
 
 
 def unlinked_pairs(correspondences: Correspondences, side: Side) -> BoolArray:
-    """Mask of the left or right matches that no track repeats: the tracks know more about those that it does."""
+    """Mask of the left or right matches that no track repeats; a track has more information than its repeats."""
     return ~repeated(getattr(correspondences, side), track_pairs(correspondences.tracks, side))
 
 
@@ -155,15 +155,15 @@ _STEREO_HALF = {"stereo_0": slice(0, 4), "stereo_1": slice(4, 8)}
 _RIVALS = 8
 """Left-right matches that may end at one point, beyond which the farthest are not looked at."""
 _SAME_PX = 0.1 * JOIN_TOLERANCE_PX
-"""Differences that decide between rivals; smaller ones are rounding, which shall decide nothing."""
+"""Smallest difference that decides between rivals; smaller ones are rounding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Joined:
-    """What ``join_stereo`` made."""
+    """The result of ``join_stereo``."""
 
     correspondences: Correspondences
-    """As given, with the tracks that were joined after those that were given."""
+    """The given sets; joined tracks follow the given ones."""
     alone: dict[str, int]
     """How many matches in ``stereo_0`` and ``stereo_1`` are part of no track."""
 

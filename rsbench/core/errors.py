@@ -25,7 +25,7 @@ class RsbenchError(Exception):
     """
 
     exit_code = 2
-    """Of the command that it ends."""
+    """Exit code of a command that ends with this error."""
 
     def __init__(self, message: object = "") -> None:
         shortened = re.sub(rf"\S{{{_WORD + 1},}}", lambda word: f"{word[0][:60]}...{word[0][-20:]}", str(message))

@@ -25,7 +25,7 @@ from rsbench.core.so3 import FloatArray
 
 
 class MovingRig(Protocol):
-    """What sees, how it reads and how it moves."""
+    """Cameras, how they read their rows, and how they move."""
 
     @property
     def rig(self) -> StereoRig: ...
@@ -36,7 +36,7 @@ class MovingRig(Protocol):
 
 
 class Geometry(MovingRig, Protocol):
-    """A rig on its way past objects, which may move by themselves: a ``Sequence`` is one."""
+    """A moving rig and the objects that it passes, which may move by themselves; a ``Sequence`` is one."""
 
     @property
     def frames(self) -> int: ...
@@ -52,7 +52,7 @@ class FixedGeometry(NamedTuple):
     motion: Motion
     frames: int = len(FRAMES)
     objects: tuple[MovingObject, ...] = ()
-    """Those that move by themselves, in the order of their numbers from 1."""
+    """Objects that move by themselves, in the order of their numbers from 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class MovingObject:
         return Pose(R, t + self.pivot - R @ self.pivot)
 
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Of ``world_from_object``, as ``Motion.velocity``."""
+        """Velocities of ``world_from_object``, as ``Motion.velocity``."""
         R, _ = self.motion.body_from_world(tau)
         w_rate, t_rate = self.motion.velocity(tau)
         return w_rate, t_rate - so3.cross(w_rate, R @ self.pivot)
@@ -92,7 +92,7 @@ def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class TurnedMotion(Motion):
-    """Another motion told in turned axes: R(tau) and t(tau) become ``A R A^T`` and ``A t``."""
+    """Another motion in turned axes: R(tau) and t(tau) become ``A R A^T`` and ``A t``."""
 
     name: ClassVar[str] = "turned"
     motion: Motion
@@ -171,19 +171,19 @@ def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
 
 
 def check_view(side: str, frame: int) -> None:
-    """Raises ValueError unless there is such a side, and may be such a frame."""
+    """Raises ValueError unless the side exists and the frame may exist."""
     arguments.check_one_of("side", side, SIDES)
     arguments.check_whole("frame", frame, 0, arguments.LARGEST_SIZE)
 
 
 def check_motion(rig: StereoRig, motion: Motion) -> None:
-    """Raises ValueError unless they are what they are called."""
+    """Raises ValueError unless ``rig`` is a rig and ``motion`` a motion."""
     arguments.check_type("rig", rig, StereoRig)
     arguments.check_type("motion", motion, Motion)
 
 
 def check_moving_rig(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> None:
-    """Raises ValueError unless they are what they are called, and the shutter is of the rig's cameras."""
+    """Raises ValueError on arguments of another type, and on a shutter of another size than the cameras."""
     check_rows(rig, shutter)
     check_motion(rig, motion)
 

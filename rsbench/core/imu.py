@@ -74,7 +74,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 class Inertial(NamedTuple):
-    """What ideal sensors show; (..., 3) in the axes of the body."""
+    """Measurements of ideal sensors, (..., 3) in the axes of the body."""
 
     turn: FloatArray
     """Angular velocity of the body, rad/s."""
@@ -83,7 +83,7 @@ class Inertial(NamedTuple):
 
 
 def inertial(motion: Motion, tau: ArrayLike, frame_period_s: float, gravity: ArrayLike) -> Inertial:
-    """What is felt at times ``tau`` (...), frame periods.
+    """Ideal measurements at times ``tau`` (...), frame periods.
 
     With u = t' - w' x t the body's origin moves in the world by p' = -R^T u, and so p'' = R^T (w' x u - u').
     ``Motion`` carries points from the world into the body, hence the signs: the body turns by -w'.

@@ -21,7 +21,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
 _STEP = 1e-3
-"""Frame periods between the velocities whose differences are accelerations where a model does not say its own."""
+"""Frame periods between velocities whose differences are accelerations, for models without exact ones."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -55,7 +55,7 @@ class Motion(ABC):
         """Angular and linear acceleration, (..., 3) each: the derivatives of ``velocity``.
 
         Here by central differences of fourth order, which err by 3e-14 (the fourth power of their step, over 30)
-        of the fifth derivative of the velocity; rsbench's own models say theirs exactly.
+        of the fifth derivative of the velocity; rsbench's own models have exact ones.
         """
         tau = np.asarray(tau, dtype=np.float64)
         weights = {-2.0: 1.0, -1.0: -8.0, 1.0: 8.0, 2.0: -1.0}
@@ -65,7 +65,7 @@ class Motion(ABC):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What the model has beside w and d, as JSON holds it: ``type(m)(m.w, m.d, **m.parameters)`` is m."""
+        """The model's parameters beside w and d, as in JSON: ``type(m)(m.w, m.d, **m.parameters)`` is m."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in ("w", "d")}
 
     def with_endpoint(self, w: ArrayLike, d: ArrayLike) -> Self:
@@ -73,21 +73,21 @@ class Motion(ABC):
         return type(self)(w, d, **self.parameters)
 
     def fastest(self, first: float, last: float) -> tuple[float, float] | None:
-        """What |w'| and |t'| do not exceed at times from ``first`` to ``last``; None when that is not known."""
+        """Upper bounds of |w'| and |t'| at times from ``first`` to ``last``; None when they are not known."""
         return None
 
     def from_time(self, start: float) -> Motion:
-        """The same way, seen from the body at time ``start``, which is time 0 of the new one."""
+        """The same motion, seen from the body at time ``start``, which is time 0 of the new one."""
         return self if start == 0.0 else LaterMotion.of(self, start)
 
     @property
     def lasts(self) -> float:
-        """Until when the model says how the rig moves, frame periods; it then goes on at the speed that it has."""
+        """Until when the model describes the motion, frame periods; the rig then goes on at constant speed."""
         return float("inf")
 
     @classmethod
     def lasting(cls, parameters: Mapping[str, Any], periods: float) -> dict[str, Any]:
-        """The parameters, with those left out that decide how long it ``lasts`` such that it is so long."""
+        """The parameters, with those added that make the motion last so many periods."""
         return dict(parameters)
 
     @classmethod
@@ -108,7 +108,7 @@ class Motion(ABC):
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class LaterMotion(Motion):
-    """Another motion from a later time on: what it is for a pair of frames in the middle of a sequence."""
+    """Another motion from a later time on, as for a pair of frames in the middle of a sequence."""
 
     name: ClassVar[str] = "later"
     motion: Motion

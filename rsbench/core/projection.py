@@ -3,7 +3,7 @@
 A point is seen at row y when its projection at row y's pose falls on row y:
 ``f(y) = project(cam_from_world(row_time(y)) X).y - y = 0``. It may have no solution (never seen) or several
 (seen twice, when the image of the point keeps pace with the readout). Rows are those of the image as the lens
-distorts it. Where a camera reads columns, all that is said of rows and y holds for columns and x.
+distorts it. Where a camera reads columns, read column for row and x for y.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _COARSE_ROWS, _FINE_ROWS, _MAX_ITERATIONS, _MAX_NEWTON_STEPS = 17, 513, 60, 12
 
 
 class ProjectionStatus(IntEnum):
-    """What became of a point."""
+    """Whether and how often a point is seen."""
 
     SEEN = 0
     NEVER = 1
@@ -239,7 +239,7 @@ def pixel_moves(
     points: FloatArray,
     along: FloatArray,
 ) -> FloatArray:
-    """Derivative (n, 2, 2) of the pixels that see points (n, 3) at tau (n,), by steps along two ways (n, 3, 2).
+    """Derivative (n, 2, 2) of the pixels that see points (n, 3) at tau (n,), by steps along (n, 3, 2).
 
     That of the implicit row equation q = proj(pose(time(q)) X): (1 - v r')^-1 J, with J the derivative of the
     projection at that time, v the velocity of the pixel and r the derivative of the time by the pixel.

@@ -20,7 +20,7 @@ SIDES: tuple[Side, Side] = ("left", "right")
 View = tuple[Side, int]
 """Side and frame, from 0."""
 FRAMES = (0, 1)
-"""Of a pair, of which all estimates are."""
+"""The frames of a pair; every estimate is of one pair."""
 
 
 def views_of(frames: int) -> tuple[View, ...]:

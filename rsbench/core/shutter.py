@@ -18,14 +18,14 @@ _LONGEST_DELAY = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Scanning:
-    """How cameras read their lines, as cards and files say it; each key may be left out."""
+    """How cameras read their lines, as in cards and files; each key may be left out."""
 
     scan: Scan = "top"
     """Side of the image at which the readout of both cameras begins; ``left`` and ``right`` read columns."""
     right_scan: Scan | None = None
     """Side at which the readout of the right camera begins. Absent: as the left camera's."""
     right_delay: float = 0.0
-    """Frame periods by which the right camera is late, from -1 to 1."""
+    """Frame periods by which the right camera reads later than the left one, from -1 to 1."""
 
     @property
     def plain(self) -> bool:
@@ -52,7 +52,7 @@ class Scanning:
 
 @dataclass(frozen=True, kw_only=True)
 class StatedShutter(Scanning):
-    """What a user says of a shutter; what is left out is found from the frames or matches."""
+    """What a user states of a shutter; what is left out is estimated from the frames or matches."""
 
     scan: Scan | None = None  # pyrefly: ignore[bad-override]
     """Side of the image at which the readout of both cameras begins. Absent: found with the readout ratio, or
@@ -62,15 +62,15 @@ class StatedShutter(Scanning):
 
     @property
     def scanning(self) -> Scanning | None:
-        """How the cameras read their lines; None where that is to be found with the readout ratio."""
-        said = (self.readout_ratio, self.scan, self.right_scan) != (None, None, None) or self.right_delay != 0.0
+        """How the cameras read their lines; None where that is estimated with the readout ratio."""
+        stated = (self.readout_ratio, self.scan, self.right_scan) != (None, None, None) or self.right_delay != 0.0
         scan = self.scan or "top"
-        return Scanning(scan=scan, right_scan=self.right_scan, right_delay=self.right_delay) if said else None
+        return Scanning(scan=scan, right_scan=self.right_scan, right_delay=self.right_delay) if stated else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class RollingShutter:
-    """Lines are read evenly within ``readout_ratio`` of a frame period: rows from the top, unless said otherwise.
+    """Lines are read evenly within ``readout_ratio`` of a frame period: rows from the top by default.
 
     A line is a row of the image, or a column where a camera reads from the left or the right. Times belong to
     pixels of the image as the sensor has it, whatever its lens does.
@@ -82,9 +82,9 @@ class RollingShutter:
     """phi = T_a / (T_a + T_b) in [0, 1]; 0 is a global shutter (paper, section 2.2)."""
     scan: Scan = "top"
     right_scan: Scan | None = None
-    """Of the right camera; None: as the left one."""
+    """Side at which the readout of the right camera begins; None: as the left camera's."""
     right_delay: float = 0.0
-    """Frame periods by which the right camera is late, from -1 to 1."""
+    """Frame periods by which the right camera reads later than the left one, from -1 to 1."""
     width: int | None = None
     """Number of columns; needed where columns are read."""
 
@@ -117,7 +117,7 @@ class RollingShutter:
         return self.readout_ratio / self.height
 
     def at_once(self) -> RollingShutter:
-        """The shutter of one who believes that there is none: everything at the start of the frame."""
+        """A global shutter of the same height: every pixel is read at the start of the frame."""
         return RollingShutter(height=self.height, readout_ratio=0.0)
 
     def with_ratio(self, readout_ratio: float) -> RollingShutter:
@@ -126,11 +126,11 @@ class RollingShutter:
 
     @property
     def scanning(self) -> Scanning:
-        """What ``Scanning.shutter_of`` made it of."""
+        """The part of it that ``Scanning.shutter_of`` takes."""
         return Scanning(scan=self.scan, right_scan=self.right_scan, right_delay=self.right_delay)
 
     def scan_of(self, side: str) -> Scan:
-        """Where the camera of a side begins."""
+        """Side of the image at which a camera's readout begins."""
         return self.right_scan if side == "right" and self.right_scan is not None else self.scan
 
     def axis(self, side: str) -> int:

@@ -42,7 +42,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
 _SINES = 8
-"""Of a band, for each axis."""
+"""Number of sines in a band, for each axis."""
 _FASTEST = 0.25
 """Cycles of a band for each interval of the control poses, at most: a cubic spline through four points of a sine
 differs from it by less than 3 % of its size."""
@@ -321,7 +321,7 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
 
 
 def _generator(purpose: str, parameters: Mapping[str, Any]) -> np.random.Generator:
-    """What is drawn with the seed of the parameters."""
+    """The generator with the seed of the parameters; one for each purpose."""
     seed = parameters.get("seed", 0)
     arguments.check_whole("seed", seed, 0, 1 << 256)
     digest = hashlib.sha256(f"{purpose}/{int(seed)}".encode()).digest()
@@ -492,7 +492,7 @@ class TrajectoryMotion(Motion):
 
 
 class Moving(NamedTuple):
-    """Where the body is and how it moves."""
+    """Pose, velocities and accelerations of the body."""
 
     world_from_body: Pose
     turn: FloatArray

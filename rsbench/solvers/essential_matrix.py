@@ -49,7 +49,7 @@ def null_essential(rows: FloatArray) -> FloatArray | None:
 
 
 def decompose_essential(E: FloatArray, x0: FloatArray, x1: FloatArray) -> tuple[Pose, int]:
-    """Of the four ``cam1_from_cam0`` of E the one with most points (n, 3) in front, with unit t; how many."""
+    """The one of E's four ``cam1_from_cam0`` with most points (n, 3) in front, with unit t; and how many."""
     U, _, Vt = np.linalg.svd(E)
     U, Vt = U * np.linalg.det(U), Vt * np.linalg.det(Vt)
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -138,7 +138,7 @@ class OpenCvFivePointSolver(Solver):
         return self._motions(temporal_pairs(sample, "left"), rig)
 
     def _motions(self, matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
-        """Of every essential matrix that OpenCV returns: several for five matches, one for more."""
+        """Motions of every essential matrix that OpenCV returns: several for five matches, one for more."""
         try:
             stacked, _ = cv2.findEssentialMat(
                 np.ascontiguousarray(matches[:, :2]),

@@ -111,7 +111,7 @@ class FreeMotion(NamedTuple):
         return self._replace(t=self.t / length, v0=self.v0 / length, v1=self.v1 / length)
 
     def flipped(self) -> FreeMotion:
-        """All translations the other way: the other sign of the essential matrices."""
+        """All translations reversed: the other sign of the essential matrices."""
         return self._replace(t=-self.t, v0=-self.v0, v1=-self.v1)
 
     def twin(self) -> FreeMotion:
@@ -136,7 +136,7 @@ class Rows(NamedTuple):
 
     @classmethod
     def of(cls, matches: FloatArray, camera: PinholeCamera, first: float) -> Rows:
-        """Of matches (n, 4), or (n, 8) with affine frames, with s = 0 at the row ``first``."""
+        """From matches (n, 4), or (n, 8) with affine frames, with s = 0 at the row ``first``."""
         x, y = camera.unproject(matches[:, :2]), camera.unproject(matches[:, 2:4])
         s0, s1 = (matches[:, 1] - first) / camera.fy, (matches[:, 3] - first) / camera.fy
         return cls(x, y, s0, s1, camera, matches[:, 4:])
@@ -251,7 +251,7 @@ _MOST_TURN = 1.0
 """Radians in a frame; cameras that spin faster pass every match nearly, and fit what there is."""
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUICK, _FULL = 8, 100
-"""Evaluations of a descent that is one of several or a step of a search, and of one whose end is told."""
+"""Evaluations of a descent that is one of several or a step of a search, and of the final one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -321,7 +321,7 @@ class FreeVelocitySolver(Solver):
             return MotionEstimate.failed(found)
         begun = [*near, *(_at_first_row(each, rig.camera) for each in middle)]
         rows = Rows.of(matches, rig.camera, 0.0)
-        # Noise may have spoiled a linear solution's velocities: each starts a descent with them and one without.
+        # Noise may dominate a linear solution's velocities: each starts a descent with them and one without.
         ends = [self._refined(each, rows, _QUICK) for each in [*begun, *(each.at_rest() for each in begun)]]
         gentle = [end for end in ends if _turn(end[0], rig.camera) < _MOST_TURN] or ends
         best = min(_in_front([end for end, _ in gentle], rows), key=lambda k: gentle[k][1])
@@ -572,10 +572,10 @@ class DaiSolver(FreeVelocitySolver):
 
     @property
     def about(self) -> tuple[str, str]:
-        held = "no rotation within a frame" if self.model == "linear" else "small rotation within a frame"
+        within = "no rotation within a frame" if self.model == "linear" else "small rotation within a frame"
         return (
             "Dai, Li, Kneip: Rolling Shutter Camera Relative Pose: Generalized Epipolar Geometry, CVPR 2016",
-            f"{held}; a constant velocity in each; readout ratio above 0; a scene that is not planar; translation",
+            f"{within}; constant velocity in each; readout ratio above 0; a scene that is not planar; translation",
         )
 
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
@@ -606,9 +606,9 @@ class DaiSolver(FreeVelocitySolver):
 
 
 _STEPS = 6
-"""Of Gauss and Newton: of exact matches at 6 degrees and 1.2 m a frame the last changes w by 1e-9 rad."""
+"""Gauss-Newton steps: on exact matches at 6 degrees and 1.2 m a frame the last changes w by 1e-9 rad."""
 _ROUNDING = 1e-14
-"""Of singular values."""
+"""Smallest singular value relative to the largest."""
 _DEGENERATE = "the matches fit more than one essential matrix: degenerate scene or motion"
 
 
@@ -636,7 +636,7 @@ def _outer(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def essential_of_jets(x: FloatArray, y: FloatArray) -> FloatArray | None:
-    """As ``eight_point``, of the rays and their changes (n, 3, 3)."""
+    """Like ``eight_point``, from the rays and their changes (n, 3, 3)."""
     T0, T1 = normalising_transform(x[:, 0, :2]), normalising_transform(y[:, 0, :2])
     E = null_essential(_product(_outer, y @ T1.T, x @ T0.T).reshape(-1, 9))
     return None if E is None else T1.T @ E @ T0
@@ -735,7 +735,7 @@ class AffineSolver(FreeVelocitySolver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> list[list[MotionEstimate]]:
-        """With the velocities, and at rest: noise of a few matches may have spoiled them."""
+        """With the velocities, and at rest: noise of a few matches may dominate them."""
         sets = [self.matches_of(sample) for sample in samples]
         short = self.spec.shortage({"left": len(sets[0]), "affine": len(samples[0].affine)})
         if short is not None:

@@ -55,9 +55,9 @@ _CONTRADICTED = 3.0
 @final
 @dataclass(frozen=True, kw_only=True)
 class GyroSolver(Solver):
-    """Linear least squares for d, then those of the exact Sampson error; the rotation is what the samples say.
+    """Linear least squares for d, then those of the exact Sampson error; the rotation comes from the samples.
 
-    What the gyroscope has wrong stays wrong: w is its integral.
+    Errors of the gyroscope stay: w is its integral.
     """
 
     cameras_used: Literal["left", "both"] = "left"
@@ -122,7 +122,7 @@ class GyroSolver(Solver):
         metric = metric and (not descend or sigma <= _MAX_SCALE_SIGMA)
         if not (np.all(np.isfinite(d)) and np.any(d)):
             return MotionEstimate.failed("no finite translation fits")
-        # At last: a step of the descent may lead through zero to the other side.
+        # Last, because a step of the descent may lead through zero to the other side.
         d, metric = _signed(motion, d, metric, about, shutter, matches)
         reason = "" if metric else "the length of d is not determined by these matches"
         d = d if self._stereo else d / np.linalg.norm(d)
@@ -133,7 +133,7 @@ def _translation(m: FloatArray, beta: FloatArray) -> tuple[FloatArray | None, bo
     """d (3,) and whether it has a length; None where its direction is open.
 
     The smallest singular vector of [m, beta], as in ``linear.scaled_translation``; of m alone where
-    nothing turns or one camera is asked.
+    nothing turns or one camera is used.
     """
     sizes = np.linalg.norm(m), np.linalg.norm(beta)
     if not (np.isfinite(sizes[0]) and sizes[0] > 0.0):
@@ -153,7 +153,7 @@ def _translation(m: FloatArray, beta: FloatArray) -> tuple[FloatArray | None, bo
 class _Constraints:
     """The exact constraints at known rotations, ``m . d + beta = 0``, and their derivatives by the pixels.
 
-    Both are affine in d: their values at no translation and at three unit ones say all.
+    Both are affine in d: their values at no translation and at three unit ones determine them.
     """
 
     m: FloatArray
@@ -247,7 +247,7 @@ class Uprights(NamedTuple):
 
     @classmethod
     def of(cls, gravity: FloatArray) -> Uprights | None:
-        """Of the directions (n, 4) nearest to tau = 0 and 1; None where one is missing or has no length."""
+        """From the directions (n, 4) nearest to tau = 0 and 1; None where one is missing or has no length."""
         turns = []
         for frame in (0.0, 1.0):
             near = gravity[np.argsort(np.abs(gravity[:, 0] - frame), kind="stable")[:1]]
@@ -267,7 +267,7 @@ class Uprights(NamedTuple):
         return np.asarray(self.second.T @ so3.exp(angle * _DOWN) @ self.first)
 
     def angle(self, w: FloatArray) -> float:
-        """That of the nearest rotation."""
+        """The angle of the nearest rotation that gravity allows."""
         R = self.second @ so3.exp(w) @ self.first.T
         return float(np.arctan2(R[0, 2] - R[2, 0], R[0, 0] + R[2, 2]))
 
@@ -306,7 +306,7 @@ class UprightSolver(Solver):
     cameras_used: Literal["left", "both"] = "left"
     """The left camera's own motion without a length, or the rig's in metres."""
     refinement: Literal["upright", "free"] = "upright"
-    """Whether what gravity has wrong stays wrong in the end, or the last least squares turn all three angles."""
+    """Whether errors of gravity stay in the estimate, or the last least squares refine all three angles."""
 
     @property
     def spec(self) -> SolverSpec:

@@ -159,15 +159,15 @@ class LinearSolver(Solver):
     terms: Literal["second", "third"] = "second"
     """Order of the terms in the motion that A holds: 19 unknowns, or the 27 of which the paper drops eight."""
     scaling: Literal["none", "unit-columns"] = "none"
-    """Of the columns of A before the singular value decomposition; unit columns are worse with noise."""
+    """Scaling of the columns of A before the singular value decomposition; unit columns are worse with noise."""
     baseline_unit: Literal["metre", "half-baseline"] = "metre"
     """Unit of length in A: metres, or the paper's b."""
     extraction: Literal["full", "symmetric"] = "full"
     """Entries of E = [d]x[w]x that give w: all nine, or the symmetric part, which noise reaches less."""
     scale: Literal["rotation", "constraint"] = "rotation"
-    """What gives the length of d: the two entries of X that hold w alone, or the exact constraint at this w."""
+    """Source of the length of d: the two entries of X with w alone, or the exact constraint at this w."""
     sign: Literal["cheirality", "scale"] = "cheirality"
-    """What gives the sign of d: the points in front of the cameras, or the sign of the scale."""
+    """Source of the sign of d: the points in front of the cameras, or the sign of the scale."""
 
     @property
     def spec(self) -> SolverSpec:

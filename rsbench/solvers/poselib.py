@@ -73,7 +73,7 @@ def poselib_module() -> Any:
 
 
 def poselib_camera(camera: PinholeCamera) -> dict[str, Any]:
-    """As PoseLib names it; ValueError for a lens: it is given matches without one."""
+    """The camera as PoseLib describes it; ValueError for a lens, since PoseLib gets matches without one."""
     if camera.lens is not None:
         raise ValueError("PoseLib is given matches without a lens")
     return {
@@ -295,7 +295,7 @@ class P3pSolver(Solver):
     """PoseLib's robust absolute pose; a card of it says ``robust = "own"``."""
 
     cameras_used: Literal["left", "both"] = "both"
-    """Whose pixels of frame 1 count in the end; the search is on the left camera's."""
+    """Cameras whose pixels of frame 1 count in the final estimate; the search uses the left camera's."""
     threshold_px: float = 4.0
     """Largest reprojection error of an inlier: beyond the noise of pixels and points, on a rolling shutter too."""
     confidence: float = 0.999

@@ -89,7 +89,7 @@ class Resection(NamedTuple):
     def of(
         cls, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, sides: tuple[Side, ...], moved: bool
     ) -> Resection:
-        """Of tracks (n, 8) with depth."""
+        """From tracks (n, 8) with depth."""
         tau0 = shutter.pixel_time(tracks[:, :2], 0, "left")
         return cls(
             stereo_points(tracks, rig),
@@ -213,7 +213,7 @@ def refined(data: Resection, start: RowPose, most: int) -> RowPose:
 
 
 class _Search:
-    """What LO-RANSAC asks of the method: all twelve unknowns of a sample, judged by their own reprojection."""
+    """The estimator for LO-RANSAC: all twelve unknowns of a sample, judged by their own reprojection."""
 
     sample_size = (_LEAST,)
 
@@ -227,7 +227,7 @@ class _Search:
         return (len(self.tracks),)
 
     def of(self, tracks: FloatArray, minimal: bool = False) -> Resection:
-        """Of some tracks (n, 8): minimal samples are seen by the left camera alone."""
+        """The data of some tracks (n, 8); minimal samples use the left camera alone."""
         sides: tuple[Side, ...] = ("left",) if minimal else self.solver.sides
         return Resection.of(tracks, self.rig, self.shutter, sides, self.solver.frame_0 == "moved")
 
@@ -251,7 +251,7 @@ class _Search:
         return self.fit(inliers, model, _QUICK)
 
     def fit(self, inliers: BoolArray, start: RowPose | None, most: int) -> RowPose | None:
-        """Of all inliers together, from a start if there is one."""
+        """The pose of all inliers together, from a start if there is one."""
         data = self.of(self.tracks[inliers])
         if start is None or self.solver.refinement == "none":
             start = self.linear(data)
@@ -272,7 +272,7 @@ class R6pSolver(Solver):
     """Whether the points of each row of frame 0 are moved to time 0 with the motion of the step before (constant
     velocity from frame to frame: it ends where points and pose agree), or taken as they are, as of a known map."""
     cameras_used: Literal["left", "both"] = "both"
-    """Whose pixels of frame 1 count; minimal samples take the left camera's alone."""
+    """Cameras whose pixels of frame 1 count; minimal samples take the left camera's alone."""
     refinement: Literal["none", "reprojection"] = "reprojection"
     """``reprojection``: least squares of the reprojection errors of all inliers at the end; ``none``: without."""
     start: Literal["p3p", "still"] = "p3p"
@@ -317,7 +317,7 @@ class R6pSolver(Solver):
 
     @property
     def sides(self) -> tuple[Side, ...]:
-        """Of the cameras whose pixels count."""
+        """Sides of the cameras whose pixels count."""
         return SIDES if self.cameras_used == "both" else ("left",)
 
     def beginning(self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
@@ -330,7 +330,7 @@ class R6pSolver(Solver):
         return so3.exp(pose.w) if pose.success else np.eye(3)
 
     def _options(self) -> RansacOptions:
-        """As the search wants it; checks the values."""
+        """The options of the search; checks the values."""
         return RansacOptions(
             threshold=self.threshold_px,
             confidence=self.confidence,

@@ -153,7 +153,7 @@ class RefinedSolver(Solver):
     motion_model: str = "linear"
     """Interpolation between the rows: a motion model that has a kernel."""
     motion_parameters: dict[str, Any] = field(default_factory=dict, hash=False)
-    """Of the motion model; absent ones have its defaults."""
+    """Parameters of the motion model; absent ones have its defaults."""
     use_tracks: bool = True
     """Off: tracks count as unlinked left and right matches, for a fair comparison with solvers of pairs."""
     use_pairs: bool = True

@@ -84,7 +84,7 @@ class Triplets(NamedTuple):
 
     @classmethod
     def of(cls, tracks: FloatArray, views: Sequence[View], rig: StereoRig) -> Triplets:
-        """Of tracks (..., n, 8) with depth in both frames; one view for each of n."""
+        """From tracks (..., n, 8) with depth in both frames; one view for each of n."""
         shape = (*tracks.shape[:-1], 3)
         X = [stereo_points(tracks.reshape(-1, 8)[:, columns:], rig).reshape(shape) for columns in (0, 4)]
         backward = np.array([frame == 0 for frame, _ in views])
@@ -301,14 +301,14 @@ class LineErrors:
 
     @classmethod
     def of(cls, lines: FloatArray, rig: StereoRig) -> LineErrors:
-        """Of lines (n, 16) that are usable."""
+        """From lines (n, 16) that are usable."""
         rays = line_rays(lines, rig)
         across = line_normals(rays)[:, 0] * [1.0, 1.0, 0.0]
         near = inverse_depths(rays, rig)[:, 0]
         return cls(rays=rays, across=across, start=np.concatenate([0.0 * near, near], axis=1), rig=rig)
 
     def only(self, wanted: BoolArray) -> LineErrors:
-        """Those of a mask (n,)."""
+        """The lines of a mask (n,)."""
         return LineErrors(
             rays=self.rays[wanted], across=self.across[wanted], start=self.start[wanted], rig=self.rig
         )
@@ -379,7 +379,7 @@ def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
 
 _LEAST = 3
 _SAMPLES = 10
-"""At least, as in the house's loop."""
+"""Fewest samples, as in rsbench's robust loop."""
 _LINE_QUICK, _FULL = 5, 50
 _SIGMAS = 2.5
 _TRACK_FREEDOM = 5
@@ -391,7 +391,7 @@ _RANGE = (0.2, 4.0)
 _MAX_DIRECTION_SIGMA = 0.5
 """Share of the length of d: radians, as in the refined solvers."""
 _MANY = 10
-"""Inliers of a kind from which its noise is told."""
+"""Fewest inliers of a kind from which its noise is estimated."""
 
 
 class Features(NamedTuple):
@@ -404,7 +404,7 @@ class Features(NamedTuple):
 
     @classmethod
     def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig) -> Features:
-        """Of tracks (m, 8) with depth in both frames and lines (n, 16) that are usable."""
+        """From tracks (m, 8) with depth in both frames and lines (n, 16) that are usable."""
         points = np.stack([stereo_points(tracks[:, at:], rig) for at in (0, 4)])
         rays = line_rays(lines, rig)
         normals = np.repeat(line_normals(rays)[:, :, None], 2, axis=2)
@@ -416,7 +416,7 @@ class Features(NamedTuple):
         )
 
     def triplets(self, chosen: IntArray, views: Sequence[View], rig: StereoRig) -> Triplets:
-        """Of features (..., n), each known in the frame that its view is not of."""
+        """Triplets of the chosen features (..., n), each known in the frame other than its view's."""
         frames = np.array([frame for frame, _ in views])
         images = np.array([2 * frame + SIDES.index(side) for frame, side in views])
         offsets = np.array([rig.offset(side) for _, side in views])
@@ -430,7 +430,7 @@ class Features(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Problem:
-    """Points and lines of a rig: what RANSAC estimates a motion from, and least squares improves it on."""
+    """Points and lines of a rig, from which RANSAC and then least squares estimate the motion."""
 
     features: Features
     points: Packed
@@ -466,7 +466,7 @@ class _Problem:
             yield [model for model in (motion_of(Pose(*one)) for one in poses) if model.success]
 
     def squares(self, model: MotionEstimate) -> tuple[FloatArray, FloatArray]:
-        """Of points and of lines, px^2."""
+        """Squared errors of points and of lines, px^2."""
         with np.errstate(all="ignore"):
             tracks = self.points.track_squares(self.points.theta(model.w, model.d))
             lines = self.lines.squares(model.w, model.d) if len(self.lines.rays) else np.zeros(0)
@@ -505,7 +505,7 @@ class _Problem:
         distance = float(np.median(np.linalg.norm(self.features.X[0, :, 0], axis=-1)))
         return _with_direction(motion_of(Pose(so3.exp(w), d)), covariance, distance)
 
-    def told(self, model: MotionEstimate, least: float, most: float) -> _Problem:
+    def with_noise_of(self, model: MotionEstimate, least: float, most: float) -> _Problem:
         """With the noise that the errors of a motion's inliers show, of each kind by itself where it has many."""
         noise = self.noise.copy()
         for k, (squares, freedom) in enumerate(zip(self.squares(model), (_TRACK_FREEDOM, FREEDOM), strict=True)):
@@ -524,7 +524,7 @@ class LineTripletSolver(Solver):
     """Samples of three points or lines in three images each; a card of it says ``robust = "own"``."""
 
     threshold_px: float = 0.625
-    """Largest error of an inlier, of a pair's as in the house's loop; it then follows the noise of either kind."""
+    """Largest error of an inlier, as of pairs in rsbench's robust loop; then it follows each kind's noise."""
     confidence: float = 0.999
     """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
@@ -559,7 +559,7 @@ class LineTripletSolver(Solver):
                 f"{len(tracks)} tracks with positive disparities and {len(lines)} lines with depth, need {_LEAST}"
             )
         problem = _Problem.of(tracks, lines, rig, self.threshold_px / _SIGMAS)
-        if count == _LEAST:  # none to spare: no consensus could be told from chance
+        if count == _LEAST:  # none to spare: a consensus would prove nothing
             return self._of_all(problem)
         reason = ""
         for factor in (1.0, _SECOND_TRY):
@@ -588,7 +588,7 @@ class LineTripletSolver(Solver):
         least, most = (factor * self.threshold_px / _SIGMAS for factor in _RANGE)
         before = np.zeros(problem.num_data, dtype=np.bool_)
         for _ in range(_REFITS):
-            problem = problem.told(model, least, most)
+            problem = problem.with_noise_of(model, least, most)
             inliers = problem.residuals(model) <= _SIGMAS
             if np.count_nonzero(inliers) < _LEAST or np.array_equal(inliers, before):
                 break
@@ -614,7 +614,7 @@ def _with_direction(motion: MotionEstimate, covariance: FloatArray, distance: fl
 
 @cache
 def _quantile(freedom: int) -> float:
-    """Of chi-squared, with the probability that a normal variable lies within ``_SIGMAS``."""
+    """Quantile of chi-squared at the probability that a normal variable lies within ``_SIGMAS``."""
     return float(scipy.special.chdtri(freedom, scipy.special.chdtrc(1, _SIGMAS**2)))
 
 

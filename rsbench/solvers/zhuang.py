@@ -228,9 +228,10 @@ class ZhuangSolver(Solver):
     """
 
     acceleration: Literal["none", "constant"] = "none"
-    """Whether k is 0 or found."""
+    """``none``: k is 0; ``constant``: k is estimated."""
     refinement: Literal["none", "reprojection"] = "reprojection"
-    """Of the linear solution on more than a minimal sample: the paper's error of the flow, over all depths too."""
+    """Refinement of the linear solution of more matches than a minimal sample has: least squares of the paper's
+    error of the flow, over all depths too."""
 
     @property
     def spec(self) -> SolverSpec:
@@ -311,8 +312,8 @@ class ZhuangSolver(Solver):
         values = [0.0] if self._least == 8 else accelerations(Z0, Z1) or [0.0]
         found = [velocity_of(flow, null_vectors(Z0 + k * Z1), k) for k in values]
         good = [each for each in found if not isinstance(each, str)]
-        told = [each for each in found if isinstance(each, str)]
-        return good, next(iter(told), "")
+        failures = [each for each in found if isinstance(each, str)]
+        return good, next(iter(failures), "")
 
     def _reported(self, found: Velocity | str) -> MotionEstimate:
         if isinstance(found, str):
@@ -389,7 +390,7 @@ class FlowScaledSolver(Solver):
 
     @property
     def spec(self) -> SolverSpec:
-        """What the solver inside declares, on a rolling shutter."""
+        """The spec of the inner solver, on a rolling shutter."""
         inner = self.inner.spec
         return replace(
             inner,

@@ -464,7 +464,7 @@ def test_the_reason_of_the_solver_is_in_that_of_the_loop() -> None:
     solver = StubbornSolver()
     result = run_loop(solver, s.correspondences)
     assert not result.estimate.success
-    assert result.estimate.reason.endswith("the solver said most often: it is Sunday")
+    assert result.estimate.reason.endswith("most frequent failure: it is Sunday")
 
 
 def test_an_own_loop_is_given_everything_once_and_not_wrapped() -> None:

@@ -36,7 +36,7 @@ part of RANSAC's samples."""
 SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
 """Samples of other sensors."""
 BESIDE: Mapping[MatchSet, str] = {"affine": "affine frames of left matches", **SENSORS}
-"""What is no set of matches."""
+"""Sets that are not matches."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,7 +62,7 @@ class MotionEstimate:
     noise_px: float | None = None
     """Standard deviation of one pixel coordinate that the residuals show."""
     motion_parameters: Mapping[str, float] = field(default_factory=dict)
-    """Those of the motion model's own parameters that the solver has found; the others are those of its spec."""
+    """The motion model's own parameters that the solver estimated; the spec has the others."""
 
     def __post_init__(self) -> None:
         for name in ("success", "metric", "direction_known"):
@@ -79,7 +79,7 @@ class MotionEstimate:
 
     @classmethod
     def failed(cls, reason: str) -> MotionEstimate:
-        """The value that says there is no estimate, and why."""
+        """A failed estimate with its reason."""
         nowhere = np.full(3, np.nan)
         return cls(w=nowhere, d=nowhere, success=False, reason=reason, direction_known=False)
 
@@ -88,8 +88,8 @@ class MotionEstimate:
 class SolverSpec:
     """What a solver declares, checked when it is made: data, which tables, cards and RANSAC read.
 
-    Raises ValueError on a set, model, shutter or point that does not exist, so that a slip of the pen cannot
-    change scores in silence.
+    Raises ValueError on a set, model, shutter or point that does not exist, so that a typing error cannot
+    change scores unnoticed.
     """
 
     needs: Set[MatchSet]
@@ -106,7 +106,7 @@ class SolverSpec:
     reference: str
     """Where it was published: paper and equation."""
     assumes: str
-    """What must hold for it to work, in words."""
+    """Its assumptions, in words."""
     cameras: Literal["ideal", "lens", "any"] = "ideal"
     """What it takes beside cameras without a lens that read rows from the top at the same times: a lens; or other
     scans and a late right camera too. It then has rays from ``camera.unproject`` and times from
@@ -157,7 +157,7 @@ class SolverSpec:
             raise ValueError(str(error)) from error
 
     def refusal(self, rig: StereoRig, shutter: RollingShutter) -> str:
-        """Why it does not take such cameras; empty when it does."""
+        """Why it does not accept such cameras; empty when it does."""
         if self.shutter == "global" or self.cameras == "any":
             return ""
         if rig.camera.lens is not None and self.cameras == "ideal":
@@ -167,7 +167,7 @@ class SolverSpec:
         return ""
 
     def shortage(self, counts: Mapping[MatchSet, int]) -> MotionEstimate | None:
-        """The failure that too few matches are; None when there are enough."""
+        """A failed estimate where there are too few matches; None when there are enough."""
         for name, least in self.minimum.items():
             if counts.get(name, 0) < least:
                 return MotionEstimate.failed(
@@ -182,7 +182,7 @@ class Solver(ABC):
     @property
     @abstractmethod
     def spec(self) -> SolverSpec:
-        """What it declares; a class attribute where the parameters do not change it."""
+        """Its declaration; a class attribute where the parameters do not change it."""
 
     @property
     def inner_keys(self) -> tuple[str, ...]:
@@ -217,11 +217,11 @@ class Solver(ABC):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
-        """Like ``estimate``, for a solver that gains from starting at a nearby motion.
+        """Like ``estimate``, for a solver that profits from a nearby start.
 
         Args:
             motion: where to start.
-            quick: a step of a search, whose result is improved again: need not be the last digit.
+            quick: a step of a search, whose result is refined again, so that few digits suffice.
         """
         return self.estimate(correspondences, rig, shutter)
 
@@ -245,12 +245,12 @@ class Solver(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
-    """What a solver's card may say beside its parameters."""
+    """Keys of a solver's card beside its parameters."""
 
     robust: Literal["ransac", "own"] = "ransac"
-    """``own``: the solver throws outliers out by itself; it is given all matches, timed and scored as it is."""
+    """``own``: the solver rejects outliers itself and gets all matches; ``ransac``: rsbench's loop does."""
     use: str = ""
-    """When to take this one rather than another, in a line for people; nothing else reads it."""
+    """When to choose this solver, one line for readers; no code uses it."""
     time_limit_s: float = 60.0
     """Wall-clock time for one problem, after which a solver of another package has failed."""
 
@@ -260,7 +260,7 @@ class SolverOptions:
 
     @property
     def deciding(self) -> dict[str, Any]:
-        """What may change an answer, by name."""
+        """Options that may change an answer, by name."""
         return {"robust": self.robust, "time_limit_s": self.time_limit_s}
 
 

@@ -54,7 +54,7 @@ class Packed:
     h: float
     baseline: float
     kernel: MotionKernel
-    """Of the motion model."""
+    """The kernel of the motion model."""
 
     @property
     def law(self) -> MotionKernel:
@@ -68,16 +68,16 @@ class Packed:
 
     @property
     def one_camera(self) -> bool:
-        """Whether all are pairs of a camera that stands in the body's origin: they do not feel the length of v."""
+        """Whether all are pairs of a camera in the body's origin, which do not determine the length of v."""
         return len(self.tracks) == 0 and not np.any(self.pairs[:, 6])
 
     @property
     def parameters(self) -> int:
-        """Number of unknowns of the motion that the measurements feel."""
+        """Number of unknowns of the motion that the measurements determine."""
         return 5 if self.one_camera else 6
 
     def definite(self, theta: FloatArray, H: FloatArray) -> FloatArray:
-        """H (6, 6), made definite along the length of v where nothing is felt there, which changes no step else.
+        """H (6, 6), made definite along the length of v where the pairs do not determine it; steps stay the same.
 
         For kernels whose T is proportional to v, as of all motion models here.
         """
@@ -305,7 +305,7 @@ class Each(NamedTuple):
 
 
 def each_term(packed: Packed, theta: FloatArray) -> Each:
-    """What ``Packed.normal_equations`` sums up, and with the row checks of the tracks in their squares."""
+    """The terms of ``Packed.normal_equations``; the squares of tracks include their row checks."""
     pairs, count = len(packed.pairs), len(packed.pairs) + len(packed.tracks)
     squares, g, H = np.zeros(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
     first, last, camera = slice(pairs), slice(pairs, None), (packed.focal, packed.h)
@@ -408,7 +408,7 @@ class HeavyTailed(Packed):
         return trust * self.scale**2 * np.log1p(squares / (self.nu * self.scale**2))
 
     def noise_variance(self, cost: float) -> float:
-        """Of a coordinate, px^2, without tails: as of a normal error, two in three are below its root."""
+        """Variance of a coordinate, px^2, without tails: two in three errors are below its root."""
         return (self.scale * float(scipy.special.stdtrit(self.nu, _ONE_SIGMA))) ** 2
 
     def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
@@ -462,7 +462,7 @@ def _freedom(packed: Packed) -> FloatArray:
 
 
 def _scale(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> float:
-    """Of the largest likelihood; the motion has taken six degrees of freedom.
+    """Scale of the largest likelihood; the motion has taken six degrees of freedom.
 
     By the parameter-expanded EM algorithm, in half the steps of the plain one: the mean that weights have in the
     end is known, and a step divides by the one they have (C. Liu, D. Rubin, Y. Wu, Biometrika 1998).

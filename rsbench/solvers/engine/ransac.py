@@ -27,7 +27,7 @@ _MOST_STEPS = 10**9
 
 
 class Estimator(Protocol[Model]):
-    """What is to be estimated. Data are indices 0 ... sum(num_data) - 1, in groups that are sampled separately."""
+    """A model to estimate. Data are indices 0 ... sum(num_data) - 1, in groups that are sampled separately."""
 
     @property
     def num_data(self) -> tuple[int, ...]:

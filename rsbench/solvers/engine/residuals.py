@@ -356,7 +356,7 @@ def _linearise(
 def _fill_velocities(
     first: Vector, p: Vector, vx: float, vy: float, focal: FloatArray, work: FloatArray, column: int
 ) -> None:
-    """Of a predicted pixel by the time of the first end, whose point moves by ``first``, and by its own."""
+    """Fill a predicted pixel's velocities by its own time and by the first end's (which moves by ``first``)."""
     work[4, 0, column] = focal[0] * (first[0] - p[0] / p[2] * first[2]) / p[2]
     work[4, 1, column] = focal[1] * (first[1] - p[1] / p[2] * first[2]) / p[2]
     work[5, 0, column], work[5, 1, column] = vx, vy
@@ -606,7 +606,7 @@ def _add_normal(
 
 
 _LEAST_SLOPE = 0.1
-"""Of the weight: what a measurement far off counts in the Hessian, at least, as in ``packed.HeavyTailed``."""
+"""Least share of its weight that an outlier has in the Hessian, as in ``packed.HeavyTailed``."""
 _MOTION = 6
 
 
@@ -696,7 +696,7 @@ def _loss(square: float, freedom: float, tails: FloatArray, trust: float) -> flo
 
 @compiled
 def _weights(square: float, freedom: float, tails: FloatArray, trust: float) -> tuple[float, float]:
-    """Of a measurement in the gradient and in the Hessian: its second derivative, averaged over directions."""
+    """Weights of a measurement in the gradient and in the Hessian (its mean second derivative over directions)."""
     variance = tails[1] * tails[1]
     weight = trust * (tails[0] + freedom) / (tails[0] + square / variance)
     bend = 2.0 * square / freedom / (tails[0] * variance + square)
@@ -715,7 +715,7 @@ def add_pairs(
     gradient: FloatArray,
     H: FloatArray,
 ) -> float:
-    """What ``add_tracks`` is, of pairs (n, 17); ``by``: (n, 2, k, 3)."""
+    """Like ``add_tracks``, for pairs (n, 17); ``by``: (n, 2, k, 3)."""
     size = len(gradient)
     J, work, ends = np.zeros(size), np.zeros((4, 3, 3)), np.zeros(6)
     cost = 0.0

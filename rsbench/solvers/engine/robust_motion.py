@@ -65,7 +65,7 @@ class RobustProblem:
         self.spec = solver.spec
         self._stereo = "stereo" in self.spec.needs
         self.reasons: Counter[str] = Counter()
-        """Why the solver gave no motion of a sample, in its own words."""
+        """How often the solver failed on a sample for each reason."""
         self._sizes, self.linked = self._plan(linked)
         self._affine = "affine" in self.spec.needs
         self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
@@ -105,7 +105,7 @@ class RobustProblem:
         return Correspondences(**pairs, tracks=tracks, affine=affine)
 
     def _packed(self) -> Packed:
-        """The data under the shutter that the solver believes in, about the point whose motion it gives."""
+        """The data under the shutter that the solver assumes, about the point whose motion it gives."""
         data, rig, shutter = self.data, self.rig, self.shutter
         model, own = self.spec.motion_model, self.spec.motion_parameters
         if self.spec.shutter == "global":
@@ -147,7 +147,7 @@ class RobustProblem:
 
     @property
     def shortage(self) -> str:
-        """What is missing for a minimal sample; empty when nothing is."""
+        """What is missing for a minimal sample; empty when nothing is missing."""
         names = dict(zip(_GROUPS, ("left matches", "right matches", "tracks"), strict=True))
         if self._affine:
             names["left"] = "left matches with affine frames"
@@ -158,9 +158,9 @@ class RobustProblem:
         return "; ".join(short)
 
     def failure(self, reason: str) -> str:
-        """Why there is no motion, with what the solver said of the samples most often."""
-        said = "".join(f"; the solver said most often: {text}" for text, _ in self.reasons.most_common(1))
-        return f"{self.shortage or reason}{said}"
+        """Why there is no motion, with the most frequent reason that the solver gave for samples."""
+        most_often = "".join(f"; most frequent failure: {text}" for text, _ in self.reasons.most_common(1))
+        return f"{self.shortage or reason}{most_often}"
 
     def noise_threshold(self, model: MotionEstimate, threshold: float) -> float:
         """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
@@ -184,7 +184,7 @@ class RobustProblem:
         return estimate if estimate.success else None
 
     def weigh(self, model: MotionEstimate, threshold: float) -> MotionEstimate | None:
-        """What a solver that weighs matches itself makes of all of them near a model."""
+        """The motion from all matches near a model, of a solver that weighs matches itself."""
         near = np.flatnonzero(np.abs(self.residuals(model)) <= _NEAR * threshold)
         found = self.solver.weigh(model, self._subset(near), self.rig, self.shutter, threshold / SIGMAS)
         return found if found is not None and found.success else None
@@ -196,7 +196,7 @@ class RobustProblem:
         return estimate if estimate.success else model
 
     def on_all(self) -> MotionEstimate:
-        """What the solver itself makes of all matches."""
+        """The solver's own estimate from all matches."""
         data = self.data
         everything = self._handed(data.left, data.right, data.tracks) if self._stereo else self.given
         return self.solver.estimate(everything, self.rig, self.shutter)
@@ -214,7 +214,7 @@ class RobustProblem:
     def _handed(
         self, left: FloatArray, right: FloatArray, tracks: FloatArray, affine: FloatArray | None = None
     ) -> Correspondences:
-        """Matches as the solver wants them: tracks as they are, or as matches that end in left-right matches."""
+        """Matches as the solver needs them: tracks as they are, or as matches that end in left-right matches."""
         if not self._stereo:
             frames = {} if affine is None else {"affine": affine}
             return Correspondences(left=left, right=right, tracks=tracks, **frames, **self._sensed)
@@ -230,7 +230,7 @@ class RobustProblem:
 
     @property
     def _sensed(self) -> dict[str, FloatArray]:
-        """What other sensors say, which is given whole."""
+        """Samples of other sensors, all of them."""
         return {name: getattr(self.given, name) for name in SENSORS}
 
     def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
@@ -266,7 +266,7 @@ class RobustProblem:
 
 @functools.cache
 def _quantile(freedom: int) -> float:
-    """Of chi-squared, with the probability that a normal variable lies within 2.5 standard deviations."""
+    """Quantile of chi-squared at the probability that a normal variable lies within 2.5 standard deviations."""
     return float(2.0 * scipy.special.gammaincinv(0.5 * freedom, float(scipy.special.chdtr(1, SIGMAS**2))))
 
 
@@ -303,7 +303,7 @@ class RobustOptions:
     adapt_threshold: bool = True
     """Whether the threshold then follows the noise that the inliers show, between a fifth and four times it."""
     confidence: float = 0.999
-    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
+    """Probability, 0 to 1, of having drawn a sample without outliers when RANSAC stops."""
     min_iterations: int = 10
     """Samples that RANSAC draws, at least."""
     max_iterations: int = 1000
@@ -314,7 +314,7 @@ class RobustOptions:
     """Refinements at the end, until the inliers stay the same."""
 
     def ransac(self) -> RansacOptions:
-        """As the loop wants it; checks the values."""
+        """The options of the search; checks the values."""
         same = ("confidence", "min_iterations", "max_iterations", "lo_steps", "final_steps")
         return RansacOptions(threshold=self.threshold_px, **{name: getattr(self, name) for name in same})
 
@@ -331,7 +331,7 @@ class RobustEstimate:
     """Masks over ``left``, ``right`` and ``tracks``; all False after a failure. Sets may repeat the same points:
     their sum counts those twice, ``counts`` does not."""
     counts: dict[MatchSet, MatchCount] = field(default_factory=dict)
-    """Of the matches that the solver works on, each once: ``tracks``, and under ``left`` and ``right`` the pairs
+    """Counts of matches that the solver uses, each once: ``tracks``, and under ``left`` and ``right`` the pairs
     that no track repeats. For a solver of pairs a track is a left and a right pair, which count there."""
     iterations: int
     seconds: float
@@ -375,7 +375,7 @@ def estimate_motion(
     Left-right matches count as parts of tracks; where no tracks are given, those are joined (``join_stereo``).
 
     Args:
-        loop: ``own`` (``robust`` in a solver's card): the solver throws outliers out by itself. It is given all
+        loop: ``own`` (``robust`` in a solver's card): the solver rejects outliers itself. It is given all
             matches once; its inliers are those that its motion explains.
     """
     given, note = correspondences, ""
@@ -413,7 +413,7 @@ def estimate_motion(
 def _refused(
     correspondences: Correspondences, reason: str, solver: Solver, options: RobustOptions
 ) -> RobustEstimate:
-    """The failure of a solver that is not asked."""
+    """The failure of a solver that is not run."""
     names: tuple[MatchSet, ...] = ("left", "right", "tracks")
     return RobustEstimate(
         estimate=MotionEstimate.failed(reason),
@@ -445,7 +445,7 @@ class _Task(NamedTuple):
     options: RobustOptions
 
     def by_ransac(self, rng: np.random.Generator) -> _Found:
-        """By RANSAC around the solver."""
+        """The motion by RANSAC around the solver."""
         failed, iterations, options = None, 0, self.options
         for problem, threshold in self._attempts():
             report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
@@ -459,7 +459,7 @@ class _Task(NamedTuple):
         return failed
 
     def by_solver(self) -> _Found:
-        """By the solver alone, which rejects outliers itself."""
+        """The motion by the solver alone, which rejects outliers itself."""
         problem, threshold = RobustProblem(*self[:4]), self.options.threshold_px
         estimate = problem.on_all()
         if not estimate.success:
@@ -510,12 +510,12 @@ def _conclude(
 
 
 def _cost(problem: RobustProblem, model: MotionEstimate, threshold: float) -> float:
-    """What the search minimises, MSAC."""
+    """The MSAC cost, which the search minimises."""
     errors = np.abs(problem.residuals(model))
     return msac_score(np.where(np.isnan(errors), np.inf, errors), threshold)
 
 
 def _adapted(problem: RobustProblem, model: MotionEstimate, threshold: float, options: RobustOptions) -> float:
-    """The threshold that fits the noise of a model's inliers, between a fifth and four times the one asked for."""
+    """The threshold that fits the noise of a model's inliers, between a fifth and four times the requested one."""
     least, most = 0.2 * options.threshold_px, 4.0 * options.threshold_px
     return float(np.clip(problem.noise_threshold(model, threshold), least, most))
