@@ -28,7 +28,9 @@ _NEAR = 1.5
 that of a bright neighbour counts up to twice."""
 _COARSE, _OFF = 4, 1.25
 """Steps from which on a coefficient tells, and how far it may be from whole steps: six standard deviations of what
-rounding to codes leaves. Of those that were not rounded to a step of 4, a third are farther off."""
+rounding to codes leaves where it differs from pixel to pixel. Of those that were not rounded to a step of 4, a third
+are farther off. In blocks of equal rows or columns the rounding repeats and adds up: coefficients count only where
+whole steps also leave more than so many codes at a pixel, where both roundings, of luminance and of RGB, leave 1."""
 _OPEN = 125.0
 """Luminance about grey beyond which it may have been cut off."""
 _FIRST = 1.0 / np.sqrt(2.0)
@@ -135,7 +137,8 @@ class _Blocks(NamedTuple):
     def off_steps(self, quality: int) -> _Counts:
         """Coefficients that are not whole steps."""
         steps = quality_steps(quality)
-        off = np.abs(self.coefficients - steps * np.round(self.coefficients / steps)) > _OFF
+        left = np.where(steps >= _COARSE, self.coefficients - steps * np.round(self.coefficients / steps), 0.0)
+        off = (np.abs(left) > _OFF) & np.any(np.abs(_DCT.T @ left @ _DCT) > _OFF, axis=(-2, -1), keepdims=True)
         judged = np.broadcast_to(self.open[..., None, None] & (steps >= _COARSE), off.shape)
         counts = (
             np.sum(each, axis=(1, 2, 3)).repeat(_BLOCK).astype(np.float64) for each in (off & judged, judged)

@@ -260,3 +260,13 @@ def test_cameras_may_differ_and_records_say_what_there_is() -> None:
     assert right.of("left", 0) == right
     assert set(sensor.record) - set(NOISY.record) == {"mosaic", "right_mosaic", "right_jpeg_quality"}
     assert not {"mosaic", "jpeg_quality"} & set(NOISY.record)
+
+
+@pytest.mark.parametrize("quality", [10, 20, 50, 80])
+def test_a_compressed_image_of_equal_rows_is_sound(quality: int) -> None:
+    """In each block all rows are alike: their rounding repeats, and adds up in few coefficients."""
+    rows = np.random.default_rng(0).uniform(30.0, 90.0, (12, 96)).repeat(8, axis=0)
+    raw = (rows[..., None] * np.array([0.8, 1.0, 0.6])).astype(np.uint8)
+    sensor = Sensor(jpeg_quality=quality)
+    assert processing_fault(compressed(raw, quality), sensor, "x") is None
+    assert "whole steps" in str(processing_fault(raw, sensor, "x"))
