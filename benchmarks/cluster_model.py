@@ -112,8 +112,7 @@ def child(what: str, scene: str) -> list[float]:
 
 def _scene_seconds(scene: str) -> float:
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.generation import build_scene
-    from rsbench.dataset.posed_scenes import PosedScenes
+    from rsbench.dataset.generation import PosedScenes, build_scene
 
     sequence = next(each for each in load_dataset_card(CARD).sequence if each.scene == scene)
     begun = time.process_time()

@@ -16,14 +16,13 @@ from typing import Any
 from rsbench.components.cards import load_card
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.generation import build_scene, render_camera, scene_name
-from rsbench.dataset.posed_scenes import PosedScenes
+from rsbench.dataset.generation import PosedScenes, build_scene, render_camera, scene_name
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.llvm import cpu_features
 from rsbench.renderers.options import RendererOptions
 from rsbench.storage.files import background_writer, sha256, write_bytes
 from rsbench.storage.work_folder import files_below
-from rsbench.verification.reference_copy import FRAME, SIDE, record_of
+from rsbench.verification.digests import FRAME, SIDE, record_of
 
 ROOT = Path(__file__).parents[1]
 

@@ -73,7 +73,7 @@ def resume(card: Path, out: Path | str) -> None:
     """Resume in this process, and print seconds and the largest memory, MB."""
     from rsbench.dataset import generation
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.posed_scenes import Built
+    from rsbench.dataset.generation import Built
 
     vars(generation)["build_scene"] = lambda name: Built(None, SCENE)  # pyrefly: ignore[bad-argument-type]
     start, processor = time.perf_counter(), time.process_time()

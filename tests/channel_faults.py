@@ -12,7 +12,6 @@ from attack.planting import drop, manifest_of, put
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.dataset.affine import AffineFrames, jacobians_of, save_affine
 from rsbench.dataset.channels import (
     AFFINE,
     COMPONENTS,
@@ -21,9 +20,9 @@ from rsbench.dataset.channels import (
     PixelClass,
     matches_file,
 )
-from rsbench.dataset.match_truth import Arranged, labelled
-from rsbench.dataset.matches import MatchClass, Matching, save_matches
+from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled, save_matches
 from rsbench.dataset.sequence import read_sequence
+from rsbench.dataset.tracks import AffineFrames, jacobians_of, save_affine
 from rsbench.renderers.image import to_srgb8
 from rsbench.storage.files import (
     read_depth,

@@ -17,7 +17,7 @@ from markdown_it import MarkdownIt
 import rsbench
 from rsbench.components.cards import CardKind, list_cards
 from rsbench.core.version import RELEASED
-from rsbench.verification.reference_copy import references
+from rsbench.verification.digests import references
 
 ROOT = Path(__file__).parents[1]
 

@@ -150,8 +150,14 @@ def _correct_four(
 
     from rsbench.capture.calibration import NO_ERRORS
     from rsbench.cli.console import progress_bar
-    from rsbench.dataset.corrected_frames import fresh_folder, motion_record, rig_record, write_frame, write_record
-    from rsbench.dataset.corrected_video import refuse_video
+    from rsbench.dataset.corrected_frames import (
+        fresh_folder,
+        motion_record,
+        refuse_video,
+        rig_record,
+        write_frame,
+        write_record,
+    )
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
     from rsbench.report.corrected_page import card_of

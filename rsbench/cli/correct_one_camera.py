@@ -79,7 +79,7 @@ def correct_one_camera(
 
 def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None) -> None:
     """A line where a ratio is of another frame rate than the frames: it is a share of the frame period."""
-    from rsbench.dataset.corrected_video import said_fps
+    from rsbench.dataset.corrected_frames import said_fps
 
     fps = said_fps(source.path) if said is None else said
     if card.frame_period_s is None or card.readout_ratio is None or fps is None or not fps > 0.0:
@@ -141,7 +141,7 @@ class GyroGiven:
     def _fps(self, source: FrameSource) -> float:
         """Raises RsbenchError where nobody says it."""
         from rsbench.core.errors import RsbenchError
-        from rsbench.dataset.corrected_video import said_fps
+        from rsbench.dataset.corrected_frames import said_fps
 
         fps = said_fps(source.path) if self.fps is None else self.fps
         if fps is None:
@@ -165,8 +165,15 @@ def _correct(
     source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions, gyro: Gyroscope | None
 ) -> dict[str, Any]:
     """What motion.json holds, once all is written, as a folder or a video."""
-    from rsbench.dataset.corrected_frames import fresh_folder, read_corrected, write_record
-    from rsbench.dataset.corrected_video import fps_of, is_video, video_place, write_video
+    from rsbench.dataset.corrected_frames import (
+        fps_of,
+        fresh_folder,
+        is_video,
+        read_corrected,
+        video_place,
+        write_record,
+        write_video,
+    )
     from rsbench.report.corrected_page import write_page
 
     run = _run_key(source, card, options, is_video(out), gyro)

@@ -34,8 +34,7 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     from dataclasses import replace
 
     from rsbench.core.shutter import Scanning
-    from rsbench.dataset.corrected_frames import fresh_folder, rig_record
-    from rsbench.dataset.corrected_video import is_video, video_place
+    from rsbench.dataset.corrected_frames import fresh_folder, is_video, rig_record, video_place
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.found_camera import spread_windows
 
@@ -76,7 +75,7 @@ def _run_key(
     import hashlib
 
     from rsbench.core.version import __version__
-    from rsbench.dataset.corrected_video import is_video
+    from rsbench.dataset.corrected_frames import is_video
 
     flags = close, given.row_poses, is_video(given.out)
     said = [__version__, repr(given.card), repr(options), repr(flags)]
@@ -193,8 +192,7 @@ def _write_both(out: Path, folder: Path, sources: Sources, record: dict[str, Any
     """A video of both cameras side by side; a time that is not corrected is there as it was read."""
     import numpy as np
 
-    from rsbench.dataset.corrected_frames import read_corrected
-    from rsbench.dataset.corrected_video import fps_of, write_video
+    from rsbench.dataset.corrected_frames import fps_of, read_corrected, write_video
 
     def shown(side: str, number: int, image: Any) -> Any:
         name = f"{side}_{number:06d}"
@@ -209,7 +207,7 @@ def _write_both(out: Path, folder: Path, sources: Sources, record: dict[str, Any
 
 def _say(out: Path, first: str, record: dict[str, Any], given_gyro: bool) -> None:
     """Exit 1 where a time is not corrected."""
-    from rsbench.dataset.corrected_video import is_video
+    from rsbench.dataset.corrected_frames import is_video
 
     frames = record["frames"]
     failed, skipped = (

@@ -135,8 +135,8 @@ def generate(
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
     from rsbench.cli.console import progress_bar
+    from rsbench.dataset.destinations import store_for
     from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.dataset.store_destination import store_for
     from rsbench.renderers.backend import start_backend
     from rsbench.storage.files import check_out
     from rsbench.storage.object_store import path_or_url, shown
@@ -236,7 +236,7 @@ def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
     """What it will take, in one line."""
     from rsbench.cli.console import progress_bar
     from rsbench.core.errors import RsbenchError
-    from rsbench.dataset.cost_estimate import estimate_dataset
+    from rsbench.dataset.generation import estimate_dataset
 
     if full_frames:
         raise RsbenchError("--estimate: not with --full-frames, of which one frame takes as long as hundreds")

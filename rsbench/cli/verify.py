@@ -88,7 +88,7 @@ def verify(
 
 def _reference_faults(folder: Path) -> list[str]:
     """What differs from the reference copy, after telling what does not."""
-    from rsbench.verification.reference_copy import against_reference
+    from rsbench.verification.digests import against_reference
 
     found = list(against_reference(folder))
     same = sum(each.same for each in found)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.affine import AffineFrames, read_affine
 from rsbench.dataset.channels import (
     AFFINE,
     COMPONENTS,
@@ -31,8 +30,8 @@ from rsbench.dataset.channels import (
 from rsbench.dataset.imu import IMU_MANIFEST, ImuSamples, read_imu
 from rsbench.dataset.layout import frames_of
 from rsbench.dataset.matches import LabelledMatches, read_matches
-from rsbench.dataset.timing import MANIFEST, read_timing_table, table_file
-from rsbench.dataset.tracks import Tracks, read_tracks
+from rsbench.dataset.timing import TIMING_MANIFEST, read_timing_table, table_file
+from rsbench.dataset.tracks import AffineFrames, Tracks, read_affine, read_tracks
 from rsbench.storage.files import read_exr, read_grey_png, read_json
 from rsbench.storage.untrusted_files import inside
 
@@ -110,7 +109,7 @@ class ChannelReader:
     def timing(self) -> dict[str, Any]:
         """Content of timing.json; RsbenchError as of ``offsets``."""
         self._check_channel("timing")
-        return read_json(inside(self.folder, MANIFEST))
+        return read_json(inside(self.folder, TIMING_MANIFEST))
 
     def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
         """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""

@@ -31,7 +31,7 @@ from rsbench.dataset.channels import (
     radiance_file,
     surface_file,
 )
-from rsbench.dataset.object_records import numbers_of
+from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces

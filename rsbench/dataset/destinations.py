@@ -1,23 +1,37 @@
-"""Destinations of a generated dataset: a local folder, or an object store (``store_destination``)."""
+"""Destinations of a generated dataset: a local folder, or an object store."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.layout import is_of_sequence
-from rsbench.dataset.manifest import Files, write_manifest
-from rsbench.dataset.scene_hashes import SceneHashes
-from rsbench.dataset.sequence_identity import Plan, check_same, hashes_in, wanted_files
-from rsbench.jobs.process_jobs import Workers
-from rsbench.storage.files import HASHES, FileHashes, read_json, sha256
-from rsbench.storage.work_folder import HIDDEN, WORK, named, unknown_files, work_folder
+from rsbench.dataset.manifest import CROISSANT, DATASET, Files, croissant_of, manifest_of, says, write_manifest
+from rsbench.dataset.sequence_identity import Plan, SceneHashes, check_same, hashes_in, wanted_files
+from rsbench.jobs.process_jobs import Cluster, Workers
+from rsbench.storage.files import HASHES, FileHashes, HashedFile, read_json, sha256, write_json
+from rsbench.storage.object_store import Listed, Store, cache_of, key_of, open_store
+from rsbench.storage.work_folder import (
+    HIDDEN,
+    WORK,
+    files_below,
+    named,
+    remove,
+    temporary,
+    unknown_files,
+    work_folder,
+)
 
 
 class Target(Protocol):
@@ -156,7 +170,231 @@ def open_destination(out: Path | str, workers: Workers, rehash: bool) -> Iterato
         with folder_destination(out, rehash) as folder:
             yield folder
     else:
-        from rsbench.dataset.store_destination import store_destination
-
         with store_destination(out, workers, rehash) as store:
             yield store
+
+
+_OBJECTS = "objects.jsonl"
+_MANIFEST = "sequence.json"
+_REHASHED = 8
+"""Files in memory at once."""
+_MOST_CHILDREN = 1024
+"""Of all commands at work on one machine of a cluster for one store."""
+
+
+@dataclass(frozen=True)
+class StoreTarget:
+    """A ``Target``."""
+
+    url: str
+    work: Path | None
+    """Workplace; None where each process has one of its own, for it may be on another machine."""
+
+    def work_folder(self) -> Path:
+        return _own_work_folder(key_of(self.url)) if self.work is None else self.work
+
+    def place(self, partial: Path, name: str) -> None:
+        store = open_store(self.url)
+        files = {f"{name}/{file}": partial / file for file in files_below(partial)}
+        last = f"{name}/{_MANIFEST}"
+        store.upload({path: file for path, file in files.items() if path != last})
+        store.upload({last: files[last]})
+        remove(partial)
+
+
+class _Known(NamedTuple):
+    """A sequence as it was sent or first seen."""
+
+    token: str
+    """Of its sequence.json: size and token, as of ``Listed``."""
+    sha256: str
+    sizes: dict[str, int]
+    manifest: Plan
+
+    @property
+    def files(self) -> Files:
+        listed = {_MANIFEST: self.sha256, **hashes_in(self.manifest)}
+        return {file: HashedFile(self.sizes[file], 0, 0, digest) for file, digest in listed.items()}
+
+
+class StoreDestination:
+    """A ``Home``."""
+
+    def __init__(self, store: Store, hidden: Path, target: StoreTarget, rehash: bool) -> None:
+        self.hidden, self.target = hidden, target
+        self._store, self._rehash = store, rehash
+        if rehash:
+            (hidden / _OBJECTS).unlink(missing_ok=True)
+        self._lines = _read_lines(hidden / _OBJECTS)
+        self._objects: dict[str, dict[str, Listed]] = {}
+        self._has_dataset = False
+
+    def complete(
+        self, sequences: Sequence[SequenceCard], plans: Mapping[str, Plan], scene_hashes: SceneHashes
+    ) -> Iterator[tuple[str, Files]]:
+        self._list("", plans)
+        self._has_dataset = "" in self._objects
+        new = [name for name in plans if self._is_new(name)]
+        self._learn(new, self._sizes_of_dataset() if new and self._has_dataset else {})
+        for sequence in sequences:
+            known = self._complete(sequence, plans[sequence.name], scene_hashes)
+            if known is not None:
+                yield sequence.name, known.files
+        self._objects.clear()
+
+    def learned(self, name: str) -> Files:
+        self._list(name, [name])
+        self._learn([name], {})
+        known = self._known(name)
+        if missing := [file for file in hashes_in(known.manifest) if file not in known.sizes]:
+            raise RsbenchError(
+                f"{self._store.url}/{name}: {named(missing)} is not there although it was sent; run the same "
+                "command again"
+            )
+        return known.files
+
+    def finish(self, card: DatasetCard, made: Mapping[str, Files]) -> None:
+        content, work = manifest_of(card, made), self.hidden / WORK
+        there = self._store.read([DATASET]) if self._has_dataset else ()
+        if not any(says(data, content) for _, data in there):
+            write_json(work / DATASET, content)
+            write_json(work / CROISSANT, croissant_of(content, sha256(work / DATASET)))
+            self._store.upload({CROISSANT: work / CROISSANT})
+            self._store.upload({DATASET: work / DATASET})
+
+    def _list(self, folder: str, names: Iterable[str]) -> None:
+        """See what the store has of these sequences; dataset.json is of the sequence without a name."""
+        found = {name: dict[str, Listed]() for name in names}
+        for path, listed in self._store.listing(folder).items():
+            name, _, file = path.partition("/")
+            if name in found:
+                found[name][file] = listed
+            elif path == DATASET:
+                found[""] = {path: listed}
+        self._objects = found
+
+    def _is_new(self, name: str) -> bool:
+        """Whether there is a sequence.json that has not been read, or has changed since."""
+        there = self._objects[name].get(_MANIFEST)
+        return there is not None and (name not in self._lines or self._known(name).token != there.state)
+
+    def _known(self, name: str) -> _Known:
+        return _Known(*json.loads(self._lines[name])[1:])
+
+    def _learn(self, names: Iterable[str], sizes: Mapping[tuple[str, str], int]) -> None:
+        """Read each sequence.json; files have the ``sizes`` of their paths and hashes, else those that they have
+        there now."""
+        with (self.hidden / _OBJECTS).open("a", encoding="utf-8", newline="\n") as stream:
+            for path, data in self._store.read([f"{name}/{_MANIFEST}" for name in names]):
+                name = path.partition("/")[0]
+                objects = self._objects[name]
+                manifest = _parsed(data, f"{self._store.url}/{path}")
+                digest = hashlib.sha256(data).hexdigest()
+                hashes = {_MANIFEST: digest, **hashes_in(manifest)}
+                own = {
+                    file: sizes.get((f"{name}/{file}", str(hashes.get(file))), there.size)
+                    for file, there in objects.items()
+                }
+                state = objects.get(_MANIFEST, Listed(0, "")).state
+                self._lines[name] = json.dumps([name, state, digest, own, manifest])
+                stream.write(f"\n{self._lines[name]}\n")  # the line before may have been cut by a kill
+
+    def _sizes_of_dataset(self) -> dict[tuple[str, str], int]:
+        """What dataset.json says of paths and hashes, as far as it can be read."""
+        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            for _, data in self._store.read([DATASET]):
+                files = json.loads(data)["files"].items()
+                return {(path, str(file["sha256"])): int(file["size"]) for path, file in files}
+        return {}
+
+    def _complete(self, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes) -> _Known | None:
+        """A sequence that was made from the same plan and has files of the sizes that they had then; else None."""
+        objects, place = self._objects[sequence.name], f"{self._store.url}/{sequence.name}"
+        others = named(sorted(file for file in objects if not is_of_sequence(file)))
+        if _MANIFEST not in objects:  # nothing is there, or what was sent until a run was stopped
+            if others:
+                raise RsbenchError(
+                    f"{place}: holds {others}, which is not rsbench's: move it away or choose another --out"
+                )
+            return None
+        known = self._known(sequence.name)
+        check_same(place, known.manifest, plan, scene_hashes.of(sequence.scene))
+        hashes, wanted = hashes_in(known.manifest), wanted_files(known.manifest, plan)
+        damaged = [file for file in wanted if not self._is_whole(objects.get(file), known.sizes.get(file))]
+        damaged += [file for file in wanted if not (isinstance(hashes.get(file), str) and is_of_sequence(file))]
+        if self._rehash and not damaged:
+            paths = {f"{sequence.name}/{file}": hashes[file] for file in wanted}
+            contents = self._store.read(paths, at_once=_REHASHED)
+            damaged = [path for path, data in contents if hashlib.sha256(data).hexdigest() != paths[path]]
+        if not damaged:
+            return known
+        if others:
+            raise RsbenchError(
+                f"{place}: {named(damaged)} differs from what was written, but {others} is not rsbench's: move it "
+                "away, then run the same command again"
+            )
+        self._store.remove(f"{sequence.name}/{_MANIFEST}")  # until it is whole again
+        return None
+
+    @staticmethod
+    def _is_whole(there: Listed | None, size: int | None) -> bool:
+        return there is not None and there.size == size
+
+
+def _parsed(data: bytes, path: str) -> Plan:
+    with contextlib.suppress(ValueError, RecursionError):
+        content = json.loads(data)
+        if isinstance(content, dict):
+            return content
+    raise RsbenchError(f"{path}: damaged, or not rsbench's: remove it, then run the same command again")
+
+
+def _read_lines(path: Path) -> dict[str, str]:
+    """The last line of each sequence, in which all that ``_Known`` has stands behind its name."""
+    lines = {}
+    with contextlib.suppress(FileNotFoundError), path.open(encoding="utf-8", errors="replace") as stream:
+        for line in stream:
+            with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or not ours
+                name, *known = json.loads(line)
+                if len(known) == len(_Known._fields):
+                    lines[name] = line
+    return lines
+
+
+def store_for(url: str, workers: Workers) -> Store:
+    """The store of a URL, if so many can write there.
+
+    Raises:
+        RsbenchError: see ``Store``; or processes of a store in this process's memory.
+    """
+    if url.startswith("memory:") and workers != 1:
+        raise RsbenchError(f"--out {url}: lives in one process: without --workers and --scheduler")
+    return open_store(url)
+
+
+@contextmanager
+def store_destination(url: str, workers: Workers, rehash: bool) -> Iterator[StoreDestination]:
+    """A store, to which no other command of this user on this machine sends a dataset; ``rehash`` reads all of it.
+
+    Raises:
+        RsbenchError: see ``store_for`` and ``work_folder``.
+    """
+    store, hidden = store_for(url, workers), cache_of(url)
+    with work_folder(hidden, hidden):
+        target = StoreTarget(url, None if isinstance(workers, Cluster) else hidden / WORK)
+        yield StoreDestination(store, hidden, target, rehash)
+
+
+_kept = contextlib.ExitStack()
+"""As long as this process."""
+
+
+@cache
+def _own_work_folder(key: str) -> Path:
+    """The first free one on this machine; its last owner may have been killed there."""
+    base = (temporary() or Path(tempfile.mkdtemp())) / "stores" / key
+    for number in range(_MOST_CHILDREN):
+        place = base / str(number)
+        with contextlib.suppress(RsbenchError):
+            return _kept.enter_context(work_folder(place, place)) / WORK
+    raise RsbenchError(f"{base}: cannot be written; set TMPDIR to a folder that can")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import secrets
+import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +32,15 @@ from rsbench.dataset.destinations import Target, open_destination
 from rsbench.dataset.layout import clean_file, files_of
 from rsbench.dataset.manifest import Files
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.posed_scenes import Build, Built, PosedScenes
-from rsbench.dataset.scene_hashes import SceneHashes, scene_hash
 from rsbench.dataset.sequence_channels import write_sequence_channels
-from rsbench.dataset.sequence_identity import Plan, of_scene, plans_of, with_gloss
+from rsbench.dataset.sequence_identity import Plan, SceneHashes, of_scene, plans_of, scene_hash, with_gloss
 from rsbench.dataset.views import ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import Cluster, Workers, finished_jobs
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene
+from rsbench.scenes.model import Scene
+from rsbench.scenes.object_meshes import with_moving
 from rsbench.storage.files import (
     Later,
     background_writer,
@@ -54,6 +57,49 @@ from rsbench.vision.feature_matcher import load_features
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame, OnGlobalFrame
     from rsbench.renderers.scene import MitsubaScene
+
+
+class Built(NamedTuple):
+    """A scene and its hash."""
+
+    scene: Scene
+    sha256: str
+
+
+Build = Callable[[str], Built]
+
+
+class PosedScenes:
+    """The scene of the last sequence in the renderer: sequences that are seen from one place share it."""
+
+    def __init__(self, build: Build) -> None:
+        self._build = build
+        self._place: object = None
+        self._scene: Any = None
+
+    def set_for(self, sequence: SequenceCard) -> tuple[MitsubaScene, str]:
+        """The scene in the frame of a sequence, and the hash of the scene."""
+        from rsbench.renderers.scene import MitsubaScene
+
+        place = place_of(sequence)
+        if place != self._place:
+            self._scene = None  # not two at a time
+        built = self._build(sequence.scene)
+        if self._scene is None:
+            self._scene, self._place = MitsubaScene(seen_scene(built.scene, sequence)), place
+        return self._scene, built.sha256
+
+
+def place_of(sequence: SequenceCard) -> tuple[object, ...]:
+    """What decides from where a sequence sees its scene."""
+    return sequence.scene, sequence.viewpoint, sequence.start, sequence.moving
+
+
+def seen_scene(scene: Scene, sequence: SequenceCard) -> Scene:
+    """A scene in the frame of the body at time 0 of a sequence, with its objects that move."""
+    seen = scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
+    return with_moving(seen, sequence.moving) if sequence.moving else seen
+
 
 Progress = Callable[[str], None]
 """Called with the name of the sequence after each of its ``steps_of``."""
@@ -81,7 +127,7 @@ def generate_dataset(
     Args:
         card: what to make.
         out: folder of the dataset, made if missing, or the URL of a store, to which sequences are sent when they
-            are complete (``store_destination``).
+            are complete (``StoreDestination``).
         workers: processes, or a cluster; each renders whole sequences.
         full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
@@ -301,3 +347,96 @@ def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDAr
 
     folder.mkdir(parents=True, exist_ok=True)
     return lambda row, image: write_png(folder / f"{row:04d}.png", to_srgb8(image, options.exposure))
+
+
+_LISTED_BYTES = 200
+"""Of a file in sequence.json and dataset.json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Of a whole dataset; bytes and seconds are those of one camera's frames times their number."""
+
+    sequences: int
+    files: int
+    bytes: int
+    seconds: float
+    """On this machine, in one process."""
+
+
+def estimate_dataset(card: DatasetCard, progress: Callable[[str], None]) -> Estimate:
+    """Render a little of a card and count the rest; ``progress`` is called with the name of each scene tried.
+
+    Raises:
+        RsbenchError: a scene or renderer of the card does not exist.
+    """
+    options = load_card(RendererOptions, "renderers", card.renderer)
+    found: list[Estimate] = []
+    warm: set[str] = set()
+    for scene, group in groupby(sorted(card.sequence, key=scene_name), key=scene_name):
+        found.append(_of_scene(card, list(group), options, warm))
+        progress(scene)
+    total = _sum(found)
+    return replace(total, files=total.files + 2, bytes=total.bytes + _LISTED_BYTES * (total.files + 2))
+
+
+def _sum(parts: list[Estimate]) -> Estimate:
+    return Estimate(
+        sequences=sum(each.sequences for each in parts),
+        files=sum(each.files for each in parts),
+        bytes=sum(each.bytes for each in parts),
+        seconds=sum(each.seconds for each in parts),
+    )
+
+
+def _of_scene(
+    card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, warm: set[str]
+) -> Estimate:
+    """Of the sequences of one scene: a trial with each sensor. ``warm``: those whose kernels are compiled."""
+    from rsbench.renderers.scene import MitsubaScene
+
+    start = time.monotonic()
+    scene = build_scene(sequences[0].scene).scene
+    built = time.monotonic()
+    rendered = MitsubaScene(seen_scene(scene, sequences[0]))
+    loaded = time.monotonic()
+    places = len({repr(place_of(sequence)) for sequence in sequences})
+    kinds: dict[str, list[SequenceCard]] = {}
+    for sequence in sequences:
+        kinds.setdefault(repr((card.sensor_of(sequence), len(sequence.moving))), []).append(sequence)
+    tried: list[Estimate] = []
+    for kind, alike in kinds.items():
+        same = alike[0].moving == sequences[0].moving
+        shown = rendered if same else MitsubaScene(seen_scene(scene, alike[0]))
+        tried.append(_of_kind(card, alike, options, shown, warm=kind in warm))
+        warm.add(kind)
+    total = _sum(tried)
+    return replace(total, seconds=total.seconds + built - start + places * (loaded - built))
+
+
+def _of_kind(
+    card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, scene: MitsubaScene, warm: bool
+) -> Estimate:
+    """Of sequences of one sensor; its first image compiles, which is counted once."""
+    glossy: dict[str, bool] = {"glossy": True} if scene.glossy else {}
+    own = files_of(card.manifest_of(sequences[0]) | glossy)
+    with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:
+        for folder in {Path(name).parent for name in own}:
+            (Path(temporary) / folder).mkdir(parents=True, exist_ok=True)
+        times, middle = list[float](), (card.frames - 1) // 2
+        for _ in range(1 if warm else 2):
+            begun = time.monotonic()
+            with background_writer() as later:
+                for _ in render_camera(
+                    card, sequences[0], options, scene, SIDES[0], middle, Path(temporary), later
+                ):
+                    pass
+            times.append(time.monotonic() - begun)
+        written = sum((Path(temporary) / name).stat().st_size for name in files_below(Path(temporary)))
+    cameras = len(SIDES) * card.frames * len(sequences)
+    return Estimate(
+        sequences=len(sequences),
+        files=len(sequences) * (len(own) + 1),
+        bytes=cameras * written,
+        seconds=max(times[0] - times[-1], 0.0) + cameras * times[-1],
+    )

@@ -36,7 +36,7 @@ from rsbench.dataset.layout import (
     picture_file,
 )
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.object_records import MovingManifest, check_moving, numbers_of
+from rsbench.dataset.motion_cards import MovingManifest, check_moving, numbers_of
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
 from rsbench.storage.untrusted_files import check_name, check_size, inside

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import VIEWS, views_of
-from rsbench.dataset.affine import make_affine, save_affine
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channels import AFFINE, INSTANCE_TABLE, MATCHER, matches_file
 from rsbench.dataset.imu import Imu, draw_samples, gravity_of, sample_times_ns, write_imu
 from rsbench.dataset.matches import Matching, save_matches
 from rsbench.dataset.timing import write_timing
-from rsbench.dataset.tracks import make_tracks, write_tracks
+from rsbench.dataset.tracks import make_affine, make_tracks, save_affine, write_tracks
 from rsbench.dataset.views import ImageView
 from rsbench.storage.files import read_depth, read_png, write_json
 
@@ -54,7 +53,7 @@ def write_sequence_channels(
         if "affine" in card.channels:
             save_affine(folder / AFFINE, make_affine(geometry, tracks, SceneRays(scene)))
     if "matches" in card.channels:
-        from rsbench.dataset.match_truth import make_matches, matcher_record
+        from rsbench.dataset.matches import make_matches, matcher_record
 
         matching, rays = card.matches or Matching(), SceneRays(scene)
         write_json(folder / MATCHER, matcher_record(matching))

@@ -15,8 +15,8 @@ from rsbench.renderers.image import Sensor
 from rsbench.storage.files import write_bytes, write_json
 from rsbench.storage.untrusted_files import read_text
 
-MANIFEST = "timing.json"
-COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"
+TIMING_MANIFEST = "timing.json"
+TIMING_COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"
 _NS = 1e9
 
 
@@ -27,7 +27,7 @@ def table_file(side: str, frame: int) -> str:
 
 def timing_files(frames: int) -> tuple[str, ...]:
     """All of them, of a sequence of so many frames."""
-    return (MANIFEST, *(table_file(*view) for view in views_of(frames)))
+    return (TIMING_MANIFEST, *(table_file(*view) for view in views_of(frames)))
 
 
 def timing_manifest(
@@ -53,7 +53,7 @@ def timing_manifest(
 def timing_table(
     shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, side: Side, frame: int
 ) -> NDArray[np.int64]:
-    """(H, 4) in the order of ``COLUMNS``, whole nanoseconds; of columns where the camera reads those."""
+    """(H, 4) in the order of ``TIMING_COLUMNS``, whole nanoseconds; of columns where the camera reads those."""
     rows = np.arange(shutter.lines(side))
     middle = _NS * frame_period_s * shutter.line_times(frame, side)
     half = 0.5 * _NS * (sensor.of(side, frame).exposure_s if sensor else 0.0)
@@ -64,15 +64,15 @@ def write_timing(
     folder: Path, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
 ) -> None:
     """All ``timing_files`` below the folder of a sequence."""
-    write_json(folder / MANIFEST, timing_manifest(shutter, frame_period_s, sensor, frames))
+    write_json(folder / TIMING_MANIFEST, timing_manifest(shutter, frame_period_s, sensor, frames))
     for side, frame in views_of(frames):
         table = timing_table(shutter, frame_period_s, sensor, side, frame)
         lines = [",".join(map(str, line)) for line in table.tolist()]
-        write_bytes(folder / table_file(side, frame), ("\n".join([COLUMNS, *lines]) + "\n").encode())
+        write_bytes(folder / table_file(side, frame), ("\n".join([TIMING_COLUMNS, *lines]) + "\n").encode())
 
 
 def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:
-    """(height, 4) in the order of ``COLUMNS``.
+    """(height, 4) in the order of ``TIMING_COLUMNS``.
 
     Raises:
         RsbenchError: missing, or not such a table.
@@ -82,6 +82,6 @@ def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:
         table = np.array([[int(cell) for cell in line.split(",")] for line in lines], dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise RsbenchError(f"{path}: not a table of whole numbers: {error}") from error
-    if header != COLUMNS or table.shape != (height, 4) or np.any(table[:, 0] != np.arange(height)):
-        raise RsbenchError(f"{path}: must have the columns {COLUMNS} and rows 0 to {height - 1}")
+    if header != TIMING_COLUMNS or table.shape != (height, 4) or np.any(table[:, 0] != np.arange(height)):
+        raise RsbenchError(f"{path}: must have the columns {TIMING_COLUMNS} and rows 0 to {height - 1}")
     return table

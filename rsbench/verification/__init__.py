@@ -12,11 +12,10 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.storage.files import read_json
 from rsbench.verification import manifest_checks
+from rsbench.verification.checks import STEPS, State, check_sequence, run_stage
 from rsbench.verification.findings import DepthAgreement, Finding, Progress, SequenceReport
 from rsbench.verification.rerender import Rerender, Rerenderer
-from rsbench.verification.state import State
 from rsbench.verification.verifying_jobs import reports_apart
-from rsbench.verification.walk import STEPS, check_sequence, run_stage
 
 __all__ = [
     "DepthAgreement",

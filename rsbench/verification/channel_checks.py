@@ -1,25 +1,39 @@
-"""Channels of ground truth against depth, motion and each other: every value is derived again."""
+"""Channels with a value for each pixel, against depth, motion and each other: every value is derived again."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES
-from rsbench.dataset.channel_truth import Rays, SeenSurfaces, carry, pair_truth, target_of
+from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.se3 import inverse
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.channel_truth import Rays, SeenSurfaces, carry, pair_truth, surface_truth, target_of
 from rsbench.dataset.channel_writer import pair_values
-from rsbench.dataset.channels import STEP_PX, Layer, PixelClass, pair_layers
-from rsbench.dataset.object_records import numbers_of
+from rsbench.dataset.channels import (
+    INSTANCE_TABLE,
+    STEP_PX,
+    Layer,
+    PixelClass,
+    pair_layers,
+    radiance_file,
+    surface_file,
+)
+from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, ImageView
+from rsbench.dataset.views import FAR, ImageView, points_of, seen_from, times_at
+from rsbench.renderers.image import linear_of_codes, to_srgb8
+from rsbench.verification.content import clean_picture
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import BoolArray, DepthMap, reproject
+from rsbench.verification.image_checks import Picture
+from rsbench.verification.reprojection import BoolArray, DepthMap, reproject
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
@@ -155,7 +169,7 @@ def _pair_faults(
     if _many(wrong & both, both):
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
-        cause = _cause(layer, view, stored, derived, stride)
+        cause = _pair_cause(layer, view, stored, derived, stride)
         yield Finding(file, what, _rows(wrong & both, stride, len(stored[view].classes)), cause)
     empty = np.isnan(values).any(axis=-1)
     if np.any(empty == known):
@@ -244,7 +258,7 @@ def _rows(wrong: BoolArray, stride: int, height: int) -> str:
     return rows_of(np.repeat(share > 0.5 * np.max(share), stride)[:height])
 
 
-def _cause(
+def _pair_cause(
     layer: Layer, view: ImageView, stored: Mapping[ImageView, _Stored], derived: _Derived, stride: int
 ) -> str:
     """What the stored values are instead, in words; "" where nothing explains most of them."""
@@ -274,3 +288,213 @@ def _explains(candidate: Float32Array, derived: _Derived) -> bool:
     both = np.isfinite(candidate[..., 0]) & np.isfinite(derived.values[..., 0])
     near = np.all(np.abs(candidate - derived.values) <= _SAME_PX, axis=-1)
     return bool(np.any(both) and np.mean(near[both]) > _EXPLAINS)
+
+
+_UNIT = 1e-5
+"""Of a length: the rounding of float32."""
+LEVEL, FEW_BENT = 0.05, 0.02
+"""Cosine between a normal and its surface, which bends by less where it counts as flat; and the share of flat
+pixels that may be beyond, at creases of less than that."""
+_SAME_SURFACE, _FEW_OTHERS = 5e-5, 0.02
+"""As in ``channel_checks``; what is thinner than a pixel may lie between four that see something else."""
+
+
+def surface_faults(
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    times: tuple[int, ...] = FRAMES,
+    new: tuple[int, ...] = FRAMES,
+) -> Iterator[Finding]:
+    """What normals and instances show that the surfaces of the depth maps are not, but for files ``reported``.
+
+    Of frames at these ``times``, and of pairs of them with one that is ``new``.
+    """
+    instances: dict[ImageView, NDArray[np.uint16]] = {}
+    for side, frame in product(SIDES, times):
+        view = ImageView("rs", side, frame)
+        if view not in maps or view.depth in reported:
+            continue
+        try:
+            file = surface_file("normals", side, frame)
+            if "normals" in sequence.channels and file not in reported and frame in new:
+                yield from _normal_faults(sequence, maps[view], file, sequence.normals(side, frame))
+            file = surface_file("instances", side, frame)
+            if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(reported):
+                instances[view] = sequence.instances(side, frame)
+                if frame in new:
+                    yield from _number_faults(maps[view], file, instances[view], len(sequence.instance_table()))
+        except RsbenchError as error:
+            yield Finding.of(error)
+    for view in instances:
+        for partner in view.partners():
+            if partner in instances and {view.frame, partner.frame} & {*new}:
+                yield from _agreement_faults(sequence, maps, instances, view, partner)
+
+
+def _normal_faults(
+    sequence: Sequence, depth_map: DepthMap, file: str, normals: NDArray[np.float32]
+) -> Iterator[Finding]:
+    solid = depth_map.depth > 0
+    length = np.linalg.norm(normals, axis=-1)
+    wrong = ~(np.abs(length - solid) <= _UNIT)
+    if np.sum(wrong) > _LEAST:
+        yield Finding(
+            file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", _worst_rows(wrong)
+        )
+        return
+    z = np.where(solid, depth_map.depth, 1.0).astype(np.float64)
+    X, ways, normals = _resting(sequence, depth_map, z, normals)
+    away = solid & (np.sum(ways * normals, axis=-1) > 0)
+    if np.sum(away) > _LEAST:
+        yield Finding(file, f"{np.sum(away)} normals point away from the camera", _worst_rows(away))
+    bent = np.zeros(solid.shape, dtype=np.bool_)
+    for step in (X[1:-1, 2:] - X[1:-1, :-2], X[2:, 1:-1] - X[:-2, 1:-1]):
+        cosine = np.sum(step * normals[1:-1, 1:-1], axis=-1) / np.linalg.norm(step, axis=-1)
+        bent[1:-1, 1:-1] |= np.abs(cosine) > LEVEL
+    flat = depth_map.flat
+    if np.sum(bent & flat) > max(FEW_BENT * np.sum(flat), _LEAST):
+        share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
+        what = f"{share} have a normal that is not upright on the surface of {depth_map.view.depth}"
+        yield Finding(file, what, _worst_rows(bent & flat))
+
+
+def _resting(
+    sequence: Sequence, depth_map: DepthMap, z: FloatArray, normals: NDArray[np.float32]
+) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
+    """Points, rays to them and normals, (H, W, 3) each, in the world; of what moves, in its own frame, where it
+    rests: the normals of a frame are those of the times of its rows."""
+    view, grid, labels = depth_map.view, sequence.rig.camera.pixel_grid(), depth_map.labels
+
+    def of(number: int, chosen: Any) -> tuple[FloatArray, FloatArray]:
+        pixels, depth = grid[chosen], z[chosen]
+        own = seen_from(sequence, number)
+        points = points_of(own, view, pixels, depth)
+        return points, points - points_of(own, view, pixels, depth * 0)
+
+    X, ways = of(0, ...)
+    for number, thing in enumerate(sequence.objects, start=1):
+        chosen = np.zeros(z.shape, np.bool_) if labels is None else numbers_of(labels) == number
+        X[chosen], ways[chosen] = of(number, chosen)
+        turned = inverse(thing.world_from_object(times_at(sequence, view, grid[chosen]))).R
+        normals = normals.copy()
+        normals[chosen] = (turned @ normals[chosen][..., None])[..., 0]
+    return X, ways, normals
+
+
+def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], count: int) -> Iterator[Finding]:
+    wrong = (numbers > 0) != (depth_map.depth > 0)
+    if np.sum(wrong) > _LEAST:
+        yield Finding(
+            file, f"{np.sum(wrong)} pixels have an instance and no depth, or depth and none", _worst_rows(wrong)
+        )
+    if np.any(numbers > count):
+        yield Finding(
+            file, f"holds instance {np.max(numbers)}, {INSTANCE_TABLE} has {count}", _worst_rows(numbers > count)
+        )
+
+
+def _agreement_faults(
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    instances: Mapping[ImageView, NDArray[np.uint16]],
+    view: ImageView,
+    partner: ImageView,
+) -> Iterator[Finding]:
+    reprojection = reproject(sequence, maps[view], maps[partner])
+    with np.errstate(invalid="ignore"):
+        same = np.abs(reprojection.relative) < _SAME_SURFACE
+    # One of the four pixels around must see the same: between them, things that touch change.
+    height, width = same.shape
+    x, y = np.floor(reprojection.pixels[same]).astype(int).T
+    around = [
+        instances[partner][np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
+        for down in (0, 1)
+        for across in (0, 1)
+    ]
+    other = np.zeros(same.shape, dtype=np.bool_)
+    other[same] = ~np.any(np.equal(around, instances[view][same]), axis=0)
+    if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
+        file, there = (surface_file("instances", each.side, each.frame) for each in (view, partner))
+        share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
+        yield Finding(file, f"{share} see another instance than {there}", _worst_rows(other))
+
+
+def surfaces_again(
+    sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
+) -> Iterator[tuple[str, Finding | None, bool]]:
+    """As ``channel_checks.channels_again``, of normals and instances."""
+    names = [name for name in ("normals", "instances") if view.shutter == "rs" and name in sequence.channels]
+    seen = SeenSurfaces(sequence, view, frame.depth, rows, numbers_of(frame.labels))
+    truth = surface_truth(seen, rays) if names else None
+    for name in names:
+        file = surface_file("normals" if name == "normals" else "instances", view.side, view.frame)
+        if truth is None or file in reported:
+            continue
+        try:
+            stored: NDArray[Any] = getattr(sequence, name)(view.side, view.frame)[rows]
+        except RsbenchError:  # reported already
+            continue
+        made: FloatArray = getattr(truth, name)
+        off = np.abs(stored.astype(np.float64) - made).reshape(*frame.depth.shape, -1).max(axis=-1)
+        wrong: BoolArray = ~(off <= _UNIT)
+        in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
+        bad = np.sum(wrong) > max(_FEW_AGAIN * wrong.size, _LEAST)
+        what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} pixels differ from what is made again"
+        yield file, Finding(file, what, rows_of(in_rows)) if bad else None, bool(np.all(off == 0))
+
+
+def _worst_rows(wrong: BoolArray) -> str:
+    """Words for the rows in which many of the wrong pixels lie."""
+    share = np.mean(wrong, axis=1)
+    return rows_of(share > 0.5 * np.max(share))
+
+
+_CODE = 0.54
+"""Codes by which light may differ from a code: its rounding, and that of half floats by 2^-12 of a value."""
+
+
+def hdr_faults(
+    sequence: Sequence, pictures: Mapping[ImageView, Picture], reported: Collection[str]
+) -> Iterator[Finding]:
+    """What linear images show otherwise than the clean images, but for files ``reported``."""
+    renderer = sequence.manifest.get("renderer")
+    exposure = renderer.get("exposure") if isinstance(renderer, dict) else None
+    if "hdr" not in sequence.channels or not isinstance(exposure, float):
+        return
+    for view, picture in pictures.items():
+        file, image = radiance_file(view.side, view.frame), clean_picture(sequence, view)
+        if view.shutter != "rs" or {file, image} & set(reported):
+            continue
+        try:
+            radiance = sequence.radiance(view.side, view.frame)
+        except RsbenchError as error:
+            yield Finding.of(error)
+            continue
+        light, codes = radiance * exposure, picture.colours
+        dark = (codes > 0) & (light < linear_of_codes(codes - _CODE))
+        wrong = np.any(dark | ((codes < 255) & (light > linear_of_codes(codes + _CODE))), axis=-1)
+        if np.sum(wrong) > max(_FEW * wrong.size, _LEAST):
+            off = np.max(np.abs(to_srgb8(radiance, exposure) - codes))
+            what = f"{100 * np.mean(wrong):.3g} % of {wrong.size} pixels are not {image} before its rounding"
+            rows = np.mean(wrong, axis=1)
+            in_rows = rows_of(rows > 0.5 * np.max(rows))
+            yield Finding(file, f"{what}, by up to {off:g} codes", in_rows, _radiance_cause(light, picture))
+
+
+def _radiance_cause(light: NDArray[np.float32], picture: Picture) -> str:
+    """What linear values (H, W, 3) are instead, in words; "" where nothing explains most of them."""
+    wanted = linear_of_codes(picture.colours)
+    open_ = (wanted > 0.02) & (wanted < 0.98)
+    if not np.any(light):
+        return "looks zeroed"
+    ratio = float(np.median(light[open_] / wanted[open_])) if np.any(open_) else 1.0
+    tried = {
+        f"scaled by {ratio:.3g}": light / max(ratio, 1e-9),
+        "red and blue exchanged": light[..., ::-1],
+        "upside down": light[::-1],
+        "encoded as sRGB": linear_of_codes(255.0 * light),
+    }
+    costs = {words: float(np.mean(np.abs(each - wanted)[open_])) for words, each in tried.items()}
+    best = min(costs, key=costs.__getitem__)
+    return f"looks {best}" if costs[best] < 0.2 * float(np.mean(np.abs(light - wanted)[open_])) else ""

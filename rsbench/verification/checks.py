@@ -1,33 +1,142 @@
-"""The table of checks of ``rsbench verify``: a check is one function and one row of it.
-
-``python -m rsbench.verification docs/explanation/verification.md`` writes the table into that document.
-"""
+"""The checks of ``rsbench verify``: their table, one function and one row each, and their run over a sequence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+import contextlib
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import pairwise
 from typing import Literal
 
-from rsbench.verification.affine_checks import affine_faults
-from rsbench.verification.channel_checks import channel_faults
-from rsbench.verification.content import twin_faults
-from rsbench.verification.findings import Finding
-from rsbench.verification.frame_pair_checks import geometry_faults, picture_faults
-from rsbench.verification.gloss_checks import gloss_faults, known_gloss
-from rsbench.verification.hdr_checks import hdr_faults
-from rsbench.verification.imu_checks import imu_faults
-from rsbench.verification.manifest_checks import dataset_faults, file_faults, sequence_faults
-from rsbench.verification.match_checks import match_faults, matched_again
-from rsbench.verification.moving_object_checks import label_faults
-from rsbench.verification.pose_checks import pose_faults
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset.sequence import Sequence, read_sequence
+from rsbench.dataset.views import VIEW_PAIRS, Times
+from rsbench.verification.channel_checks import channel_faults, hdr_faults, surface_faults
+from rsbench.verification.content import (
+    Comparison,
+    Content,
+    OtherImages,
+    images_of_others,
+    other_twin_faults,
+    read_content,
+    read_twins,
+    stack_faults,
+    twin_faults,
+    with_twins,
+)
+from rsbench.verification.depth_checks import GeometryFault, frames_of_other_times
+from rsbench.verification.findings import MISSING, DepthAgreement, Finding, Progress, files_of
+from rsbench.verification.manifest_checks import Listing, dataset_faults, file_faults, sequence_faults
+from rsbench.verification.mask_checks import gloss_faults, known_gloss, label_faults
+from rsbench.verification.point_checks import affine_faults, match_faults, matched_again, track_faults
+from rsbench.verification.pose_checks import imu_faults, pose_faults, timing_faults
+from rsbench.verification.rerender import RerenderedRows, Rerenderer
 from rsbench.verification.sensor_checks import sensor_faults
-from rsbench.verification.stack_checks import stack_faults
-from rsbench.verification.state import State
-from rsbench.verification.surface_checks import surface_faults
-from rsbench.verification.timing_checks import timing_faults
-from rsbench.verification.track_checks import track_faults
-from rsbench.verification.twin_checks import other_twin_faults, with_twins
+
+_MOST_ELSEWHERE = 8
+"""Other sequences among whose images an exchanged one is looked for."""
+
+
+@dataclass(eq=False)
+class State:
+    """One sequence under verification; each check reads from here.
+
+    Frames are read two at a time, so that long sequences take no more memory.
+    """
+
+    listing: Listing
+    name: str
+    stride: int = 1
+    again: Rerenderer | None = None
+    """Builds the scene and renders rows again; None where nobody asked for it."""
+    step: Progress = lambda name: None
+    findings: list[Finding] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    agreements: dict[tuple[str, str], DepthAgreement] = field(default_factory=dict)
+    disagreeing: dict[Times, GeometryFault] = field(default_factory=dict)
+    """Frames whose depth maps do not agree, none by itself."""
+    missing: Collection[str] = ()
+    """Files that a manifest lists and that are not there."""
+    sequence: Sequence = field(init=False)
+    """From the stage "sequence" on, as ``other_images``."""
+    other_images: OtherImages = field(init=False)
+    """Images that may have been exchanged with its own."""
+    fresh: Content = field(init=False)
+    """The frames that were read last: both of the first two, then one at a time. From the stage "masks" on."""
+    twins: Content = field(init=False)
+    """Their global-shutter twins at other rows than the first."""
+    content: Content = field(init=False)
+    """The last two frames, without what earlier checks found wrong. From the stage "frames" on."""
+    masks_by_rays: bool = False
+    """Whether the masks of ``fresh`` and ``twins`` are those that rays meet, not those that are stored."""
+    rerendered: RerenderedRows | None = None
+
+    @property
+    def reported(self) -> set[str]:
+        """Files that need not be reported again."""
+        return {*self.missing, *files_of(self.findings)}
+
+    @property
+    def all_content(self) -> Content:
+        """The last two frames, and the twins of what was read last."""
+        return with_twins(self.content, self.twins)
+
+    def open(self) -> None:
+        """Read sequence.json, after the files of the sequence were looked for.
+
+        Raises:
+            RsbenchError: it cannot be read.
+        """
+        below = f"{self.name}/"
+        self.missing = {each.file.removeprefix(below) for each in self.findings if each.words == MISSING}
+        self.sequence = read_sequence(self.listing.folder / self.name)
+        self.other_images = images_of_others(self.sequence, self._other_sequences)
+
+    def _other_sequences(self) -> Iterator[Sequence]:
+        """Some sequences of the dataset, the nearest in the list first."""
+        names = self.listing.names
+        place = names.index(self.name)
+        around = range(max(place - _MOST_ELSEWHERE, 0), min(place + _MOST_ELSEWHERE + 1, len(names)))
+        near = sorted(around, key=lambda other: abs(other - place))[1 : _MOST_ELSEWHERE + 1]
+        for other in near:
+            with contextlib.suppress(RsbenchError):
+                yield read_sequence(self.listing.folder / names[other])
+
+
+def picture_faults(state: State) -> Iterator[Finding]:
+    """What depth maps and images of two successive frames show that the others contradict."""
+    content, again = state.content, state.again
+    comparison = Comparison(content, state.stride)
+    for agreement in comparison.pairs():
+        if agreement is not None:
+            state.agreements.setdefault((agreement.source, agreement.target), agreement)
+        state.step(state.sequence.name)
+    judges = (
+        ()
+        if again is None
+        else (partial(again.depth_is_rendered, content), partial(again.image_is_rendered, content))
+    )
+    geometry = comparison.geometry()
+    if geometry is None:
+        yield from comparison.faults(state.other_images, *judges)
+    else:
+        state.disagreeing[content.times[0], content.times[-1]] = geometry
+    state.notes += comparison.notes
+
+
+def geometry_faults(state: State) -> Iterator[Finding]:
+    """What the frames that do not agree show of sequence.json, or of one of them."""
+    if not state.disagreeing:
+        return
+    first = min(state.disagreeing.values(), key=lambda each: (each.over_time, each.share))
+    count = state.sequence.frames - 1
+    if count > 1 and first.over_time and (found := frames_of_other_times(state.sequence, state.disagreeing)):
+        yield from found
+        return
+    where = "" if count == 1 else f", in {len(state.disagreeing)} of {count} pairs of frames"
+    yield Finding("sequence.json", first.what + where, cause=first.cause)
+
 
 Stage = Literal["dataset", "files", "sequence", "masks", "frames", "channels", "matcher", "rays"]
 """When a check runs: once for a dataset ("dataset") or a sequence ("files", before it is opened, and "sequence"),
@@ -340,3 +449,56 @@ def with_table(text: str) -> str:
     """A document with the table between ``START`` and ``END``."""
     before, _, rest = text.partition(START)
     return f"{before}{START}\n{table()}\n{END}{rest.partition(END)[2]}"
+
+
+STEPS = len(VIEW_PAIRS)
+"""Of progress, for two successive frames."""
+
+
+def run_stage(state: State, stage: Stage) -> None:
+    """Run the checks of one stage; each knows what those before it found."""
+    for check in CHECKS:
+        if check.stage == stage:
+            state.findings += check.found(check.run(state))
+
+
+def check_sequence(state: State) -> None:
+    """Run all checks of one sequence.
+
+    Raises:
+        RsbenchError: a file without which nothing can be checked any further cannot be read.
+    """
+    run_stage(state, "files")
+    state.open()
+    run_stage(state, "sequence")
+    state.rerendered = None if state.again is None else RerenderedRows(state.again, state.sequence)
+    state.content = Content(state.sequence)
+    for times in pairwise(range(state.sequence.frames)):
+        state.fresh = read_content(state.sequence, state.missing, times if times[0] == 0 else times[1:])
+        state.twins = read_twins(state.sequence, state.missing, state.fresh.times)
+        run_stage(state, "masks")
+        state.content = state.content.followed_by(state.fresh, state.reported)
+        run_stage(state, "frames")
+        _check_channels(state)
+        run_stage(state, "rays")
+    for check in CHECKS:
+        if check.at_end is not None:
+            state.findings += check.found(check.at_end(state))
+
+
+def _check_channels(state: State) -> None:
+    """Run the checks of channels; drop what they found in files that rays make again bit for bit, with a note.
+
+    Rays say nothing of what the pictures do not show, and so clear no file of what the matcher says.
+    """
+    first = len(state.findings)
+    run_stage(state, "channels")
+    last = len(state.findings)
+    run_stage(state, "matcher")
+    accused = state.findings[first:last]
+    if state.again is None or not accused:
+        return
+    cleared = state.again.cleared(state.all_content, files_of(accused))
+    what = "others contradict it, and it is what is made again, all of it"
+    state.notes += sorted(str(Finding(file, what)) for file in cleared)
+    state.findings[first:last] = [each for each in accused if each.file not in cleared]

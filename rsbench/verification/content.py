@@ -1,30 +1,60 @@
-"""What the files of a sequence hold: poses, depth and images, each alone and against the others."""
+"""The pictures of a sequence: read, and those that share a row compared bit for bit."""
 
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Sequence as Rows
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES
-from rsbench.dataset.layout import clean_file
+from rsbench.core.rig import FRAMES, SIDES
+from rsbench.dataset.layout import clean_file, stack_file, whole_frames
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_views, nearby_views, view_pairs
 from rsbench.storage.files import read_png
-from rsbench.storage.untrusted_files import inside
+from rsbench.storage.untrusted_files import inside, open_regular
 from rsbench.verification import depth_checks, image_checks
-from rsbench.verification.depth_causes import likely_cause
+from rsbench.verification.depth_checks import likely_cause, roughly_agree
 from rsbench.verification.findings import DepthAgreement, Finding, rows_of
-from rsbench.verification.frame_comparison import DepthMap, reproject, without_changing_light
-from rsbench.verification.image_causes import OtherImages as OtherImages
-from rsbench.verification.image_causes import colour_faults
-from rsbench.verification.png_header import png_fault
-from rsbench.verification.thin_structures import roughly_agree
+from rsbench.verification.image_checks import OtherImages as OtherImages
+from rsbench.verification.image_checks import colour_faults
+from rsbench.verification.reprojection import (
+    DEPTH_TOLERANCE,
+    BoolArray,
+    DepthMap,
+    reproject,
+    without_changing_light,
+)
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGBA"}
+
+
+def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
+    """What keeps a file from being an 8-bit RGB image of ``size`` (width, height); only its header is read."""
+    try:
+        with open_regular(path) as stream:
+            head = stream.read(26)
+    except OSError as error:
+        return Finding(name, f"cannot be read: {error.strerror}")
+    if len(head) < 26 or head[:8] != _SIGNATURE or head[12:16] != b"IHDR":
+        return Finding(name, "damaged or not a PNG")
+    width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
+    if (width, height) != size:
+        return Finding(name, f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}")
+    if (bits, colour) != (8, 2):
+        kind = _COLOUR_TYPES.get(colour, f"colour type {colour}")
+        return Finding(name, f"is {kind} of {bits} bits per channel: 8-bit RGB is needed")
+    return None
+
 
 Judge = Callable[[ImageView], bool]
 """Says of a file of a view, from what nobody who made the dataset could change, that it is right."""
@@ -287,3 +317,122 @@ def images_of_others(sequence: Sequence, others: Callable[[], Iterable[Sequence]
                     continue
 
     return candidates
+
+
+_SAME_SURFACE, _LEAST_SHARED = 0.05, 100
+"""Relative distance within which surfaces are one and the same, badly placed; beyond, one hides the other. And the
+pixels that tell."""
+_MOST_WRONG = 0.1
+"""Share of them: what is thinner than a pixel, and edges that are nearly flat."""
+
+
+def read_twins(sequence: Sequence, missing: Collection[str], times: tuple[int, ...]) -> Content:
+    """As ``content.read_content``, of the twins at other rows than the first."""
+    content = Content(sequence, times=times)
+    for row in sequence.twins:
+        for side, frame in product(SIDES, times):
+            read_view(content, ImageView("gs", side, frame, row), missing)
+    return content
+
+
+def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iterator[Finding]:
+    """A twin shares a row with its rolling-shutter frame, bit for bit; it sees the surfaces that this one sees."""
+    sequence = content.sequence
+    for row in sequence.twins:
+        for side, frame in product(SIDES, content.times):
+            twin, source = ImageView("gs", side, frame, row), ImageView("rs", side, frame)
+            yield from _shared_line_faults(content, twins, source, twin)
+            if source in content.maps and twin in twins.maps:
+                yield from _twin_depth_faults(content, twins, source, twin, stride)
+
+
+def _shared_line_faults(content: Content, twins: Content, source: ImageView, twin: ImageView) -> Iterator[Finding]:
+    shutter = content.sequence.shutter
+    axis, line = 1 - shutter.axis(twin.side), abs(shutter.first_line(twin.side) - twin.row)
+    words = f"{'row' if axis == 0 else 'column'} {line} differs from"
+    if source in content.pictures and twin in twins.pictures:
+        own, other = (
+            np.take(each.colours, line, axis) for each in (twins.pictures[twin], content.pictures[source])
+        )
+        unlike = np.any(own != other, axis=-1)
+        if np.sum(unlike) > spare_pixels(axis, unlike.size):
+            of = clean_picture(content.sequence, source)
+            yield Finding(twin.image, f"{words} {of}: {np.sum(unlike)} pixels at the same pose")
+    if source in content.maps and twin in twins.maps:
+        own, other = (np.take(each.depth, line, axis) for each in (twins.maps[twin], content.maps[source]))
+        if np.sum(own != other) > spare_pixels(axis, own.size):
+            far = np.max(np.abs(own - other))
+            yield Finding(twin.depth, f"{words} {source.depth}: by up to {far:.3g} m at the same pose")
+
+
+def _twin_depth_faults(
+    content: Content, twins: Content, source: ImageView, twin: ImageView, stride: int
+) -> Iterator[Finding]:
+    relative = reproject(content.sequence, twins.maps[twin], content.maps[source], stride).relative
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(relative) < _SAME_SURFACE) & (twins.maps[twin].depth[::stride, ::stride] > 0)
+        wrong: BoolArray = near & ~(np.abs(relative) < DEPTH_TOLERANCE)
+    if np.sum(near) >= _LEAST_SHARED and np.sum(wrong) > _MOST_WRONG * np.sum(near):
+        middle = float(np.median(relative[near]))
+        cause = f"looks scaled by {1 + middle:.5g}" if abs(middle) > DEPTH_TOLERANCE else ""
+        share = f"{100 * np.sum(wrong) / np.sum(near):.0f} % of {np.sum(near)} pixels"
+        rows = np.repeat(np.sum(wrong, axis=1) > _MOST_WRONG * np.maximum(np.sum(near, axis=1), 1), stride)
+        what = f"{share} differ from the surface of {source.depth}"
+        yield Finding(twin.depth, what, rows_of(rows[: len(twins.maps[twin].depth)]), cause)
+
+
+def with_twins(content: Content, twins: Content) -> Content:
+    """Both, for checks of channels and of rows rendered again."""
+    maps, pictures = content.maps | twins.maps, content.pictures | twins.pictures
+    return Content(content.sequence, maps, pictures, times=content.times)
+
+
+def stack_faults(content: Content, missing: Collection[str], stride: int = 1) -> Iterator[Finding]:
+    """Row y of image y is row y of the rolling-shutter frame, and image 0 is its global-shutter twin; every
+    ``stride``-th image is read."""
+    sequence = content.sequence
+    for view, picture in content.pictures.items():
+        rows_scanned = sequence.shutter.axis(view.side) == 1
+        if view.shutter != "rs" or not rows_scanned or not whole_frames(sequence.manifest):
+            continue
+        rows = range(0, sequence.rig.camera.height, stride)
+        wrong = np.zeros(sequence.rig.camera.height, dtype=np.bool_)
+        for row in rows:
+            file = stack_file(view.side, view.frame, row)
+            if file in missing:
+                continue
+            try:
+                image = _stack_image(sequence, view, row)
+            except RsbenchError as error:
+                yield Finding.of(error)
+                continue
+            wrong[row] = not np.array_equal(image[row], picture.colours[row])
+            twin = content.pictures.get(view._replace(shutter="gs"))
+            if (
+                row == sequence.shutter.first_line(view.side)
+                and twin is not None
+                and not np.array_equal(image, twin.colours)
+            ):
+                yield Finding(file, f"differs from {twin.view.image}, which has the same pose")
+        if np.any(wrong):
+            what = f"{np.sum(wrong)} images differ in their own row from {clean_picture(sequence, view)}"
+            yield Finding(f"gs_stack/{view.side}_{view.frame}", what, rows_of(wrong))
+
+
+def stack_rows(sequence: Sequence, view: ImageView, rows: Rows[int], of: Rows[int]) -> NDArray[np.uint8]:
+    """(H, W, 3) of which row ``rows[k]`` is that of image ``of[k]``, and others are black.
+
+    Raises:
+        RsbenchError: an image cannot be read.
+    """
+    camera = sequence.rig.camera
+    shown = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
+    for row, image in zip(rows, of, strict=True):
+        shown[row] = _stack_image(sequence, view, image)[row]
+    return shown
+
+
+def _stack_image(sequence: Sequence, view: ImageView, row: int) -> NDArray[np.uint8]:
+    camera = sequence.rig.camera
+    file = inside(sequence.folder, stack_file(view.side, view.frame, row))
+    return read_png(file, (camera.width, camera.height))

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.dataset.views import ImageView
+from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.motion_cards import numbers_of
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.views import ImageView, Times, nearby_views
 from rsbench.verification.compiled_comparison import Evidence, Limits, weigh_rows
 from rsbench.verification.findings import DepthAgreement, Finding
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, Reprojection
-from rsbench.verification.row_bands import by_bands
+from rsbench.verification.reprojection import (
+    DEPTH_TOLERANCE,
+    BoolArray,
+    DepthMap,
+    Reprojection,
+    by_bands,
+    reproject,
+    seen_with,
+)
 
 Bits = NDArray[np.uint8]
 
@@ -235,7 +248,7 @@ class GeometryFault(NamedTuple):
     """Whether it is only the two times that disagree."""
 
 
-def geometry_fault(pairs: Sequence[tuple[ImageView, ImageView, DepthAgreement]]) -> GeometryFault | None:
+def geometry_fault(pairs: list[tuple[ImageView, ImageView, DepthAgreement]]) -> GeometryFault | None:
     """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
     wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
@@ -261,7 +274,7 @@ def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
 
 
 def pair_faults(
-    pairs: Sequence[tuple[ImageView, ImageView, DepthAgreement]], wrong: Collection[ImageView]
+    pairs: list[tuple[ImageView, ImageView, DepthAgreement]], wrong: Collection[ImageView]
 ) -> Iterator[Finding]:
     """Pairs that disagree though neither map is contradicted by all who see it."""
     for source, target, agreement in pairs:
@@ -273,3 +286,231 @@ def pair_faults(
         )
         keys = _ACROSS if source.side != target.side else _OVER_TIME
         yield Finding(source.depth, what, cause=f"look at {keys} in sequence.json")
+
+
+_TRIED_PIXELS = 20_000
+_EXPLAINED = 0.8
+"""Share of the comparable pixels that a candidate must explain, and 0.3 more than the map as it is."""
+
+Depth = NDArray[np.float32]
+
+
+def likely_cause(sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView, rows: BoolArray) -> str:
+    """In words, "" where nothing explains it. ``rows`` (H,) are those that are wrong."""
+    depth = maps[view].depth
+    if not np.any(depth[rows]):
+        return "zeroed"
+    same = [other for other in maps if other != view and np.array_equal(depth[rows], maps[other].depth[rows])]
+    if same:
+        return f"the same as {same[0].depth}"
+    partners = [maps[partner] for partner in view.partners() if partner in maps]
+    if not partners:
+        return ""
+    best, words = _agreeing(sequence, maps[view], partners, rows) + 0.3, ""
+    for name, candidate in _depth_candidates(sequence, maps, view):
+        share = _agreeing(sequence, candidate, partners, rows)
+        if share > max(best, _EXPLAINED):
+            best, words = share, name
+    if words:
+        return words
+    scale, share, spread = _scale(sequence, maps[view], partners, rows)
+    if share > _EXPLAINED and abs(scale - 1) > 1e-6:
+        return f"looks scaled by {scale:.7g}"
+    return f"looks like noise of {spread:.1e} of the depth" if DEPTH_TOLERANCE / 3 < spread < 0.3 else ""
+
+
+def _depth_candidates(
+    sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView
+) -> Iterator[tuple[str, DepthMap]]:
+    """Depth maps that the stored one may have been, or the views whose depth it may be."""
+    stored = maps[view]
+    depth = stored.depth
+    for other in nearby_views(view, sequence.frames):
+        yield f"looks like {other.depth}", replace(stored, view=other)
+    lines = sequence.shutter.lines(view.side)
+    for line in {1, 2, lines // 4, lines // 2, 3 * lines // 4, lines - 1} if view.shutter == "gs" else set():
+        words = f"looks like the global shutter at the pose of line {line}"
+        yield words, replace(stored, view=view._replace(row=line))
+    for by in (-1, 1, -2, 2):
+        plural = "s" if abs(by) > 1 else ""
+        yield f"looks shifted by {abs(by)} row{plural}", replace(stored, depth=np.roll(depth, -by, axis=0))
+        yield f"looks shifted by {abs(by)} column{plural}", replace(stored, depth=np.roll(depth, -by, axis=1))
+    yield "looks flipped left to right", replace(stored, depth=np.ascontiguousarray(depth[:, ::-1]))
+    yield "looks flipped upside down", replace(stored, depth=np.ascontiguousarray(depth[::-1]))
+    rays = np.linalg.norm(stored.camera.unproject(stored.camera.pixel_grid()), axis=-1)
+    along = (depth / rays).astype(np.float32)
+    yield "looks like the distance along the ray instead of z", replace(stored, depth=along)
+
+
+def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: BoolArray) -> NDArray[np.float32]:
+    """(n,) relative differences of pixels in these rows that meet a flat surface of a partner, or -inf."""
+    stride = max(1, int(np.sqrt(np.sum(rows) * source.depth.shape[1] / _TRIED_PIXELS)))
+    if not np.any(rows[::stride]):
+        stride = 1
+    relative = reproject(sequence, source, partner, stride).relative
+    chosen = rows[::stride, None] & (source.depth[::stride, ::stride] > 0) & ~np.isnan(relative)
+    return relative[chosen]
+
+
+def _agreeing(sequence: Sequence, source: DepthMap, partners: list[DepthMap], rows: BoolArray) -> float:
+    """Share of these rows that agrees with the middle one of the partners: one may be wrong itself."""
+    shares = []
+    for partner in partners:
+        relative = _relative(sequence, source, partner, rows)
+        near = relative[relative < 0.01]
+        shares.append(float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if len(near) else 0.0)
+    return float(np.median(shares)) if shares else 0.0
+
+
+def _scale(
+    sequence: Sequence, source: DepthMap, partners: list[DepthMap], rows: BoolArray
+) -> tuple[float, float, float]:
+    """Factor that the depth has too much, the share that agrees without it, and the scatter that is left."""
+    scale, share, spread = 1.0, 0.0, 0.0
+    for _ in range(5):
+        scaled = replace(source, depth=(source.depth / np.float32(scale)).astype(np.float32))
+        relative = np.concatenate([_relative(sequence, scaled, partner, rows) for partner in partners])
+        near = relative[np.abs(relative) < 0.5]
+        if len(near) == 0:
+            break
+        middle = float(np.median(near))
+        spread = 1.4826 * float(np.median(np.abs(near - middle)))
+        share = float(np.mean(np.abs(near) <= DEPTH_TOLERANCE))
+        if abs(middle) < 1e-6:
+            break
+        scale *= 1 + middle
+    return scale, share, spread
+
+
+_NEAR_DEPTH = 5e-3
+"""Relative difference of two depths that may be of one thin thing."""
+_JUMP, _JUMPS = 3e-2, 0.5
+"""Relative second difference of inverse depth at an edge, and the share of pixels beside one in a picture of thin
+things: 0.69 to 0.85 in the scene ``forest`` at 63 to 128 px, 0.35 in ``castle`` at 128 px, 0.05 at 900 px."""
+_LIKER, _AWAY = 1.6, 7
+"""How many times as many pixels two partners must see where they are than up to 7 px beside. Sound maps of
+``forest`` and ``old-town`` at 52 to 96 px: 2.3 and more. Scaled by 1.02, flipped, of the other frame: 0.6 to 1.5
+in ``forest``."""
+
+
+def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: ImageView) -> bool:
+    """Whether a depth map shows thin things, and two partners see them about where they are.
+
+    A map that could show flat places and shows none is spoilt. One partner alone may be spoilt in the same way:
+    rows of a frame and of its global-shutter twin lie hardly apart.
+    """
+    alike = (_roughly_alike(geometry, maps[view], maps[each]) for each in view.partners() if each in maps)
+    return maps[view].share_of_edges(_JUMP) > _JUMPS and sum(alike) >= 2
+
+
+def _roughly_alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
+    stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+    grid, depth = source.camera.pixel_grid()[::stride, ::stride], source.depth[::stride, ::stride]
+    numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][depth > 0])
+    pixels, z = grid[depth > 0], depth[depth > 0].astype(np.float64)
+    seen = seen_with(geometry, source.view, target.view, pixels, z, numbers)
+    inside = np.isfinite(seen.depth)
+    middle = np.rint(seen.pixels[inside]).astype(np.int64)
+    shares = [
+        _share_of_depth(target, middle + np.array(by) * _AWAY, seen.depth[inside])
+        for by in product((0, 1, -1), repeat=2)
+    ]
+    return shares[0] > _LIKER * max(shares[1:])
+
+
+def _share_of_depth(target: DepthMap, middle: NDArray[np.int64], depth: FloatArray) -> float:
+    """Of points (n,) those that are as deep as one of the 3 x 3 pixels (n, 2) around, in the picture."""
+    height, width = target.depth.shape
+    inside = np.all((middle >= 1) & (middle < np.array([width - 1, height - 1])), axis=1)
+    x, y = middle[inside].T
+    around = np.stack([target.depth[y + down, x + across] for down, across in product((-1, 0, 1), repeat=2)])
+    near = np.any(np.abs(around / depth[inside] - 1.0) < _NEAR_DEPTH, axis=0)
+    return float(np.mean(near)) if near.size else 0.0
+
+
+_AGREE, _LEAST = 0.8, 50
+"""Share of the comparable pixels that agree where both maps are at their places, and how many there must be."""
+_BESIDE = 4
+"""Frames before and after with which a frame is compared, the nearest first."""
+_FARTHEST = 32
+
+
+def frames_of_other_times(sequence: Sequence, apart: Collection[Times]) -> list[Finding]:
+    """A finding for each frame, of those ``apart`` from one beside it, that is that of another time.
+
+    A frame is in order if it agrees with any other one near it, but for those that it is said not to.
+    """
+    maps = _MapsOverTime(sequence)
+    suspects = sorted({frame for times in apart for frame in times})
+    lost = [frame for frame in suspects if not any(maps.agree(frame, frame, other) for other in maps.near(frame))]
+    sound = [frame for frame in range(sequence.frames) if frame not in lost]
+    found = {frame: _time_of(maps, frame, sound or maps.near(frame)) for frame in lost}
+    return [
+        _frame_fault(frame, time)
+        for frame, time in found.items()
+        if time is not None or (sound and maps.seen(frame))
+    ]
+
+
+def _time_of(maps: _MapsOverTime, frame: int, others: list[int]) -> int | None:
+    """The time at which a frame that agrees with none at its own does."""
+    beside = sorted(others, key=lambda other: abs(other - frame))[: 2 * _BESIDE]
+    times = sorted(range(maps.sequence.frames), key=lambda other: abs(other - frame))[1 : _FARTHEST + 1]
+    pairs = ((time, other) for time in times for other in beside if other not in (frame, time))
+    return next((time for time, other in pairs if maps.agree(frame, time, other)), None)
+
+
+def _frame_fault(frame: int, time: int | None) -> Finding:
+    what = f"all pictures of frame {frame} disagree with those of other times, and not with each other"
+    return Finding(
+        ImageView("rs", "left", frame).depth, what, cause="" if time is None else f"looks like frame {time}"
+    )
+
+
+class _MapsOverTime:
+    """Depth maps of the left camera, read when needed."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence = sequence
+        self._read: dict[int, DepthMap | None] = {}
+        self._found: dict[tuple[int, int, int], tuple[float, int]] = {}
+
+    def near(self, frame: int) -> list[int]:
+        """Other frames, the nearest first."""
+        others = sorted(range(self.sequence.frames), key=lambda other: abs(other - frame))
+        return others[1 : 2 * _BESIDE + 1]
+
+    def agree(self, frame: int, time: int, other: int) -> bool:
+        """Whether the map of a frame, as if it were that of a time, agrees with the map of another frame."""
+        share, count = self._share(frame, time, other)
+        return count >= _LEAST and share > _AGREE
+
+    def seen(self, frame: int) -> bool:
+        """Whether another one near it sees what it sees."""
+        return any(self._share(frame, frame, other)[1] >= _LEAST for other in self.near(frame))
+
+    def _share(self, frame: int, time: int, other: int) -> tuple[float, int]:
+        key = frame, time, other
+        if key not in self._found:
+            self._found[key] = self._compare(*key)
+        return self._found[key]
+
+    def _compare(self, frame: int, time: int, other: int) -> tuple[float, int]:
+        source, target = self._map(frame), self._map(other)
+        if source is None or target is None:
+            return 0.0, 0
+        moved = replace(source, view=source.view._replace(frame=time))
+        stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+        relative = reproject(self.sequence, moved, target, stride).relative
+        near = relative[(source.depth[::stride, ::stride] > 0) & (relative < 0.01)]
+        near = near[np.isfinite(near)]
+        return (float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if near.size else 0.0), near.size
+
+    def _map(self, frame: int) -> DepthMap | None:
+        if frame not in self._read:
+            view = ImageView("rs", "left", frame)
+            try:
+                self._read[frame] = DepthMap(view, self.sequence.depth(*view), self.sequence.rig.camera)
+            except RsbenchError:  # reported already
+                self._read[frame] = None
+        return self._read[frame]

@@ -58,7 +58,7 @@ class DepthAgreement:
     compared: int
     """Pixels on a locally flat surface that lie on one in the target and are not plainly hidden there."""
     agreeing: int
-    """Of these, within ``frame_comparison.DEPTH_TOLERANCE``."""
+    """Of these, within ``reprojection.DEPTH_TOLERANCE``."""
     typical: float
     """Median of the relative difference of the agreeing and near pixels."""
     p99: float

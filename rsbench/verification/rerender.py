@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
@@ -23,29 +24,127 @@ from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
 from rsbench.dataset.generation import render_view
 from rsbench.dataset.layout import whole_frames
-from rsbench.dataset.scene_hashes import scene_hash
+from rsbench.dataset.motion_cards import MovingManifest
 from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.sequence_identity import mesh_file_hash, scene_hash
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_seed, image_views
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Start
 from rsbench.scenes.object_meshes import with_moving
-from rsbench.verification.affine_checks import affine_again
-from rsbench.verification.channel_checks import channels_again
-from rsbench.verification.content import Content, clean_picture
-from rsbench.verification.findings import Finding
-from rsbench.verification.image_checks import Picture
-from rsbench.verification.match_checks import matches_again
-from rsbench.verification.mesh_files import with_files
-from rsbench.verification.rendered_checks import SAME_DEPTH, Check, depth_check, image_check, label_checks
-from rsbench.verification.stack_checks import stack_rows
-from rsbench.verification.surface_checks import surfaces_again
-from rsbench.verification.track_checks import tracks_again
+from rsbench.verification.channel_checks import channels_again, surfaces_again
+from rsbench.verification.content import Content, clean_picture, stack_rows
+from rsbench.verification.findings import Finding, rows_of
+from rsbench.verification.image_checks import CHANGES, Picture
+from rsbench.verification.point_checks import affine_again, matches_again, tracks_again
+from rsbench.verification.reprojection import DepthMap
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
     from rsbench.renderers.scene import MitsubaScene
     from rsbench.renderers.visibility import SceneRays
+
+
+def with_files(sequence: Sequence, files: Many[Path]) -> tuple[MovingManifest, ...]:
+    """The objects of a sequence, their mesh files found by name among these.
+
+    Raises:
+        RsbenchError: a file that was not named, cannot be read, or is another than the sequence was made of.
+    """
+    named = {path.name: path for path in files}
+    hashes = sequence.manifest.get("meshes")
+    made = []
+    for number, each in enumerate(sequence.moving, start=1):
+        if each.mesh is None:
+            made.append(each)
+            continue
+        if (path := named.get(each.mesh.name)) is None:
+            raise RsbenchError(
+                f"the mesh {each.mesh.name!r} of moving object {number} is a file of yours; name it with --scene"
+            )
+        mesh = replace(each.mesh, file=str(path))
+        stated = hashes.get(str(number)) if isinstance(hashes, dict) else None
+        if mesh_file_hash(mesh) != stated:
+            raise RsbenchError(f"{path}: what is drawn of it has another sha256 than meshes in sequence.json says")
+        made.append(replace(each, mesh=mesh))
+    return tuple(made)
+
+
+SAME_DEPTH = 2e-6
+"""Relative: rays in float32 on another processor; on the same one they have the same bits."""
+_OTHER_CODES, _FAR_CODES, _FAR_ON_GPU = 0.05, 0.005, 0.02
+"""Shares of pixels that may differ at all, and by more than ``_NEAR_CODES``: rounding on another processor moves a
+sample across an edge now and then, and more often on a GPU, which intersects triangles by another rule."""
+_NEAR_CODES = 2.0
+_OTHER_DEPTH = 0.005
+_OTHER_LABELS, _FEW_LABELS = 1e-3, 8
+"""Share and number of labels that rounding on another processor may change, at edges."""
+
+
+@dataclass(frozen=True)
+class RowCheck:
+    """One file against its rows rendered again; ``fault`` is None when they are alike."""
+
+    file: str
+    fault: Finding | None
+    same_bits: bool
+
+
+def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[RowCheck]:
+    if stored.labels is None:
+        return
+    wrong, file = stored.labels[rows] != rendered, stored.view.labels
+    what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
+    in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
+    bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
+    yield RowCheck(file, Finding(file, what, rows_of(in_rows)) if bad else None, not np.any(wrong))
+
+
+def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> RowCheck:
+    depth, file = stored.depth[rows], stored.view.depth
+    wrong = np.abs(depth - rendered) > SAME_DEPTH * np.maximum(depth, rendered)
+    share = float(np.mean(wrong))
+    if share <= _OTHER_DEPTH:
+        return RowCheck(file, None, np.array_equal(depth, rendered))
+    both = wrong & (depth > 0) & (rendered > 0)
+    ratio = depth[both] / rendered[both] if np.any(both) else np.ones(1)
+    middle = float(np.median(ratio))
+    scaled = np.median(np.abs(ratio / middle - 1)) < 1e-6 and abs(middle - 1) > SAME_DEPTH
+    cause = f"looks scaled by {middle:.7g}" if scaled else ""
+    what = f"depth differs from what is rendered again on {100 * share:.3g} % of {wrong.size} pixels"
+    if np.any(both):
+        what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
+    return RowCheck(file, Finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
+
+
+def image_check(
+    file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool, by_gpu: bool = False
+) -> RowCheck:
+    """``noisy``: by other random numbers; ``by_gpu``: one was rendered on a GPU and the other was not."""
+    truth = rendered.astype(np.float32)
+    difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
+    far = difference > _NEAR_CODES + (4 * stored.noise if noisy else 0.0)
+    other = far if noisy else difference > 0
+    few = _FAR_ON_GPU if by_gpu else _FAR_CODES
+    if np.mean(far) <= few and np.mean(other) <= _OTHER_CODES:
+        return RowCheck(file, None, not np.any(difference))
+    what = (
+        f"the image differs from what is rendered again on {100 * np.mean(other):.3g} % of {far.size} pixels, "
+        f"by up to {np.max(difference):g} codes"
+    )
+    y, x = (each.ravel() for each in np.meshgrid(rows, np.arange(truth.shape[1]), indexing="ij"))
+    costs = [np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3))) for change in CHANGES]
+    best = int(np.argmin(costs))
+    cause = f"looks {CHANGES[best].words}" if best and costs[best] < 0.5 * costs[0] else ""
+    return RowCheck(file, Finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
+
+
+def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:
+    """Words for the rendered rows in which many pixels are wrong."""
+    flags = np.zeros(height, dtype=np.bool_)
+    flags[np.asarray(rows)[np.mean(wrong, axis=1) > _OTHER_DEPTH]] = True
+    return "all rows that were rendered" if np.sum(flags) == len(rows) else rows_of(flags)
+
 
 Rerender = Literal["no", "auto", "all"]
 """No row, some rows of every image where that takes seconds, or all rows."""
@@ -155,7 +254,7 @@ class RerenderedRows:
     """Rows of one sequence rendered again, some frames after the other."""
 
     def __init__(self, again: Rerenderer, sequence: Sequence) -> None:
-        self._sequence, self._checks = sequence, list[Check]()
+        self._sequence, self._checks = sequence, list[RowCheck]()
         self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
         try:
             self._options = parse_card(
@@ -173,9 +272,9 @@ class RerenderedRows:
     def add(self, content: Content, reported: set[str]) -> None:
         """Render again what was read, but for channels that are ``reported`` already."""
         if not self._refusal:
-            self._take(_checks(content, self._scene, self._options, self._rows, reported))
+            self._take(_row_checks(content, self._scene, self._options, self._rows, reported))
 
-    def _take(self, checks: Iterator[Check]) -> None:
+    def _take(self, checks: Iterator[RowCheck]) -> None:
         start = time.perf_counter()
         self._checks += checks
         self._seconds += time.perf_counter() - start
@@ -189,7 +288,7 @@ class RerenderedRows:
         of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, reported))
         of_points = (made(self._sequence, rays, reported) for made in (tracks_again, affine_again))
         again = chain(*of_points, of_matches)
-        self._take(Check(*check) for check in again)
+        self._take(RowCheck(*check) for check in again)
         wrong = [check for check in checks if check.fault]
         done = f"{len(self._rows)} rows of each image and depth map rendered again in {self._seconds:.1f} s"
         if _table(manifest, "scene").get("sha256") != self._digest:
@@ -236,9 +335,9 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
     return table
 
 
-def _checks(
+def _row_checks(
     content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], reported: set[str]
-) -> Iterator[Check]:
+) -> Iterator[RowCheck]:
     from rsbench.renderers.visibility import SceneRays
 
     own = image_views(content.times)
@@ -254,7 +353,7 @@ def _checks(
             yield _picture_check(content, frame, options, view, rows)
         for made in (channels_again, surfaces_again):
             again = made(content.sequence, view, rows, frame, SceneRays(scene, content.sequence.objects), reported)
-            yield from (Check(*check) for check in again)
+            yield from (RowCheck(*check) for check in again)
         if view.shutter == "rs":
             yield from _frame_checks(content, scene, options, view, rows, reported)
         elif content.sequence.exposed_twins:
@@ -263,7 +362,7 @@ def _checks(
 
 def _picture_check(
     content: Content, frame: Frame, options: RendererOptions, view: ImageView, rows: list[int]
-) -> Check:
+) -> RowCheck:
     from rsbench.renderers.image import to_srgb8
 
     noisy = options.integrator == "path" and not _made_here(content)
@@ -279,7 +378,7 @@ def _frame_checks(
     view: ImageView,
     rows: list[int],
     reported: set[str],
-) -> Iterator[Check]:
+) -> Iterator[RowCheck]:
     """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
 
     Each row of a sensor has random numbers of its own, and so its bits without the others; of an image that was
@@ -308,7 +407,7 @@ def _exposed_check(
     view: ImageView,
     rows: list[int],
     reported: set[str],
-) -> Iterator[Check]:
+) -> Iterator[RowCheck]:
     """The global-shutter image as the sensor exposes it."""
     from rsbench.renderers.render import sensed_rows
 
@@ -324,7 +423,7 @@ def _exposed_check(
 
 def _stack_check(
     content: Content, scene: MitsubaScene, chosen: RendererOptions, view: ImageView, rows: list[int]
-) -> Check:
+) -> RowCheck:
     """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import LinePoses, render

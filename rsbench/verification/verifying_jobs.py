@@ -10,7 +10,7 @@ from typing import Any
 
 from rsbench.jobs.isolation import THREAD_VARIABLES, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
-from rsbench.verification import row_bands
+from rsbench.verification import reprojection
 from rsbench.verification.findings import DepthAgreement, Finding, SequenceReport
 
 CheckSequence = Callable[[str], SequenceReport]
@@ -55,7 +55,7 @@ def _serve(
     make: Callable[..., CheckSequence], threads: int, renders: bool, *arguments: object
 ) -> Callable[[str], dict[str, Any]]:
     """What checks, in a child."""
-    row_bands.set_threads(threads)
+    reprojection.set_threads(threads)
     if threads == 1:
         use_one_thread()
     if renders:

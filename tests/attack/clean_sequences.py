@@ -30,7 +30,7 @@ from rsbench.core.shutter import Scan, Scanning
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import CHANNELS, Channel, check_channels
-from rsbench.dataset.object_records import TAKEN, MovingCard
+from rsbench.dataset.motion_cards import TAKEN, MovingCard
 from rsbench.renderers.image import Mosaic, Sensor
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Scene

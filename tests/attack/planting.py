@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.croissant import croissant_of
+from rsbench.dataset.manifest import croissant_of
 from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
 from rsbench.dataset.timing import write_timing
 from rsbench.scenes.castle import CastleBuilder

@@ -20,7 +20,6 @@ from yard_dataset import rounds, write_yard, yard_card
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES, VIEWS
-from rsbench.dataset.affine import jacobians_of
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.channels import (
     CHANNELS,
@@ -34,6 +33,7 @@ from rsbench.dataset.channels import (
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
+from rsbench.dataset.tracks import jacobians_of
 from rsbench.dataset.views import ImageView
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from rsbench.dataset import cost_estimate
+from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, SequenceCard, load_dataset_card
+from rsbench.dataset.generation import Built
 from rsbench.dataset.layout import files_of
-from rsbench.dataset.posed_scenes import Built
 from rsbench.renderers import scene as renderer
 
 
@@ -28,9 +28,9 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
         Path(folder, "rs", f"{side}_{frame}.png").write_bytes(b"x" * (300 if real else 100))
         yield
 
-    monkeypatch.setattr(cost_estimate, "build_scene", lambda name: Built(SimpleNamespace(glossy=False), ""))  # pyrefly: ignore[bad-argument-type]
-    monkeypatch.setattr(cost_estimate, "seen_scene", lambda scene, sequence: scene)
-    monkeypatch.setattr(cost_estimate, "render_camera", render)
+    monkeypatch.setattr(generation, "build_scene", lambda name: Built(SimpleNamespace(glossy=False), ""))  # pyrefly: ignore[bad-argument-type]
+    monkeypatch.setattr(generation, "seen_scene", lambda scene, sequence: scene)
+    monkeypatch.setattr(generation, "render_camera", render)
     monkeypatch.setattr(renderer, "MitsubaScene", lambda seen: seen)
     return tried
 
@@ -41,7 +41,7 @@ def listed_files(card: DatasetCard) -> int:
 
 def test_every_sensor_of_a_scene_is_tried_and_stands_for_its_own(tried: list[tuple[str, bool]]) -> None:
     card = load_dataset_card("standard")
-    found = cost_estimate.estimate_dataset(card, lambda scene: None)
+    found = generation.estimate_dataset(card, lambda scene: None)
     scenes = {sequence.scene for sequence in card.sequence}
     assert set(tried) == {(scene, real) for scene in scenes for real in (False, True)}
     # The first picture of each sensor is made twice, for it compiles.
@@ -54,6 +54,6 @@ def test_every_sensor_of_a_scene_is_tried_and_stands_for_its_own(tried: list[tup
 def test_moving_objects_can_be_estimated(tried: list[tuple[str, bool]]) -> None:
     """Their motions have parameters, which Python does not hash."""
     card = load_dataset_card("stress")
-    found = cost_estimate.estimate_dataset(card, lambda scene: None)
+    found = generation.estimate_dataset(card, lambda scene: None)
     assert (found.sequences, found.files) == (45, listed_files(card))
     assert set(tried) == {(sequence.scene, True) for sequence in card.sequence}

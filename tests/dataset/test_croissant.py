@@ -13,7 +13,7 @@ import pytest
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
 from rsbench.dataset.card import load_dataset_card
-from rsbench.dataset.croissant import croissant_of
+from rsbench.dataset.manifest import croissant_of
 from rsbench.dataset.sequence import read_dataset
 from rsbench.verification import verify_dataset
 

@@ -21,8 +21,7 @@ from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
-from rsbench.dataset.cost_estimate import estimate_dataset
-from rsbench.dataset.generation import generate_dataset, steps_of
+from rsbench.dataset.generation import estimate_dataset, generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset
 from rsbench.storage.files import read_png, sha256, write_png
 from rsbench.storage.work_folder import HIDDEN

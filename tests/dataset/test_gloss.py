@@ -19,8 +19,7 @@ from trimesh.visual.material import PBRMaterial
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.cost_estimate import estimate_dataset
-from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.generation import estimate_dataset, generate_dataset
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.storage.files import read_grey_png, read_json, read_mask, write_mask

@@ -31,7 +31,7 @@ from rsbench.dataset.imu import (
 from rsbench.dataset.sequence import read_sequence, sequence_manifest
 from rsbench.renderers.image import Sensor
 from rsbench.storage.files import write_json
-from rsbench.verification.imu_checks import imu_faults
+from rsbench.verification.pose_checks import imu_faults
 
 RIG = StereoRig(camera=PinholeCamera.centred(64, 48, 60.0), baseline=0.3)
 SHUTTER = RollingShutter(height=48, readout_ratio=0.9)

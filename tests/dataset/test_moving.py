@@ -25,9 +25,8 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel, PixelClass
-from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.object_records import NUMBER, SHADED, TAKEN, MovingCard
-from rsbench.dataset.posed_scenes import seen_scene
+from rsbench.dataset.generation import generate_dataset, seen_scene
+from rsbench.dataset.motion_cards import NUMBER, SHADED, TAKEN, MovingCard
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.renderers.image import Sensor
 from rsbench.renderers.options import RendererOptions
@@ -37,9 +36,8 @@ from rsbench.renderers.visibility import obstacle
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset
-from rsbench.verification.content import read_content
-from rsbench.verification.moving_object_checks import label_faults
-from rsbench.verification.twin_checks import read_twins
+from rsbench.verification.content import read_content, read_twins
+from rsbench.verification.mask_checks import label_faults
 
 SCENE = """
 name = "lot"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rsbench.dataset.card import SequenceCard
-from rsbench.dataset.posed_scenes import Built, PosedScenes
+from rsbench.dataset.generation import Built, PosedScenes
 from rsbench.renderers import scene as renderer
 from rsbench.scenes.model import Start
 

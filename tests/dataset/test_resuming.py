@@ -15,7 +15,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.scene_hashes import SceneHashes, scene_key
+from rsbench.dataset.sequence_identity import SceneHashes, scene_key
 from rsbench.jobs.process_jobs import LostJobsError
 from rsbench.storage import files
 from rsbench.storage.files import HASHES, FileHashes, sha256

@@ -19,8 +19,7 @@ from rsbench.components.cards import load_card, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
-from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.posed_scenes import seen_scene
+from rsbench.dataset.generation import generate_dataset, seen_scene
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.image import Sensor, compressed, fall_off, to_srgb8

@@ -19,7 +19,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import world_from_body
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.trajectory import TrajectoryCard, parts_along, read_trajectory
+from rsbench.dataset.motion_cards import TrajectoryCard, parts_along, read_trajectory
 from rsbench.scenes.model import Viewpoint
 from rsbench.storage.files import read_json, write_json
 from rsbench.verification import verify_dataset

@@ -25,7 +25,7 @@ from rsbench.renderers.image import (
     shares_of_noise,
     to_srgb8,
 )
-from rsbench.verification.processing_checks import processing_fault, quality_steps
+from rsbench.verification.sensor_checks import processing_fault, quality_steps
 
 PHONE = Sensor(
     exposure_s=0.01, full_well=6000, gain=4, photon_noise=True, read_noise=2.5, dark_current=100, bit_depth=10

@@ -15,7 +15,7 @@ from small_scenes import write_box_scene
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.dataset.scene_hashes import scene_hash, scene_key
+from rsbench.dataset.sequence_identity import scene_hash, scene_key
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.options import Integrator, RendererOptions

@@ -20,9 +20,8 @@ from small_scenes import write_box_scene, write_small_card
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.posed_scenes import Built
-from rsbench.dataset.store_destination import store_destination
+from rsbench.dataset.destinations import store_destination
+from rsbench.dataset.generation import Built, generate_dataset
 from rsbench.renderers import scene, visibility
 from rsbench.storage.object_store import Store, path_or_url
 from rsbench.storage.work_folder import HIDDEN

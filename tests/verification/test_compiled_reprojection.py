@@ -17,9 +17,8 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.views import VIEW_PAIRS, ImageView
-from rsbench.verification import frame_comparison
-from rsbench.verification.compiled_reprojection import table_of_target
-from rsbench.verification.frame_comparison import DepthMap, Reprojection, reproject
+from rsbench.verification import reprojection
+from rsbench.verification.reprojection import DepthMap, Reprojection, reproject, table_of_target
 
 W, D = [0.03, -0.05, 0.04], [0.2, -0.1, 0.25]
 CAMERA = PinholeCamera.centred(64, 48, 60.0)
@@ -60,7 +59,7 @@ def both_ways(
 ) -> tuple[Reprojection, Reprojection]:
     shape = source.depth[::stride, ::stride].shape
     exact = Reprojection(np.full((*shape, 2), np.nan, np.float32), np.full(shape, np.nan, np.float32))
-    frame_comparison._reproject_exactly(geometry, source, target, exact, stride)
+    reprojection._reproject_exactly(geometry, source, target, exact, stride)
     return reproject(geometry, source, target, stride), exact
 
 

@@ -17,11 +17,10 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.views import IMAGE_VIEWS
 from rsbench.storage.files import read_depth, write_depth
-from rsbench.verification import frame_comparison as reprojection
-from rsbench.verification import verify_sequence
-from rsbench.verification.frame_comparison import DepthMap
+from rsbench.verification import reprojection, verify_sequence
+from rsbench.verification.depth_checks import roughly_agree
 from rsbench.verification.manifest_checks import Listing
-from rsbench.verification.thin_structures import roughly_agree
+from rsbench.verification.reprojection import DepthMap
 
 LENSES = (
     None,

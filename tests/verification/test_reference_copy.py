@@ -11,7 +11,7 @@ from commands import run_here
 
 from rsbench.dataset.card import load_dataset_card
 from rsbench.storage.files import read_json, read_png, sha256, write_json, write_png
-from rsbench.verification.reference_copy import against_reference, references
+from rsbench.verification.digests import against_reference, references
 
 
 def test_what_is_rendered_here_is_the_reference_copy_or_alike(smoke_dataset: Path) -> None:

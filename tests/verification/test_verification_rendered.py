@@ -23,7 +23,7 @@ from rsbench.storage.files import read_depth, read_png, write_depth, write_png
 from rsbench.verification import SequenceReport, rerender, verify_dataset
 from rsbench.verification.content import read_content
 from rsbench.verification.image_checks import Picture
-from rsbench.verification.rendered_checks import image_check
+from rsbench.verification.rerender import image_check
 
 
 @pytest.fixture(scope="module")

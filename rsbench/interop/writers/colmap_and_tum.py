@@ -28,8 +28,8 @@ from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import MARKER, read_corrected
+from rsbench.dataset.motion_cards import FORMAT
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.trajectory import FORMAT
 from rsbench.interop.writers.sequence_views import (
     CORNER_PX,
     Format,

@@ -1,8 +1,4 @@
-"""Masks of glossy surfaces, of which comparisons of images leave out the pixels: nothing may hide behind them.
-
-Where the scene can be built, rays say where it is glossy, and the stored masks only have to agree. Elsewhere
-they are held against each other: a surface is glossy in all pictures or in none.
-"""
+"""Masks of glossy surfaces and labels of moving objects, against rays, depth and each other."""
 
 from __future__ import annotations
 
@@ -15,10 +11,11 @@ import numpy as np
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
+from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.views import ImageView, view_pairs
 from rsbench.verification.content import Content, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.frame_comparison import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
+from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
 from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8
@@ -78,9 +75,9 @@ def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
     if not content.sequence.glossy:
         return
     for each in (*fresh.maps.values(), *twins.maps.values()):
-        yield from _by_itself(each)
+        yield from _gloss_by_itself(each)
     for part in (content, twins):
-        yield from _dropped(part, {view: _unlike_twin(content, each) for view, each in part.maps.items()})
+        yield from _dropped(part, {view: _gloss_unlike_twin(content, each) for view, each in part.maps.items()})
     yield from _dropped(content, dict(_contradicted(content)))
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
@@ -93,8 +90,8 @@ def _dropped(content: Content, faults: dict[ImageView, Finding | None]) -> Itera
             yield fault
 
 
-def _by_itself(each: DepthMap) -> Iterator[Finding]:
-    gloss, solid = _of(each), each.depth > 0
+def _gloss_by_itself(each: DepthMap) -> Iterator[Finding]:
+    gloss, solid = _gloss_of(each), each.depth > 0
     empty = gloss & ~solid
     if np.any(empty):
         what = f"{np.sum(empty)} pixels of the mask show no surface"
@@ -106,14 +103,14 @@ def _by_itself(each: DepthMap) -> Iterator[Finding]:
         yield Finding(each.view.gloss, what)
 
 
-def _unlike_twin(content: Content, own: DepthMap) -> Finding | None:
+def _gloss_unlike_twin(content: Content, own: DepthMap) -> Finding | None:
     """The line of a global shutter that its rolling-shutter frame shares."""
     source, view = own.view._replace(shutter="rs", row=0), own.view
     if view == source or source not in content.maps:
         return None
     shutter = content.sequence.shutter
     axis, line = 1 - shutter.axis(view.side), abs(shutter.first_line(view.side) - view.row)
-    unlike = np.take(_of(own), line, axis) != np.take(_of(content.maps[source]), line, axis)
+    unlike = np.take(_gloss_of(own), line, axis) != np.take(_gloss_of(content.maps[source]), line, axis)
     if np.sum(unlike) <= spare_pixels(axis, unlike.size):
         return None
     words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.gloss}"
@@ -159,9 +156,86 @@ def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolAr
 
 def _span(each: DepthMap) -> tuple[BoolArray, BoolArray]:
     """(H, W) whether all of the 3 x 3 pixels around are glossy, and whether any is."""
-    gloss, around = _of(each).astype(np.uint8), np.ones((3, 3), np.uint8)
+    gloss, around = _gloss_of(each).astype(np.uint8), np.ones((3, 3), np.uint8)
     return cv2.erode(gloss, around) > 0, cv2.dilate(gloss, around) > 0
 
 
-def _of(each: DepthMap) -> BoolArray:
+def _gloss_of(each: DepthMap) -> BoolArray:
     return np.zeros(each.depth.shape, dtype=np.bool_) if each.gloss is None else each.gloss
+
+
+_FEW_LABELS = 8
+"""So many labels may be wrong anywhere: at edges thinner than a pixel."""
+
+
+def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
+    """What labels cannot be. Their maps are taken out of all: they would accuse the depth of others.
+
+    Args:
+        content: of two successive frames.
+        fresh: what was read of them last.
+        twins: at other rows than the first, of these last.
+    """
+    if not content.sequence.moving:
+        return
+    for part in (content, twins):
+        faults = {view: _on_nothing(each) or _misplaced(content, each) for view, each in part.maps.items()}
+        yield from _dropped(part, faults)
+    for part in (content, twins):
+        yield from _dropped(part, {view: _labels_unlike_twin(content, twins, view) for view in part.maps})
+    for view in fresh.maps.keys() - content.maps.keys():
+        del fresh.maps[view]
+
+
+def _on_nothing(each: DepthMap) -> Finding | None:
+    labels = np.zeros(each.depth.shape, dtype=np.uint8) if each.labels is None else each.labels
+    empty = (labels > 0) & (each.depth == 0)
+    if not np.any(empty):
+        return None
+    return Finding(each.view.labels, f"{np.sum(empty)} labels where there is no surface", _rows(empty))
+
+
+def _labels_unlike_twin(content: Content, twins: Content, view: ImageView) -> Finding | None:
+    """The line of a global shutter that its rolling-shutter frame shares."""
+    source = view._replace(shutter="rs", row=0)
+    own, other = (twins.maps if view.row else content.maps).get(view), content.maps.get(source)
+    if view == source or own is None or other is None or own.labels is None or other.labels is None:
+        return None
+    shutter = content.sequence.shutter
+    axis, line = 1 - shutter.axis(view.side), abs(shutter.first_line(view.side) - view.row)
+    unlike = np.take(own.labels, line, axis) != np.take(other.labels, line, axis)
+    if np.sum(unlike) <= spare_pixels(axis, unlike.size):
+        return None
+    words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.labels}"
+    return Finding(view.labels, f"{words}: {np.sum(unlike)} labels at the same time")
+
+
+def _misplaced(content: Content, own: DepthMap) -> Finding | None:
+    """Surfaces through which partners see where their labels take them, and which they see where another would."""
+    sequence, view = content.sequence, own.view
+    stride = max(1, int(np.sqrt(own.depth.size / _TRIED_PIXELS)))
+    numbers = np.zeros(own.depth.shape, np.uint8) if own.labels is None else numbers_of(own.labels)
+    elsewhere = np.zeros(own.depth[::stride, ::stride].shape, dtype=np.bool_)
+    # The other camera sees all of them at about the same time, which tells nothing.
+    over_time = view._replace(frame=view.frame + 1, row=0), view.frame_before._replace(row=0)
+    for partner in (view.other_shutter._replace(row=0), *over_time):
+        if partner not in content.maps:
+            continue
+        with np.errstate(invalid="ignore"):
+            through = reproject(sequence, own, content.maps[partner], stride).relative < -DEPTH_TOLERANCE
+            for other in range(len(sequence.moving) + 1) if np.sum(through) > _FEW_LABELS else ():
+                moved = replace(own, labels=np.full(own.depth.shape, other, dtype=np.uint8))
+                seen = (
+                    np.abs(reproject(sequence, moved, content.maps[partner], stride).relative) <= DEPTH_TOLERANCE
+                )
+                elsewhere |= through & seen & (numbers[::stride, ::stride] != other)
+    # Along an edge that stands out by a hair, a line of pixels may lie by chance where another label takes it.
+    wide = cv2.morphologyEx(elsewhere.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    if np.sum(wide) <= _FEW_LABELS:
+        return None
+    what = f"{np.sum(elsewhere)} pixels are not where their labels take them, but where another would"
+    return Finding(view.labels, what, rows_of(np.repeat(np.any(elsewhere, axis=1), stride)[: len(own.depth)]))
+
+
+def _rows(wrong: BoolArray) -> str:
+    return rows_of(np.any(wrong, axis=1))

@@ -1,0 +1,508 @@
+"""Channels of points (``tracks``, ``affine``, ``matches``) against depth, the row equation, images and rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import asdict
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.components.cards import list_cards, parse_card
+from rsbench.components.plugins import wrap
+from rsbench.core.camera import inverse_2x2
+from rsbench.core.correspondences import repeated
+from rsbench.core.errors import RsbenchError
+from rsbench.core.projection import RSProjection, back_project, project_at, rs_project
+from rsbench.core.rig import FRAMES, VIEWS, View
+from rsbench.core.so3 import FloatArray
+from rsbench.core.version import __version__
+from rsbench.dataset.channel_truth import Rays
+from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, PixelClass, matches_file
+from rsbench.dataset.matches import (
+    MATCHED,
+    Arranged,
+    LabelledMatches,
+    MatchClass,
+    Matching,
+    MatchRays,
+    PairLabels,
+    arranged,
+    at,
+    classes_of,
+    labelled,
+    looks,
+    matched_frames,
+    matcher_record,
+    seen_near,
+)
+from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.tracks import (
+    AffineFrames,
+    SurfaceRays,
+    Tracks,
+    jacobians_of,
+    look_for,
+    make_affine,
+    points_at,
+    track_views,
+)
+from rsbench.dataset.views import FAR, ImageView
+from rsbench.verification.channel_checks import FEW_BENT, LEVEL
+from rsbench.verification.findings import Finding
+from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, relative_depth
+from rsbench.vision.feature_matcher import FEATURE_MATCHERS
+from rsbench.vision.features import SiftMatcher
+
+_SAME, _SAME_PX = 1e-9, 1e-6
+"""Relative distance of points, and px: roundings, and the 1e-9 px to which rows are solved over a small slope."""
+_BEFORE, _BEHIND, _FEW = 1e-2, 1e-2, 0.15
+"""Relative distance beyond which a point is before or behind all that the pixels around it see; the share that may
+be, by what is thinner than a pixel: leaves far away, and gaps between them."""
+_NEARLY_ALL = 0.8
+"""Of the points that lie so, the share whose class cannot be such leaves' and gaps' doing."""
+_FEW_AGAIN, _LEAST = 5e-3, 4
+
+
+def track_faults(
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    times: tuple[int, ...] = FRAMES,
+) -> Iterator[Finding]:
+    """What the tracks show in frames at these times that depth maps and motion cannot have made.
+
+    But for files ``reported``.
+    """
+    if "tracks" not in sequence.channels or TRACKS in reported:
+        return
+    try:
+        tracks = sequence.tracks()
+    except RsbenchError as error:
+        yield Finding.of(error)
+        return
+    if len(tracks.points) == 0 and any(np.any(each.depth) for each in maps.values()):
+        yield Finding(TRACKS, "has no points")
+    for k, view in enumerate(track_views(sequence.frames)):
+        if view[1] not in times:
+            continue
+        image_view, name = ImageView("rs", *view), f"{view[0]}_{view[1]}"
+        found = rs_project(sequence.rig, sequence.shutter, sequence.motion, *view, tracks.points)
+        yield from _pixel_faults(sequence, tracks, k, found, name)
+        if image_view in maps and image_view.depth not in reported:
+            yield from _source_faults(sequence, tracks, k, maps[image_view], name)
+            yield from _hiding_faults(tracks, k, found, maps[image_view], name)
+
+
+def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, name: str) -> Iterator[Finding]:
+    """Points are those of the depth map at the whole pixels from which they were drawn."""
+    own = tracks.sources == k
+    pixels, points = tracks.pixels[own, k], tracks.points[own]
+    outside = ~np.all((pixels == np.round(pixels)) & sequence.rig.camera.contains(pixels)[:, None], axis=1)
+    if np.any(outside):
+        yield Finding(TRACKS, f"{np.sum(outside)} points were drawn from no pixel of it", part=name)
+        return
+    X = points_at(sequence, depth.view[1:3], pixels, depth.depth)
+    off = np.linalg.norm(points - X, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)
+    if np.any(off > _SAME):
+        ratio = float(np.median(np.linalg.norm(points, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)))
+        scaled = np.median(np.linalg.norm(points - ratio * X, axis=1)) < 1e-6 and abs(ratio - 1) > _SAME
+        cause = f"looks scaled by {ratio:.6g}" if scaled else ""
+        what = f"{np.sum(off > _SAME)} of {len(X)} points are not what {depth.view.depth} sees"
+        yield Finding(TRACKS, what, cause=cause, part=name)
+
+
+def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjection, name: str) -> Iterator[Finding]:
+    """Known where and only where a row sees the point; and where that row sees it."""
+    pixels, tau, classes = tracks.pixels[:, k], tracks.tau[:, k], tracks.classes[:, k]
+    view = track_views(sequence.frames)[k]
+    known, own = np.isin(classes, (PixelClass.VISIBLE, PixelClass.OCCLUDED)), tracks.sources == k
+    seen = np.isfinite(found.tau)
+    wrong = (known != np.all(np.isfinite(pixels), axis=1)) | (known != (seen | own)) | (known != np.isfinite(tau))
+    if np.any(wrong):
+        yield Finding(TRACKS, f"{np.sum(wrong)} points are wrongly in or out of view", part=name)
+        return
+    late = np.abs(tau[known] - sequence.shutter.pixel_time(pixels[known], view[1], view[0])) > _SAME
+    exact = project_at(sequence.rig, sequence.motion, view[0], tau[known], tracks.points[known])[:, :2]
+    off = np.max(np.abs(pixels[known] - exact), axis=1)
+    for words, bad in (
+        ("have another time than their row", late),
+        ("are not where their row sees them", off > _SAME_PX),
+    ):
+        if np.any(bad):
+            size = f", typically by {np.median(off[bad]):.2g} px" if words.startswith("are") else ""
+            yield Finding(TRACKS, f"{np.sum(bad)} of {np.sum(known)} points {words}{size}", part=name)
+
+
+def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap, name: str) -> Iterator[Finding]:
+    """Visible points are not far behind the pixels around them, hidden ones not before all of them."""
+    known = np.isfinite(found.tau) & (tracks.sources != k)
+    low, high = depths_around(depth.depth, found.pixels[known])
+    z, classes = found.depth[known], tracks.classes[known, k]
+    for words, so, wrong in (
+        ("are visible, but hidden by", z > high * (1 + _BEHIND), PixelClass.VISIBLE),
+        ("are hidden, but visible by", z < low * (1 + _BEFORE), PixelClass.OCCLUDED),
+    ):
+        bad = int(np.sum(classes[so] == wrong))
+        if bad > max(min(_FEW * np.sum(known), _NEARLY_ALL * np.sum(so)), _LEAST):
+            yield Finding(TRACKS, f"{bad} of {np.sum(known)} points {words} {depth.view.depth}", part=name)
+
+
+def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least and largest depth (n,) of the 4 x 4 pixels around pixels (n, 2); sky is infinitely far."""
+    far = np.where(depth > 0, depth.astype(np.float64), np.inf)
+    x, y = np.floor(pixels).astype(np.int64).T
+    height, width = depth.shape
+    steps = range(-1, 3)
+    around = [
+        far[np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
+        for down in steps
+        for across in steps
+    ]
+    return np.min(around, axis=0, initial=np.inf), np.max(around, axis=0, initial=0.0)
+
+
+def tracks_again(
+    sequence: Sequence, rays: Rays, reported: Collection[str]
+) -> Iterator[tuple[str, Finding | None, bool]]:
+    """As ``channel_checks.channels_again``, of tracks: what rays say of each frame."""
+    if "tracks" not in sequence.channels or TRACKS in reported:
+        return
+    try:
+        tracks = sequence.tracks()
+    except RsbenchError:  # reported already
+        return
+    views = enumerate(track_views(sequence.frames))
+    wrong: list[BoolArray] = [_classes_unlike(sequence, tracks, k, view, rays) for k, view in views]
+    share = float(np.mean(wrong)) if len(tracks.points) else 0.0
+    bad = np.sum(wrong) > max(_FEW_AGAIN * np.size(wrong), _LEAST)
+    what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from what rays say"
+    yield TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong)
+
+
+def _classes_unlike(sequence: Sequence, tracks: Tracks, k: int, view: View, rays: Rays) -> BoolArray:
+    _, _, classes = look_for(sequence, view, tracks.points, rays.blocked)
+    return (classes != tracks.classes[:, k]) & (tracks.sources != k)
+
+
+_UNIT = 1e-6
+"""Of a length: normals are rounded to float32."""
+_SAME_DERIVATIVE = 1e-6
+"""Of a derivative, relative to its largest entry: what rounding of normals and rows leaves at a grazing view."""
+_FEW_WITHOUT_NORMAL = 0.02
+
+
+def affine_faults(
+    sequence: Sequence,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    times: tuple[int, ...] = FRAMES,
+) -> Iterator[Finding]:
+    """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``reported``.
+
+    Derivatives are looked at once, with frame 0 among these ``times``; normals with the maps that there are.
+    """
+    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
+        return
+    try:
+        affine, tracks = sequence.affine(), sequence.tracks()
+    except RsbenchError as error:
+        yield Finding.of(error)
+        return
+    if affine.jacobians.shape[:2] != tracks.tau.shape:
+        yield Finding(AFFINE, f"is of {affine.jacobians.shape[:2]} points and views, tracks of {tracks.tau.shape}")
+        return
+    if 0 in times:
+        yield from _jacobian_faults(sequence, affine, tracks)
+    lost = np.all(affine.normals == 0.0, axis=1)
+    off = ~lost & (np.abs(np.linalg.norm(affine.normals, axis=1) - 1.0) > _UNIT)
+    if np.any(off) or np.sum(lost) > max(_FEW_WITHOUT_NORMAL * len(lost), _LEAST):
+        yield Finding(AFFINE, f"{np.sum(off)} normals are not of length 1, and {np.sum(lost)} are 0")
+        return
+    for k, view in enumerate(track_views(sequence.frames)):
+        image_view, own = ImageView("rs", *view), (tracks.sources == k) & ~lost
+        if image_view in maps and image_view.depth not in reported:
+            yield from _normal_faults(sequence, maps[image_view], affine.normals[own], tracks.pixels[own, k])
+
+
+def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -> Iterator[Finding]:
+    made = jacobians_of(sequence, tracks, affine.normals)
+    for k, (side, frame) in enumerate(track_views(sequence.frames)):
+        own, stored = made[:, k], affine.jacobians[:, k]
+        name = f"{side}_{frame}"
+        empty = np.any(np.isnan(stored), axis=(1, 2)) != np.any(np.isnan(own), axis=(1, 2))
+        if np.any(empty):
+            yield Finding(
+                AFFINE, f"{np.sum(empty)} derivatives are there without a pixel, or lack with one", part=name
+            )
+            continue
+        size = np.maximum(np.max(np.abs(own), axis=(1, 2)), 1.0)[:, None, None]
+        wrong = np.any(np.abs(stored - own) > _SAME_DERIVATIVE * size, axis=(1, 2))
+        if np.any(wrong):
+            what = f"{np.sum(wrong)} of {len(own)} derivatives are not those of plane, motion and row times"
+            typical = np.median(np.max(np.abs(stored - own)[wrong], axis=(1, 2)))
+            cause = _affine_cause(stored[wrong], own[wrong])
+            yield Finding(AFFINE, f"{what}, typically by {typical:.2g}", cause=cause, part=name)
+
+
+def _affine_cause(stored: FloatArray, made: FloatArray) -> str:
+    """What derivatives (n, 2, 2) are instead, in words; "" where nothing explains most of them."""
+    tried = {"transposed": np.swapaxes(stored, 1, 2), "x and y exchanged": stored[:, ::-1, ::-1]}
+    tried["inverted"] = inverse_2x2(stored)
+    near = {words: np.mean(np.all(np.abs(each - made) < 1e-3, axis=(1, 2))) for words, each in tried.items()}
+    best = max(near, key=near.__getitem__)
+    return f"looks {best}" if near[best] > 0.8 else ""
+
+
+def _normal_faults(
+    sequence: Sequence, depth: DepthMap, normals: FloatArray, pixels: FloatArray
+) -> Iterator[Finding]:
+    """Normals (n, 3) at whole pixels (n, 2) stand upright on the surface around them, where it is flat."""
+    x, y = pixels.astype(np.int64).T
+    flat = depth.flat[y, x]
+    x, y, normals = x[flat], y[flat], normals[flat]
+
+    def seen(across: int, down: int) -> FloatArray:
+        place, z = np.stack([x + across, y + down], axis=-1), depth.depth[y + down, x + across]
+        args = sequence.rig, sequence.shutter, sequence.motion, depth.view.side, depth.view.frame
+        return back_project(*args, place, z)
+
+    bent = np.zeros(len(x), dtype=np.bool_)
+    for step in (seen(1, 0) - seen(-1, 0), seen(0, 1) - seen(0, -1)):
+        bent |= np.abs(np.sum(step * normals, axis=-1)) > LEVEL * np.linalg.norm(step, axis=-1)
+    if np.sum(bent) > max(FEW_BENT * len(x), _LEAST):
+        what = f"{np.sum(bent)} of {len(x)} normals are not upright on the surface of {depth.view.depth}"
+        yield Finding(AFFINE, what, part=f"{depth.view.side}_{depth.view.frame}")
+
+
+def affine_again(
+    sequence: Sequence, rays: SurfaceRays, reported: Collection[str]
+) -> Iterator[tuple[str, Finding | None, bool]]:
+    """As ``channel_checks.channels_again``, of affine frames: what rays meet at the points of the tracks."""
+    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
+        return
+    try:
+        stored, tracks = sequence.affine(), sequence.tracks()
+    except RsbenchError:  # reported already
+        return
+    made = make_affine(sequence, tracks, rays)
+    wrong = np.any(np.abs(made.normals - stored.normals) > 10 * _UNIT, axis=1)
+    bad = np.sum(wrong) > max(_FEW_AGAIN * len(wrong), _LEAST)
+    what = f"{np.sum(wrong)} of {len(wrong)} normals differ from what rays meet"
+    names = ("normals", "jacobians")
+    same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
+    yield AFFINE, Finding(AFFINE, what) if bad else None, same
+
+
+"""Of distances, and px: roundings, and the 1e-9 px to which rows are solved over a small slope."""
+_BESIDE_ALL, _FEW_BESIDE = 1e-2, 0.15
+"""Relative distance from all that the pixels around see, and the share of what may lie beyond, by things thinner
+than a pixel: keypoints sit at edges."""
+_FEW_OTHERS = 0.02
+"""Of what is compared on flat surfaces, with what is matched again on another processor, and with other rays."""
+_AGREES_PX = 1e-3
+"""Of places made again by rays: depth is rounded to float32."""
+Report = Callable[..., Finding]
+"""Makes findings of one pair of views, from their words."""
+_OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
+
+
+def match_faults(
+    sequence: Sequence, maps: Mapping[ImageView, DepthMap], reported: Collection[str], first: int = 0
+) -> Iterator[Finding]:
+    """What the labels of frame ``first`` and the next show that depth maps and motion cannot have made.
+
+    But for files ``reported``.
+    """
+    if "matches" not in sequence.channels:
+        return
+    matching = sequence.matching or Matching()
+    yield from _record_faults(sequence, matching, reported)
+    if (stored := matches_file(first)) in reported:
+        return
+    try:
+        matches = sequence.matches(first)
+    except RsbenchError as error:
+        yield Finding.of(error)
+        return
+    for k, (name, views) in enumerate(MATCHED.items()):
+        source, target = (at(view, first) for view in views)
+        part, found = matches.of_pair(k), partial(Finding, stored, part=name)
+        outside = ~sequence.rig.camera.contains(part.pixels).all(axis=1)
+        if np.any(outside):
+            yield found(f"{np.sum(outside)} matches have a keypoint beside the images")
+            continue
+        yield from _depth_faults(sequence, part, source, maps, reported, found)
+        yield from _truth_faults(sequence, part, source, target, found)
+        yield from _class_faults(sequence, part, source, target, maps, reported, matching.bound_px, found)
+
+
+def _record_faults(sequence: Sequence, matching: Matching, reported: Collection[str]) -> Iterator[Finding]:
+    """matcher.json against sequence.json, and against the card of the same name where this version wrote it."""
+    if MATCHER in reported:
+        return
+    try:
+        record = sequence.matcher()
+    except RsbenchError as error:
+        yield Finding.of(error)
+        return
+    own = record.get("versions") == _versions() and matching.features in list_cards("features")
+    made = matcher_record(matching) if own else asdict(matching)
+    for key, value in made.items():
+        if record.get(key) != value:
+            yield Finding(MATCHER, f"{key} = {record.get(key)!r}, sequence.json and its matcher say {value!r}")
+    versions = record.get("versions")
+    if not isinstance(versions, dict) or not all(isinstance(versions.get(k), str) for k in ("rsbench", "opencv")):
+        yield Finding(MATCHER, f"versions = {versions!r}: those of rsbench and opencv are needed")
+    if not isinstance(record.get("class"), str) or not isinstance(record.get("parameters"), dict):
+        yield Finding(MATCHER, "class and parameters of the matcher are needed")
+
+
+def _depth_faults(
+    sequence: Sequence,
+    part: PairLabels,
+    source: View,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    found: Report,
+) -> Iterator[Finding]:
+    """The depth of keypoints is that of the flat surface around them, or between those of the pixels around."""
+    view = ImageView("rs", *source)
+    if view not in maps or view.depth in reported:
+        return
+    sky = part.depth == 0.0
+    relative = relative_depth(maps[view], part.pixels[:, 0], part.depth, sky)
+    low, high = depths_around(maps[view].depth, part.pixels[:, 0])
+    z = np.where(sky, np.inf, part.depth)
+    with np.errstate(invalid="ignore"):
+        flat, beside = np.isfinite(relative), (z < low * (1 - _BESIDE_ALL)) | (z > high * (1 + _BESIDE_ALL))
+        off = flat & (np.abs(relative) > DEPTH_TOLERANCE)
+    for wrong, among, few in ((off, flat, _FEW_OTHERS), (beside, np.ones_like(flat), _FEW_BESIDE)):
+        if np.sum(wrong) > max(few * np.sum(among), _LEAST):
+            what = f"the depth of {np.sum(wrong)} of {np.sum(among)} keypoints is not that of {view.depth}"
+            ratio = float(np.median(1.0 + relative[off])) if np.any(off) else 1.0
+            scaled = np.mean(np.abs(relative[off] + 1.0 - ratio) < DEPTH_TOLERANCE) > 0.5 if np.any(off) else False
+            yield found(what, cause=f"looks scaled by {ratio:.6g}" if scaled else "")
+            return
+
+
+def _truth_faults(
+    sequence: Sequence, part: PairLabels, source: View, target: View, found: Report
+) -> Iterator[Finding]:
+    """True places are those where a row sees the point at its own time, and errors the distances from them."""
+    points = _points(sequence, part, source)
+    _, tau, unsolved = seen_near(sequence, target, points, part.pixels[:, 1])
+    known = np.all(np.isfinite(part.truth), axis=1)
+    wrong = (known != np.isfinite(tau)) & ~unsolved
+    if np.any(wrong):
+        yield found(f"{np.sum(wrong)} of {len(wrong)} true places are wrongly in or out of view")
+        return
+    times = sequence.shutter.pixel_time(part.truth[known], target[1], target[0])
+    exact = project_at(sequence.rig, sequence.motion, target[0], times, points[known])[:, :2]
+    off = np.max(np.abs(part.truth[known] - exact), axis=1)
+    if np.any(~(off <= _SAME_PX)):
+        what = (
+            f"{np.sum(~(off <= _SAME_PX))} of {np.sum(known)} true places are not where their row sees the point"
+        )
+        yield found(f"{what}, typically by {np.nanmedian(off[~(off <= _SAME_PX)]):.2g} px")
+    error = np.linalg.norm(part.pixels[:, 1] - part.truth, axis=1)
+    if np.any(bad := ~((np.abs(error - part.error) <= _SAME) | (np.isnan(error) & np.isnan(part.error)))):
+        yield found(f"{np.sum(bad)} of {len(bad)} errors are not the distance from the true place")
+
+
+def _class_faults(
+    sequence: Sequence,
+    part: PairLabels,
+    source: View,
+    target: View,
+    maps: Mapping[ImageView, DepthMap],
+    reported: Collection[str],
+    bound_px: float,
+    found: Report,
+) -> Iterator[Finding]:
+    """Classes are those of the errors; hidden points lie behind what the target sees, others do not."""
+    hidden = part.classes == MatchClass.OCCLUDED
+    unsolved = part.classes == MatchClass.UNSOLVED
+    made = classes_of(part.pixels, part.depth, part.truth, hidden, unsolved, bound_px)
+    if np.any(made != part.classes):
+        what = f"{np.sum(made != part.classes)} of {len(made)} classes are not what error and depth make"
+        yield found(f"{what}, within {bound_px:g} px")
+    view, seen = ImageView("rs", *target), np.isfinite(part.error) & (part.depth > 0.0)
+    if view not in maps or view.depth in reported:
+        return
+    points, places = _points(sequence, part, source)[seen], part.truth[seen]
+    times = sequence.shutter.pixel_time(places, target[1], target[0])
+    z = project_at(sequence.rig, sequence.motion, target[0], times, points)[:, 2]
+    low, high = depths_around(maps[view].depth, places)
+    for words, so, wrong in (
+        ("are in sight, but hidden by", z > high * (1 + _BESIDE_ALL), ~hidden[seen]),
+        ("are hidden, but in sight by", z < low * (1 + _BESIDE_ALL), hidden[seen]),
+    ):
+        # Where few points are hidden, all of them may be by things thinner than a pixel.
+        if np.sum(so & wrong) > max(_FEW_BESIDE * np.sum(so), _FEW_OTHERS * np.sum(seen), _LEAST):
+            yield found(f"{np.sum(so & wrong)} of {np.sum(seen)} points {words} {view.depth}")
+
+
+def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
+    """World points (n, 3) that the first keypoints see; those in the sky far away."""
+    eyes, ahead = looks(sequence, source, part.pixels[:, 0])
+    return eyes + np.where(part.depth > 0.0, part.depth, FAR)[:, None] * (ahead - eyes)
+
+
+def matched_again(
+    sequence: Sequence, reported: Collection[str], first: int = 0
+) -> tuple[list[Finding], list[str]]:
+    """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not asked.
+
+    Only rsbench's own matcher is asked, in the versions that made them: what a dataset names is never imported.
+    """
+    images_of, file = [ImageView("rs", *at(view, first)) for view in VIEWS], matches_file(first)
+    if "matches" not in sequence.channels or {*(each.image for each in images_of), file, MATCHER} & set(reported):
+        return [], []
+    try:
+        stored, record = sequence.matches(first), sequence.matcher()
+        if record.get("class") != _OURS or record.get("versions") != _versions():
+            return [], [str(Finding(file, "not matched again: another matcher or version made it"))]
+        component = parse_card(SiftMatcher, record["parameters"], f"{MATCHER}: parameters")
+        images = {each[1:3]: sequence.image(*each) for each in images_of}
+        found = matched_frames(sequence, first, images, wrap(FEATURE_MATCHERS, component))
+    except RsbenchError as error:
+        return [Finding.of(error)], []
+    return list(_unlike_faults(file, stored, arranged(found))), []
+
+
+def _versions() -> dict[str, str]:
+    return {"rsbench": __version__, "opencv": str(cv2.__version__)}
+
+
+def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Iterator[Finding]:
+    for k, name in enumerate(MATCHED):
+        ours, theirs = (each.pixels[each.sets == k].reshape(-1, 4) for each in (found, stored))
+        strange, missing = np.sum(~repeated(theirs, ours)), np.sum(~repeated(ours, theirs))
+        if strange + missing > max(_FEW_OTHERS * (len(ours) + len(theirs)), _LEAST):
+            what = f"{strange} of {len(theirs)} matches are not found in the images, and {missing} others are"
+            yield Finding(file, what, part=name)
+
+
+def matches_again(
+    sequence: Sequence, first: int, rays: MatchRays, reported: Collection[str]
+) -> Iterator[tuple[str, Finding | None, bool]]:
+    """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
+    if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
+        return
+    try:
+        stored = sequence.matches(first)
+    except RsbenchError:  # reported already
+        return
+    as_given = Arranged(stored.sets, stored.tracks, stored.pixels)
+    made = labelled(sequence, first, as_given, (sequence.matching or Matching()).bound_px, rays)
+    with np.errstate(invalid="ignore"):
+        near = np.abs(made.error - stored.error) <= _AGREES_PX
+    alike = (made.classes == stored.classes) & (near | (np.isnan(made.error) & np.isnan(stored.error)))
+    wrong = int(np.sum(~alike))
+    what = f"{wrong} of {len(alike)} labels differ from what rays say"
+    names = ("depth", "truth", "classes")
+    same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
+    yield file, Finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else None, same
