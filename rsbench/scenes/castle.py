@@ -6,16 +6,15 @@ The yard spans x from -17 to 17 and y from -18 to 25; the gate looks north (+y),
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
+from rsbench.scenes.model import FloatArray
 from rsbench.scenes.parts import (
     HouseStyle,
+    PartsBuilder,
     Piece,
-    assemble,
     curtain_wall,
     gatehouse,
     grid,
@@ -26,14 +25,13 @@ from rsbench.scenes.parts import (
     square_tower,
     wall_stairs,
 )
-from rsbench.scenes.surfaces import paint_palette
 
 
 @dataclass(frozen=True, kw_only=True)
-class CastleBuilder(SceneBuilder):
+class CastleBuilder(PartsBuilder):
     """The courtyard of a castle; lengths in metres."""
 
-    closed = True
+    RANGES = (("wall_height", 3.0, 15.0), ("keep_height", 8.0, 40.0), ("trees", 0, 60))
 
     wall_height: float = 6.5
     """Height of the walls, metres, 3 to 15."""
@@ -42,20 +40,10 @@ class CastleBuilder(SceneBuilder):
     trees: int = 26
     """Trees on the hills around the castle."""
 
-    def __post_init__(self) -> None:
-        if not 3.0 <= self.wall_height <= 15.0:
-            raise ValueError(f"wall_height = {self.wall_height}: allowed are 3 to 15 metres")
-        if not 8.0 <= self.keep_height <= 40.0:
-            raise ValueError(f"keep_height = {self.keep_height}: allowed are 8 to 40 metres")
-        if not 0 <= self.trees <= 60:
-            raise ValueError(f"trees = {self.trees}: allowed are 0 to 60")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the castle in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_ground(), *_walls(rng, self), *_buildings(rng, self), *_yard(rng)]
         pieces += _surroundings(rng, self)
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def terrain_height(x: FloatArray, y: FloatArray) -> FloatArray:

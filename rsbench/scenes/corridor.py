@@ -6,14 +6,23 @@ It runs along y from -9 to 15 m, 3.2 m wide; the floor is z = 0. The default vie
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import shapely
 
-from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.parts import Piece, Point, assemble, block, box, panel, placed, prism, rectangle, revolve, tube
-from rsbench.scenes.surfaces import paint_palette
+from rsbench.scenes.parts import (
+    PartsBuilder,
+    Piece,
+    Point,
+    block,
+    box,
+    panel,
+    placed,
+    prism,
+    rectangle,
+    revolve,
+    tube,
+)
 
 _HALF, _START, _END, _HEIGHT = 1.6, -9.0, 15.0, 2.8
 _TILE, _JOINT = 0.6, 0.004
@@ -25,29 +34,21 @@ _NICHE = (7.6, 2.2)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorridorBuilder(SceneBuilder):
+class CorridorBuilder(PartsBuilder):
     """A corridor with doors on both sides."""
 
-    closed = True
+    RANGES = (("doors", 0, 6), ("lights", 1, 8))
 
     doors: int = 5
     """On each side."""
     lights: int = 5
     """Openings in the ceiling; the sun enters through nothing else."""
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.doors <= 6:
-            raise ValueError(f"doors = {self.doors}: allowed are 0 to 6")
-        if not 1 <= self.lights <= 8:
-            raise ValueError(f"lights = {self.lights}: allowed are 1 to 8")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the corridor in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_floor(), *_ceiling(self.lights), *_end_walls(), *_niche()]
         for side in (-1, 1):
             pieces += _side(rng, side, self.doors)
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def _floor() -> list[Piece]:

@@ -6,14 +6,12 @@ The default viewpoint stands near the origin and looks along +y, up a slope. Met
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
-from rsbench.scenes.parts import Piece, assemble, flat, grid, lump, placed, tube
-from rsbench.scenes.surfaces import paint_palette
+from rsbench.scenes.model import FloatArray
+from rsbench.scenes.parts import PartsBuilder, Piece, flat, grid, lump, placed, tube
 
 _CLEAR = 1.7
 """No trunk stands nearer to the path, which runs along y from -4 to 2 m, so that the rig has room."""
@@ -22,31 +20,23 @@ _NEAR = ((-1.15, 3.3, 0.07), (1.25, 3.9, 0.10), (-0.35, 5.2, 0.035), (0.62, 6.1,
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForestBuilder(SceneBuilder):
+class ForestBuilder(PartsBuilder):
     """A mixed wood with undergrowth."""
 
-    closed = True
+    RANGES = (("trees", 10, 150), ("ferns", 0, 200))
 
     trees: int = 75
     """Beside those in the foreground."""
     ferns: int = 60
     """On the ground between them."""
 
-    def __post_init__(self) -> None:
-        if not 10 <= self.trees <= 150:
-            raise ValueError(f"trees = {self.trees}: allowed are 10 to 150")
-        if not 0 <= self.ferns <= 200:
-            raise ValueError(f"ferns = {self.ferns}: allowed are 0 to 200")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the wood in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_ground(rng), *_backdrop(rng), *_foreground(rng)]
         for x, y in _places(rng, self.trees, 5.5, 34.0):
             pieces += placed(_tree(rng, float(np.hypot(x, y))), (x, y, float(_height(x, y))))
         for x, y in _places(rng, self.ferns, 3.2, 22.0):
             pieces += placed(_fern(rng), (x, y, float(_height(x, y))))
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def _height(x: FloatArray | float, y: FloatArray | float) -> FloatArray:

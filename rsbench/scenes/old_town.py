@@ -6,17 +6,15 @@ The street runs along y from -26 (a town gate) to 14, the square spans x from -1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.model import SceneBuilder, SceneMesh
 from rsbench.scenes.parts import (
     HouseStyle,
+    PartsBuilder,
     Piece,
     arch,
-    assemble,
     beam,
     box,
     gatehouse,
@@ -32,17 +30,16 @@ from rsbench.scenes.parts import (
     revolve,
     square_tower,
 )
-from rsbench.scenes.surfaces import paint_palette
 
 _WALLS = ("plaster_0", "plaster_1", "plaster_2", "plaster_3", "plaster_4", "brick")
 _GROUNDS = ("stone", "ashlar_1", "ashlar_3", "brick")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OldTownBuilder(SceneBuilder):
+class OldTownBuilder(PartsBuilder):
     """A street and a market square; lengths in metres."""
 
-    closed = True
+    RANGES = (("street_width", 6.0, 14.0), ("storeys", 1, 5), ("stalls", 0, 7))
 
     street_width: float = 9.0
     """Width of the street, metres, 6 to 14."""
@@ -51,20 +48,10 @@ class OldTownBuilder(SceneBuilder):
     stalls: int = 5
     """Market stalls on the square."""
 
-    def __post_init__(self) -> None:
-        if not 6.0 <= self.street_width <= 14.0:
-            raise ValueError(f"street_width = {self.street_width}: allowed are 6 to 14 metres")
-        if not 1 <= self.storeys[0] <= self.storeys[1] <= 5:
-            raise ValueError(f"storeys = {self.storeys}: allowed are 1 to 5, the least first")
-        if not 0 <= self.stalls <= 7:
-            raise ValueError(f"stalls = {self.stalls}: allowed are 0 to 7")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the town in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_ground(self), *_street(rng, self), *_square(rng, self)]
         pieces += [*_street_life(rng, self), *_market(rng, self), *_surroundings(rng)]
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def _ground(parameters: OldTownBuilder) -> list[Piece]:

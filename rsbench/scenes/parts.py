@@ -13,8 +13,11 @@ from __future__ import annotations
 
 import functools
 import itertools
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
 
 import mapbox_earcut
 import numpy as np
@@ -22,8 +25,8 @@ import shapely
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.scenes.model import FloatArray, SceneMesh
-from rsbench.scenes.surfaces import Surface
+from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
+from rsbench.scenes.surfaces import Surface, paint_palette
 
 Point = tuple[float, float]
 IndexArray = NDArray[np.intp]
@@ -307,6 +310,31 @@ def assemble(
             uv = uv * mirror / np.asarray(repeat) + rng.random(2)
         by_surface.setdefault(piece.surface, []).append((piece, uv))
     return tuple(_merged(name, by_surface[name], palette[name]) for name in sorted(by_surface))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartsBuilder(SceneBuilder):
+    """A scene of parts, painted and merged. Raises ValueError on a parameter that is out of its range."""
+
+    closed = True
+    RANGES: ClassVar[tuple[tuple[str, float, float], ...]] = ()
+    """Name, least and largest value of each parameter; a pair must ascend between them."""
+
+    def __post_init__(self) -> None:
+        for name, least, most in self.RANGES:
+            value = getattr(self, name)
+            low, high = value if isinstance(value, tuple) else (value, value)
+            if not least <= low <= high <= most:
+                order = ", the least first" if isinstance(value, tuple) else ""
+                raise ValueError(f"{name} = {value}: allowed are {least:g} to {most:g}{order}")
+
+    @abstractmethod
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
+        """The parts, in the scene frame."""
+
+    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
+        pieces = self.pieces(np.random.default_rng((seed, 1)))
+        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
 
 
 def _merged(name: str, parts: list[tuple[Piece, FloatArray]], surface: Surface) -> SceneMesh:

@@ -7,14 +7,11 @@ to 13 m. Some posts are so near the border that only one camera of a rig sees th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.parts import Piece, assemble, box, grid, panel, placed, rectangle, tube, window
-from rsbench.scenes.surfaces import paint_palette
+from rsbench.scenes.parts import PartsBuilder, Piece, box, grid, panel, placed, rectangle, tube, window
 
 _BORDER = ((-0.72, 2.2, 0.035), (0.74, 2.25, 0.05), (-1.16, 3.6, 0.06), (1.24, 3.8, 0.045))
 """Posts at the border of the default view: x, y, radius; metres."""
@@ -22,27 +19,19 @@ _HEIGHT = 3.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolesBuilder(SceneBuilder):
+class PolesBuilder(PartsBuilder):
     """A yard seen past posts, rails and a street lamp."""
 
-    closed = True
+    RANGES = (("posts", 0, 40), ("thinnest", 0.002, 0.05))
 
     posts: int = 9
     """Thin ones in the middle of the picture."""
     thinnest: float = 0.008
     """Least radius of a post, metres: 5 px across at 4 m in the paper's camera."""
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.posts <= 40:
-            raise ValueError(f"posts = {self.posts}: allowed are 0 to 40")
-        if not 0.002 <= self.thinnest <= 0.05:
-            raise ValueError(f"thinnest = {self.thinnest}: allowed are 0.002 to 0.05 metres")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the yard in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_yard(rng), *_posts(rng, self.posts, self.thinnest)]
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def _post(surface: str, x: float, y: float, radius: float, lean: tuple[float, float] = (0.0, 0.0)) -> Piece:

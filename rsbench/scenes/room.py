@@ -6,16 +6,14 @@ The room spans x from -2.7 to 2.7 and y from -2.9 to 2.9; the floor is z = 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.model import SceneBuilder, SceneMesh
 from rsbench.scenes.parts import (
+    PartsBuilder,
     Piece,
     Point,
-    assemble,
     beam,
     box,
     door,
@@ -27,34 +25,25 @@ from rsbench.scenes.parts import (
     rectangle,
     window,
 )
-from rsbench.scenes.surfaces import paint_palette
 
 _HALF_X, _HALF_Y = 2.7, 2.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoomBuilder(SceneBuilder):
+class RoomBuilder(PartsBuilder):
     """A living room, furnished."""
 
-    closed = True
+    RANGES = (("ceiling_height", 2.5, 4.0), ("chairs", 0, 4))
 
     ceiling_height: float = 2.7
     """Metres."""
     chairs: int = 3
     """Around the table."""
 
-    def __post_init__(self) -> None:
-        if not 2.5 <= self.ceiling_height <= 4.0:
-            raise ValueError(f"ceiling_height = {self.ceiling_height}: allowed are 2.5 to 4 metres")
-        if not 0 <= self.chairs <= 4:
-            raise ValueError(f"chairs = {self.chairs}: allowed are 0 to 4")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the room in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_shell(self.ceiling_height), *_back_wall(rng, self.ceiling_height)]
         pieces += [*_seats(), *_table(rng, self.chairs), *_sides(rng), *_garden(rng)]
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def _shell(height: float) -> list[Piece]:

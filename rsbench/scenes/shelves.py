@@ -6,15 +6,13 @@ The aisle runs along y from -9 to 17 m, 4.4 m wide; the floor is z = 0. The defa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import shapely
 
-from rsbench.scenes.model import SceneBuilder, SceneMesh
-from rsbench.scenes.parts import Piece, assemble, beam, block, box, picture, placed, prism, revolve
+from rsbench.scenes.parts import PartsBuilder, Piece, beam, block, box, picture, placed, prism, revolve
 from rsbench.scenes.props import sheet_cell
-from rsbench.scenes.surfaces import CARTONS, cell_uv, paint_palette
+from rsbench.scenes.surfaces import CARTONS, cell_uv
 
 _AISLE = 2.2
 """Half its width, metres."""
@@ -25,25 +23,17 @@ _LEVELS = (0.0, 1.75, 3.3)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShelvesBuilder(SceneBuilder):
+class ShelvesBuilder(PartsBuilder):
     """A storehouse with two rows of racks."""
 
-    closed = True
+    RANGES = (("bays", 1, 9), ("disorder", 0, 0.03))
 
     bays: int = 8
     """Of each row."""
     disorder: float = 0.02
     """How far a carton stands from its place, metres (standard deviation); 0 repeats exactly."""
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.bays <= 9:
-            raise ValueError(f"bays = {self.bays}: allowed are 1 to 9")
-        if not 0 <= self.disorder <= 0.03:
-            raise ValueError(f"disorder = {self.disorder}: allowed are 0 to 0.03 metres")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the storehouse in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_hall(), *_aisle(rng, self.disorder)]
         for heading in (90, -90):
             row: list[Piece] = []
@@ -52,7 +42,7 @@ class ShelvesBuilder(SceneBuilder):
             row += placed(_upright(), (_BAY * self.bays / 2, 0, 0))
             middle = (_START + _END) / 2 - 0.5
             pieces += placed(row, (np.sign(-heading) * _AISLE, middle, 0), heading)
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def carton(design: int, size: tuple[float, float, float]) -> list[Piece]:

@@ -7,15 +7,13 @@ the roadway is z = 0. The default viewpoint looks along +y.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rsbench.scenes import props
-from rsbench.scenes.model import SceneBuilder, SceneMesh
 from rsbench.scenes.parts import (
+    PartsBuilder,
     Piece,
-    assemble,
     beam,
     block,
     box,
@@ -29,7 +27,6 @@ from rsbench.scenes.parts import (
     revolve,
     tube,
 )
-from rsbench.scenes.surfaces import paint_palette
 
 _HALF, _START, _END = 6.5, -14.0, 62.0
 _KERB = 2.4
@@ -39,25 +36,17 @@ _DEPTH = 9.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreetBuilder(SceneBuilder):
+class StreetBuilder(PartsBuilder):
     """A street between tall houses."""
 
-    closed = True
+    RANGES = (("storeys", 2, 8), ("cars", 0, 16))
 
     storeys: tuple[int, int] = (4, 6)
     """Least and greatest."""
     cars: int = 12
     """At the kerbs."""
 
-    def __post_init__(self) -> None:
-        if not 2 <= self.storeys[0] <= self.storeys[1] <= 8:
-            raise ValueError(f"storeys = {self.storeys}: allowed are 2 to 8, the least first")
-        if not 0 <= self.cars <= 16:
-            raise ValueError(f"cars = {self.cars}: allowed are 0 to 16")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the street in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_roadway(), *_closing(rng, self.storeys), *_furniture(rng, self.cars)]
         for side in (-1, 1):
             y, number = _START - float(rng.uniform(0, 3)), 0
@@ -68,7 +57,7 @@ class StreetBuilder(SceneBuilder):
                 )
                 pieces += placed(house, (side * _HALF, y + width / 2, 0.12), -90 * side)
                 y, number = y + width, number + 1
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
 
 def _facade(rng: np.random.Generator, width: float, storeys: int, number: int) -> list[Piece]:

@@ -9,15 +9,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rsbench.scenes.model import FloatArray, SceneBuilder, SceneMesh
+from rsbench.scenes.model import FloatArray
 from rsbench.scenes.parts import (
+    PartsBuilder,
     Piece,
-    assemble,
     block,
     box,
     chimney,
@@ -31,7 +30,6 @@ from rsbench.scenes.parts import (
     revolve,
     tube,
 )
-from rsbench.scenes.surfaces import paint_palette
 
 _CUTS_X = (-110.0, -72.0, -36.0, -12.0, -8.0, 17.0, 42.0, 68.0, 105.0)
 _CUTS_Y = (-60.0, -32.0, -14.0, 6.0, 11.0, 31.0, 52.0, 76.0, 110.0, 160.0)
@@ -62,25 +60,17 @@ class _Plot(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerrainBuilder(SceneBuilder):
+class TerrainBuilder(PartsBuilder):
     """Land with a village at a crossing."""
 
-    closed = True
+    RANGES = (("relief", 0, 8), ("houses", 0, 2))
 
     relief: float = 2.5
     """Height of the swells of the land, metres."""
     houses: int = 2
     """On each of the four plots at the crossing."""
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.relief <= 8:
-            raise ValueError(f"relief = {self.relief}: allowed are 0 to 8 metres")
-        if not 0 <= self.houses <= 2:
-            raise ValueError(f"houses = {self.houses}: allowed are 0 to 2")
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of the land in the scene frame."""
-        rng = np.random.default_rng((seed, 1))
+    def pieces(self, rng: np.random.Generator) -> list[Piece]:
 
         def at(x: float, y: float) -> tuple[float, float, float]:
             ground = self.ground(np.array(x), np.array(y))
@@ -96,7 +86,7 @@ class TerrainBuilder(SceneBuilder):
             if plot.kind == "garden":
                 pieces += _yard(rng, plot, at, self.houses)
         pieces += _traffic(rng, at)
-        return assemble(pieces, paint_palette((piece.surface for piece in pieces), seed), (seed, 2))
+        return pieces
 
     def ground(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Points (..., 3) of the land at places of the map before the warp, which bends the borders."""
