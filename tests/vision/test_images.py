@@ -19,7 +19,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.features import MatchOptions, SiftMatcher, detect, refine_matches
+from rsbench.vision.features import SiftMatcher, refine_matches
 from rsbench.vision.images import ahead, at_full_size, guided_upsample, halved, map_ahead, map_frames, resample
 from rsbench.vision.stereo_depth import SgmOptions, depth_metrics, stereo_disparity
 
@@ -40,23 +40,6 @@ def test_a_halved_ramp_has_the_values_of_the_places_that_it_stands_for(shape: tu
     places = at_full_size(np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2), shape)
     for each, place in zip(small, places.T, strict=True):
         np.testing.assert_allclose(2.0 * each.reshape(-1), place, atol=1.6)  # whole grey levels of half a pixel
-
-
-def test_features_lie_where_the_blobs_are() -> None:
-    """Of an image of odd size, whose halves are a little more than two pixels wide."""
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:401, :399]
-    centres = np.stack(np.meshgrid(np.arange(6), np.arange(6)), -1).reshape(-1, 2) * 60.0 + 45
-    centres += rng.uniform(-0.5, 0.5, centres.shape)
-    image = np.full(x.shape, 60.0)
-    for (cx, cy), sigma in zip(centres, rng.uniform(4, 8, len(centres)), strict=True):
-        image += 120 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2))
-    points = detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), MatchOptions(half=True)).points
-    distance = np.linalg.norm(points[:, None] - centres, axis=-1)
-    found = distance.min(axis=1) < 2
-    assert np.unique(distance[found].argmin(axis=1)).size > 30
-    offset = points[found] - centres[distance[found].argmin(axis=1)]
-    assert np.all(np.abs(offset.mean(axis=0)) < 0.03)  # the pixel of half the size is twice as large
 
 
 def test_matches_that_are_aligned_are_as_good_as_those_of_the_full_size(scene: Any, u8: Build) -> None:
