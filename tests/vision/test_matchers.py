@@ -102,19 +102,19 @@ def answered(self: Any, *known: Any) -> Any:
 @dataclass(frozen=True)
 class Says(StereoMatcher):
     answer: Any
-    disparities = answered
+    disparities = answered  # pyrefly: ignore[bad-override]
 
 
 @dataclass(frozen=True)
 class SaysDepth(MotionMatcher):
     answer: Any
-    depths = answered
+    depths = answered  # pyrefly: ignore[bad-override]
 
 
 @dataclass(frozen=True)
 class Finds(FeatureMatcher):
     answer: Any
-    match = answered
+    match = answered  # pyrefly: ignore[bad-override]
 
 
 def entry_of(component: Any) -> Entry[Any, RunOptions]:
