@@ -78,8 +78,15 @@ def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> Non
         assert word in line, line
 
 
-def bytes_below(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, by its path there."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
-    }
+def bytes_below(folder: Path, *without: str) -> dict[str, bytes]:
+    """Every file below a folder by its path there, except those with a file's or folder's name in ``without``."""
+    files = ((path.relative_to(folder), path) for path in sorted(folder.rglob("*")) if path.is_file())
+    return {place.as_posix(): path.read_bytes() for place, path in files if not {*without} & {*place.parts}}
+
+
+def install_package(folder: Path, name: str, points: str) -> None:
+    """Metadata of an installed package in a folder of ``sys.path``; ``points`` are its entry points."""
+    info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", "utf-8")
+    (info / "entry_points.txt").write_text(points, "utf-8")

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import sweep_card
+from commands import install_package, sweep_card
 
 from rsbench.components.cards import read_toml
 
@@ -31,11 +31,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
             name, content = block.removeprefix("# ").split("\n", 1)
             (folder / name).write_text(content, "utf-8")
     groups = read_toml(folder / "pyproject.toml")["project"]["entry-points"]
-    info = folder / "ease_motion-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ease-motion\nVersion: 1.0\n")
     lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in table.items()) for group, table in groups.items()]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    install_package(folder, "ease-motion", "\n".join(lines) + "\n")
     (folder / "mine.toml").write_text(SWEEP)
     return folder
 

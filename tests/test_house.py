@@ -14,6 +14,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from commands import install_package
 
 import rsbench
 from rsbench.benchmark.simulated.contract import CHECKS, check_solver
@@ -273,11 +274,8 @@ def test_the_documented_checks_are_those_that_run() -> None:
 
 def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
     groups = read_toml(documented_solver / "pyproject.toml")["project"]["entry-points"]
-    info = documented_solver / "scipy_solver-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: scipy-solver\nVersion: 1.0\n")
     lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in table.items()) for group, table in groups.items()]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    install_package(documented_solver, "scipy-solver", "\n".join(lines) + "\n")
     assert "scipy" in {entry.name for entry in metadata.entry_points(group="rsbench.solvers")}
     assert "scipy" in list_solvers()
     assert load_solver_entry("scipy").name == "scipy"

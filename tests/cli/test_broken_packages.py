@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from commands import sweep_card
+from commands import install_package, sweep_card
 
 CARD = sweep_card(["gs-8pt"], noise_px=[0.5], trials=2)
 BROKEN = {
@@ -49,10 +49,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "hasty_solver.py").write_text(GOOD)
     targets |= {"gs-8pt-scaled": "broken_raises:Solver", "hasty": "hasty_solver:Solver"}
     for name, target in targets.items():
-        info = folder / f"broken_{name.replace('-', '_')}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: broken-{name}\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[rsbench.solvers]\n{name} = {target}\n")
+        install_package(folder, f"broken-{name}", f"[rsbench.solvers]\n{name} = {target}\n")
     return folder
 
 

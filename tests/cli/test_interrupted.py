@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import run_here, sweep_card
+from commands import bytes_below, run_here, sweep_card
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.storage.work_folder import HIDDEN, WORK
@@ -77,11 +77,6 @@ class Run:
         return self.process.communicate(timeout=300.0)[1]
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.parent.name != "seconds"]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in paths if path.name != "provenance.json"}
-
-
 @pytest.mark.slow
 def test_stopped_and_a_worker_killed_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     (tmp_path / "slow_plugin.py").write_text(SLOW)
@@ -104,7 +99,8 @@ def test_stopped_and_a_worker_killed_it_goes_on_to_the_same_bytes(tmp_path: Path
     run = Run("simulate", card, out, 0.0)
     errors = run.finish()
     assert run.process.returncode == 0, errors
-    assert contents(out) == contents(undisturbed)
+    of_the_run = ("seconds", "provenance.json")
+    assert bytes_below(out, *of_the_run) == bytes_below(undisturbed, *of_the_run)
 
 
 @pytest.mark.slow

@@ -90,9 +90,9 @@ class _Card:
     """Anything."""
 
 
-def test_keys_are_told_as_a_card_writes_them() -> None:
-    told = [(key.name, key.type, key.default, key.meaning) for key in keys_of(_Card)]
-    assert told == [
+def test_keys_are_described_as_a_card_writes_them() -> None:
+    found = [(key.name, key.type, key.default, key.meaning) for key in keys_of(_Card)]
+    assert found == [
         ("name", "text", "required", "Its name."),
         ("mode", '"a" or "b"', "", "Absent: none."),
         ("class", "integer", "3", "Of a word of Python."),
@@ -103,7 +103,7 @@ def test_keys_are_told_as_a_card_writes_them() -> None:
     assert [(key.type, key.default) for key in keys_of(_Inner)] == [("3 numbers", "[1.0, 2.0, 3.0]")]
 
 
-def test_a_misspelt_shutter_is_told_by_its_name(tmp_path: Path) -> None:
+def test_a_misspelt_shutter_is_named(tmp_path: Path) -> None:
     text = list_cards("datasets")["smoke"].read_text("utf-8").replace("readout_ratio", "shuter", 1)
     (tmp_path / "mine.toml").write_text(text, "utf-8")
     result = run_here("generate", tmp_path / "mine.toml", "--out", tmp_path / "out")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import run_here
+from commands import bytes_below, run_here
 from small_scenes import write_box_scene, write_small_card
 
 MACHINE = {"seconds.json", "seconds.csv", "provenance.json", "hashes.jsonl", "report.html", "seconds"}
@@ -17,11 +17,6 @@ MACHINE = {"seconds.json", "seconds.csv", "provenance.json", "hashes.jsonl", "re
 NEEDS_DASK = pytest.mark.skipif(
     find_spec("distributed") is None or sys.platform != "linux", reason="needs rsbench[cluster]"
 )
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    files = [each for each in folder.rglob("*") if each.is_file() and not MACHINE & {each.name, each.parent.name}]
-    return {each.relative_to(folder).as_posix(): each.read_bytes() for each in files}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +31,7 @@ def address() -> Iterator[str]:
 def evaluated(folder: Path, out: Path, *options: object) -> dict[str, bytes]:
     run = run_here("-q", "evaluate", folder, "--out", out, "--solver", "rs-stereo-linear", *options)
     assert run.returncode == 0, run.stderr
-    return contents(out)
+    return bytes_below(out, *MACHINE)
 
 
 @pytest.mark.slow
@@ -52,7 +47,7 @@ def test_processes_and_a_cluster_are_not_both_taken(smoke_dataset: Path, tmp_pat
     run = run_here(
         "evaluate", smoke_dataset, "--out", tmp_path / "out", "--workers", 2, "--scheduler", "tcp://127.0.0.1:1"
     )
-    assert run.returncode == 2 and "give one of both" in run.stderr and run.stderr.count("\n") == 1
+    assert run.returncode == 2 and "give one of the two" in run.stderr and run.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
@@ -72,7 +67,7 @@ def test_a_cluster_generates_evaluates_and_simulates_the_same_bytes(
     for name, how in (("rendered", ()), ("sent", ("--scheduler", address))):
         run = run_here("-q", "generate", card, "--out", tmp_path / name, *how)
         assert run.returncode == 0, run.stderr
-        generated.append(contents(tmp_path / name))
+        generated.append(bytes_below(tmp_path / name, *MACHINE))
     assert len(generated[0]) > 20 and generated[0] == generated[1]
     one = evaluated(smoke_dataset, tmp_path / "one")
     assert one == evaluated(smoke_dataset, tmp_path / "there", "--scheduler", address)
@@ -81,5 +76,5 @@ def test_a_cluster_generates_evaluates_and_simulates_the_same_bytes(
         trials = ("--trials", 2, "--solver", "gs-8pt")
         run = run_here("-q", "simulate", "noise", "--out", tmp_path / name, *trials, *how)
         assert run.returncode == 0, run.stderr
-        made.append(contents(tmp_path / name))
+        made.append(bytes_below(tmp_path / name, *MACHINE))
     assert made[0] == made[1]

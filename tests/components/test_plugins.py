@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from commands import install_package
 
 from rsbench.components import imports
 from rsbench.components.plugins import Entry, Kind, NoOptions, list_names, load_class, load_entry, offers
@@ -84,12 +85,9 @@ def refusal(card: Path | str) -> str:
     return str(caught.value)
 
 
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch, package: str, points: str, name: str = "") -> None:
-    """What a package's files about itself say, in a folder on the path."""
-    info = folder / f"{package}-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name or package}\nVersion: 1.0\n", "utf-8")
-    (info / "entry_points.txt").write_text(points, "utf-8")
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch, package: str, points: str) -> None:
+    """Metadata of a package in a folder on the path."""
+    install_package(folder, package, points)
     if str(folder) not in sys.path:
         monkeypatch.syspath_prepend(folder)
 

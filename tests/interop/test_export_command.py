@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, bytes_below, run_here
 from exported_data import dataset, exported, only
 
 from rsbench.cli.export import Target
@@ -23,16 +23,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return dataset(tmp_path_factory.mktemp("made") / "data")
 
 
-def _files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_is_written_whole_and_again_the_same(made: Path, tmp_path: Path, name: str) -> None:
     result = run_here("export", made, "--to", name, "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines()[-1] == f"{tmp_path / 'out'}: {name}; README.txt says what it holds"
-    first = _files(tmp_path / "out")
+    first = bytes_below(tmp_path / "out")
     record = read_json(tmp_path / "out/export.json")
     assert record["to"] == name and list(record["sequences"]) == ["planes"]
     notes = [f"planes: {sentence}" for sentence in record["sequences"]["planes"]["told"]]
@@ -40,7 +36,7 @@ def test_every_format_is_written_whole_and_again_the_same(made: Path, tmp_path: 
     readme = first["README.txt"].decode()
     assert all(sentence in readme for sentence in [record["about"], *notes])
     assert run_here("--quiet", "export", made, "--to", name, "--out", tmp_path / "out").returncode == 0
-    assert _files(tmp_path / "out") == first
+    assert bytes_below(tmp_path / "out") == first
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
@@ -71,17 +67,17 @@ def test_what_is_no_dataset_and_an_out_of_others_are_refused(made: Path, tmp_pat
     (tmp_path / "mine/notes.txt").write_text("mine")
     result = run_here("export", made, "--to", "tum", "--out", tmp_path / "mine")
     assert_refused(result, "exists and was not written by 'rsbench export'")
-    assert _files(tmp_path / "mine") == {"notes.txt": b"mine"}
+    assert bytes_below(tmp_path / "mine") == {"notes.txt": b"mine"}
 
 
 def test_a_damaged_file_leaves_the_earlier_export(made: Path, tmp_path: Path) -> None:
     data = dataset(tmp_path / "data")
     assert run_here("export", data, "--to", "kitti", "--out", tmp_path / "out").returncode == 0
-    before = _files(tmp_path / "out")
+    before = bytes_below(tmp_path / "out")
     (data / "planes/gs_depth/left_1.exr").write_bytes(b"no image")
     result = run_here("export", data, "--to", "kitti", "--out", tmp_path / "out")
     assert_refused(result, "gs_depth/left_1.exr: damaged or not an EXR file")
-    assert _files(tmp_path / "out") == before
+    assert bytes_below(tmp_path / "out") == before
     assert not list(tmp_path.glob(".*"))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import assert_refused, run_here, sweep_card
+from commands import assert_refused, bytes_below, run_here, sweep_card
 from evaluations import MACHINE, contents
 from small_scenes import write_box_scene, write_small_card
 
@@ -69,8 +69,7 @@ def dataset(card: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, b
     """The files of a folder."""
     out = tmp_path_factory.mktemp("s3") / "dataset"
     generate_dataset(load_dataset_card(str(card)), out)
-    paths = [path for path in out.rglob("*") if path.is_file() and HIDDEN not in path.parts]
-    return {path.relative_to(out).as_posix(): path.read_bytes() for path in paths}
+    return bytes_below(out, HIDDEN)
 
 
 def stored(bucket: Any, folder: str) -> dict[str, bytes]:

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, bytes_below, run_here
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core.errors import RsbenchError
@@ -41,8 +41,7 @@ def dataset(card: DatasetCard, tmp_path_factory: pytest.TempPathFactory) -> dict
     """The files of a folder, which was rendered in the way of folders."""
     out = tmp_path_factory.mktemp("stores") / "dataset"
     generate_dataset(card, out)
-    paths = [path for path in out.rglob("*") if path.is_file() and HIDDEN not in path.parts]
-    return {path.relative_to(out).as_posix(): path.read_bytes() for path in paths}
+    return bytes_below(out, HIDDEN)
 
 
 @pytest.fixture

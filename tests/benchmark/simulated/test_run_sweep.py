@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import bytes_below
 
 from rsbench.benchmark.simulated import run_sweep as module
 from rsbench.benchmark.simulated.run_sweep import geometry_of, read_bounds, read_trials, run_sweep, sweep_steps
@@ -52,8 +53,7 @@ CARD = SweepCard(
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Files whose bytes must not depend on the run."""
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.parent.name != "seconds"]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+    return bytes_below(folder, "seconds")
 
 
 @pytest.fixture(scope="module")
