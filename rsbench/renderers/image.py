@@ -25,9 +25,9 @@ from rsbench.core.errors import RsbenchError
 
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 _MOSAIC_BITS = 16
-"""Of what a mosaic reads where numbers are not rounded: they are interpolated as whole numbers."""
+"""Bits of a mosaic's readings where numbers are not rounded: demosaicing needs whole numbers."""
 _BLACK_SHARE = 1 / 16
-"""Of the digital range lies below black, so that noise in the dark is not clipped there."""
+"""Share of the digital range below black, so that noise in the dark is not clipped there."""
 _RANGES: dict[str, tuple[float, float]] = {
     "exposure_s": (0.0, 3600.0),
     "full_well": (1.0, 1e9),
@@ -170,7 +170,7 @@ _DEFAULTS = {
     "jpeg_quality": 0,
     **{f"right_{name}": None for name in _BY_CAMERA},
 }
-"""What records leave out, and with which values: there is none of it."""
+"""Values with which records leave a key out: there is no such effect."""
 
 
 def filters(mosaic: Mosaic, width: int, rows: ArrayLike) -> NDArray[np.intp]:

@@ -23,7 +23,7 @@ from rsbench.renderers.scene import MitsubaScene
 
 
 class Hits(NamedTuple):
-    """Of rows of a frame, each (rows, width)."""
+    """What rays through the pixel centres of some rows meet; arrays (rows, width)."""
 
     depth: NDArray[np.float32]
     """z in the camera of the row, metres; 0 = no surface."""
@@ -40,7 +40,7 @@ class Hits(NamedTuple):
 
 
 _BELOW_A_COAT = 0.95
-"""Of the light that comes evenly from all sides the share that passes the coat, over that which passes it upright.
+"""Share of even light from all sides that passes the coat, divided by the share of upright light that does.
 0.946 to 0.953 for the roughnesses that a material may have, by the sum of that BSDF over directions."""
 
 
@@ -110,7 +110,7 @@ class Placed:
     """An object where it is at the times of the lanes."""
 
     scene: Any
-    """Of Mitsuba, in the frame of the object."""
+    """Mitsuba's scene, in the frame of the object."""
     ball: tuple[Any, Any]
     """Centre, in that frame, and square of the radius of a ball around it."""
     pose: list[Any]
@@ -212,7 +212,7 @@ def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]
 
 
 def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any, Any]:
-    """Of the first surface along rays its parameter, 0 where there is none, label (see ``SHADED``) and BSDF."""
+    """Ray parameter (0: none), label (see ``SHADED``) and BSDF of the first surface along rays."""
     import drjit as dr
     import mitsuba as mi
 
@@ -308,7 +308,7 @@ def sunsky_radiance(
 
 
 _WITHIN = 0.9999
-"""Of the sphere's radius: the opposite of a normal would leave no direction."""
+"""Share of the sphere's radius that is used: the opposite of a normal would leave no direction."""
 
 
 def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, sky_points: Sequence[Any], active: Any) -> Any:

@@ -58,7 +58,7 @@ class Reflectances:
         dr.eval(self._places, self._colours, self._texels, self._codes)
 
     def texture(self, shape: Any) -> NDArray[np.uint8] | None:
-        """That of a shape's material, (h, w, 3); None without one."""
+        """Texture (h, w, 3) of a shape's material; None without one."""
         begin, width, height = (int(each[_number(shape)]) for each in self._places)
         if width == 0:
             return None
@@ -179,7 +179,7 @@ class MitsubaScene:
         materials: dict[int, tuple[Material, Any]] = {}
         surfaces, self._bare = list[tuple[Any, Material]](), list[tuple[Any, Material]]()
         self.instances = [{"name": mesh.name, "material": mesh.material.name} for mesh in drawn]
-        """Of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
+        """Names of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
         for number, mesh in enumerate(drawn):
             key = id(mesh.material)
             if key not in materials:

@@ -51,7 +51,7 @@ class LensRays:
         self._start = [mi.Float64(np.ascontiguousarray(column)) for column in centres.T]
 
     def pixel(self, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
-        """What all samples of the pixel share in which (x, y) is, for ``coordinates``."""
+        """Values that all samples of the pixel around (x, y) share, for ``coordinates``."""
         import drjit as dr
         import mitsuba as mi
 
@@ -81,7 +81,7 @@ class LensRays:
         return [(mi.Float64(value) - centre) * rate for value, centre, rate in rates]
 
     def _derivative(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Of Brown's distortion, symmetric: by x of x, across, by y of y."""
+        """Symmetric derivative of Brown's distortion: of x by x, of x by y, of y by y."""
         k1, k2, p1, p2, k3, _ = self._k.values()
         s = x * x + y * y
         gain = 1 + s * (k1 + s * (k2 + s * k3))
@@ -105,7 +105,7 @@ class LensRays:
         return x, y
 
     def _slope(self, angle: Any) -> Any:
-        """Of Kannala's radius by the angle."""
+        """Derivative of Kannala's radius by the angle."""
         k1, k2, _, _, k3, k4 = self._k.values()
         a = angle * angle
         return 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
@@ -280,7 +280,7 @@ def sensor_class() -> Any:
             self.lines = 0
             """Poses of an instant."""
             self.instants = 1
-            """Of an exposure: so many poses has each row."""
+            """Number of instants of an exposure: each row has as many poses."""
 
         def set_intrinsics(self, camera: PinholeCamera) -> None:
             values = (camera.fx, camera.fy, camera.cx, camera.cy)

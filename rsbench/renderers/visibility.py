@@ -39,7 +39,7 @@ class SceneRays:
 
     scene: MitsubaScene
     objects: Sequence[MovingObject] = ()
-    """Those of the scene that move; without them, only what stands still is there."""
+    """The scene's moving objects; without them rays meet only what stands still."""
 
     def blocked(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> NDArray[np.bool_]:
         """Whether (n,) a surface stands before the points, at times (n,): where objects move, these are needed."""
@@ -90,7 +90,7 @@ def _at(tau: FloatArray | None, chosen: Any) -> FloatArray:
 
 
 def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """See ``SceneRays.blocked``, of one scene of Mitsuba."""
+    """``SceneRays.blocked`` for one scene of Mitsuba."""
     found = [np.zeros(0, dtype=np.bool_)]
     for ray in _rays(eyes, points):
         ray.maxt = REACH
@@ -99,7 +99,7 @@ def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool
 
 
 def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
-    """See ``SceneRays.surfaces``, of one scene of Mitsuba."""
+    """``SceneRays.surfaces`` for one scene of Mitsuba."""
     import drjit as dr
     import mitsuba as mi
 

@@ -40,7 +40,7 @@ class ForestBuilder(PartsBuilder):
 
 
 def _height(x: FloatArray | float, y: FloatArray | float) -> FloatArray:
-    """Of the ground: a slope that rises beyond 6 m, with humps."""
+    """Height of the ground: a slope that rises beyond 6 m, with humps."""
     rise = 0.10 * np.maximum(np.asarray(y) - 6.0, 0.0)
     return rise + 0.10 * np.sin(1.1 * x + 0.4) * np.cos(0.8 * y) + 0.05 * np.sin(2.9 * x - 1.7 * y) - 0.1
 

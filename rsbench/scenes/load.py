@@ -71,7 +71,7 @@ def built_key(builder: SceneBuilder, seed: int) -> str | None:
 
 
 def cached_meshes(key: str) -> tuple[SceneMesh, ...] | None:
-    """What ``keep`` stored under a key; None when there is nothing that can be read."""
+    """Meshes that ``keep`` stored under a key; None where nothing can be read."""
     folder = _folder()
     if folder is None:
         return None
@@ -152,7 +152,7 @@ def _unpacked(arrays: Any) -> Iterator[SceneMesh]:
 
 
 PIXELS = 1 << 23
-"""Of a map: 4096 x 2048."""
+"""Largest number of pixels of a map: 4096 x 2048."""
 _CHANNELS = 16
 _REC_709 = np.array([0.2126, 0.7152, 0.0722])
 _SUN_DEG, _RING_DEG, _SUNNY = 5.0, 8.0, 50.0
@@ -253,7 +253,7 @@ _SCENE_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def _directions(height: int) -> tuple[FloatArray, FloatArray]:
-    """Of pixels (H, 2 H): unit directions (..., 3) in the frame of the scene, and solid angles (H, 1)."""
+    """Unit directions (H, 2 H, 3) of a map's pixels in the frame of the scene, and solid angles (H, 1)."""
     down = np.pi * (np.arange(height) + 0.5) / height
     around = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
     level = np.sin(down)[:, None]
@@ -402,7 +402,7 @@ BUILDERS: Kind[SceneBuilder, NoOptions] = Kind(
         "terrain": "rsbench.scenes.terrain:TerrainBuilder",
     },
 )
-"""What ``builder`` in a scene card may name; others' are of the entry points ``rsbench.scenes``."""
+"""Names that ``builder`` in a scene card may have; other packages add entry points ``rsbench.scenes``."""
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

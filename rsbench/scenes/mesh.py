@@ -43,7 +43,7 @@ _ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
 
 @dataclass(frozen=True, kw_only=True)
 class TextureTransform:
-    """Of texture coordinates, in glTF's own frame: u right, v down."""
+    """Transform of texture coordinates, in glTF's own frame: u right, v down."""
 
     offset: tuple[float, float] = (0.0, 0.0)
     rotation: float = 0.0
@@ -248,9 +248,9 @@ def _check_ply(data: bytes, where: str) -> None:
 
 _GROUND, _WALL = "cobbles", "brick"
 _SUNK = 1e-3
-"""Of the model's size: a base at the height of the ground would share its surface."""
+"""Depth of the ground below the model, in sizes of the model: a base at its height would share its surface."""
 _APART, _HIGH = 4.0, 2.0
-"""Of the model's size: from its axis to the walls, and their height."""
+"""Distance from the model's axis to the walls, and their height, in sizes of the model."""
 
 
 def standing(meshes: Sequence[SceneMesh], size: float | None) -> tuple[SceneMesh, ...]:

@@ -138,7 +138,7 @@ class Start:
             raise ValueError(f"quaternion = {self.quaternion}: must be of length 1")
 
     def world_from_scene(self, viewpoint: Viewpoint) -> tuple[FloatArray, FloatArray]:
-        """As of ``Viewpoint``: rotation (3, 3) and translation (3,)."""
+        """Rotation (3, 3) and translation (3,), as in ``Viewpoint``."""
         turn, position = so3.from_quaternion(self.quaternion).T, np.asarray(self.position)
         R, t = (np.eye(3), np.zeros(3)) if self.absolute else viewpoint.world_from_scene()
         return turn @ R, turn @ (t - position)

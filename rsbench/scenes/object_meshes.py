@@ -21,7 +21,7 @@ MOST_MOVING = 64
 _PIXELS = 256
 Vector = tuple[float, float, float]
 _WORLD_FROM_SCENE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""From x right, y forward, z up."""
+"""Turns axes x right, y forward, z up into x right, y down, z forward."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class MeshFile:
 
     @property
     def name(self) -> str:
-        """Of the file, without folders."""
+        """File name without folders."""
         return Path(self.file).name
 
     def meshes(self) -> tuple[SceneMesh, ...]:

@@ -29,7 +29,7 @@ class ShelvesBuilder(PartsBuilder):
     RANGES = (("bays", 1, 9), ("disorder", 0, 0.03))
 
     bays: int = 8
-    """Of each row."""
+    """Bays of each row."""
     disorder: float = 0.02
     """How far a carton stands from its place, metres (standard deviation); 0 repeats exactly."""
 

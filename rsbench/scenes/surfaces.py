@@ -628,10 +628,10 @@ class Recipe:
 
     paint: Callable[[Painter], Bytes]
     metres: float | None
-    """What one repeat of the texture covers; None: the texture fits its part exactly."""
+    """Length that one repeat of the texture covers; None: the texture fits its part exactly."""
     pixels: int
     roughness: float | None
-    """Of a glossy surface, as ``Material`` has it."""
+    """Roughness of a glossy surface, as in ``Material``."""
 
 
 def _recipe(

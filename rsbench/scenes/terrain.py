@@ -41,9 +41,9 @@ _SURFACES = {
     "rows": "field_rows",
     "soil": "field_soil",
 }
-"""Of kinds of plots; all others are meadows."""
+"""Surfaces of kinds of plots; all others are meadows."""
 _STEP = 3.0
-"""Of the grid, metres."""
+"""Spacing of the grid, metres."""
 
 Place = Callable[[float, float], tuple[float, float, float]]
 """The point of the land at a place of the map."""

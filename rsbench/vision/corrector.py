@@ -33,7 +33,7 @@ Depths = Mapping[View, NDArray[np.float32]]
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectorSpec:
-    """What a corrector declares, checked when it is made. Raises ValueError on what does not exist."""
+    """What a corrector declares, checked when it is made. Raises ValueError on unknown values."""
 
     needs: Set[Knowledge]
     """What the chain must estimate for it first; what is not needed is not estimated. Gyroscope samples cannot be
@@ -76,7 +76,7 @@ class CorrectionProblem:
     target_row: float
     """A corrected frame shows the time at which its camera had read this many lines: a row, from the top."""
     motion: Motion | None
-    """Of the rig's body, metres; None when the corrector does not need it."""
+    """Motion of the rig's body, metres; None when the corrector does not need it."""
     depth: Depths | None
     """(H, W) metres in each row's own camera; inf at infinity, 0 unknown. None when the corrector does not need
     it."""
@@ -85,12 +85,12 @@ class CorrectionProblem:
     disparity_offset: float = 0.0
     """px by which disparities in the images are too large, half of it in either camera; ``depth`` is without."""
     matches: Correspondences | None = None
-    """Of the four frames, outliers among them; None when the corrector does not need them."""
+    """Matches of the four frames, outliers included; None when the corrector does not need them."""
     gyro: FloatArray | None = None
     """(n, 4) tau, w: samples of a gyroscope, as in ``Correspondences``; None when it does not need them."""
 
     def camera(self, side: Side, reference: Side) -> PinholeCamera:
-        """Of one side's images, in pixels in which the images of ``reference`` have the rig's principal point."""
+        """Camera of one side, in pixels in which the images of ``reference`` have the rig's principal point."""
         if side == reference or self.disparity_offset == 0.0:
             return self.rig.camera
         shift = self.disparity_offset if side == "left" else -self.disparity_offset

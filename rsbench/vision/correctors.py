@@ -33,13 +33,13 @@ _RETURNS_PX = 1.0
 _MOVED_PX = 2.0
 """Distance between the end of the flow and where geometry puts a still point, above which it moved."""
 _DISPARITY_PX = 1.0
-"""What depth may err by: a still point may be so much farther or nearer."""
+"""Error of depth: a point at rest may be so much farther or nearer."""
 _NOISE_LEVELS, _CLEARLY = 1.0, 0.7
 """Grey levels that differ anyway, and the part of the difference where geometry leads that must be left."""
 _MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
 """Sides, px, of the windows in which most must move, and all; how far beyond, px, a thing goes on."""
 _LEAST = 0.004
-"""Of the image's area: a smaller thing is left to geometry, which errs in such spots too."""
+"""Share of the image's area: smaller things are left to geometry, which errs in such spots too."""
 _SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
 """Relative difference of inverse depth to the nearest certain pixel of a thing, up to which one is part of it, and
 of flow, up to which its own is kept."""
@@ -55,21 +55,21 @@ _FLOW_BYTES = 100.0
 
 
 class _Still(NamedTuple):
-    """Where a still point goes: (H, W, 2) px, NaN where that is unknown, and (H, W) whether it is hidden there."""
+    """How points at rest move: (H, W, 2) px, NaN where that is unknown, and (H, W) whether they are hidden there."""
 
     far: F32
-    """Of a point that is somewhat farther."""
+    """(H, W, 2) px that a point at rest moves if it is somewhat farther."""
     near: F32
     hidden: Mask
-    """By something nearer, so that what is seen there tells nothing of the point."""
+    """Hidden by something nearer, so that the other frame's colour there is not the point's."""
 
     def half(self) -> _Still:
-        """Of an image of half the size."""
+        """The same at half the image's size."""
         return _Still(self.far[1::2, 1::2] / 2.0, self.near[1::2, 1::2] / 2.0, self.hidden[1::2, 1::2])
 
 
 class Moving(NamedTuple):
-    """What moves by itself in a frame."""
+    """Things that move by themselves in a frame."""
 
     mask: Mask
     """(H, W)."""
@@ -84,7 +84,7 @@ def find_moving(
     rig: StereoRig,
     shutter: RollingShutter,
 ) -> dict[View, Moving]:
-    """Of all four frames (H, W[, 3]) with their depth (H, W) and the poses of their lines; empty where none is.
+    """Things that move by themselves in four frames (H, W[, 3]), by depth (H, W) and the lines' poses; or empty.
 
     Of most scenes a look at a frame of half the size says that.
     """

@@ -46,7 +46,7 @@ from rsbench.vision.reprojection import (
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 _REACH = 0.2
-"""Of the image's longer side: the largest parallax that is searched."""
+"""Largest parallax that is searched, as a share of the image's longer side."""
 _WINDOW = 5
 _PLAIN = 1, 1, 40
 """Costs of a differing bit of 24, of a grey level, and of a place outside the other frame."""
@@ -338,7 +338,7 @@ class SweepOptions:
 
 
 class Swept(NamedTuple):
-    """Of one frame, at the size of the search."""
+    """Result of the search in one frame, at the size of the search."""
 
     rho: F32
     """(h, w) inverse depth in each row's own camera, in the motion's unit; at least 0."""

@@ -35,7 +35,7 @@ def returns_px(flow: F32, back: F32) -> F32:
 
 
 def followed(image: NDArray[Any], flow: F32, border: int) -> NDArray[Any]:
-    """What an image (H, W[, C]) shows where a flow (H, W, 2), px, leads; ``border``: beyond it, of OpenCV."""
+    """Values of an image (H, W[, C]) where a flow (H, W, 2), px, leads; ``border``: OpenCV's mode beyond it."""
     height, width = flow.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.asarray(cv2.remap(image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=border))

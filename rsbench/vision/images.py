@@ -98,7 +98,7 @@ def guided_upsample(values: F32, small: U8, grey: U8) -> F32:
 
 
 def _farther_neighbour(places: FloatArray) -> NDArray[Any]:
-    """Of the two whole numbers around each place the one that is farther."""
+    """The farther one of the two whole numbers around each place."""
     nearest = np.rint(places)
     return nearest + np.where(places >= nearest, 1.0, -1.0)
 

@@ -102,7 +102,7 @@ class MovingCamera(NamedTuple):
         return row_poses(self.rig, self.shutter, self.motion, self.side, frame)
 
     def inverse_depths(self, planes: FloatArray, frame: int) -> F32:
-        """Of planes (n, 3) at the pixels of a frame (n, H, W), in the row's own camera; NaN behind it."""
+        """Inverse depths (n, H, W) of planes (n, 3) at a frame's pixels, in the row's camera; NaN behind it."""
         seen = planes_seen(planes, self.row_poses(frame))  # (H, n, 3)
         rays = self.rig.camera.unproject(self.rig.camera.pixel_grid())
         rho = np.einsum("hnk,hwk->nhw", seen, rays)
@@ -348,7 +348,7 @@ class Followed(NamedTuple):
 
 
 def on_layers(matches: FloatArray, labelled: Labelled) -> Followed:
-    """Those of matches (n, 4) whose pixel in frame 0 lies within a layer that frame 1 sees."""
+    """The matches, of (n, 4), whose pixel in frame 0 lies within a layer that frame 1 sees."""
     height, width = labelled.labels[0].shape
     x, y = np.clip(np.rint(matches[:, :2]).astype(np.int64), 0, (width - 1, height - 1)).T
     inner = _inner(labelled)[y, x]
@@ -425,7 +425,7 @@ class _Ends(NamedTuple):
 
 
 def _ends(matches: FloatArray, camera: MovingCamera, planes: FloatArray) -> _Ends:
-    """Of matches (n, 4) on planes (n, 3), one each; both ends at the times of the rows in which they are."""
+    """Ends of matches (n, 4) on planes (n, 3), one each; both ends at the times of their rows."""
     rig, shutter, side, motion = camera
     halves = matches[:, :2], matches[:, 2:]
     first, second = (rig.cam_from_world(motion, shutter.pixel_time(halves[f], f, side), side) for f in FRAMES)
@@ -448,14 +448,14 @@ def _split(ends: _Ends) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 class _Weights(NamedTuple):
-    """What the errors of matches are divided by, (n,) px."""
+    """Divisors (n,) px of the errors of matches."""
 
     across: FloatArray
     along: FloatArray
 
 
 def _weights(given: Followed, camera: MovingCamera, planes: FloatArray) -> _Weights:
-    """From how far the matches miss at this motion and these planes."""
+    """Weights by the errors of the matches at this motion and these planes."""
     layer = given.layer
     across, along, length = _split(_ends(given.matches, camera, planes[layer]))
     noise = max(_MAD * float(np.median(np.abs(across))), _LEAST_NOISE_PX) if len(layer) else _LEAST_NOISE_PX

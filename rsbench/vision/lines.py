@@ -83,7 +83,7 @@ class SiftLineMatcher(MatchOptions, FeatureMatcher):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segments:
-    """Those of one image, the longest first."""
+    """Segments of one image, the longest first."""
 
     ends: FloatArray
     """(n, 4) xa, ya, xb, yb, px."""

@@ -35,7 +35,7 @@ from rsbench.vision.stereo_depth import fill_holes
 
 F32 = NDArray[np.float32]
 _FITTED, _WIDEST = 0.125, 0.15
-"""Of the image's height or width: what a line is fitted to beside a band, and how wide that is at most."""
+"""Shares of the image's height or width: what a line is fitted to beside a band, and the widest band."""
 _BESIDE = 1 / 16
 """Columns to either side, of the width, whose slopes count."""
 _ON_LINE = 0.05

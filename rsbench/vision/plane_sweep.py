@@ -197,9 +197,9 @@ class SweepMatcher(MotionMatcher):
     window: int = 3
     """Side, px, of the window in which views are compared."""
     p1: int = 24
-    """What a step to the next plane costs, of 255, which the worst likeness costs."""
+    """Cost of a step to the next plane; the worst likeness costs 255."""
     p2: int = 200
-    """Of larger steps."""
+    """Cost of larger steps."""
     nearest_depth: float | None = None
     """Metres; None finds the range in the images, by a sweep at a quarter of the size."""
     least_parallax_px: float = 0.5

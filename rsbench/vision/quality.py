@@ -36,11 +36,11 @@ class Window(NamedTuple):
     mean: Callable[[FloatArray], FloatArray]
     """Averages an image (H, W[, C]) over the window of every pixel."""
     factor: float = 1.0
-    """Of variances and covariance."""
+    """Factor of variances and covariance."""
 
 
 class Moments(NamedTuple):
-    """Of the windows of an image (H, W[, C])."""
+    """Moments of the windows of an image (H, W[, C])."""
 
     mean: FloatArray
     variance: FloatArray
@@ -55,11 +55,11 @@ class Picture:
 
     @cached_property
     def unit(self) -> FloatArray:
-        """See ``to_unit``."""
+        """Values in [0, 1], by ``to_unit``."""
         return to_unit(self.image)
 
     def moments(self, window: Window) -> Moments:
-        """Of its values in [0, 1]."""
+        """Moments of the image's values in [0, 1]."""
         if window not in self._moments:
             unit = self.unit
             mean = window.mean(unit)

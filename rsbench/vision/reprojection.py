@@ -26,7 +26,7 @@ Table = FloatArray | None
 
 
 class Optics(NamedTuple):
-    """What ``optics_of`` makes of a camera and its scan.
+    """A camera and its scan for compiled loops, by ``optics_of``.
 
     The lens of an ideal camera is None: the compiler then drops the branches that would use it. Rows and columns
     share one compilation: a branch costs less than a second one.
@@ -41,7 +41,7 @@ class Optics(NamedTuple):
 
 
 class LineMaps(NamedTuple):
-    """Of each line of a frame its map of ideal pixels to another camera's, with the optics of both.
+    """Maps of each line of a frame, from its ideal pixels to another camera's, with the optics of both.
 
     Homogeneous target pixel = M_y (x, y, 1) + b_y / depth, and the target has the lens of the source.
     """
@@ -51,7 +51,7 @@ class LineMaps(NamedTuple):
     b: FloatArray
     """(lines, 3) px m."""
     ideal: Table
-    """Of ``Optics``, as the next two."""
+    """Field of ``Optics``, as the next two."""
     lens: Table
     columns: bool
 
@@ -127,7 +127,7 @@ def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
 
 F32 = NDArray[np.float32]
 _STEPS = 6
-"""Of the search for the line that sees a point: each leaves of the error what a pixel moves in a line."""
+"""Steps of the search for the line that sees a point: each scales the error by the motion, px, in one line."""
 
 
 class Reprojection(NamedTuple):
@@ -142,7 +142,7 @@ class Reprojection(NamedTuple):
     B: FloatArray
     """(lines, 3)."""
     ideal: Table
-    """Of ``Optics``, as the next two."""
+    """Field of ``Optics``, as the next two."""
     lens: Table
     columns: bool
     there: bool
@@ -152,7 +152,7 @@ class Reprojection(NamedTuple):
 def reprojection_of(
     camera: PinholeCamera, here: Pose, there: Pose, axes: tuple[int, int] = (1, 1)
 ) -> Reprojection:
-    """From the view whose lines have the poses ``here`` to that of ``there``.
+    """Maps from the view whose lines have the poses ``here`` to that of ``there``.
 
     Args:
         camera: of both views.

@@ -27,7 +27,7 @@ from rsbench.vision.straightness import (
 )
 
 _SHORTEST = 0.08
-"""Of a curve, in heights of the image."""
+"""Length of a curve, in heights of the image."""
 
 
 @final

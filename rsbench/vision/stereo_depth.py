@@ -431,7 +431,7 @@ def fill_holes(disparity: F32) -> F32:
 
 
 def known_beside(values: F32) -> tuple[F32, F32]:
-    """Of each pixel (H, W) the nearest finite value at it or to its left, and to its right; NaN where none is."""
+    """Nearest finite value (H, W) at or left of each pixel, and at or right of it; NaN where there is none."""
     height, width = values.shape
     known = np.isfinite(values)
     columns = np.broadcast_to(np.arange(width), (height, width))
@@ -498,9 +498,9 @@ Mask = NDArray[np.bool_]
 _SMOOTH_LEVELS = 2.0
 """Largest standard deviation, grey levels, of 3 x 3 pixels of sky."""
 _LEAST_SHARE = 0.002
-"""Of the image; smaller areas are left alone."""
+"""Share of the image; smaller areas are ignored."""
 _FAR_QUANTILE = 0.4
-"""Of all disparities: what surrounds the sky is farther than this."""
+"""Quantile of all disparities: what surrounds the sky is farther than this."""
 _RIM = 7
 _REDDER = 6.0
 """Levels by which the mean red of the sky may exceed its mean blue."""
@@ -586,12 +586,12 @@ def timed_depth(
 
 
 _ROUNDS, _SETTLED, _STILL_PX = 5, 0.02, 0.5
-"""Of matching, at most; it ends earlier where what is known moves by more than so many px at less than this share
-of the pixels. Late cameras and columns take two or three, opposite scans all."""
+"""Most rounds of matching; it ends earlier where less than this share of the pixels moves by more than so many px.
+Late cameras and columns take two or three, opposite scans all."""
 _STEPS = 5
-"""Of the search for the line that sees a point: it leaves of the error what a pixel moves in a line."""
+"""Steps of the search for the line that sees a point: each scales the error by the motion, px, in one line."""
 _SMOOTH = 5
-"""Window, px, of the median that what is known passes before images are resampled by it."""
+"""Window, px, of the median filter on known inverse depth before images are resampled by it."""
 
 
 class _Eye(NamedTuple):

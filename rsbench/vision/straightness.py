@@ -60,7 +60,7 @@ _BLUR_PX = 1.0
 _LEAST_GRADIENT = 6.0
 """Grey levels per px at an edge: three deviations of the gradient of 8-bit noise of 3 levels so blurred."""
 _BESIDE_PX, _SAME_DIRECTION, _SAME_STRENGTH = 0.6, 0.94, 0.6
-"""Of places that are one curve: how far the second is from where the first leads, the cosine of the angle between
+"""Places of one curve: how far the second is from where the first leads, the cosine of the angle between
 their directions (20 degrees), and the least ratio of their gradients."""
 _BENT_PX = 0.35
 """Greatest distance of a curve's smoothed places from a parabola."""
@@ -101,7 +101,7 @@ def _curves_down(grey: F32, least_length: float) -> Curves:
 
 
 def _places(grey: F32) -> list[FloatArray]:
-    """Of each row, edges (n, 4): x, gradient along x and y, its length; those more upright than flat."""
+    """Edges (n, 4) of each row: x, gradient along x and y, its length; those more upright than flat."""
     blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
     gx, gy = (cv2.Scharr(blurred, cv2.CV_32F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1)))
     strength = np.maximum(np.hypot(gx, gy), np.float32(1e-3))
@@ -163,7 +163,7 @@ _STEPS, _DONE = 30, 1e-3
 _FLATTEST = 1e-9
 """Slope, 1 / px, of a curve along its row."""
 _PARTS = (1.0, 0.3, 0.1, 0.03)
-"""Of a step, tried in turn."""
+"""Shares of a step, tried in turn."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -416,7 +416,7 @@ class LineOptions:
     samples: int = 500
     """Random samples of the search."""
     prior_deg: float = 3.0
-    """What a component of the rotation in a frame period is expected to be, a standard deviation."""
+    """Expected size of a component of the rotation in a frame period, a standard deviation."""
 
     @property
     def prior(self) -> float:
@@ -468,16 +468,16 @@ _CONVERGED = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class ManhattanOptions:
-    """Of the search."""
+    """Search for the rotation from three directions."""
 
     threshold_px: float = 0.3
     """Root mean square by which the points of a curve may miss a line along its direction."""
     least_share: float = 0.3
-    """Of all points that must lie on lines along the directions."""
+    """Share of all points that must lie on lines along the directions."""
     samples: int = 500
     """Random samples of the search."""
     prior_deg: float = 3.0
-    """What a component of the rotation in a frame period is expected to be, a standard deviation."""
+    """Expected size of a component of the rotation in a frame period, a standard deviation."""
 
     @property
     def prior(self) -> float:
