@@ -21,25 +21,22 @@ from numpy.typing import ArrayLike
 
 from rsbench.capture.trajectory_fit import (
     ANCHORED,
-    NORMAL,
     Fit,
+    anchored,
     choose,
     continued,
     covariance_band,
     first_curve,
     fit,
-    held,
-    information,
     normal_equations,
     right_tracks,
     window_motions,
 )
-from rsbench.capture.trajectory_gyro import Drift, GyroFound, GyroSteps, bordered_inverse, contradicts, gyro_steps
+from rsbench.capture.trajectory_gyro import Drift, GyroFound, GyroSteps, contradicts, gyro_steps
 from rsbench.capture.trajectory_spline import (
     ContinuousMotion,
     Curve,
     Prior,
-    approximated,
     covariance_between,
     evaluate,
     make_curve,
@@ -48,7 +45,7 @@ from rsbench.capture.trajectory_spline import (
     pose_covariance,
     span_of,
 )
-from rsbench.capture.trajectory_tracks import Past, Tails, TimedTracks, pack_windows, telling, thinned
+from rsbench.capture.trajectory_tracks import Past, Tails, TimedTracks, informative, pack_windows, thinned
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
@@ -62,35 +59,69 @@ _JUDGED = 8
 _FEWEST, _LEAST_SHARE = 15, 0.2
 """Right tracks, and their share, from which on a window is supported by its own matches."""
 MOST_NOISE_PX = 10.0
-"""Beyond which errors are no noise: random tracks leave some 20 px, and by that scale most of them are right."""
+"""Larger errors are no noise: random tracks leave some 20 px, and at that scale most of them count as right."""
+_ADVANCE, _LAG = 6, 5
+"""Windows that leave a stream together, and later windows that they wait for."""
+_FAR = 1_000_000
+_JUDGED_BY = 250
+"""Tracks of a window, about, by which knots and prior of a stream are chosen."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryOptions:
-    """How a trajectory is found."""
+    """How a trajectory is estimated."""
 
     intervals: tuple[float, ...] = (1 / 2, 1 / 3, 1 / 4)
-    """Frame periods between two control poses: those of most evidence are taken, the first ones to begin with."""
+    """Frame periods between two control poses: the first one to begin with, then those of most evidence."""
     prior: Prior = Prior(memory=0.5, smooth=2, rotation=1e-4, position=1e-4)  # noqa: RUF009
     """To begin with."""
     learn: bool = True
-    """Whether the matches say the prior and the knots."""
+    """Whether the prior and the knots are estimated."""
     link: bool = True
     """Whether tracks that meet in a frame are one; without it their common ends count as two."""
     share: float = 0.5
-    """What a track counts beside the prior. Patches of neighbouring tracks overlap and err alike: counted for one
-    each, they take a still hand's common errors for accelerations."""
+    """Weight of a track beside the prior. Patches of neighbouring tracks overlap and have common errors: with a
+    weight of 1, the common errors of a still hand are estimated as accelerations."""
     seed: int = 0
     """Of the search for motions of single windows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TrajectoryBound:
-    """How well a trajectory can be known: covariances of its poses."""
+class Trajectory:
+    """What the rig did, seen from the body at time 0."""
 
-    curve: Curve
+    motion: ContinuousMotion
+    """body_from_world at any time of the sequence, frame periods."""
+    shutter: RollingShutter
+    """Given or estimated."""
+    noise_px: float
+    """Of a coordinate, as of a normal error: two in three are below it."""
+    nu: float
+    """Degrees of freedom of the tails; 30 is as good as normal."""
+    prior: Prior
+    inliers: tuple[BoolArray, ...]
+    """For each window, which of its tracks are right."""
+    supported: BoolArray
+    """(windows,) whether a window's own tracks support it; elsewhere the spline bridges it."""
+    fit: Fit
     covariance_band: FloatArray
     """Of the control poses, see ``trajectory_spline``."""
+    gyro: GyroFound | None = None
+    """What was estimated of a gyroscope; None: none was given."""
+
+    @property
+    def curve(self) -> Curve:
+        """The spline."""
+        return self.fit.curve
+
+    @property
+    def interval(self) -> float:
+        """Frame periods between two control poses."""
+        return self.motion.interval
+
+    def window(self, number: int) -> Motion:
+        """The motion seen from the body at the start of a frame, which is time 0."""
+        return self.motion.from_time(float(number))
 
     def covariance(self, tau: ArrayLike) -> FloatArray:
         """Covariance (n, 6, 6) of the poses at times (n,), given that of time 0.
@@ -108,37 +139,6 @@ class TrajectoryBound:
         return covariance_between(self.curve, self.covariance_band, start, np.atleast_1d(tau))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trajectory(TrajectoryBound):
-    """What the rig did, seen from the body at time 0."""
-
-    motion: ContinuousMotion
-    """body_from_world at any time of the sequence, frame periods."""
-    shutter: RollingShutter
-    """Given or found."""
-    noise_px: float
-    """Of a coordinate, as of a normal error: two in three are below it."""
-    nu: float
-    """Degrees of freedom of the tails; 30 is as good as normal."""
-    prior: Prior
-    inliers: tuple[BoolArray, ...]
-    """For each window, which of its tracks are right."""
-    supported: BoolArray
-    """(windows,) whether a window's own tracks carry it; elsewhere the spline bridges it."""
-    fit: Fit
-    gyro: GyroFound | None = None
-    """What was found of a gyroscope; None: none was given."""
-
-    @property
-    def interval(self) -> float:
-        """Frame periods between two control poses."""
-        return self.motion.interval
-
-    def window(self, number: int) -> Motion:
-        """The motion seen from the body at the start of a frame, which is time 0."""
-        return self.motion.from_time(float(number))
-
-
 def estimate_trajectory(
     windows: Sequence[Correspondences],
     rig: StereoRig,
@@ -152,30 +152,43 @@ def estimate_trajectory(
 
     Args:
         windows: of the frames 0 and 1, 1 and 2, ...
-        motions: of each window, to begin with; None: they are searched.
+        motions: of each window, to begin with; None: a search finds them.
         seed: of that search, where there are no options.
-        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; bias and noise are found.
+        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; bias and noise are estimated.
 
     Raises:
         ValueError: no windows, or no tracks in any.
     """
-    options, windows = options or TrajectoryOptions(seed=seed), [telling(each) for each in windows]
+    options, windows = options or TrajectoryOptions(seed=seed), [informative(each) for each in windows]
     if not any(len(window.tracks) for window in windows):
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
         motions = window_motions(windows, rig, shutter, options.seed)
-    given = _Given(windows, rig, shutter, motions, options, None if gyro is None else gyro_steps(gyro))
-    found, tracks = given.fitted()
+    inputs = _Inputs(windows, rig, shutter, motions, options, None if gyro is None else gyro_steps(gyro))
+    found, tracks = inputs.fitted()
+    used = None if found.drift is None else GyroFound.of(found.drift)
     if tracks.gyro is not None and found.drift is not None and contradicts(tracks.gyro, found.drift):
-        drift = found.drift
-        found, tracks = replace(given, gyro=None).fitted()
-        return replace(_told(found, tracks, windows, shutter), gyro=GyroFound.of(drift, used=False))
-    return _told(found, tracks, windows, shutter)
+        used = GyroFound.of(found.drift, used=False)
+        found, tracks = replace(inputs, gyro=None).fitted()
+    masks = tuple(found.trust[each] > 0.0 for each in tracks.members)
+    inliers = tuple(mask[: len(window.tracks)] for mask, window in zip(masks, windows, strict=True))
+    return Trajectory(
+        motion=ContinuousMotion.of(found.curve),
+        shutter=shutter,
+        noise_px=noise_px(found.tails),
+        nu=found.tails.nu,
+        prior=found.prior,
+        inliers=inliers,
+        supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
+        fit=found,
+        covariance_band=covariance_band(found, tracks),
+        gyro=used,
+    )
 
 
 @dataclass(frozen=True)
-class _Given:
-    """What a trajectory is found of."""
+class _Inputs:
+    """What a trajectory is estimated from."""
 
     windows: Sequence[Correspondences]
     rig: StereoRig
@@ -185,7 +198,7 @@ class _Given:
     gyro: GyroSteps | None
 
     def fitted(self) -> tuple[Fit, TimedTracks]:
-        """The spline, and what it was fitted to."""
+        """The spline, and the tracks that it was fitted to."""
         options = self.options
         found, tracks = self._first(_JUDGED, options.intervals[0], options.prior)
         if options.learn:
@@ -201,7 +214,7 @@ class _Given:
     def _first(
         self, count: int, interval: float, prior: Prior, drift: Drift | None = None
     ) -> tuple[Fit, TimedTracks]:
-        """The spline of so many windows, and their tracks."""
+        """The spline of the first windows, and their tracks."""
         tracks, motions = self._packed(count, drift), self.motions[:count]
         curve = first_curve(motions, tracks, span_of(len(motions), self.shutter), interval)
         return fit(curve, tracks, prior, self.options.learn, drift=drift), tracks
@@ -216,74 +229,23 @@ class _Given:
         return replace(tracks, gyro=self.gyro.between(first - shift, last - shift))
 
 
-def _told(
-    found: Fit, tracks: TimedTracks, windows: Sequence[Correspondences], shutter: RollingShutter
-) -> Trajectory:
-    masks = tuple(found.trust[each] > 0.0 for each in tracks.members)
-    inliers = tuple(mask[: len(window.tracks)] for mask, window in zip(masks, windows, strict=True))
-    return Trajectory(
-        motion=ContinuousMotion.of(found.curve),
-        shutter=shutter,
-        noise_px=noise_px(found.tails),
-        nu=found.tails.nu,
-        prior=found.prior,
-        inliers=inliers,
-        supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
-        fit=found,
-        curve=found.curve,
-        covariance_band=covariance_band(found, tracks),
-        gyro=None if found.drift is None else GyroFound.of(found.drift),
-    )
-
-
 def noise_px(tails: Tails) -> float:
     """Of a coordinate, as of a normal error: two in three are below it."""
     return tails.scale * float(scipy.special.stdtrit(tails.nu, _ONE_SIGMA))
 
 
 def is_supported(inliers: BoolArray, tails: Tails) -> bool:
-    """Whether tracks (n,), some of them right, carry their window."""
+    """Whether tracks (n,), some of them right, support their window."""
     enough = np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers))
     return bool(enough and noise_px(tails) <= MOST_NOISE_PX)
 
 
-def trajectory_bound(
-    motion: Motion,
-    windows: Sequence[Correspondences],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    noise_px: float,
-    interval: float = 0.5,
-    prior: Prior | None = None,
-) -> TrajectoryBound:
-    """The Cramer-Rao bound of a trajectory, at the truth.
-
-    Args:
-        windows: the right matches, without outliers; those that meet in a frame are one track.
-        noise_px: standard deviation of a coordinate, normal.
-        interval: frame periods between the control poses, which are all that is unknown.
-        prior: what is known beside (H. van Trees' bound); None: nothing.
-
-    Raises:
-        ValueError: the matches do not determine the trajectory.
-    """
-    everything = [np.ones(len(each)) for each in pack_windows(windows, rig, shutter).members]
-    tracks = pack_windows(windows, rig, shutter, everything)
-    curve = approximated(motion.body_from_world, span_of(len(windows), shutter), interval)
-    told = information(curve, tracks, Tails(NORMAL, noise_px), prior, np.ones(len(tracks)))
-    return TrajectoryBound(curve=curve, covariance_band=bordered_inverse(*told))
-
-
-_ADVANCE, _LAG = 6, 5
-"""Windows that leave together, and those behind them that they wait for."""
-_FAR = 1_000_000
-_JUDGED_BY = 250
-"""Tracks of a window, about, by which knots and prior are chosen."""
+# Streams
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreamedWindow:
-    """Two successive frames of a sequence; all that is said of them is final."""
+    """Two successive frames of a sequence; every value is final."""
 
     number: int
     motion: ContinuousMotion
@@ -295,14 +257,14 @@ class StreamedWindow:
     covariance: FloatArray | None
     """(6, 6) of w and d of ``motion``; None where no track spans a period."""
     apart: int
-    """Windows to the nearest one that its own tracks carry, of those seen so far; 0: it is one itself."""
+    """Windows to the nearest supported one of those seen so far; 0: this one is supported."""
     noise_px: float
     gyro: GyroFound | None
     """What is known of a gyroscope by then; None: there is none."""
 
     @property
     def supported(self) -> bool:
-        """Whether its own tracks carry it; else the spline bridges it."""
+        """Whether its own tracks support it; else the spline bridges it."""
         return self.apart == 0
 
 
@@ -326,21 +288,21 @@ def stream_trajectory(
         state.add(window, *window_motions([window], rig, shutter, options.seed))
         if len(state.windows) == _ADVANCE + _LAG:
             found, tracks = state.solve()
-            yield from state.told(found, tracks, _ADVANCE)
+            yield from state.final(found, tracks, _ADVANCE)
             state.leave(found, tracks, _ADVANCE)
     if state.windows:
-        yield from state.told(*state.solve(), len(state.windows))
+        yield from state.final(*state.solve(), len(state.windows))
 
 
 class _State:
-    """What is remembered: the windows since the last that left, and what those said that have."""
+    """The memory of a stream: the windows since the last that left, and a summary of those that have left."""
 
     def __init__(
         self, rig: StereoRig, shutter: RollingShutter, options: TrajectoryOptions, gyro: GyroSteps | None
     ) -> None:
         self.rig, self.shutter, self.options = rig, shutter, options
         self.gyro = gyro
-        """Of the windows that are remembered and of later ones."""
+        """Of the windows in memory and of later ones."""
         self.unlike: GyroFound | None = None
         """One that contradicted the matches."""
         self.windows, self.motions = list[Correspondences](), list[Motion | None]()
@@ -348,11 +310,11 @@ class _State:
         self.curve: Curve | None = None
         self.past: Past | None = None
         self.fit: Fit | None = None
-        self._carried = -_FAR
-        """Number of the last window that its own tracks carry, of those that have left."""
+        self._supported = -_FAR
+        """Number of the last supported window of those that have left."""
 
     def add(self, window: Correspondences, motion: Motion | None) -> None:
-        self.windows.append(telling(window))
+        self.windows.append(informative(window))
         self.motions.append(motion)
         self.fresh += 1
 
@@ -366,14 +328,14 @@ class _State:
         tracks = pack_windows(windows, self.rig, self.shutter, right, self.first, self.past, share)
         if self.gyro is None:
             return tracks
-        # What has left with earlier windows is no more looked at, wherever a clock puts it by now.
+        # Samples that have left with earlier windows are not used again, wherever a clock puts them by now.
         shift = 0.0 if drift is None else drift.shift
         first = span_of(0, self.shutter)[0] - shift if self.curve is None else -np.inf
         last = span_of(self.first + len(windows), self.shutter)[1] - shift
         return replace(tracks, gyro=self.gyro.between(first, last))
 
     def solve(self) -> tuple[Fit, TimedTracks]:
-        """The spline of all that is remembered; a gyroscope that contradicts the matches is forgotten."""
+        """The spline of all windows in memory; a gyroscope that contradicts the matches is dropped."""
         found, tracks = self._solved()
         if tracks.gyro is None or found.drift is None or not contradicts(tracks.gyro, found.drift):
             return found, tracks
@@ -383,11 +345,14 @@ class _State:
         return self._solved()
 
     def _solved(self) -> tuple[Fit, TimedTracks]:
-        """Some of the tracks say first which are right."""
+        """A first fit to some of the tracks shows which are right."""
         count, options = len(self.windows), self.options
         few = thinned(self.windows, _JUDGED_BY)
         if self.curve is None or self.fit is None:
-            found = self._begun(few)
+            tracks = self._pack(few)
+            curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
+            found = fit(curve, tracks, options.prior, options.learn)
+            found = choose(found, tracks, options.intervals) if options.learn else found
         else:
             start = self.first + count - self.fresh
             ahead = self.motions[count - self.fresh :]
@@ -401,39 +366,29 @@ class _State:
             tracks = self._pack(self.windows, [trust[each] for each in tracks.members], found.drift)
         return fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift), tracks
 
-    def _begun(self, few: Sequence[Correspondences]) -> Fit:
-        """The first spline: some of the tracks say which knots and which prior."""
-        options, tracks = self.options, self._pack(few)
-        curve = first_curve(self.motions, tracks, span_of(len(few), self.shutter), options.intervals[0])
-        found = fit(curve, tracks, options.prior, options.learn)
-        return choose(found, tracks, options.intervals) if options.learn else found
-
-    def told(self, found: Fit, tracks: TimedTracks, count: int) -> Iterator[StreamedWindow]:
-        """The first so many windows."""
+    def final(self, found: Fit, tracks: TimedTracks, count: int) -> Iterator[StreamedWindow]:
+        """The first ``count`` windows."""
         start, end = span_of(1, self.shutter)
         inverse = covariance_band(found, tracks)
-        windows = enumerate(self.windows)
-        right = [found.trust[tracks.members[k]][: len(each.tracks)] > 0.0 for k, each in windows]
-        carried = [
-            self._carried,
-            *(self.first + k for k, each in enumerate(right) if is_supported(each, found.tails)),
-        ]
-        for k in range(count):
-            number = self.first + k
+        pairs = zip(tracks.members, self.windows, strict=True)
+        right = [found.trust[members][: len(each.tracks)] > 0.0 for members, each in pairs]
+        own = [self.first + k for k, each in enumerate(right) if is_supported(each, found.tails)]
+        supported = [self._supported, *own]
+        for number in range(self.first, self.first + count):
             yield StreamedWindow(
                 number=number,
                 motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),
                 body_from_world=evaluate(found.curve, float(number))[0],
                 covariance=motion_covariance(found.curve, inverse, float(number)),
-                inliers=right[k],
-                apart=min(abs(number - each) for each in carried),
+                inliers=right[number - self.first],
+                apart=min(abs(number - each) for each in supported),
                 noise_px=noise_px(found.tails),
                 gyro=self.unlike if found.drift is None else GyroFound.of(found.drift),
             )
-        self._carried = max(each for each in carried if each < self.first + count)
+        self._supported = max(each for each in supported if each < self.first + count)
 
     def leave(self, found: Fit, tracks: TimedTracks, count: int) -> None:
-        """Forget the first so many windows, but for what they say of those that stay."""
+        """Drop the first ``count`` windows, except for what they determine of those that stay."""
         right = [found.trust[each] for each in tracks.members[:count]]
         gone = self._pack(self.windows[:count], right if self.options.link else None)
         trust = np.zeros(len(gone))
@@ -455,10 +410,10 @@ class _State:
 
 
 def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Past:
-    """What tracks say of the control poses from number ``drop`` on, whatever those before are."""
+    """What tracks determine of the control poses from number ``drop`` on, whatever those before are."""
     curve, smooth, drift = found.curve, found.prior.smooth, found.drift
     equations = normal_equations(curve, gone, found.tails, found.prior, trust, until=drop, drift=drift)
-    band, border = held(equations, curve, gone, ANCHORED), equations.border
+    band, border = anchored(equations, curve, gone, ANCHORED), equations.border
     ends = gone.span[1]
     if gone.gyro is not None and drift is not None:
         ends = np.concatenate([ends, gone.gyro.end + drift.shift])
@@ -466,7 +421,10 @@ def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Pa
     known = 0 if gone.past is None else len(gone.past.p)
     count = min(max(int(np.max(latest, initial=0)) + 4, drop + smooth + 2, known), len(curve.p))
     m, size = 6 * drop, 6 * count
-    H, gradient = _dense(band, size), equations.gradient[:size]
+    H, gradient = np.zeros((size, size)), equations.gradient[:size]
+    for i in range(band.shape[1]):
+        rows = np.arange(max(size - i, 0))
+        H[rows + i, rows] = H[rows, rows + i] = band[: len(rows), i]
     if border is not None:
         H = np.block([[H, border.mixed[:size]], [border.mixed[:size].T, border.corner]])
         gradient = np.concatenate([gradient, border.slope])
@@ -479,12 +437,3 @@ def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Pa
         H=0.5 * (reduced + reduced.T),
         errors=None if drift is None else drift.errors,
     )
-
-
-def _dense(band: FloatArray, size: int) -> FloatArray:
-    """The first rows and columns (size, size) of a matrix."""
-    H = np.zeros((size, size))
-    for i in range(band.shape[1]):
-        rows = np.arange(max(size - i, 0))
-        H[rows + i, rows] = H[rows, rows + i] = band[: len(rows), i]
-    return H

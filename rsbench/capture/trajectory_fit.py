@@ -8,7 +8,7 @@ evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992), as are th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -66,32 +66,42 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.levenberg_marquardt import Damping, descend
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 NORMAL = 1e9
-"""Degrees of freedom of tails that are none."""
+"""Degrees of freedom of normal errors."""
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
 _FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
 _FLAT_COST, _NEAR = 1e-3, 1.0
 _MANY = 300
-"""Tracks from which on it pays to share them."""
+"""Tracks from which on two threads are faster."""
 _LEAST_WIDTH = 5
-"""Control poses that the prior ties, and a moment of a gyroscope."""
+"""Control poses that one term of the prior, or a sample of a gyroscope, depends on."""
 ANCHORED = 1e4
-"""Precision of the pose at time 0, in those of the most certain control pose."""
+"""Precision of the pose at time 0 over that of the most certain control pose."""
 _TELLING = 2.0
-"""Accelerations that tracks must determine, at least, to say how strong they are."""
+"""Accelerations that tracks must determine before their strength is estimated."""
 _STRENGTHS = (1e-10, 1e2)
-"""Least and largest, of both kinds: far below and far above what anybody holds a camera with."""
-_LEAST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
+"""Least and largest, of both kinds: far beyond those of hand-carried cameras."""
+_DAMPING = Damping(least=0.0, first=1e-6, largest=3e8, dropped=1e-6)
+_SOME = 250
+"""Tracks of a window, about: enough to begin with."""
+_SUSPECT = 4.0
+"""A window's own motion is wrong where its error is so many times that of one interpolated from its neighbours."""
+MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Frame periods."""
+_PRECISION = 1e12
+_WORTH = 1.0
+"""Gain in the logarithm of evidence from which another choice is taken."""
 
 
 class Equations(NamedTuple):
     """Normal equations at a spline."""
 
     cost: float
-    """Negative logarithm of likelihood and prior, but for constants."""
+    """Negative logarithm of likelihood and prior, except for constants."""
     gradient: FloatArray
     band: FloatArray
     """Without anchors."""
@@ -111,7 +121,7 @@ class Equations(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fit:
-    """A spline, and the distributions that it was found under."""
+    """A spline, and the distributions under which it was fitted."""
 
     curve: Curve
     tails: Tails
@@ -124,7 +134,7 @@ class Fit:
 
 
 def width_of(tracks: TimedTracks, curve: Curve) -> int:
-    """Width of the band: unknowns that are felt together."""
+    """Width of the band: unknowns that one track depends on."""
     last = len(curve.p) - 4
     places = [np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in tracks.span]
     known = 0 if tracks.past is None else len(tracks.past.p)
@@ -176,7 +186,7 @@ def _add_halves(
     out: tuple[FloatArray, FloatArray, FloatArray],
     want: bool,
 ) -> float:
-    """``add_tracks``, many of them in two halves side by side: on any machine, so that sums are the same."""
+    """``add_tracks``, many of them in two halves side by side, on any machine, so that sums are the same."""
     starts, middle, same = tracks.starts, len(trust) // 2, (tracks.focal, tails)
     if len(trust) < _MANY:
         return add_tracks(curve, tracks.ends, starts, *same, trust, *out, want)
@@ -195,7 +205,7 @@ def _add_halves(
 def _add_past(
     past: Past, curve: Curve, gradient: FloatArray, band: FloatArray, border: Border | None, drift: Drift | None
 ) -> float:
-    """Cost of control poses, and errors of a gyroscope, that are not as they were earlier, and its equations."""
+    """Cost of control poses, and errors of a gyroscope, that differ from earlier ones; adds its equations."""
     k = len(past.p)
     turned = so3.log(curve.R[:k] @ np.swapaxes(past.R, 1, 2))
     away = np.concatenate([turned, curve.p[:k] - past.p], axis=1).ravel()
@@ -211,11 +221,11 @@ def _add_past(
     return float(away @ (0.5 * slope + past.gradient))
 
 
-def held(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float) -> FloatArray:
-    """The normal matrix, a band, with the pose at time 0 held where nothing else holds the spline.
+def anchored(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float) -> FloatArray:
+    """The normal matrix, a band, with the pose at time 0 fixed where nothing else fixes the spline.
 
     Args:
-        certain: precision of that pose, in those of the most certain control pose.
+        certain: precision of that pose over that of the most certain control pose.
     """
     band = equations.band
     if tracks.past is not None:
@@ -223,43 +233,27 @@ def held(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float
     return band + anchors(curve, band.shape[1], certain * float(np.max(band[:, 0])))
 
 
-def information(
-    curve: Curve,
-    tracks: TimedTracks,
-    tails: Tails,
-    prior: Prior | None,
-    trust: FloatArray,
-    drift: Drift | None = None,
-    share: float = 1.0,
-) -> tuple[FloatArray, Border | None]:
-    """Factor of the expected information of the control poses, a band, and its border; the pose at time 0 is held.
+def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> FloatArray:
+    """Covariance of the control poses of a fit, in its band, by their expected information; time 0 is fixed.
 
     Args:
-        prior: None: what the tracks alone say.
-        drift: of the gyroscope, where the tracks have one.
-        share: what a track counts beside the prior, in place of what it counted in a fit.
+        share: weight of a track beside the prior, in place of its weight in the fit.
 
     Raises:
-        NotDefiniteError: they do not determine the spline.
+        NotDefiniteError: the tracks do not determine the spline.
     """
     # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
-    expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
-    silent = prior or Prior(1.0, 1, np.inf, np.inf)
-    each = replace(tracks, share=share)
-    found = normal_equations(curve, each, Tails(NORMAL, tails.scale), silent, expected, drift=drift)
-    return band_factor(held(found, curve, tracks, ANCHORED)), found.border
-
-
-def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> FloatArray:
-    """Covariance of the control poses of a fit, in its band, see ``information``. Raises NotDefiniteError."""
-    told = information(found.curve, tracks, found.tails, found.prior, found.trust, found.drift, share)
-    return bordered_inverse(*told)
+    tails, curve = found.tails, found.curve
+    expected = found.trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
+    normal, each = Tails(NORMAL, tails.scale), replace(tracks, share=share)
+    equations = normal_equations(curve, each, normal, found.prior, expected, drift=found.drift)
+    return bordered_inverse(band_factor(anchored(equations, curve, tracks, ANCHORED)), equations.border)
 
 
 def log_evidence(found: Fit, precision: float) -> float:
-    """Logarithm of the probability of the tracks under the prior (Laplace's approximation), but for constants.
+    """Logarithm of the probability of the tracks under the prior (Laplace's approximation), except for constants.
 
-    To compare fits of other knots and orders, under the same tails and of the same tracks.
+    To compare fits with other knots and orders, under the same tails and of the same tracks.
 
     Args:
         precision: of the pose at time 0, the same for all.
@@ -276,20 +270,9 @@ def log_evidence(found: Fit, precision: float) -> float:
 
 def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     """(n,) of the best points of tracks, px^2."""
-    squares, nothing = np.zeros(len(tracks)), np.zeros((1, width_of(tracks, curve)))
-    trust = np.zeros(len(squares))
-    add_tracks(
-        curve,
-        tracks.ends,
-        tracks.starts,
-        tracks.focal,
-        Tails(3.0, 1.0),
-        trust,
-        squares,
-        nothing,
-        np.zeros(1),
-        False,
-    )
+    squares, trust, nothing = *np.zeros((2, len(tracks))), np.zeros((1, width_of(tracks, curve)))
+    of_tracks = tracks.ends, tracks.starts, tracks.focal, Tails(3.0, 1.0)
+    add_tracks(curve, *of_tracks, trust, squares, nothing, np.zeros(1), False)
     return squares
 
 
@@ -299,60 +282,59 @@ def right_tracks(found: Fit, tracks: TimedTracks) -> FloatArray:
     return (squared_errors(found.curve, tracks) <= reach).astype(np.float64)
 
 
-def descend(
-    curve: Curve,
-    tracks: TimedTracks,
-    tails: Tails,
-    prior: Prior,
-    trust: FloatArray,
-    steps: int,
-    drift: Drift | None = None,
-) -> tuple[Curve, Equations, Drift | None]:
-    """Levenberg-Marquardt steps, until one promises to lower the cost by less than a thousandth of a unit.
+class _Place(NamedTuple):
+    """Where the descent is."""
+
+    curve: Curve
+    drift: Drift | None
+    equations: Equations
+    promise: float = 0.0
+    """Decrease of the cost that was predicted for the last step."""
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The cost of a spline under given distributions, for ``descend``.
 
     Steps that promise little are taken as they are: the equations take the weights of pixels as given, and their
     root is not quite the least cost.
     """
-    here, damping = normal_equations(curve, tracks, tails, prior, trust, drift=drift), 0.0
-    for _ in range(steps):
-        matrix = held(here, curve, tracks, 1.0)
-        promise, trial, there, other = 0.0, curve, here, drift
-        while damping <= _LARGEST_DAMPING:
-            step = _step(matrix, here, damping)
-            if step is not None:
-                promise = -0.5 * float(step @ here.slope)
-                trial, other = moved(curve, step[: len(matrix)]), _moved(drift, step[len(matrix) :])
-                if tracks.past is None:
-                    trial = from_pose_at(trial, 0.0)
-                there = normal_equations(trial, tracks, tails, prior, trust, drift=other)
-                near = damping == 0.0 and abs(promise) < _NEAR
-                if there.cost <= here.cost + (_NEAR if near else 0.0):
-                    break
-            damping = max(10.0 * damping, _LEAST_DAMPING)
-        if damping > _LARGEST_DAMPING:
-            break
-        curve, here, drift = trial, there, other
-        damping = 0.1 * damping if damping > _LEAST_DAMPING else 0.0
-        if promise < _FLAT_COST:
-            break
-    return curve, here, drift
 
+    tracks: TimedTracks
+    tails: Tails
+    prior: Prior
+    trust: FloatArray
 
-def _moved(drift: Drift | None, step: FloatArray) -> Drift | None:
-    return None if drift is None else drift.moved(step)
+    def place(self, curve: Curve, drift: Drift | None, promise: float = 0.0) -> _Place:
+        here = normal_equations(curve, self.tracks, self.tails, self.prior, self.trust, drift=drift)
+        return _Place(curve, drift, here, promise)
 
+    def stepped(self, here: _Place, damping: float) -> _Place | None:
+        equations, drift = here.equations, here.drift
+        damped = anchored(equations, here.curve, self.tracks, 1.0).copy()
+        damped[:, 0] += damping * equations.band[:, 0]
+        try:
+            lower = band_factor(damped)
+            if equations.border is None:
+                step = -band_solve(lower, equations.gradient)
+            else:
+                step = np.concatenate(bordered_step(lower, equations.gradient, equations.border))
+        except NotDefiniteError:
+            return None
+        curve, promise = moved(here.curve, step[: len(damped)]), -0.5 * float(step @ equations.slope)
+        if self.tracks.past is None:
+            curve = from_pose_at(curve, 0.0)
+        there = self.place(curve, None if drift is None else drift.moved(step[len(damped) :]), promise)
+        near = damping == 0.0 and abs(promise) < _NEAR
+        return there if there.equations.cost <= equations.cost + (_NEAR if near else 0.0) else None
 
-def _step(matrix: FloatArray, here: Equations, damping: float) -> FloatArray | None:
-    """Of the control poses and, where there is a gyroscope, of its errors."""
-    damped = matrix.copy()
-    damped[:, 0] += damping * here.band[:, 0]
-    try:
-        lower = band_factor(damped)
-        if here.border is None:
-            return -band_solve(lower, here.gradient)
-        return np.concatenate(bordered_step(lower, here.gradient, here.border))
-    except NotDefiniteError:
-        return None
+    def settled(self, before: _Place, after: _Place) -> bool:
+        return after.promise < _FLAT_COST
+
+    def descended(self, curve: Curve, drift: Drift | None, steps: int) -> tuple[Curve, Equations, Drift | None]:
+        """Steps until one promises to lower the cost by less than a thousandth of a unit."""
+        found = descend(self, self.place(curve, drift), steps, _DAMPING)
+        return found.curve, found.equations, found.drift
 
 
 def fit(
@@ -367,10 +349,10 @@ def fit(
     """The spline, from one that is near, with the noises, tails and, if ``learn``, the prior's strength.
 
     Args:
-        trust: with it, ``tails`` and ``trust`` stay as they are.
+        trust: with it, ``tails`` and ``trust`` are fixed.
         drift: of the gyroscope that the tracks have, to begin with.
     """
-    settled = trust is not None
+    fixed = trust is not None
     trust = np.ones(len(tracks)) if trust is None else trust
     if tails is None:
         median = float(np.median(squared_errors(curve, tracks) / tracks.freedom))
@@ -378,31 +360,31 @@ def fit(
     if tracks.gyro is not None and drift is None:
         drift = first_drift(curve, tracks.gyro)
     for _ in range(_ROUNDS):
-        curve, here, drift = descend(curve, tracks, tails, prior, trust, _STEPS_A_ROUND, drift)
+        curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _STEPS_A_ROUND)
         last = _strengths_of(prior, drift)
-        old, lower = tails.scale, band_factor(held(here, curve, tracks, ANCHORED))
+        old, lower = tails.scale, band_factor(anchored(here, curve, tracks, ANCHORED))
         used, determined, better, drift = _strengths(here, lower, prior, drift)
-        if not settled:
+        if not fixed:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
         prior = better if learn else prior
         change = np.abs(np.log(_strengths_of(prior, drift) / last))
         settling = (change > _FLAT_STRENGTH) & (change * determined > _FLAT_EVIDENCE)
         if abs(np.log(tails.scale / old)) < _FLAT and not np.any(settling):
             break
-    curve, here, drift = descend(curve, tracks, tails, prior, trust, _LAST_STEPS, drift)
+    curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _LAST_STEPS)
     return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, drift=drift)
 
 
 def _strengths_of(prior: Prior, drift: Drift | None) -> FloatArray:
-    """Variances that are found with the spline."""
+    """Variances that are estimated with the spline."""
     return np.array([prior.rotation, prior.position, *([] if drift is None else [drift.variance])])
 
 
 def _strengths(
     here: Equations, lower: FloatArray, prior: Prior, drift: Drift | None
 ) -> tuple[float, FloatArray, Prior, Drift | None]:
-    """Numbers of parameters that tracks determine, and of accelerations and errors of a gyroscope that are left
-    beside them (2 or 3,); the prior and the gyroscope's noise of more evidence."""
+    """Number of parameters that tracks determine; numbers (2 or 3,) of accelerations and errors of a gyroscope
+    beside them; the prior and the gyroscope's noise of more evidence."""
     inverse, old = bordered_inverse(lower, here.border), np.array([prior.rotation, prior.position])
     tied = np.array([band_inner(inverse, band) for band in here.rough.bands]) / old
     determined = np.maximum(here.rough.count - tied, 1e-3)
@@ -414,10 +396,7 @@ def _strengths(
     return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1])), drift
 
 
-_SOME = 250
-"""Tracks of a window, about: enough to begin with."""
-_SUSPECT = 4.0
-"""Times the error of a window whose motion is made of its neighbours', from which on its own is wrong."""
+# Where the descent begins
 
 
 def window_motions(
@@ -436,27 +415,28 @@ def window_motions(
 def first_curve(
     motions: Sequence[Motion | None], tracks: TimedTracks, span: tuple[float, float], interval: float
 ) -> Curve:
-    """A spline along the motions of the windows; one that is missing or wrong is made of its neighbours'.
+    """A spline along the motions of the windows; missing and wrong ones are interpolated from their neighbours'.
 
     Args:
         span: times of the first and the last line.
     """
-    known = np.array([motion is not None for motion in motions])
-    rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
-    own = _chained(_bridged(rates, known), span, interval)
-    others = np.stack([_without(rates, known, k) for k in range(len(rates))])
-    bridged = _chained(others, span, interval)
-    errors = [_median_errors(squared_errors(curve, tracks), tracks) for curve in (own, bridged)]
+    rates, known = _rates(motions)
+    places = np.arange(len(rates))
+    others = np.stack([_bridged(rates, known & (places != k))[k] for k in places])
+    own, bridged = (_chained(each, span, interval) for each in (_bridged(rates, known), others))
+    errors = []
+    for curve in (own, bridged):
+        chosen = [squared_errors(curve, tracks)[members] for members in tracks.members]
+        errors.append(np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen]))
     known &= ~(errors[0] > _SUSPECT * errors[1])
     return _chained(_bridged(rates, known), span, interval)
 
 
 def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:
-    """A spline, longer: along the motions of the windows from ``start`` on, to a time."""
-    known = np.array([motion is not None for motion in motions])
+    """A longer spline: along the motions of the windows from ``start`` on, to a time."""
+    rates, known = _rates(motions)
     if not np.any(known):
-        motions, known = [ContinuousMotion.of(curve).from_time(start - 1.0)], np.ones(1, dtype=np.bool_)
-    rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
+        rates, known = _rates([ContinuousMotion.of(curve).from_time(start - 1.0)])
     rates = _bridged(rates, known)
     count = control_count(curve.first, last, curve.interval)
     taus = curve.first + curve.interval * (np.arange(count) - 1.0)
@@ -471,57 +451,46 @@ def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: 
     return make_curve(curve.first, curve.interval, R, p)
 
 
-def _median_errors(squares: FloatArray, tracks: TimedTracks) -> FloatArray:
-    """(windows,) of the tracks of each window; 0 of none."""
-    chosen = [squares[members] for members in tracks.members]
-    return np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen])
+def _rates(motions: Sequence[Motion | None]) -> tuple[FloatArray, BoolArray]:
+    """Rates (n, 6) of rotation and translation, and which are known."""
+    rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
+    return rates, np.array([motion is not None for motion in motions])
 
 
 def _bridged(rates: FloatArray, known: BoolArray) -> FloatArray:
-    """Rates (n, 6), those that are not known between those of neighbours; 0 where none is."""
+    """Rates (n, 6), the unknown ones interpolated; 0 where none is known."""
     if not np.any(known):
         return np.zeros_like(rates)
     places = np.arange(len(rates))
     return np.stack([np.interp(places, places[known], column[known]) for column in rates.T], axis=1)
 
 
-def _without(rates: FloatArray, known: BoolArray, k: int) -> FloatArray:
-    """What the neighbours of window k say of it (6,)."""
-    others = known.copy()
-    others[k] = False
-    return _bridged(rates, others)[k]
-
-
 def _chained(rates: FloatArray, span: tuple[float, float], interval: float) -> Curve:
     """Through the poses that rates of rotation and translation (n, 6) lead to."""
-    poses = [Pose(np.eye(3), np.zeros(3))]
-    for rate in rates:
-        poses.append(compose(Pose(*LinearMotion(rate[:3], rate[3:]).body_from_world(1.0)), poses[-1]))
-    taus = span[0] + interval * (np.arange(control_count(*span, interval)) - 1.0)
+    motions, poses = [LinearMotion(rate[:3], rate[3:]) for rate in rates], [Pose(np.eye(3), np.zeros(3))]
+    for motion in motions:
+        poses.append(compose(Pose(*motion.body_from_world(1.0)), poses[-1]))
     controls = []
-    for tau in taus:
+    for tau in span[0] + interval * (np.arange(control_count(*span, interval)) - 1.0):
         k = int(np.clip(np.floor(tau), 0, len(rates) - 1))
-        along = LinearMotion(rates[k, :3], rates[k, 3:]).body_from_world(tau - k)
-        controls.append(inverse(compose(along, poses[k])))
+        controls.append(inverse(compose(motions[k].body_from_world(tau - k), poses[k])))
     R = np.swapaxes(np.stack([each.R for each in controls]), 1, 2)
     return make_curve(span[0], interval, R, np.stack([each.t for each in controls]))
 
 
-MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Frame periods."""
-_PRECISION = 1e12
-_WORTH = 1.0
-"""Logarithm of evidence that another choice must gain."""
+# Knots and kind of prior
 
 
 def choose(found: Fit, tracks: TimedTracks, intervals: Sequence[float]) -> Fit:
     """The fit of most evidence, by climbing from one: its memory, then its smoothness, then its knots."""
     best, most = found, log_evidence(found, _PRECISION)
 
-    def better(trial: Callable[[], Fit]) -> bool:
+    def better(curve: Curve, memory: float, smooth: int) -> bool:
+        """Whether another prior or other knots are, with the same tails and tracks; they are then the best."""
         nonlocal best, most
+        prior = best.prior._replace(memory=memory, smooth=smooth)
         try:
-            other = trial()
+            other = fit(curve, tracks, prior, tails=best.tails, trust=best.trust, drift=best.drift)
             evidence = log_evidence(other, _PRECISION)
         except NotDefiniteError:
             return False
@@ -530,27 +499,17 @@ def choose(found: Fit, tracks: TimedTracks, intervals: Sequence[float]) -> Fit:
             best, most = other, evidence
         return gained
 
-    def with_memory(memory: float, smooth: int) -> Fit:
-        return again(best, best.curve, tracks, memory, smooth)
-
     start = int(np.argmin(np.abs(np.log(np.array(MEMORIES) / best.prior.memory))))
-    for way in (-1, 1):
-        place = start + way
-        while 0 <= place < len(MEMORIES) and better(lambda: with_memory(MEMORIES[place], best.prior.smooth)):  # noqa: B023
-            place += way
-        if place != start + way:
+    for step in (-1, 1):
+        place = start + step
+        while 0 <= place < len(MEMORIES) and better(best.curve, MEMORIES[place], best.prior.smooth):
+            place += step
+        if place != start + step:
             break
-    better(lambda: with_memory(best.prior.memory, 3 - best.prior.smooth))
+    better(best.curve, best.prior.memory, 3 - best.prior.smooth)
     for interval in intervals:
-        if abs(interval - best.curve.interval) > 1e-9:
-            curve = approximated(
-                lambda tau: evaluate(best.curve, tau)[0], (best.curve.first, best.curve.last), interval
-            )
-            better(lambda: again(best, curve, tracks, best.prior.memory, best.prior.smooth))  # noqa: B023
+        old = best.curve
+        if abs(interval - old.interval) > 1e-9:
+            curve = approximated(lambda tau: evaluate(old, tau)[0], (old.first, old.last), interval)  # noqa: B023
+            better(curve, best.prior.memory, best.prior.smooth)
     return best
-
-
-def again(found: Fit, curve: Curve, tracks: TimedTracks, memory: float, smooth: int) -> Fit:
-    """A fit under another prior or with other knots, with the same tails and the same tracks."""
-    prior = found.prior._replace(memory=memory, smooth=smooth)
-    return fit(curve, tracks, prior, tails=found.tails, trust=found.trust, drift=found.drift)

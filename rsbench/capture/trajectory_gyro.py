@@ -27,27 +27,26 @@ from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
 _APART = 1 / 16
-"""Frame periods: samples that are closer are taken together. A filter in the sensor makes their noise alike, and
-the mean over an eighth of a period blunts what a hand shakes."""
+"""Frame periods: closer samples are averaged. A filter in the sensor correlates their noise, and a mean over an
+eighth of a period would blunt the shake of a hand."""
 _MOMENT = 1e-3
-"""Half of the time over which the spline's turn is taken for its rate: far above rounding, far below a knot."""
+"""Half of the time over which the spline's turn is measured as its rate: far above rounding, far below a knot."""
 _BIAS = 1e-2
-"""Standard deviation of the bias, rad per frame period, before anything is seen: 0.3 rad/s at 30 Hz."""
+"""Prior standard deviation of the bias, rad per frame period: 0.3 rad/s at 30 Hz."""
 _SHIFT, FARTHEST = 0.2, 0.5
-"""Standard deviation of the shift of its clock, frame periods, before anything is seen, and the largest that is
-looked for: a quarter of the period of the fastest shakes of a hand."""
+"""Prior standard deviation of the shift of its clock, frame periods, and the largest shift: a quarter of the
+period of the fastest shakes of a hand."""
 _CROOKED, _MOST_CROOKED = 0.02, 0.3
-"""Standard deviation of axes and scales before anything is seen, rad and relative, and the largest errors of them
-that are believed."""
+"""Prior standard deviation of errors of axes and scales, rad and relative, and their largest credible ones."""
 ERRORS = 13
 _EXPECTED = np.array([_BIAS] * 3 + [_SHIFT] + [_CROOKED] * 9)
 _LEAST_VARIANCE = 1e-12
 """rad^2 per frame period: far below that of any gyroscope, and above rounding."""
 _TELLING = 2.0
-"""Errors beside those that the spline follows, at least, to say how large they are."""
+"""Errors, in number, beside those that the spline follows, from which on their variance is estimated."""
 _UNLIKE, _NOISY = 0.3, 3.0
-"""Root mean square of a gyroscope's errors, over that of how its rates vary and over that of its own noise, from
-which on both it contradicts the matches."""
+"""Root mean square of a gyroscope's errors, over the variation of its rates and over its own noise: above both, it
+contradicts the matches."""
 
 
 class GyroSteps(NamedTuple):
@@ -57,27 +56,22 @@ class GyroSteps(NamedTuple):
     """(n,) frame periods."""
     end: FloatArray
     turn: FloatArray
-    """(n, 3) rotation vectors of the body at the end, seen from the body at the start; bias and all."""
+    """(n, 3) rotation vectors of the body at the end, seen from the body at the start; with the bias."""
     worth: FloatArray
-    """(n,) frame periods that one speaks for: its rates have the noise of a turn over so long."""
+    """(n,) frame periods that each stands for: its rates have the noise of a turn over that time."""
 
     def between(self, first: float, last: float) -> GyroSteps:
         """Those that start at a time or later, and end at another or earlier."""
-        return self._part(self._begun(first), int(np.searchsorted(self.end, last, side="right")))
+        begun, ended = np.searchsorted(self.start, first), np.searchsorted(self.end, last, side="right")
+        return GyroSteps(*(each[begun:ended] for each in self))
 
     def begun_before(self, time: float) -> GyroSteps:
-        """Those that start before a time: all others do so then or later."""
-        return self._part(0, self._begun(time))
-
-    def _begun(self, time: float) -> int:
-        return int(np.searchsorted(self.start, time))
-
-    def _part(self, first: int, after: int) -> GyroSteps:
-        return GyroSteps(*(each[first:after] for each in self))
+        """Those that start before a time."""
+        return GyroSteps(*(each[: np.searchsorted(self.start, time)] for each in self))
 
 
 class Drift(NamedTuple):
-    """What a gyroscope errs by."""
+    """Errors of a gyroscope."""
 
     errors: FloatArray
     """(13,) bias of its rates in the convention of ``Correspondences.gyro``, rad per frame period; the shift:
@@ -101,7 +95,7 @@ class Drift(NamedTuple):
         return self.errors[4:].reshape(3, 3)
 
     def moved(self, step: FloatArray) -> Drift:
-        """Other errors, the shift no farther than what is looked for."""
+        """After a step of the errors (13,), the shift within its limits."""
         errors = self.errors + step
         errors[3] = np.clip(errors[3], -FARTHEST, FARTHEST)
         return self._replace(errors=errors)
@@ -109,22 +103,22 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroFound:
-    """What a sequence says of a gyroscope."""
+    """Errors of a gyroscope, as estimated from a sequence."""
 
     bias: FloatArray
     """(3,) of its samples, rad per frame period."""
     shift: float
     """Frame periods that its times are early by."""
     matrix: FloatArray
-    """(3, 3) what its rates are multiplied by, bias and all: near the identity, where axes and scales are off."""
+    """(3, 3) which multiplies its rates, with the bias: near the identity, where axes and scales are off."""
     noise: float
-    """Standard deviation of its turn over a frame period about each axis, rad; what no spline follows is in it."""
+    """Standard deviation of its turn over a frame period about each axis, rad; with motion that no spline
+    follows."""
     used: bool
     """False: its samples contradict the matches, being of another time, sign or other axes, and were left out."""
 
     @classmethod
     def of(cls, drift: Drift, *, used: bool = True) -> GyroFound:
-        """In words of users."""
         noise = float(np.sqrt(drift.variance))
         return cls(bias=drift.bias, shift=drift.shift, matrix=np.eye(3) + drift.crooked, noise=noise, used=used)
 
@@ -141,7 +135,7 @@ class Border(NamedTuple):
 
 
 class Sensed(NamedTuple):
-    """Sum of squared errors of steps, whitened but for the variance, and half its derivatives."""
+    """Sum of squared errors of steps, whitened except for the variance, and half its derivatives."""
 
     squares: float
     gradient: FloatArray
@@ -154,7 +148,7 @@ class Sensed(NamedTuple):
 
 
 def gyro_steps(samples: FloatArray) -> GyroSteps:
-    """Turns within a moment around samples (n, 4) tau, w, in any order; close ones are taken together."""
+    """Turns within a moment around samples (n, 4) tau, w, in any order; close ones are averaged."""
     samples = samples[np.argsort(samples[:, 0], kind="stable")]
     first = np.flatnonzero(np.diff(np.floor(samples[:, 0] / _APART), prepend=-np.inf))
     if len(first) < 2:
@@ -187,11 +181,8 @@ def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
     by, rows = np.zeros((count, size, 3, 3)), np.arange(count)[:, None]
     by[rows, (index[:count] - first)[:, None] + np.arange(4)] -= (by_end @ turned)[:, None] @ turn[0]
     by[rows, (index[count:] - first)[:, None] + np.arange(4)] += by_end[:, None] @ turn[1]
-    gradient, band, mixed = (
-        np.zeros(6 * controls),
-        np.zeros((6 * controls, width)),
-        np.zeros((controls, 6, ERRORS)),
-    )
+    gradient, band = np.zeros(6 * controls), np.zeros((6 * controls, width))
+    mixed = np.zeros((controls, 6, ERRORS))
     add_blocks(gradient, band, by, errors, first, 0)
     np.add.at(mixed[:, :3], first[:, None] + np.arange(size), np.swapaxes(by, 2, 3) @ by_drift[:, None])
     corner, slope = np.einsum("kmi,kmj->ij", by_drift, by_drift), np.einsum("kmi,km->i", by_drift, errors)
@@ -200,13 +191,13 @@ def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
 
 
 def first_drift(curve: Curve, steps: GyroSteps) -> Drift:
-    """None but the noise that steps have about a spline."""
+    """No errors, except for the noise of steps about a spline."""
     found = sensed(curve, steps, Drift(np.zeros(ERRORS), 1.0), 6 * max(len(curve.p), 5))
     return Drift(np.zeros(ERRORS), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
 
 
 def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]:
-    """Cost of steps, and the border; ``begins``: with what is expected of the gyroscope's errors."""
+    """Cost of steps, and the border; ``begins``: with the prior on the gyroscope's errors."""
     border = Border(*(each / drift.variance for each in found.border))
     cost = 0.5 * found.squares / drift.variance
     if begins:
@@ -218,7 +209,7 @@ def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]
 
 
 class Eliminated(NamedTuple):
-    """A gyroscope's errors, left out of normal equations whose factor is known."""
+    """A gyroscope's errors, eliminated from normal equations whose factor is known."""
 
     follows: FloatArray
     """(6 controls, 13) how the control poses move against them."""
@@ -248,7 +239,7 @@ def bordered_step(lower: FloatArray, gradient: FloatArray, border: Border) -> tu
 
 
 def bordered_inverse(lower: FloatArray, border: Border | None) -> FloatArray:
-    """Covariance of control poses, in its band, with a gyroscope's errors that are not known beside them."""
+    """Covariance of control poses, in its band, beside a gyroscope's unknown errors."""
     inverse = band_inverse(lower)
     if border is None:
         return inverse
@@ -279,10 +270,10 @@ def learned(
 
 
 def contradicts(steps: GyroSteps, drift: Drift) -> bool:
-    """Whether a gyroscope is of another clock or axes.
+    """Whether the samples of a gyroscope are of another clock or other axes than the matches.
 
-    It errs by much of what it measures and by more than its noise, or its clock, axes or scales are off by more
-    than is believed.
+    Its errors are a large part of its rates and exceed its noise, or its clock, axes or scales are off by more
+    than is credible.
     """
     if len(steps.start) < 3 or drift.variance <= _LEAST_VARIANCE:
         return False

@@ -105,7 +105,7 @@ def band_inverse(lower: FloatArray) -> FloatArray:
 
 
 _ORDER = 4
-"""Control poses that a time feels."""
+"""Control poses that a pose depends on."""
 _SAME = 1e-9
 
 
@@ -147,14 +147,14 @@ def moved(curve: Curve, step: FloatArray) -> Curve:
 
 
 def from_pose_at(curve: Curve, tau: float) -> Curve:
-    """The same way, seen from the body at a time: it is the world then."""
+    """The same trajectory, with the body at a time as the world."""
     (R, t), _, _ = evaluate(curve, tau)
     p = -R.T @ t
     return make_curve(curve.first, curve.interval, curve.R @ R.T, (curve.p - p) @ R.T)
 
 
 def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
-    """Of the intervals that hold times from ``first`` to ``last``; ``zero`` is time 0 there."""
+    """The intervals that contain times from ``first`` to ``last``; ``zero`` becomes time 0."""
     low = int(np.clip(np.floor((first - curve.first) / curve.interval + 1e-9), 0, len(curve.p) - _ORDER))
     high = int(np.clip(np.ceil((last - curve.first) / curve.interval - 1e-9), low + 1, len(curve.p) - _ORDER + 1))
     chosen = slice(low, high + _ORDER - 1)
@@ -162,7 +162,7 @@ def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
 
 
 def span_of(windows: int, shutter: RollingShutter) -> tuple[float, float]:
-    """From the first line to the last one of so many windows, time 0 within."""
+    """Times of the first and the last line of a number of windows, with time 0 between."""
     ends = [shutter.start(frame, side) for frame in (0, windows) for side in SIDES]
     return min(0.0, float(np.min(ends))), float(np.max(ends)) + shutter.readout_ratio
 
@@ -198,7 +198,7 @@ def evaluate(curve: Curve, tau: ArrayLike) -> tuple[Pose, FloatArray, FloatArray
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class ContinuousMotion(Motion):
-    """The way of a rig over many frames, seen from the body at time 0."""
+    """The trajectory of a rig over many frames, seen from the body at time 0."""
 
     name: ClassVar[str] = "continuous"
     first: float
@@ -225,7 +225,7 @@ class ContinuousMotion(Motion):
             object.__setattr__(self, name, value)
         R, t = self.body_from_world(1.0)
         if np.max(np.abs(np.concatenate([so3.log(R) - self.w, t - self.d]))) > _SAME:
-            raise ValueError("w and d of a continuous motion are those of its controls, and were given otherwise")
+            raise ValueError("w and d of a continuous motion must be those of its controls")
 
     @classmethod
     def of(cls, curve: Curve) -> ContinuousMotion:
@@ -251,7 +251,8 @@ class ContinuousMotion(Motion):
         return spin, so3.cross(spin, t) - (R @ speed[..., None])[..., 0]
 
     def seen(self, axes: FloatArray, scale: float = 1.0) -> ContinuousMotion:
-        """In other axes (3, 3), a mirror's too, and another unit of length, of which the old one is so many."""
+        """In other axes (3, 3), also mirrored ones, and another unit of length, of which the old one is
+        ``scale``."""
         turns, places = self.controls[:, :3], self.controls[:, 3:]
         rows = np.concatenate([np.linalg.det(axes) * turns @ axes.T, scale * places @ axes.T], axis=1)
         own = {"first": self.first, "interval": self.interval, "controls": rows}
@@ -277,7 +278,7 @@ class Views(NamedTuple):
     """Poses at n times."""
 
     index: NDArray[np.int64]
-    """(n,) the first of the four control poses that a time feels."""
+    """(n,) the first of the four control poses that a pose depends on."""
     R: FloatArray
     """(n, 3, 3) body_from_world."""
     p: FloatArray
@@ -294,7 +295,7 @@ class Views(NamedTuple):
 
 @compiled(error_model="numpy")
 def blank_views(count: int) -> Views:
-    """Room for so many poses."""
+    """Work arrays for a number of poses."""
     return Views(
         np.zeros(count, dtype=np.int64),
         np.zeros((count, 3, 3)),
@@ -394,20 +395,23 @@ def _multiply_transposed(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 _WIDEST = (1.0, 10.0)
-"""Rates, radians and metres per frame period, that are expected before anything is seen."""
+"""Prior standard deviation of rates, radians and metres per frame period."""
 
 
 class Prior(NamedTuple):
-    """Accelerations that are expected."""
+    """Prior on accelerations."""
 
     memory: float
-    """Frame periods after which they are forgotten."""
+    """Frame periods of their correlation."""
     smooth: int
-    """m: 1 or 2; the power of fast shaking falls with its rate to the power of -4 - 2 m."""
+    """m: 1 or 2; the power of fast shakes falls with their rate to the power of -4 - 2 m."""
     rotation: float
     """Variance of angular accelerations about each axis, rad^2 per frame period^4."""
     position: float
     """Variance of accelerations along each axis, m^2 per frame period^4."""
+
+
+NO_PRIOR = Prior(1.0, 1, np.inf, np.inf)
 
 
 class Roughness(NamedTuple):
@@ -422,14 +426,13 @@ class Roughness(NamedTuple):
     count: int
     """Accelerations of either kind, scalar."""
     log_density: float
-    """Logarithm of the density of control poses of one axis, at unit variances and but for constants."""
+    """Logarithm of the density of control poses of one axis, at unit variances, except for constants."""
 
 
 def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
     """Weights of successive second differences, for accelerations of unit variance.
 
-    One row for each of the first ``smooth`` differences, which know less of what was before, and one for all
-    later ones.
+    One row for each of the first ``smooth`` differences, which have fewer before them, and one for all later ones.
     """
     rho = float(np.exp(-interval / memory)) if memory > 0.0 else 0.0
     unit = interval**-2
@@ -448,8 +451,7 @@ def roughness(
     """Of a spline, in bands of a width (at least 6 (smooth + 3)).
 
     Args:
-        begins: whether nothing is known of accelerations before the first control pose; without it, differences
-            that need them are left out.
+        begins: whether the spline begins here; otherwise differences that need earlier control poses are left out.
         until: number of a control pose; only differences that begin before it.
     """
     n, steps = len(curve.p), (curve.steps, np.diff(curve.p, axis=0))
@@ -478,22 +480,16 @@ def roughness(
 
 
 def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
-    """Logarithm of the density of a prior at its mode, but for constants that are the same for any knots.
+    """Logarithm of the density of a prior at its mode, except for constants that are the same for any knots.
 
-    All second differences, one rate and one pose are as good as the control poses: the matrix between them has the
-    determinant 1.
+    All second differences, one rate and one pose determine the control poses by a matrix of determinant 1.
     """
     sizes = 0.5 * rough.count * float(np.log(prior.rotation) + np.log(prior.position))
     return 6.0 * rough.log_density - sizes
 
 
 def add_blocks(
-    gradient: FloatArray,
-    band: FloatArray,
-    by: FloatArray,
-    errors: FloatArray,
-    first: NDArray[np.int64],
-    part: int,
+    gradient: FloatArray, band: FloatArray, by: FloatArray, errors: FloatArray, first: NDArray[np.int64], part: int
 ) -> None:
     """Add normal equations of errors (n, m) whose derivatives (n, k, m, 3) are by k successive control poses.
 
@@ -501,18 +497,12 @@ def add_blocks(
         first: (n,) number of the first of these poses.
         part: 0 or 3: rotations or positions.
     """
-    by, errors = np.ascontiguousarray(by), np.ascontiguousarray(errors)
-    _add_blocks(gradient, band, by, errors, first, part)
+    _add_blocks(gradient, band, np.ascontiguousarray(by), np.ascontiguousarray(errors), first, part)
 
 
 @compiled
 def _add_blocks(
-    gradient: FloatArray,
-    band: FloatArray,
-    by: FloatArray,
-    errors: FloatArray,
-    first: NDArray[np.int64],
-    part: int,
+    gradient: FloatArray, band: FloatArray, by: FloatArray, errors: FloatArray, first: NDArray[np.int64], part: int
 ) -> None:
     count, controls, size, _ = by.shape
     for k in range(count):
@@ -528,9 +518,10 @@ def _add_blocks(
 
 
 def anchors(curve: Curve, width: int, precision: float) -> FloatArray:
-    """Band (6 controls, width) of what a roughness leaves free: the pose at time 0, and a rate.
+    """Band (6 controls, width) of what a roughness leaves free, the same for any knots: the pose at time 0, a
+    rate.
 
-    They are the same for any knots. ``precision`` is that of the pose at time 0.
+    ``precision`` is that of the pose at time 0.
     """
     n = len(curve.p)
     band, views = np.zeros((6 * n, width)), blank_views(1)
@@ -552,7 +543,7 @@ _SAMPLES, _STEPS = 4, 4
 def approximated(
     body_from_world: Callable[[FloatArray], Pose], span: tuple[float, float], interval: float
 ) -> Curve:
-    """The spline next to poses at times (n,), of a motion that lasts for a span."""
+    """The spline closest to poses at times (n,), of a motion that lasts for a span."""
     count = control_count(*span, interval)
     R, t = body_from_world(np.asarray(span[0] + interval * (np.arange(count) - 1.0), dtype=np.float64))
     curve = make_curve(span[0], interval, R, _positions(R, t))
@@ -593,12 +584,12 @@ def covariance_between(curve: Curve, inverse: FloatArray, start: float, taus: Fl
     """Covariance (n, 6, 6) of poses at times (n,), seen from the pose at another one.
 
     Raises:
-        ValueError: a time so far away that the band does not hold what both have in common.
+        ValueError: a time so far away that the band does not contain their covariance.
     """
     one, by_one = _derivatives(curve, np.full(len(taus), start))
     other, by = _derivatives(curve, taus)
     if 6 * (np.max(np.abs(other.index - one.index), initial=0) + 4) > inverse.shape[1]:
-        raise ValueError(f"times that far from {start:g} have covariances of their own only")
+        raise ValueError(f"times that far from {start:g} have no covariance with it in the band")
     # R' = R R_s^T turns by dR - R' dR_s; q = R_s (p - p_s) moves by R_s (dp - dp_s) + dR_s x q.
     R, R_s = other.R, one.R
     relative = R @ np.swapaxes(R_s, 1, 2)
@@ -614,7 +605,7 @@ def covariance_between(curve: Curve, inverse: FloatArray, start: float, taus: Fl
 
 
 def _derivatives(curve: Curve, taus: FloatArray) -> tuple[Views, FloatArray]:
-    """Poses at times (n,) and their derivatives (n, 6, 24) by the control poses that they feel."""
+    """Poses at times (n,) and their derivatives (n, 6, 24) by the control poses that they depend on."""
     taus = np.clip(np.asarray(taus, dtype=np.float64), curve.first, curve.last)
     views = blank_views(len(taus))
     fill_views(curve, taus, views)
@@ -625,7 +616,7 @@ def _derivatives(curve: Curve, taus: FloatArray) -> tuple[Views, FloatArray]:
 
 
 def _block(inverse: FloatArray, a: Views, b: Views) -> FloatArray:
-    """Covariances (n, 24, 24) of the control poses that times feel."""
+    """Covariances (n, 24, 24) of the control poses that poses depend on."""
     rows, columns = (6 * views.index[:, None] + np.arange(24) for views in (a, b))
     low = np.minimum(rows[:, :, None], columns[:, None])
     high = np.maximum(rows[:, :, None], columns[:, None])

@@ -4,7 +4,7 @@ A track is any number of ends: pixels of one point, each with its camera and tim
 the camera of the first end, is found by few Gauss-Newton steps and eliminated from the normal equations (Schur
 complement; B. Triggs et al., Bundle Adjustment, 2000), in compiled functions. A pixel that is shifted is also read
 at another time, which counts in the noise of an end. Nothing is linear in the motion but for those steps. A track
-weighs as under a multivariate t distribution (``solvers.engine.heavy_tails``).
+weighs as under a multivariate t distribution (``solvers.engine.packed.HeavyTailed``).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from rsbench.capture.trajectory_gyro import GyroSteps
@@ -26,7 +25,16 @@ from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, 
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.packed import t_distribution
 
+IntArray = NDArray[np.int64]
+ENOUGH = 400
+"""Tracks of a window from which on its pairs add little, and take longer than all else."""
+LONGEST = 5
+"""Frames of a track: more would couple more control poses for little."""
+REACH = 10.0
+"""Errors, in scales, beyond which a track is wrong."""
+LEAST_SCALE_PX = 1e-3
 BEHIND = 1e12
 """Squared error, px^2, of a track whose point lies behind a camera."""
 _NEAREST = 1e-3
@@ -34,11 +42,11 @@ _NEAREST = 1e-3
 _POINT_STEPS = 2
 """Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
 _ROUGH_RHO = 3.0
-"""1/m: deviation of inverse depths about 0 that is expected where a track does not show its own."""
+"""1/m: prior standard deviation of inverse depths, for tracks that do not show their own."""
 _UNCERTAIN = 0.3
-"""px: what an expected inverse depth counts as much as."""
+"""px: the error that one such deviation counts as."""
 END = 10
-"""Numbers of an end."""
+"""Values of an end."""
 
 
 class Tails(NamedTuple):
@@ -50,7 +58,7 @@ class Tails(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of one track."""
+    """Work arrays for one track of n ends."""
 
     views: Views
     G: FloatArray
@@ -352,73 +360,38 @@ def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, 
             out[i] += weight * (row[i] - xs[i] * a - ys[i] * b - zs[i] * c)
 
 
-_TAILS = (3.0, 5.0, 10.0, 30.0)
-"""Degrees of freedom to choose from, as in ``heavy_tails``."""
-REACH = 10.0
-"""Errors, in scales, beyond which a track is wrong."""
-LEAST_SCALE_PX = 1e-3
-
-
 def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:
-    """Distribution of errors, and which tracks (n,) are right, 1 or 0.
+    """Distribution of errors of largest likelihood, and which tracks (n,) are right, 1 or 0.
 
     Args:
         used: degrees of freedom that the trajectory has taken.
     """
-    scale = tails.scale
-    near = squares <= freedom * (REACH * scale) ** 2
+    near = squares <= freedom * (REACH * tails.scale) ** 2
     if not np.any(near):
         return tails, np.ones(len(squares))
     q, p = squares[near], freedom[near]
     left = max(float(np.sum(p)) - used, 0.1 * float(np.sum(p)))
-    found = [Tails(nu, _scale(q, p, nu, scale, left)) for nu in _TAILS]
-    best = max(found, key=lambda each: _likelihood(q, p, each))
+    best = Tails(*t_distribution(q, p, tails.scale, left, LEAST_SCALE_PX))
     return best, (squares <= freedom * (REACH * best.scale) ** 2).astype(np.float64)
-
-
-def _scale(q: FloatArray, p: FloatArray, nu: float, scale: float, left: float) -> float:
-    """Of the largest likelihood (parameter-expanded EM, see ``heavy_tails``)."""
-    count = len(p) + (float(np.sum(p)) - left) / nu
-    for _ in range(50):
-        weights = (nu + p) / (nu + q / scale**2)
-        last, scale = scale, max(float(np.sqrt(weights @ q / left * count / np.sum(weights))), LEAST_SCALE_PX)
-        if abs(scale - last) <= 1e-4 * scale:
-            break
-    return scale
-
-
-def _likelihood(q: FloatArray, p: FloatArray, tails: Tails) -> float:
-    """Logarithm, without terms that are the same for all."""
-    nu, scale = tails
-    gammaln = scipy.special.gammaln
-    norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
-    return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(q / (nu * scale**2))))
-
-
-IntArray = NDArray[np.int64]
-ENOUGH = 400
-"""Tracks of a window from which on its pairs say little more, and take longer than all else."""
-LONGEST = 5
-"""Frames of a track: more would couple more control poses for little."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Past:
-    """What matches that are gone say of the first control poses of a spline: a quadratic cost."""
+    """The summary of matches that have left, for the first control poses of a spline: a quadratic cost."""
 
     R: FloatArray
-    """(k, 3, 3) the control poses about which it is known."""
+    """(k, 3, 3) the control poses at which the cost was expanded."""
     p: FloatArray
     """(k, 3)."""
     gradient: FloatArray
-    """(6 k,), and where there is a gyroscope more, of its errors."""
+    """(6 k,), followed by those of the errors of a gyroscope, where there is one."""
     H: FloatArray
     """(6 k, 6 k), likewise."""
     errors: FloatArray | None = None
-    """(m,) of the gyroscope, about which it is known."""
+    """(m,) of the gyroscope, at which the cost was expanded."""
 
     def without_gyro(self) -> Past:
-        """The same of the control poses alone, whatever the errors of a gyroscope are."""
+        """The cost of the control poses alone, with the errors of a gyroscope eliminated."""
         if self.errors is None:
             return self
         k = 6 * len(self.p)
@@ -430,7 +403,7 @@ class Past:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TimedTracks:
-    """Tracks, as ``trajectory_tracks.add_tracks`` takes them."""
+    """Tracks, as ``add_tracks`` takes them."""
 
     ends: FloatArray
     """(e, 10)."""
@@ -441,11 +414,11 @@ class TimedTracks:
     focal: FloatArray
     """(2,) fx, fy, px."""
     past: Past | None = None
-    """Of the tracks of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
+    """Summary of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
     share: float = 1.0
-    """What a track counts beside the prior: less than 1 where errors of neighbouring tracks are alike."""
+    """Weight of a track beside the prior: less than 1 where neighbouring tracks have common errors."""
     gyro: GyroSteps | None = None
-    """What a gyroscope says of the times that the spline lasts; None: there is none."""
+    """Turns by a gyroscope while the spline lasts; None: there is none."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -463,7 +436,7 @@ class TimedTracks:
 
 
 def thinned(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
-    """About so many tracks of each window, and no pairs where there are as many as that; of one camera, pairs."""
+    """About ``count`` tracks of each window, and pairs only where there are fewer tracks; of one camera, pairs."""
     if is_of_one_camera(windows):
         return [Correspondences(left=each.left[:: max(len(each.left) // count, 1)]) for each in windows]
     few = [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
@@ -475,8 +448,8 @@ def is_of_one_camera(windows: Sequence[Correspondences]) -> bool:
     return not any(len(each.tracks) or len(each.right) for each in windows)
 
 
-def telling(window: Correspondences) -> Correspondences:
-    """What is looked at of a window: its tracks alone, where there are enough."""
+def informative(window: Correspondences) -> Correspondences:
+    """The part of a window that is used: its tracks alone, where there are enough."""
     return Correspondences(tracks=window.tracks) if len(window.tracks) >= ENOUGH else window
 
 
@@ -492,18 +465,22 @@ def pack_windows(
     """The tracks of windows, and their pairs that no track repeats; window k is of the frames k and k + 1.
 
     Args:
-        right: for each window, which of its members (m,) are right (not 0): of those, ones that meet in a frame
-            are one track; None: none is linked to another.
+        right: for each window, which of its members (m,) are right (not 0): right ones that meet in a frame are
+            one track; None: none is linked to another.
         first: number of the first window.
-        past: of those before.
-        share: what a track counts beside the prior.
+        past, share: as in ``TimedTracks``.
     """
     members = [np.zeros(0, dtype=np.int64) for _ in windows]
     ends, owners = list[FloatArray](), list[IntArray]()
     count = offset = 0
     for sides in (SIDES, SIDES[:1], SIDES[1:]):
-        pixels = [_pixels(window, sides) for window in windows]
-        known = [_known(right, k, len(members[k]), len(rows)) for k, rows in enumerate(pixels)]
+        if len(sides) == 2:
+            pixels = [window.tracks for window in windows]
+        else:  # pairs that no track repeats
+            pixels = [getattr(window, sides[0])[unlinked_pairs(window, sides[0])] for window in windows]
+        known = [np.zeros(len(rows), dtype=np.bool_) for rows in pixels]
+        if right is not None:
+            known = [right[k][len(members[k]) :][: len(rows)] != 0.0 for k, rows in enumerate(pixels)]
         numbers, count = _numbered(pixels, known, offset)
         for k, own in enumerate(numbers):
             new = own >= 0 if k == 0 else ~np.isin(own, numbers[k - 1])
@@ -528,30 +505,15 @@ def pack_windows(
     )
 
 
-def _known(right: Sequence[FloatArray] | None, window: int, first: int, count: int) -> BoolArray:
-    return np.zeros(count, dtype=np.bool_) if right is None else right[window][first : first + count] != 0.0
-
-
-def _pixels(window: Correspondences, sides: Sequence[Side]) -> FloatArray:
-    """Tracks (n, 8), or pairs (n, 4) that no track repeats."""
-    if len(sides) == 2:
-        return window.tracks
-    pairs: FloatArray = getattr(window, sides[0])
-    return pairs[unlinked_pairs(window, sides[0])]
-
-
 def _numbered(pixels: Sequence[FloatArray], right: Sequence[BoolArray], first: int) -> tuple[list[IntArray], int]:
     """Numbers (n,) of the tracks that the rows of each window belong to, from ``first`` on, and the next number.
 
-    A row that is right goes on with such a track of the window before that ends where it begins, if that has fewer
-    than ``LONGEST`` frames.
+    A right row continues a right track of the window before that ends where it begins, if that has fewer than
+    ``LONGEST`` frames.
     """
     out, count = list[IntArray](), first
-    numbers, lengths, ends = (
-        np.zeros(0, dtype=np.int64),
-        np.zeros(0, dtype=np.int64),
-        pixels[0][:0, : pixels[0].shape[1] // 2],
-    )
+    numbers = lengths = np.zeros(0, dtype=np.int64)
+    ends = pixels[0][:0, : pixels[0].shape[1] // 2]
     for rows, known in zip(pixels, right, strict=True):
         half = rows.shape[1] // 2
         open_ = np.flatnonzero(lengths < LONGEST)

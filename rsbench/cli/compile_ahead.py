@@ -51,7 +51,7 @@ def compile_all(line: int) -> None:
 def parts() -> list[Callable[[], object]]:
     """Calls that compile the spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-    from rsbench.capture.two_frame_spline import shaken_motion
+    from rsbench.capture.two_frame_spline import two_frame_spline
     from rsbench.components.motion_models import LinearMotion
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.rig import FRAMES, StereoRig
@@ -82,7 +82,7 @@ def parts() -> list[Callable[[], object]]:
         return correct_frames(images, (first, second), rig, shutter, motion, options)
 
     return [
-        lambda: shaken_motion(data.correspondences, rig, shutter, motion),
+        lambda: two_frame_spline(data.correspondences, rig, shutter, motion),
         lambda: find_depth(images, rig, shutter, motion, options),
         corrected,
         lambda: solve_frames(data.correspondences, rig, shutter.readout_ratio, options),

@@ -22,7 +22,7 @@ from rsbench.capture.shutter_decision import (
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
-from rsbench.capture.two_frame_spline import log_odds_of_opposite, shaken_motion
+from rsbench.capture.two_frame_spline import log_odds_of_opposite, two_frame_spline
 from rsbench.components.motion_models import load_kernel
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
@@ -144,7 +144,7 @@ def or_spline(
     seed: int,
 ) -> tuple[RobustEstimate, ModelChoice | None, Motion]:
     """An answer of a solver that ``takes_models``, or in its place a spline, where the matches ask for it."""
-    found = shaken_motion(matches, rig, shutter, law, seed)
+    found = two_frame_spline(matches, rig, shutter, law, seed)
     if found is None or found.probability < CERTAIN:
         return robust, choice, law
     motion = found.motion

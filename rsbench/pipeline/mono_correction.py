@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.two_frame_spline import way_of_two
+from rsbench.capture.two_frame_spline import camera_two_frame_spline
 from rsbench.components.motion_models import InertialMotion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -147,12 +147,12 @@ def by_asked_law(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, see
 
 
 def as_asked(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
-    """As ``by_asked_law``, or shaken, where two frames show how (``way_of_two``)."""
+    """As ``by_asked_law``, or shaken, where two frames show how (``camera_two_frame_spline``)."""
     lawful = by_asked_law(found, flows, robust, seed)
     own = lawful.own
     if lawful.robust is None or own.motion is None:
         return lawful
-    way = way_of_two(way_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
+    way = camera_two_frame_spline(way_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
     return lawful if way is None else on_way(lawful, way)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import scans_of
-from rsbench.capture.sequence_shutter import LONGEST, capture_along
+from rsbench.capture.sequence_shutter import LONGEST, capture_of_video
 from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
     NoMotionError,
@@ -118,7 +118,7 @@ def _found(
 ) -> FoundShutter:
     """The shutter that the frames show: many in a row along one way, else each two under laws of motion."""
     run, camera = _in_a_row(frames, card, seed, advance)
-    along = capture_along(run, camera, card.scan, seed) if len(run) >= _LEAST_IN_A_ROW else None
+    along = capture_of_video(run, camera, card.scan, seed) if len(run) >= _LEAST_IN_A_ROW else None
     if along is not None:
         return _settled(along, camera, card)
     known, windows, camera, why = known_alone(card.scan), list[Window](), None, ""

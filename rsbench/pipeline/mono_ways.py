@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from rsbench.capture.two_frame_spline import trajectory_alone
+from rsbench.capture.two_frame_spline import camera_trajectory
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.mono_correction import FoundOwnMotion, on_way
@@ -92,7 +92,9 @@ def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
     owns = [pair.found.own for _, pair in run if pair.found is not None]
     if len(run) < _FEWEST or owns[0].shutter.readout_ratio == 0.0:
         return {}
-    ways = trajectory_alone([pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter)
+    ways = camera_trajectory(
+        [pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter
+    )
     out = dict[int, FoundOwnMotion]()
     for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
         errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (way, steady)]

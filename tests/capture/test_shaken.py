@@ -9,7 +9,7 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import MODELS
 from rsbench.capture.shutter_decision import NoMotionError
-from rsbench.capture.two_frame_spline import shaken_motion
+from rsbench.capture.two_frame_spline import two_frame_spline
 from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -168,7 +168,7 @@ def test_few_tracks_and_a_global_shutter_ask_for_none() -> None:
     law = make_motion("linear", [0.0, 0.02, 0.0], [0.1, 0.0, 0.1])
     still = RollingShutter(height=HEIGHT, readout_ratio=0.0)
     few = Correspondences(tracks=window.tracks[:20])
-    assert shaken_motion(window, RIG, still, law) is None and shaken_motion(few, RIG, SHUTTER, law) is None
+    assert two_frame_spline(window, RIG, still, law) is None and two_frame_spline(few, RIG, SHUTTER, law) is None
 
 
 def test_a_rig_that_slows_down_is_told_from_any_start() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.capture.sequence_shutter import capture_along
+from rsbench.capture.sequence_shutter import capture_of_video
 from rsbench.capture.trajectory_spline import ContinuousMotion
-from rsbench.capture.two_frame_spline import trajectory_alone, way_of_two
+from rsbench.capture.two_frame_spline import camera_trajectory, camera_two_frame_spline
 from rsbench.components.motion_models import InertialMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
@@ -75,7 +75,7 @@ def test_a_way_follows_what_a_camera_trembles(shake: float) -> None:
     rng = np.random.default_rng(1)
     windows = windows_of(8, shake, 0.1, rng)
     even = InertialMotion(W, -V)
-    ways = trajectory_alone(windows, [even] * 8, RIG, SHUTTER)
+    ways = camera_trajectory(windows, [even] * 8, RIG, SHUTTER)
     assert ways is not None and len(ways) == 8
     errors = [turned_deg(way, k, shake) for k, way in enumerate(ways)]
     assert np.median(errors) < 0.03 and np.max(errors) < 0.06
@@ -101,19 +101,23 @@ def test_two_frames_are_believed_that_they_shook_where_they_show_it(shake: float
     for seed in range(3):
         (matches,) = windows_of(1, shake, 0.1, np.random.default_rng(seed))
         law = law_of(matches)
-        way = way_of_two(matches, law, RIG, SHUTTER)
+        way = camera_two_frame_spline(matches, law, RIG, SHUTTER)
         assert (way is not None) == (shake == 0.001)
         if way is not None:
             assert np.linalg.norm(way.d) == pytest.approx(1.0, abs=1e-9)
             assert turned_deg(way, 0, shake) < 0.7 * turned_deg(law, 0, shake)
-            assert way_of_two(matches[:15], law, RIG, SHUTTER) is None
-            assert way_of_two(matches, law, RIG, RollingShutter(height=480, readout_ratio=0.0)) is None
+            assert camera_two_frame_spline(matches[:15], law, RIG, SHUTTER) is None
+            assert (
+                camera_two_frame_spline(matches, law, RIG, RollingShutter(height=480, readout_ratio=0.0)) is None
+            )
 
 
 def test_wrong_matches_of_two_frames_are_no_way() -> None:
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        assert way_of_two(rng.uniform(0.0, 480.0, (300, 4)), InertialMotion(W, -V), RIG, SHUTTER) is None
+        assert (
+            camera_two_frame_spline(rng.uniform(0.0, 480.0, (300, 4)), InertialMotion(W, -V), RIG, SHUTTER) is None
+        )
 
 
 @pytest.mark.slow
@@ -123,7 +127,7 @@ def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None
     windows = windows_of(7, 0.01, 0.1, np.random.default_rng(4))
     if backwards:
         windows = [each[:, [2, 3, 0, 1]] for each in windows[::-1]]
-    capture = capture_along(windows, RIG.camera, None)
+    capture = capture_of_video(windows, RIG.camera, None)
     assert capture is not None and capture.likeliest is not None
     best = capture.likeliest
     assert best.scans.left == ("bottom" if backwards else "top") and best.probability > 0.99
@@ -135,8 +139,8 @@ def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None
 def test_wrong_matches_tell_nothing() -> None:
     for seed in (5, 6):  # of two ways: few that fit exactly, and all under much noise
         rng = np.random.default_rng(seed)
-        assert capture_along([rng.uniform(0.0, 480.0, (60, 4)) for _ in range(6)], RIG.camera, "top") is None
-    assert capture_along([np.zeros((0, 4))] * 6, RIG.camera, "top") is None
+        assert capture_of_video([rng.uniform(0.0, 480.0, (60, 4)) for _ in range(6)], RIG.camera, "top") is None
+    assert capture_of_video([np.zeros((0, 4))] * 6, RIG.camera, "top") is None
 
 
 def test_a_motion_is_the_same_in_other_axes_and_units() -> None:

@@ -13,7 +13,7 @@ from rsbench.capture.trajectory_estimate import (
     estimate_trajectory,
     stream_trajectory,
 )
-from rsbench.capture.trajectory_fit import ANCHORED, held, normal_equations, window_motions
+from rsbench.capture.trajectory_fit import ANCHORED, anchored, normal_equations, window_motions
 from rsbench.capture.trajectory_gyro import (
     ERRORS,
     Border,
@@ -151,7 +151,7 @@ def test_windows_that_leave_and_those_that_stay_say_together_what_all_said() -> 
     def equations(curve: Curve, some: TimedTracks, trust: FloatArray) -> tuple[FloatArray, FloatArray]:
         here = normal_equations(curve, some, found.tails, found.prior, trust, drift=found.drift)
         assert here.border is not None
-        return dense(held(here, curve, some, ANCHORED), here.border), here.slope
+        return dense(anchored(here, curve, some, ANCHORED), here.border), here.slope
 
     H, slope = equations(found.curve, tracks, found.trust)
     state.leave(found, tracks, 3)
@@ -163,7 +163,7 @@ def test_windows_that_leave_and_those_that_stay_say_together_what_all_said() -> 
     trust = np.concatenate([found.trust[each] for each in tracks.members[3:]])
     ours, own_slope = equations(state.curve, rest, trust)
     scale = np.sqrt(np.diagonal(ours))
-    # The pose at time 0 is held by 1e4 of the most certain control pose, which is another one of fewer windows.
+    # The pose at time 0 has 1e4 times the precision of the most certain control pose: another one here.
     wanted = H[m:, m:] - H[m:, :m] @ solved[:, :-1]
     np.testing.assert_allclose(ours / scale / scale[:, None], wanted / scale / scale[:, None], atol=1e-3)
     np.testing.assert_allclose(own_slope / scale, (slope[m:] - H[m:, :m] @ solved[:, -1]) / scale, atol=0.05)

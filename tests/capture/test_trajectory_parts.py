@@ -9,7 +9,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 from shaken_rig import RIG, SHUTTER, matches, sines
 
-from rsbench.capture.trajectory_fit import NORMAL, information, normal_equations
+from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, normal_equations
 from rsbench.capture.trajectory_spline import (
     ContinuousMotion,
     Curve,
@@ -26,7 +26,7 @@ from rsbench.capture.trajectory_spline import (
     roughness,
     whitening,
 )
-from rsbench.capture.trajectory_tracks import ENOUGH, Tails, pack_windows, telling
+from rsbench.capture.trajectory_tracks import ENOUGH, Tails, informative, pack_windows
 from rsbench.components.motion_models import LinearMotion, motion_record, read_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.so3 import FloatArray
@@ -151,7 +151,8 @@ def test_half_a_share_is_half_the_information() -> None:
     wide = normal_equations(curve, whole, Tails(NORMAL, 0.3 * np.sqrt(2.0)), prior, trust)
     for a, b in ((shared.cost, wide.cost), (shared.gradient, wide.gradient), (shared.band, wide.band)):
         np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-4 * np.max(np.abs(b)))  # nearly normal: nu is 1e9
-    one, other = (information(curve, each, Tails(5.0, 0.3), prior, trust)[0] for each in (half, whole))
+    found = Fit(curve=curve, tails=Tails(5.0, 0.3), prior=prior, trust=trust, equations=shared)
+    one, other = (covariance_band(found, each) for each in (half, whole))
     np.testing.assert_array_equal(one, other)
 
 
@@ -159,8 +160,8 @@ def test_pairs_of_windows_with_tracks_enough_are_left_out() -> None:
     rng = np.random.default_rng(7)
     pairs, tracks = rng.uniform(0.0, 470.0, (5, 4)), rng.uniform(0.0, 470.0, (ENOUGH, 8))
     few = Correspondences(left=pairs, tracks=tracks[1:])
-    assert telling(few) is few
-    many = telling(Correspondences(left=pairs, tracks=tracks))
+    assert informative(few) is few
+    many = informative(Correspondences(left=pairs, tracks=tracks))
     assert len(many.tracks) == ENOUGH and len(many.left) == 0
 
 

@@ -11,18 +11,7 @@ from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.shutter import Scanning
 
-NOTHING = Capture(
-    candidates=(),
-    models={},
-    peaks={},
-    reason="nothing",
-    named=False,
-    windows=0,
-    matches=0,
-    used=0,
-    noise_px=float("nan"),
-    moved_px=20.0,
-)
+NOTHING = Capture(reason="nothing", matches=0, moved_px=20.0)
 
 
 def test_a_sequence_shows_the_ratio_that_its_windows_do_not() -> None:

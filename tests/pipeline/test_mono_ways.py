@@ -122,9 +122,9 @@ def test_a_pair_that_a_way_does_not_explain_keeps_its_own_motion(monkeypatch: py
         matches=np.concatenate([here, here + np.array([6.0, 0.0])], axis=1),
     )
     along, across = InertialMotion([0.0] * 3, [-1.0, 0.0, 0.0]), InertialMotion([0.0] * 3, [0.0, 1.0, 0.0])
-    monkeypatch.setattr(mono_ways, "trajectory_alone", lambda *rest: [along, across, along])
+    monkeypatch.setattr(mono_ways, "camera_trajectory", lambda *rest: [along, across, along])
     told = list(on_ways([pair] * 3))
     assert [each is pair.found for each in told] == [False, True, False]
     assert all(each is pair.found for each in on_ways([pair] * 2))
-    monkeypatch.setattr(mono_ways, "trajectory_alone", lambda *rest: None)
+    monkeypatch.setattr(mono_ways, "camera_trajectory", lambda *rest: None)
     assert all(each is pair.found for each in on_ways([pair] * 3))

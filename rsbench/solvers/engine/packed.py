@@ -444,16 +444,26 @@ def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed
         near = means <= (_REACH * scale) ** 2
         if np.count_nonzero(near) < _FEWEST:
             return None
-        nu, scale = _distribution(each.squares[near], freedom[near], scale)
+        left = max(float(np.sum(freedom[near])) - _PARAMETERS, 1.0)
+        nu, scale = t_distribution(each.squares[near], freedom[near], scale, left)
     near = means <= (_REACH * scale) ** 2
     tailed = HeavyTailed(**vars(packed.only(near)), nu=nu, scale=scale, trust=np.ones(np.count_nonzero(near)))
     each = Each(*(part[near] for part in each))
     return replace(tailed, trust=_bounded(tailed, theta, each, tailed.weights(each.squares)))
 
 
-def _distribution(squares: FloatArray, p: FloatArray, scale: float) -> tuple[float, float]:
-    """nu and s of the largest likelihood."""
-    found = [(nu, _scale(squares, p, nu, scale)) for nu in _TAILS]
+def t_distribution(
+    squares: FloatArray, p: FloatArray, scale: float, freedom: float, least: float = _LEAST_SCALE_PX
+) -> tuple[float, float]:
+    """nu and s of the largest likelihood.
+
+    Args:
+        squares: (n,) squared errors of measurements, px^2, of p (n,) residuals each.
+        scale: a first guess of s, px.
+        freedom: residuals less the degrees of freedom that the fit has taken.
+        least: of s.
+    """
+    found = [(nu, _scale(squares, p, nu, scale, freedom, least)) for nu in _TAILS]
     return max(found, key=lambda tails: _likelihood(squares, p, *tails))
 
 
@@ -461,18 +471,17 @@ def _freedom(packed: Packed) -> FloatArray:
     return np.repeat([float(_PAIR_FREEDOM), float(_TRACK_FREEDOM)], [len(packed.pairs), len(packed.tracks)])
 
 
-def _scale(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> float:
-    """Scale of the largest likelihood; the motion has taken six degrees of freedom.
+def _scale(squares: FloatArray, p: FloatArray, nu: float, scale: float, freedom: float, least: float) -> float:
+    """Scale of the largest likelihood.
 
     By the parameter-expanded EM algorithm, in half the steps of the plain one: the mean that weights have in the
     end is known, and a step divides by the one they have (C. Liu, D. Rubin, Y. Wu, Biometrika 1998).
     """
-    freedom = max(float(np.sum(p)) - _PARAMETERS, 1.0)
     count = len(p) + (float(np.sum(p)) - freedom) / nu
     for _ in range(_SCALE_STEPS):
         weights = (nu + p) / (nu + squares / scale**2)
         last, scale = scale, float(np.sqrt(weights @ squares / freedom * count / np.sum(weights)))
-        scale = max(scale, _LEAST_SCALE_PX)
+        scale = max(scale, least)
         if abs(scale - last) <= _SCALE_FLAT * scale:
             break
     return scale
