@@ -28,12 +28,12 @@ from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
 from rsbench.solvers.engine.packed import (
     HeavyTailed,
     Packed,
-    _distribution,
     damped_step,
     each_term,
     heavy_tailed,
     pack,
     solve_triples,
+    t_distribution,
 )
 from rsbench.solvers.refined import RefinedSolver
 
@@ -379,14 +379,14 @@ def test_the_terms_of_each_sum_to_the_normal_equations() -> None:
 def test_the_distribution_is_that_of_scipy(nu: float) -> None:
     """Of one residual each; the six parameters of a motion are 0.15 % of 2000, and the scale feels twice that."""
     x = 0.2 * np.random.default_rng(0).standard_t(nu, 2000)
-    found, scale = _distribution(x**2, np.ones(2000), 1.0)
+    found, scale = t_distribution(x**2, np.ones(2000), 1.0, 1994.0)
     assert found == nu
     assert scale == pytest.approx(t.fit(x, fdf=nu, floc=0.0)[2], rel=4e-3)
 
 
 def test_normal_errors_have_no_tails() -> None:
     rng = np.random.default_rng(0)
-    nu, scale = _distribution(0.04 * rng.chisquare(5, 1000), np.full(1000, 5.0), 1.0)
+    nu, scale = t_distribution(0.04 * rng.chisquare(5, 1000), np.full(1000, 5.0), 1.0, 4994.0)
     # A t distribution of 30 degrees is wider by sqrt(30 / 28); the standard error of 5000 residuals is 1 %.
     assert nu == 30.0 and scale * np.sqrt(30 / 28) == pytest.approx(0.2, rel=0.03)
 
