@@ -20,10 +20,9 @@ from pathlib import Path
 from rsbench.components.cards import load_card
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.channels import CHANNELS
+from rsbench.dataset.channels import CHANNELS, write_sequence_channels
 from rsbench.dataset.generation import build_scene, render_camera
-from rsbench.dataset.layout import files_of
-from rsbench.dataset.sequence_channels import write_sequence_channels
+from rsbench.dataset.sequence import files_of
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Viewpoint

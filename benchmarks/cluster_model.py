@@ -141,7 +141,7 @@ def _command_alone() -> tuple[float, float]:
     """Seconds, for each of many made-up sequences of as many files: when it is finished, and in the manifest."""
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.destinations import folder_destination
-    from rsbench.dataset.layout import files_of
+    from rsbench.dataset.sequence import files_of
     from rsbench.storage.files import sha256, write_json
 
     card = load_dataset_card(CARD)

@@ -27,9 +27,10 @@ from traced_truth import truth
 
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
-from rsbench.dataset.channels import PAIR_CHANNELS, PixelClass, pair_layers
+from rsbench.dataset.channels import PAIR_CHANNELS, pair_layers
 from rsbench.dataset.generation import build_scene, generate_dataset
 from rsbench.dataset.sequence import read_dataset
+from rsbench.dataset.views import PixelClass
 
 Array = NDArray[np.float64]
 NEAR_PX, ENOUGH = 0.01, 0.999

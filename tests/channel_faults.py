@@ -12,17 +12,11 @@ from attack.planting import drop, manifest_of, put
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.dataset.channels import (
-    AFFINE,
-    COMPONENTS,
-    MATCHER,
-    TRACKS,
-    PixelClass,
-    matches_file,
-)
+from rsbench.dataset.channels import AFFINE, COMPONENTS, MATCHER, TRACKS, matches_file
 from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled, save_matches
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.tracks import AffineFrames, jacobians_of, save_affine
+from rsbench.dataset.views import PixelClass
 from rsbench.renderers.image import to_srgb8
 from rsbench.storage.files import (
     read_depth,

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from traced_truth import Array, first_hit, look, rays
 
-from rsbench.dataset.channels import PairChannel, PixelClass
+from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.sequence import Sequence as Recorded
+from rsbench.dataset.views import PixelClass
 
 
 class Thing(NamedTuple):

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rsbench.dataset.channels import PairChannel, PixelClass
+from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.views import PixelClass
 
 Array = NDArray[np.float64]
 FirstHit = Callable[[Array, Array], Array]

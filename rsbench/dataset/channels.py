@@ -1,69 +1,101 @@
-"""Channels of ground truth that a card may ask for beside images, depth and poses: names, files and values."""
+"""Channels of truth beside images, depth and poses: each is an object that makes, writes and reads its files.
+
+A new channel is a class here and an entry of ``OBJECTS``. ``rsbench verify`` then looks for its files and compares
+rows of it with what rays meet; a check of its own is a row in ``rsbench/verification/checks.py``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
-from enum import IntEnum
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES, View, views_of
-from rsbench.dataset.imu import IMU_FILES
-from rsbench.dataset.timing import timing_files
+from rsbench.core.geometry import FixedGeometry, Geometry
+from rsbench.core.rig import FRAMES, VIEWS, Side, StereoRig, View, views_of
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.imu import (
+    IMU_FILES,
+    IMU_MANIFEST,
+    Imu,
+    ImuSamples,
+    draw_samples,
+    gravity_of,
+    read_imu,
+    sample_times_ns,
+    write_imu,
+)
+from rsbench.dataset.layout import frames_of
+from rsbench.dataset.matches import (
+    LabelledMatches,
+    Matching,
+    make_matches,
+    matcher_record,
+    read_matches,
+    save_matches,
+)
+from rsbench.dataset.timing import TIMING_MANIFEST, read_timing_table, table_file, timing_files, write_timing
+from rsbench.dataset.tracks import (
+    AffineFrames,
+    Tracks,
+    make_affine,
+    make_tracks,
+    read_affine,
+    read_tracks,
+    save_affine,
+    write_tracks,
+)
+from rsbench.dataset.views import (
+    ImageView,
+    PixelClass,
+    Rays,
+    SeenSurfaces,
+    carry,
+    numbers_of,
+    pair_truth,
+    surface_truth,
+)
+from rsbench.storage.files import (
+    Later,
+    begun,
+    read_depth,
+    read_exr,
+    read_grey_png,
+    read_json,
+    read_png,
+    write_exr,
+    write_json,
+    write_png,
+    write_png16,
+)
+from rsbench.storage.untrusted_files import inside
+
+if TYPE_CHECKING:
+    from rsbench.dataset.card import DatasetCard, SequenceCard
+    from rsbench.renderers.render import Frame
+    from rsbench.renderers.scene import MitsubaScene
+    from rsbench.renderers.visibility import Surfaces
 
 PairChannel = Literal["disparity", "flow", "gs_flow"]
 """Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
 (disparity), of the same camera at the next time (flow; of the last frame, at the time before), and of its
 global-shutter twin (gs_flow)."""
-Channel = Literal[
-    "disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "tracks", "affine", "hdr", "matches"
-]
-
+PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 INSTANCE_TABLE, TRACKS, AFFINE = "instances.json", "tracks.npz", "affine.npz"
 MATCHER = "matches/matcher.json"
-PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
-CHANNELS: tuple[Channel, ...] = get_args(Channel)
 COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
 """Names of the float32 channels of the EXR files."""
-
 NORMAL_COMPONENTS = ("x", "y", "z")
 RADIANCE_COMPONENTS = ("R", "G", "B")
 STEP_PX = 2.0**-10
 """Values are rounded to multiples of it, which makes the files four times smaller."""
-
-
-class PixelClass(IntEnum):
-    """What became of a pixel's surface in the other picture: the values of a mask."""
-
-    UNSOLVED = 0
-    """The row that sees it could not be found; no value."""
-    VISIBLE = 1
-    OCCLUDED = 2
-    """In view, but something nearer hides it."""
-    OUT_OF_VIEW = 3
-    """Beside the picture or behind the camera, sky too."""
-    SKY = 4
-    """No surface here, and none there: the value is that of the direction."""
-    SKY_OCCLUDED = 5
-    """No surface here, but one there."""
-
-
-def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
-    """Whether cameras can have these channels: with a lens or not, reading rows from the top together or not.
-
-    Raises:
-        ValueError: one line with the channel.
-    """
-    if "affine" in names and "tracks" not in names:
-        raise ValueError("channels: 'affine' is of the points of 'tracks': ask for both")
-    if "disparity" not in names:
-        return
-    if not plain:
-        raise ValueError(
-            "channels: 'disparity' is made of cameras that read rows from the top at once, and no other"
-        )
-    if lens:
-        raise ValueError("channels: 'disparity' is made of cameras without a lens, whose pairs share their rows")
+_BRIGHTEST = float(np.finfo(np.float16).max)
 
 
 class Layer(NamedTuple):
@@ -91,15 +123,394 @@ class Layer(NamedTuple):
         return f"/{self.row:04d}" if self.row else ""
 
     def views(self, frames: int) -> tuple[View, ...]:
-        """Of a sequence of so many frames those that it leads from."""
+        """The views from which it leads, in a sequence of so many frames."""
         return tuple(view for view in views_of(frames) if not self.back or 0 < view[1] < frames - 1)
+
+    def target(self, source: ImageView, frames: int) -> ImageView:
+        """The picture in which it looks for the pixels of a frame, in a sequence of so many frames."""
+        twin = source.other_shutter._replace(row=self.row)
+        over_time = source.frame_before if self.back else source.next_frame(frames)
+        return {"disparity": source.other_side, "flow": over_time, "gs_flow": twin}[self.channel]
 
 
 def pair_layers(names: Collection[str], twins: Iterable[int], frames: int = len(FRAMES)) -> list[Layer]:
-    """Of the channels of these names in a sequence of so many frames."""
-    layers = [Layer(channel) for channel in PAIR_CHANNELS if channel in names]
-    back = [Layer("flow", back=True)] if "flow" in names and frames > len(FRAMES) else []
-    return [*layers, *back, *(Layer("gs_flow", row) for row in twins if "gs_flow" in names)]
+    """The layers of the channels of these names in a sequence of so many frames, channel by channel."""
+    layers: list[Layer] = []
+    for channel in PAIR_CHANNELS:
+        if channel in names:
+            layers.append(Layer(channel))
+            layers += [Layer("flow", back=True)] if channel == "flow" and frames > len(FRAMES) else []
+            layers += [Layer("gs_flow", row) for row in twins if channel == "gs_flow"]
+    return layers
+
+
+class FrameTruth:
+    """What the channels of one rolling-shutter frame are made of.
+
+    Args:
+        geometry: of the sequence.
+        view: the frame.
+        rendered: its light and depth; of some ``rows``, theirs.
+        rays: through its scene; used by this thread alone.
+        names: of channels that will be made.
+        twins: rows of global-shutter twins to which ``gs_flow`` leads too.
+        rows: these rows of the frame only; all by default.
+        later: starts work in other threads (``background_writer``); by default there are none.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        view: ImageView,
+        rendered: Frame,
+        rays: Rays,
+        names: Collection[str],
+        twins: Iterable[int] = (),
+        rows: Sequence[int] | None = None,
+        later: Later | None = None,
+    ) -> None:
+        self.geometry, self.view, self.rendered, self.rays, self._rows = geometry, view, rendered, rays, rows
+        frames = geometry.frames
+        layers = [each for each in pair_layers(names, twins, frames) if view[1:3] in each.views(frames)]
+        self._layers = [(layer, layer.target(view, frames)) for layer in layers]
+        targets = [target for _, target in self._layers]
+        if later is None or not targets:
+            self._carried = (carry(self.seen, target) for target in targets)
+        else:
+            seen = self.seen  # before threads would make it at the same time
+            self._carried = begun(later, lambda target: carry(seen, target), targets)
+
+    @cached_property
+    def seen(self) -> SeenSurfaces:
+        numbers = numbers_of(self.rendered.labels)
+        return SeenSurfaces(self.geometry, self.view, self.rendered.depth, self._rows, numbers)
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        return surface_truth(self.seen, self.rays)
+
+    def pairs(self, channel: str) -> Iterator[tuple[Layer, FloatArray, NDArray[np.uint8]]]:
+        """Offsets (H, W, 2), px, and ``PixelClass`` (H, W) of each layer; called in the order of ``OBJECTS``."""
+        for layer, target in self._layers:
+            if layer.channel == channel:
+                truth = pair_truth(self.seen, target, next(self._carried), self.rays.blocked)
+                yield layer, truth.offset, truth.classes
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceTruth:
+    """What the channels of a whole sequence are made of, when its frames are there."""
+
+    folder: Path
+    card: DatasetCard
+    sequence: SequenceCard
+    scene: MitsubaScene
+    record: Mapping[str, Any]
+    """What sequence.json says of the scene."""
+    rays: Any
+    """``SceneRays`` through the scene."""
+
+    @cached_property
+    def geometry(self) -> FixedGeometry:
+        card, sequence = self.card, self.sequence
+        return FixedGeometry(
+            card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence), card.frames
+        )
+
+    @property
+    def seed(self) -> str:
+        return f"{self.card.seed_of(self.sequence)}/{self.sequence.name}"
+
+    @cached_property
+    def tracks(self) -> Tracks:
+        views = views_of(self.card.frames)
+        depths = {view: read_depth(self.folder / ImageView("rs", *view).depth) for view in views}
+        return make_tracks(self.geometry, depths, self.rays.blocked, self.seed)
+
+
+class TruthChannel:
+    """One channel of ground truth."""
+
+    name: ClassVar[str] = ""
+    knows_movement: ClassVar[bool] = True
+    """Whether it is right where objects move."""
+    of_pairs: ClassVar[bool] = False
+    """Whether a pair of successive frames (``Sequence.pairs``) has it too."""
+    rounding: ClassVar[float | None] = None
+    """Largest difference between a stored value of a frame and one that rays make again; None: not compared."""
+
+    def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
+        """Why cameras cannot have it beside the channels of these ``names``; "" where they can.
+
+        ``lens``: they have one; ``plain``: both read rows from the top at the same time.
+        """
+        return ""
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        """Paths below the folder of a sequence."""
+        raise NotImplementedError
+
+    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
+        """File and values (H, W, ...) of one frame."""
+        return ()
+
+    def write_values(self, path: Path, values: NDArray[Any]) -> None:
+        """Write what ``made`` gives: float32 as EXR with these components, whole numbers as PNG."""
+        if path.suffix == ".png":
+            (write_png16 if values.dtype == np.uint16 else write_png)(path, values)
+        else:
+            write_exr(path, {name: values[..., k] for k, name in enumerate(self.components)})
+
+    components: ClassVar[tuple[str, ...]] = ()
+
+    def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
+        """What ``write_values`` wrote, of a camera of this size (width, height); RsbenchError for another file."""
+        return read_exr(path, self.components, size)
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        """Write the files that belong to no one frame."""
+
+
+class _Pairs(TruthChannel):
+    of_pairs = True
+    rounding = 1.5 * STEP_PX
+    """A step, where both were rounded, and what float32 of depth and pixels adds in images of 4000 px."""
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        layers = pair_layers([self.name], twins, frames)
+        return (file(*view) for each in layers for file in (each.values, each.mask) for view in each.views(frames))
+
+    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
+        where = frame.view[1:3]
+        for layer, offset, classes in frame.pairs(self.name):
+            yield layer.values(*where), pair_values(layer.channel, frame.view, offset)
+            yield layer.mask(*where), classes
+
+    def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
+        if path.suffix == ".exr":
+            return read_exr(path, self.components, size)
+        classes = read_grey_png(path, size)
+        if np.any(classes > max(PixelClass)):
+            raise RsbenchError(f"{path}: holds {np.max(classes)}: the classes are 0 to {max(PixelClass)}")
+        return classes
+
+
+class _Disparity(_Pairs):
+    name, components = "disparity", COMPONENTS["disparity"]
+
+    def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
+        if not plain:
+            return "channels: 'disparity' needs cameras that both read rows from the top at the same time"
+        return "channels: 'disparity' needs cameras without a lens, whose pairs share their rows" if lens else ""
+
+
+class _Flow(_Pairs):
+    name, components = "flow", COMPONENTS["flow"]
+
+
+class _CorrectionFlow(_Pairs):
+    name, components = "gs_flow", COMPONENTS["gs_flow"]
+
+
+class _Timing(TruthChannel):
+    name = "timing"
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return timing_files(frames)
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        card, sequence = whole.card, whole.sequence
+        sensor, period = card.sensor_of(sequence), card.period_of(sequence)
+        write_timing(whole.folder, card.shutter_for(sequence), period, sensor, card.frames)
+
+
+class _Normals(TruthChannel):
+    name, components, rounding = "normals", NORMAL_COMPONENTS, 1e-5
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return (surface_file("normals", *view) for view in views_of(frames))
+
+    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
+        yield surface_file("normals", *frame.view[1:3]), frame.surfaces.normals
+
+
+class _Instances(TruthChannel):
+    name, of_pairs, rounding = "instances", True, 0.0
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return (INSTANCE_TABLE, *(surface_file("instances", *view) for view in views_of(frames)))
+
+    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
+        yield surface_file("instances", *frame.view[1:3]), frame.surfaces.instances
+
+    def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
+        return read_grey_png(path, size, 16)
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        write_json(whole.folder / INSTANCE_TABLE, {"instances": whole.scene.instances})
+
+
+class _Inertial(TruthChannel):
+    name = "imu"
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return IMU_FILES
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        card, sequence, geometry = whole.card, whole.sequence, whole.geometry
+        imu, gravity, period = card.imu or Imu(), gravity_of(whole.record), card.period_of(sequence)
+        times = sample_times_ns(imu, geometry.shutter, period, card.sensor_of(sequence), card.frames)
+        samples = draw_samples(imu, geometry.motion, times, period, gravity, whole.seed)
+        write_imu(whole.folder, imu, gravity, samples)
+
+
+class _Tracks(TruthChannel):
+    name, knows_movement = "tracks", False
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return (TRACKS,)
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        write_tracks(whole.folder / TRACKS, whole.tracks)
+
+
+class _Affine(TruthChannel):
+    name, knows_movement = "affine", False
+
+    def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
+        return "" if "tracks" in names else "channels: 'affine' belongs to the points of 'tracks': add 'tracks'"
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return (AFFINE,)
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        save_affine(whole.folder / AFFINE, make_affine(whole.geometry, whole.tracks, whole.rays))
+
+
+class _Radiance(TruthChannel):
+    name, of_pairs, components = "hdr", True, RADIANCE_COMPONENTS
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return (radiance_file(*view) for view in views_of(frames))
+
+    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
+        yield radiance_file(*frame.view[1:3]), frame.rendered.image
+
+    def write_values(self, path: Path, values: NDArray[Any]) -> None:
+        light = {name: values[..., k] for k, name in enumerate(self.components)}
+        write_exr(path, {name: np.minimum(each, _BRIGHTEST) for name, each in light.items()}, half=True)
+
+    def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
+        values = read_exr(path, self.components, size, half=True)
+        if not np.all(np.isfinite(values)) or np.any(values < 0):
+            raise RsbenchError(f"{path}: radiance must be finite and not negative")
+        return values
+
+
+class _Matches(TruthChannel):
+    name, knows_movement, of_pairs = "matches", False, True
+
+    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
+        return (MATCHER, *map(matches_file, range(frames - 1)))
+
+    def write_whole(self, whole: SequenceTruth) -> None:
+        matching, folder = whole.card.matches or Matching(), whole.folder
+        write_json(folder / MATCHER, matcher_record(matching))
+        for first in range(whole.card.frames - 1):
+            views = [(side, first + frame) for side, frame in VIEWS]
+            images = {view: read_png(folder / ImageView("rs", *view).image) for view in views}
+            made = make_matches(whole.geometry, first, images, matching, whole.rays)
+            save_matches(folder / matches_file(first), made)
+
+
+OBJECTS: dict[str, TruthChannel] = {
+    each.name: each
+    for each in (
+        _Disparity(),
+        _Flow(),
+        _CorrectionFlow(),
+        _Timing(),
+        _Normals(),
+        _Instances(),
+        _Inertial(),
+        _Tracks(),
+        _Affine(),
+        _Radiance(),
+        _Matches(),
+    )
+}
+"""All channels, by name."""
+if TYPE_CHECKING:
+    Channel = str
+else:
+    Channel = Literal[tuple(OBJECTS)]
+"""Name of a channel, as cards have it."""
+CHANNELS: tuple[Channel, ...] = tuple(OBJECTS)
+
+
+def known(names: Iterable[str]) -> list[TruthChannel]:
+    """The channels of these names, in the order of ``OBJECTS``; those of later versions are left out."""
+    return [OBJECTS[name] for name in OBJECTS if name in {*names}]
+
+
+def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
+    """Check whether cameras can have these channels; arguments as of ``TruthChannel.refusal``.
+
+    Raises:
+        ValueError: one line with the channel.
+    """
+    for channel in known(names):
+        if refusal := channel.refusal(names, lens, plain):
+            raise ValueError(refusal)
+
+
+def channel_files(names: Iterable[str], twins: Iterable[int] = (), frames: int = len(FRAMES)) -> tuple[str, ...]:
+    """Paths below a sequence's folder of the channels of these names; those of later versions have none."""
+    rows = tuple(twins)
+    return tuple(file for channel in known(names) for file in channel.files(rows, frames))
+
+
+def write_channels(
+    folder: Path,
+    names: Collection[str],
+    geometry: Geometry,
+    view: ImageView,
+    rendered: Frame,
+    rays: Rays,
+    later: Later,
+    twins: Iterable[int] = (),
+) -> None:
+    """Write the files of channels that belong to one rolling-shutter frame.
+
+    ``folder`` is that of the sequence; files are written ``later``, the rest as of ``FrameTruth``.
+    """
+    frame = FrameTruth(geometry, view, rendered, rays, names, twins, later=later)
+    for channel in known(names):
+        for file, values in channel.made(frame):
+            later(channel.write_values, folder / file, values)
+
+
+def write_sequence_channels(
+    folder: Path, card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, record: Mapping[str, Any]
+) -> None:
+    """Write the files of a card's channels that belong to no one frame, as of ``SequenceTruth``."""
+    from rsbench.renderers.visibility import SceneRays
+
+    whole = SequenceTruth(
+        folder=folder, card=card, sequence=sequence, scene=scene, record=record, rays=SceneRays(scene)
+    )
+    for channel in known(card.channels):
+        channel.write_whole(whole)
+
+
+def pair_values(channel: PairChannel, source: ImageView, offset: FloatArray) -> NDArray[np.float32]:
+    """What a channel stores (..., components) of offsets (..., 2), px: a disparity is x_left - x_right."""
+    if channel == "disparity":
+        offset = offset[..., :1] * (1.0 if source.side == "right" else -1.0)
+    values = offset / STEP_PX
+    np.round(values, out=values)
+    values *= STEP_PX
+    return (values + 0.0).astype(np.float32)  # no -0
 
 
 def surface_file(channel: Literal["normals", "instances"], side: str, frame: int) -> str:
@@ -115,27 +526,8 @@ def radiance_file(side: str, frame: int) -> str:
     return f"hdr/{side}_{frame}.exr"
 
 
-def channel_files(names: Iterable[str], twins: Iterable[int] = (), frames: int = len(FRAMES)) -> tuple[str, ...]:
-    """Paths below a sequence's folder of the channels of these names; those of later versions are nobody's."""
-    given, views = set(names), views_of(frames)
-    layers = pair_layers(given, twins, frames)
-    pairs = (file(*view) for each in layers for file in (each.values, each.mask) for view in each.views(frames))
-    timing = timing_files(frames) if "timing" in given else ()
-    normals = (surface_file("normals", *view) for view in views if "normals" in given)
-    instances = (INSTANCE_TABLE, *(surface_file("instances", *view) for view in views))
-    hdr = (radiance_file(*view) for view in views if "hdr" in given)
-    whole: dict[str, tuple[str, ...]] = {
-        "imu": IMU_FILES,
-        "tracks": (TRACKS,),
-        "affine": (AFFINE,),
-        "matches": (MATCHER, *map(matches_file, range(frames - 1))),
-    }
-    of_sequence = (file for name, files in whole.items() if name in given for file in files)
-    return (*pairs, *timing, *normals, *(instances if "instances" in given else ()), *of_sequence, *hdr)
-
-
 def named_channels(text: str) -> tuple[Channel, ...]:
-    """Channels of a text like "flow,disparity"; "all" and "none" are what they say.
+    """Channels of a text like "flow,disparity", or of "all" or "none".
 
     Raises:
         RsbenchError: a name that no channel has, or one twice.
@@ -144,10 +536,137 @@ def named_channels(text: str) -> tuple[Channel, ...]:
         return CHANNELS if text == "all" else ()
     found: list[Channel] = []
     for name in text.split(","):
-        matching = [channel for channel in CHANNELS if channel == name.strip()]
-        if not matching or matching[0] in found:
+        if name.strip() not in CHANNELS or name.strip() in found:
             raise RsbenchError(
                 f"--channels {text}: {name!r}: allowed are {', '.join(CHANNELS)}, each once, or all, or none"
             )
-        found += matching
+        found.append(name.strip())
     return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelReader:
+    """What a ``Sequence`` reads of its channels; each raises RsbenchError where it does not have them."""
+
+    folder: Path
+    rig: StereoRig
+    shutter: RollingShutter
+    channels: tuple[str, ...]
+    frames: int
+    first: int
+    manifest: dict[str, Any]
+
+    def channel_values(self, channel: str, file: str) -> NDArray[Any]:
+        """(H, W, ...) of a file below the folder, one that the channel has for each frame.
+
+        Raises:
+            RsbenchError: the sequence does not have this channel, or the file cannot be read.
+        """
+        return OBJECTS[channel].read_values(self._path(channel, file), self._size)
+
+    def offsets(
+        self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
+    ) -> NDArray[np.float32]:
+        """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
+
+        ``row``: of ``gs_flow``, that of the twin to which it leads: 0, or one of ``twins``. ``back``: of ``flow``,
+        to the frame before, as from the last frame in any case. RsbenchError as of ``channel_values``.
+        """
+        return self.channel_values(
+            channel, self._layer(channel, frame, row, back).values(side, frame + self.first)
+        )
+
+    def classes(
+        self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
+    ) -> NDArray[np.uint8]:
+        """(H, W) of ``PixelClass``: what became of each pixel in the picture that the channel looks at.
+
+        Arguments and RsbenchError as of ``offsets``.
+        """
+        return self.channel_values(channel, self._layer(channel, frame, row, back).mask(side, frame + self.first))
+
+    def normals(self, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, 3) unit normals of what the pixels see, towards the camera, world frame; 0 where that is nothing.
+
+        RsbenchError as of ``channel_values``.
+        """
+        return self.channel_values("normals", surface_file("normals", side, frame + self.first))
+
+    def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
+        """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``channel_values``."""
+        return self.channel_values("instances", surface_file("instances", side, frame + self.first))
+
+    def instance_table(self) -> list[dict[str, str]]:
+        """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``channel_values``, or another
+        content."""
+        path = self._path("instances", INSTANCE_TABLE)
+        table = read_json(path).get("instances")
+        rows: list[Any] = table if isinstance(table, list) else [None]
+        for row in rows:
+            if not isinstance(row, dict) or not all(isinstance(row.get(key), str) for key in ("name", "material")):
+                raise RsbenchError(f"{path}: instances: must be a list of tables with name and material")
+        return rows
+
+    def timing(self) -> dict[str, Any]:
+        """Content of timing.json; RsbenchError as of ``channel_values``."""
+        return read_json(self._path("timing", TIMING_MANIFEST))
+
+    def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
+        """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""
+        return read_timing_table(self._path("timing", table_file(side, frame)), self.shutter.lines(side))
+
+    def inertial(self) -> ImuSamples:
+        """What the inertial sensor measured, and the truth; RsbenchError as of ``channel_values``."""
+        self._path("imu", IMU_MANIFEST)
+        return read_imu(self.folder)
+
+    def imu_manifest(self) -> dict[str, Any]:
+        """Content of imu.json; RsbenchError as of ``channel_values``."""
+        return read_json(self._path("imu", IMU_MANIFEST))
+
+    def radiance(self, side: Side, frame: int) -> NDArray[np.float32]:
+        """(H, W, 3) linear RGB radiance of a rolling-shutter frame without its sensor.
+
+        Times the renderer's ``exposure``, 1 is white. Rounded to float16 on disk. RsbenchError as of
+        ``channel_values``.
+        """
+        return self.channel_values("hdr", radiance_file(side, frame + self.first))
+
+    def tracks(self) -> Tracks:
+        """Surface points and where the frames see them; RsbenchError as of ``channel_values``."""
+        return read_tracks(self._path("tracks", TRACKS), self.frames)
+
+    def affine(self) -> AffineFrames:
+        """How the surroundings of the tracks' points lie in the frames; RsbenchError as of ``channel_values``."""
+        return read_affine(self._path("affine", AFFINE))
+
+    def matches(self, first: int = 0) -> LabelledMatches:
+        """What a feature matcher found in frame ``first`` and the next, and what is true.
+
+        RsbenchError as of ``channel_values``.
+        """
+        return read_matches(self._path("matches", matches_file(first + self.first)))
+
+    def matcher(self) -> dict[str, Any]:
+        """Content of matches/matcher.json: the matcher; RsbenchError as of ``channel_values``."""
+        return read_json(self._path("matches", MATCHER))
+
+    def _layer(self, channel: PairChannel, frame: int, row: int, back: bool) -> Layer:
+        """The layer that leads from a frame to the next or to the one before."""
+        if back and channel in self.channels and (channel != "flow" or frame == 0):
+            raise RsbenchError(f"{self.folder}: {channel} of frame {frame} leads to no frame before")
+        last = frames_of(self.manifest) - 1
+        leads_back = channel == "flow" and (back or frame == self.frames - 1)
+        return Layer(channel, row, leads_back and frame + self.first != last)
+
+    def _path(self, channel: str, file: str) -> Path:
+        if channel not in self.channels:
+            has = ", ".join(self.channels) or "none"
+            raise RsbenchError(
+                f"{self.folder}: has no channel {channel!r} ({has}); make it with: generate --channels {channel}"
+            )
+        return inside(self.folder, file)
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.rig.camera.width, self.rig.camera.height

@@ -27,12 +27,12 @@ from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.channel_writer import write_channels
+from rsbench.dataset.channels import write_channels, write_sequence_channels
 from rsbench.dataset.destinations import Target, open_destination
-from rsbench.dataset.layout import clean_file, files_of
+from rsbench.dataset.layout import clean_file
 from rsbench.dataset.manifest import Files
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.sequence_channels import write_sequence_channels
+from rsbench.dataset.sequence import files_of
 from rsbench.dataset.sequence_identity import Plan, SceneHashes, of_scene, plans_of, scene_hash, with_gloss
 from rsbench.dataset.views import ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure

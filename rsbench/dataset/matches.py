@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -20,13 +20,12 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.views import FAR
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.frame_matches import find_matches_of_rig
-from rsbench.pipeline.isolated_parts import Isolation
 from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays
-from rsbench.vision.feature_matcher import FeatureEntry, load_features
+
+if TYPE_CHECKING:
+    from rsbench.pipeline.frame_depth import Images
+    from rsbench.vision.feature_matcher import FeatureEntry
 
 MATCHED: dict[str, tuple[View, View]] = {
     "left": (("left", 0), ("left", 1)),
@@ -168,6 +167,8 @@ def matcher_record(matching: Matching) -> dict[str, Any]:
     Raises:
         RsbenchError: the feature matcher does not exist.
     """
+    from rsbench.vision.feature_matcher import load_features
+
     entry = load_features(matching.features)
     component = entry.component
     parameters = asdict(component) if entry.built_in else entry.parameters  # pyrefly: ignore[bad-argument-type]
@@ -185,6 +186,10 @@ def matched_frames(geometry: Geometry, first: int, images: Images, entry: Featur
     Raises:
         RsbenchError: that failed, see ``find_correspondences``.
     """
+    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_matches import find_matches_of_rig
+    from rsbench.pipeline.isolated_parts import Isolation
+
     levels = {(side, frame): images[side, first + frame] for side, frame in VIEWS}
     with Isolation() as isolation:
         options = isolation.chain(CorrectionOptions(features=entry))
@@ -199,6 +204,8 @@ def make_matches(
     Raises:
         RsbenchError: the feature matcher does not exist, or another package's failed.
     """
+    from rsbench.vision.feature_matcher import load_features
+
     found = matched_frames(geometry, first, images, load_features(matching.features))
     return labelled(geometry, first, arranged(found), matching.bound_px, rays)
 

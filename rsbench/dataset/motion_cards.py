@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsbench.components.motion_models import (
     drawn_parameters,
@@ -29,7 +28,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import LARGEST_TURN_DEG, turns_deg, world_from_body
-from rsbench.dataset.channels import CHANNELS, Channel
+from rsbench.dataset.channels import CHANNELS, OBJECTS, Channel
 from rsbench.scenes.model import Start
 from rsbench.scenes.object_meshes import MOST_MOVING, Body, MeshFile
 from rsbench.storage.untrusted_files import check_amount, read_text
@@ -288,10 +287,8 @@ def _start(place: Pose, first: Pose, absolute: bool) -> Start:
     return Start(position=(x, y, z), quaternion=(a, b, c, d), absolute=absolute)
 
 
-TAKEN: tuple[Channel, ...] = ("disparity", "flow", "gs_flow", "timing", "normals", "instances", "imu", "hdr")
+TAKEN: tuple[Channel, ...] = tuple(name for name, channel in OBJECTS.items() if channel.knows_movement)
 """Channels that know of moving objects, or that these do not matter to."""
-NUMBER, SHADED = 127, 128
-"""Of a label: the bits of the number, and the one that says that a moving object hides the sun."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -380,11 +377,6 @@ class MovingManifest(Body):
         super().__post_init__()
         if missing := {"model", "w", "d"} - self.motion.keys():
             raise ValueError(f"moving: motion: {min(missing)!r} is required")
-
-
-def numbers_of(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Of the objects at labels (...); 0 = none."""
-    return np.asarray(labels & NUMBER, dtype=np.uint8)
 
 
 def check_moving(moving: Sequence[Body], channels: Sequence[str]) -> None:

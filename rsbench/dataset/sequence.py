@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,21 +23,28 @@ from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channel_reader import ChannelReader
-from rsbench.dataset.channels import check_channels
+from rsbench.dataset.channels import CHANNELS, OBJECTS, ChannelReader, channel_files, check_channels
 from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import (
     MOST_FRAMES,
     MOST_TWINS,
+    SHUTTERS,
     Shutter,
+    channels_of,
     clean_file,
     exposed_file,
+    frames_of,
     gloss_file,
     moving_file,
     picture_file,
+    relative_files,
+    stack_file,
+    twins_of,
+    whole_frames,
 )
 from rsbench.dataset.matches import Matching
-from rsbench.dataset.motion_cards import MovingManifest, check_moving, numbers_of
+from rsbench.dataset.motion_cards import MovingManifest, check_moving
+from rsbench.dataset.views import numbers_of
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
 from rsbench.storage.untrusted_files import check_name, check_size, inside
@@ -49,7 +57,6 @@ for ideal, for two or for still, refuse to read them."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
 """What dataset.json tells people who find the folder."""
 
-_OF_PAIRS = ("disparity", "flow", "gs_flow", "instances", "hdr", "matches")
 Vector = tuple[float, float, float]
 M = TypeVar("M")
 
@@ -199,7 +206,7 @@ class Sequence(ChannelReader):
         """
         if self.frames == len(FRAMES):
             return [self]
-        channels = tuple(name for name in self.channels if name in _OF_PAIRS)
+        channels = tuple(name for name in self.channels if name in OBJECTS and OBJECTS[name].of_pairs)
         return [
             replace(
                 self,
@@ -408,3 +415,42 @@ def _parsed(cls: type[M], content: dict[str, Any], path: Path) -> M:
     if content.get("format") != FORMAT:
         raise RsbenchError(f"{path}: format = {content.get('format')!r}; this version reads {FORMAT}")
     return parse_card(cls, content, str(path), extra="ignore")
+
+
+def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
+    """Paths that a sequence must have, by its sequence.json."""
+    frames, rows = frames_of(manifest), twins_of(manifest)
+    views = views_of(frames)
+    clean = tuple(clean_file(*view) for view in views if manifest.get("sensor"))
+    stacks = tuple(stack_file(*view, row) for view in views for row in range(whole_frames(manifest)))
+    pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in views]
+    twins = tuple(picture_file(*each) for each in pictures)  # pyrefly: ignore[bad-argument-type]
+    every = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]
+    labels = tuple(moving_file(*each) for each in every if manifest.get("moving"))  # pyrefly: ignore[bad-argument-type]
+    gloss = tuple(gloss_file(*each) for each in every if manifest.get("glossy"))  # pyrefly: ignore[bad-argument-type]
+    shown = manifest.get("sensor") and manifest.get("exposed_twins") is True
+    exposed = tuple(exposed_file(*view, row) for row in (0, *rows) for view in views if shown)
+    own = relative_files(frames) + clean + stacks + twins + exposed + labels + gloss
+    return own + channel_files(channels_of(manifest), rows, frames)
+
+
+def is_of_sequence(name: str) -> bool:
+    """Whether a path below a sequence's folder is one that rsbench writes."""
+    first = _VIEW.sub("left_0", name)
+    return first in _KNOWN or any(form.fullmatch(first) for form in (_STACK, _TWIN, _MATCHES))
+
+
+_VIEW = re.compile(r"(left|right)_(0|[1-9][0-9]*)(?=[./])")
+_STACK = re.compile(r"gs_stack/left_0/[0-9]{4,}\.png")
+_MATCHES = re.compile(r"matches/(0|[1-9][0-9]*)\.npz")
+_TWIN = re.compile(r"gs_twin(|_depth|_exposed|_flow|_flow_mask|_moving|_gloss)/[0-9]{4,}/left_0\.(png|exr)")
+_KNOWN = {"sequence.json"} | {
+    _VIEW.sub("left_0", name)
+    for name in (
+        *relative_files(1),
+        clean_file("left", 0),
+        exposed_file("left", 0),
+        *(file(shutter, "left", 0) for file in (moving_file, gloss_file) for shutter in SHUTTERS),
+        *channel_files(CHANNELS, frames=len(FRAMES) + 1),
+    )
+}

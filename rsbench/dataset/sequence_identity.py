@@ -15,7 +15,7 @@ import numpy as np
 from rsbench.components.cards import card_path
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.layout import files_of
+from rsbench.dataset.sequence import files_of
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import SceneCard, built_key, read_scene_card
 from rsbench.scenes.model import Scene, SceneMesh

@@ -17,7 +17,7 @@ from rsbench.core.projection import ProjectionStatus, back_project, pixel_moves,
 from rsbench.core.rig import SIDES, View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channels import TRACKS, PixelClass
+from rsbench.dataset.views import PixelClass
 from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays
 
@@ -138,9 +138,9 @@ def look_for(
     return found.pixels, found.tau, classes
 
 
-def write_tracks(folder: Path, tracks: Tracks) -> None:
-    """The file of the channel below the folder of a sequence."""
-    save_arrays(folder / TRACKS, {field.name: getattr(tracks, field.name) for field in fields(tracks)})
+def write_tracks(path: Path, tracks: Tracks) -> None:
+    """The arrays by their names."""
+    save_arrays(path, {field.name: getattr(tracks, field.name) for field in fields(tracks)})
 
 
 def read_tracks(path: Path, frames: int) -> Tracks:

@@ -1,25 +1,56 @@
-"""The pictures of a sequence: their names, poses and times, and projection between them."""
+"""The pictures of a sequence, and where what one of them sees lies in another."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from enum import IntEnum
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from rsbench.components.compiled import compiled
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry, Geometry, RelativeMotion
-from rsbench.core.projection import back_project, rs_project_near
+from rsbench.core.projection import ProjectionStatus, back_project, row_poses, rs_project, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
-from rsbench.core.so3 import FloatArray
+from rsbench.core.so3 import FloatArray, hat
 from rsbench.dataset.layout import SHUTTERS, Shutter, exposed_file, gloss_file, moving_file, picture_file
+from rsbench.renderers.visibility import Surfaces
 
 _NEAREST = 32
 FAR = 1e7
 """Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
+
+
+NUMBER, SHADED = 127, 128
+"""Of a label: the bits of the number, and the one that says that a moving object hides the sun."""
+
+
+class PixelClass(IntEnum):
+    """What became of a pixel's surface in the other picture: the values of a mask."""
+
+    UNSOLVED = 0
+    """The row that sees it could not be found; no value."""
+    VISIBLE = 1
+    OCCLUDED = 2
+    """In view, but something nearer hides it."""
+    OUT_OF_VIEW = 3
+    """Beside the picture or behind the camera, sky too."""
+    SKY = 4
+    """No surface here, and none there: the value is that of the direction."""
+    SKY_OCCLUDED = 5
+    """No surface here, but one there."""
+
+
+def numbers_of(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Of the objects at labels (...); 0 = none."""
+    return np.asarray(labels & NUMBER, dtype=np.uint8)
 
 
 def seen_from(geometry: Geometry, number: int) -> FixedGeometry:
@@ -165,3 +196,377 @@ def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
     """Independent noise per image; rolling- and global-shutter twins share it, so that row 0 is the same."""
     text = f"{seed}/{sequence}/{side}/{frame}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
+
+
+_SAME = 1e-11
+"""Largest difference of entries of a pose: of rotations, and metres."""
+_FINEST, _AT_JUMPS = 64, 1e-8
+"""Entries of a table for each line, at most, and their largest difference then: accelerations jump, as at the end
+of a spline."""
+_TOLERANCE_PX = 1e-8
+"""Residual of the row equation that needs no further step; stored values are rounded to 1e-3 px."""
+_MOST_STEPS = 12
+_SEEN, _NOT_SEEN, _UNSURE = 0, 1, 2
+
+
+class Reprojected(NamedTuple):
+    """Where points (...) lie in a picture."""
+
+    pixels: FloatArray
+    """(..., 2) px; NaN where it does not see them."""
+    eyes: FloatArray
+    """(..., 3) the camera's centre at that time, world frame; at any time where it does not see them."""
+    unsolved: NDArray[np.bool_]
+    """(...) whether it is not known if it sees them."""
+
+
+class _Table(NamedTuple):
+    """Poses of a picture over its lines, from line -1 on."""
+
+    entries: FloatArray
+    """(n, 24): rotation and translation of ``cam_from_world``, and their changes by an entry."""
+    per_line: float
+    """Entries for each line; 0: one pose for all."""
+
+
+def find(geometry: Geometry, target: ImageView, points: FloatArray, start: FloatArray) -> Reprojected:
+    """Search the lines of a picture that see points (rows, n, 3), world frame, from lines (rows, n) near them.
+
+    Raises:
+        RsbenchError: a motion that no table of poses follows.
+    """
+    camera, shutter = geometry.rig.camera, geometry.shutter
+    table = _pose_table(geometry, target)
+    pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
+    status = np.zeros(start.shape, dtype=np.uint8)
+    axis, lines = shutter.axis(target.side), shutter.lines(target.side)
+    reproject_rows(
+        table.entries, table.per_line, _intrinsics(camera), axis, lines, points, start, pixels, eyes, status
+    )
+    unsure = status == _UNSURE
+    if np.any(unsure):
+        found = rs_project(geometry.rig, shutter, geometry.motion, target.side, target.frame, points[unsure])
+        pixels[unsure] = found.pixels
+        times = np.where(np.isnan(found.tau), target.frame, found.tau)
+        eyes[unsure] = inverse(geometry.rig.cam_from_world(geometry.motion, times, target.side)).t
+        unsure[unsure] = found.status == ProjectionStatus.NOT_CONVERGED
+    return Reprojected(pixels, eyes, unsure)
+
+
+def _pose_table(geometry: Geometry, view: ImageView) -> _Table:
+    rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
+    if view.shutter == "gs":
+        R, t = rig.cam_from_world(motion, shutter.time_after(view.row, view.frame, view.side), view.side)
+        entry = np.concatenate([R.ravel(), t, np.zeros(12)])
+        return _Table(np.stack([entry, entry]), 0.0)
+    lines = shutter.lines(view.side)
+    rate = shutter.rate(view.side)[shutter.axis(view.side)]
+    per_line = 1
+    while per_line <= _FINEST:
+        at = np.linspace(-1.0, lines, (lines + 1) * per_line + 1)
+        tau = shutter.line_time(at, view.frame, view.side)
+        R, t = rig.cam_from_world(motion, tau, view.side)
+        spin, speed = motion.velocity(tau)
+        changes = np.concatenate([(hat(spin) @ R).reshape(-1, 9), speed], axis=1) * (rate / per_line)
+        entries = np.concatenate([R.reshape(-1, 9), t, changes], axis=1)
+        between = shutter.line_time(at[:-1] + 0.5 / per_line, view.frame, view.side)
+        R, t = rig.cam_from_world(motion, between, view.side)
+        middle = 0.5 * (entries[:-1, :12] + entries[1:, :12]) + 0.125 * (entries[:-1, 12:] - entries[1:, 12:])
+        off = np.max(np.abs(middle - np.concatenate([R.reshape(-1, 9), t], axis=1)))
+        if off <= (_SAME if per_line < _FINEST else _AT_JUMPS):
+            return _Table(entries, float(per_line))
+        per_line *= 2
+    raise RsbenchError(
+        f"motion model {type(motion).__name__}: jumps between the lines of {view.image}, or its velocity is not "
+        "the derivative of its poses: channels of truth cannot be made"
+    )
+
+
+def _intrinsics(camera: PinholeCamera) -> FloatArray:
+    """(14,): width, height, fx, fy, cx, cy; which lens, its coefficients and its reach."""
+    lens = camera.lens
+    own = [0.0] * 8
+    if lens is not None:
+        kind = 1.0 if lens.model == "brown-conrady" else 2.0
+        own = [kind, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.reach]
+    return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *own])
+
+
+@compiled
+def reproject_rows(
+    table: FloatArray,
+    per_line: float,
+    camera: FloatArray,
+    axis: int,
+    lines: int,
+    points: FloatArray,
+    start: FloatArray,
+    pixels: FloatArray,
+    eyes: FloatArray,
+    status: NDArray[np.uint8],
+) -> None:
+    """Fill what ``Reprojected`` has; NumPy: ``core.projection.rs_project``.
+
+    Each point starts where its two neighbours in the row landed would lead, with the slope found there. That no
+    other row is heard keeps the bits of a row the same whatever rows are asked for with it.
+    """
+    pose = np.zeros(12)
+    _pose_between(table, 0.0, pose)
+    for row in range(start.shape[0]):
+        offset, change, slope = 0.0, 0.0, -1.0
+        for k in range(start.shape[1]):
+            X = points[row, k, 0], points[row, k, 1], points[row, k, 2]
+            near = start[row, k] + offset + change
+            x, y, line, slope, found = _line(table, per_line, camera, axis, lines, X, near, slope, pose)
+            status[row, k] = found
+            if found == _SEEN:
+                change = line - start[row, k] - offset
+                offset += change
+                pixels[row, k, 0], pixels[row, k, 1] = x, y
+            else:
+                offset, change, slope = 0.0, 0.0, -1.0
+            for j in range(3):
+                eyes[row, k, j] = -(pose[j] * pose[9] + pose[3 + j] * pose[10] + pose[6 + j] * pose[11])
+
+
+@compiled
+def _line(
+    table: FloatArray,
+    per_line: float,
+    camera: FloatArray,
+    axis: int,
+    lines: int,
+    X: tuple[float, float, float],
+    start: float,
+    slope: float,
+    pose: FloatArray,
+) -> tuple[float, float, float, float, int]:
+    """Pixel, line, slope and status of one point, by secant steps; leaves the line's pose in ``pose`` (12,)."""
+    line, step, before = start, 0.0, 0.0
+    x, y, off = math.nan, math.nan, math.nan
+    for _ in range(_MOST_STEPS):
+        if per_line > 0.0:
+            _pose_between(table, (line + 1.0) * per_line, pose)
+        x, y = _pixel(pose, camera, X)
+        off = (x if axis == 0 else y) - line
+        if not abs(off) > _TOLERANCE_PX:
+            break
+        if step != 0.0:
+            slope = (off - before) / step
+        if not slope < 0.0:
+            break
+        before, step = off, -off / slope
+        line += step
+    if abs(off) <= _TOLERANCE_PX:
+        if -0.5 <= x <= camera[0] - 0.5 and -0.5 <= y <= camera[1] - 0.5:
+            return x, y, line, slope, _SEEN
+        if -0.5 <= line <= lines - 0.5:
+            return x, y, line, slope, _NOT_SEEN
+    # Another crossing, or one behind a pole, cannot be told from here: the solver that looks for all of them does.
+    first = _off(table, per_line, camera, axis, X, -0.5, pose)
+    last = _off(table, per_line, camera, axis, X, lines - 0.5, pose)
+    if math.isnan(first) and math.isnan(last):
+        return x, y, line, slope, _NOT_SEEN
+    if abs(off) <= _TOLERANCE_PX and first * last > 0.0:
+        return x, y, line, slope, _NOT_SEEN
+    return x, y, line, slope, _UNSURE
+
+
+@compiled
+def _off(
+    table: FloatArray,
+    per_line: float,
+    camera: FloatArray,
+    axis: int,
+    X: tuple[float, float, float],
+    line: float,
+    pose: FloatArray,
+) -> float:
+    """How far beyond a line its camera sees a point, px; NaN behind it."""
+    _pose_between(table, (line + 1.0) * per_line, pose)
+    x, y = _pixel(pose, camera, X)
+    return (x if axis == 0 else y) - line
+
+
+@compiled
+def _pose_between(table: FloatArray, place: float, pose: FloatArray) -> None:
+    """Fill rotation and translation (12,) at a place between entries (Hermite), that of the ends beyond them."""
+    below = min(max(math.floor(place), 0), table.shape[0] - 2)
+    u = min(max(place - below, 0.0), 1.0)
+    v = 1.0 - u
+    a, b, c, d = v * v * (1.0 + 2.0 * u), u * v * v, u * u * (1.0 + 2.0 * v), -u * u * v
+    for k in range(12):
+        pose[k] = (
+            a * table[below, k] + b * table[below, 12 + k] + c * table[below + 1, k] + d * table[below + 1, 12 + k]
+        )
+
+
+@compiled
+def _pixel(pose: FloatArray, camera: FloatArray, X: tuple[float, float, float]) -> tuple[float, float]:
+    """NaN behind the camera or beyond the lens. NumPy: ``PinholeCamera.project``."""
+    z = pose[6] * X[0] + pose[7] * X[1] + pose[8] * X[2] + pose[11]
+    if not z > 0.0:
+        return math.nan, math.nan
+    x = (pose[0] * X[0] + pose[1] * X[1] + pose[2] * X[2] + pose[9]) / z
+    y = (pose[3] * X[0] + pose[4] * X[1] + pose[5] * X[2] + pose[10]) / z
+    if camera[6] > 0.0:
+        x, y = _bent(camera, x, y)
+    return camera[2] * x + camera[4], camera[3] * y + camera[5]
+
+
+@compiled
+def _bent(camera: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Distorted coordinates. NumPy: ``Lens.distort``."""
+    k1, k2, p1, p2, k3, k4 = camera[7], camera[8], camera[9], camera[10], camera[11], camera[12]
+    s = x * x + y * y
+    r = math.sqrt(s)
+    if not r < camera[13]:
+        return math.nan, math.nan
+    if camera[6] == 1.0:
+        gain = 1.0 + s * (k1 + s * (k2 + s * k3))
+        return (
+            x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+            y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
+        )
+    angle = math.atan(r)
+    a = angle * angle
+    gain = 1.0 + s * (k1 - 1.0 / 3.0)
+    if s >= 1e-12:
+        gain = angle / r * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
+    return x * gain, y * gain
+
+
+Blocked = Callable[[FloatArray, FloatArray, FloatArray | None], NDArray[np.bool_]]
+"""Whether something stands before points (n, 3) seen from eyes (n, 3), world frame, metres; at times (n,), given
+where objects move."""
+
+
+class Rays(Protocol):
+    """Rays through the scene of a sequence: ``renderers.segments.SceneRays`` is one."""
+
+    def blocked(
+        self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None
+    ) -> NDArray[np.bool_]: ...
+    def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces: ...
+
+
+class PairTruth(NamedTuple):
+    """Of the pixels of a source."""
+
+    offset: FloatArray
+    """(H, W, 2) x_target - x_source, px; NaN where the class is UNSOLVED or OUT_OF_VIEW."""
+    classes: NDArray[np.uint8]
+    """(H, W) of ``PixelClass``."""
+
+
+class SeenSurfaces:
+    """What the pixels of a rolling-shutter frame see, and from where.
+
+    Args:
+        geometry: of the sequence.
+        source: the frame.
+        depth: (H, W) of the frame, metres, 0 = sky, which is looked for at ``FAR``.
+        rows: these (H,) rows of the frame only, of which ``depth`` is; all by default.
+        numbers: (H, W) of the objects that move and are seen, 0 = none; none by default.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        source: ImageView,
+        depth: NDArray[np.float32],
+        rows: Sequence[int] | None = None,
+        numbers: NDArray[np.uint8] | None = None,
+    ) -> None:
+        camera, shutter = geometry.rig.camera, geometry.shutter
+        self.geometry, self.source = geometry, source
+        self.grid = camera.pixel_grid()[slice(None) if rows is None else np.asarray(rows)]
+        self.sky = depth == 0
+        self.numbers = numbers
+        poses = row_poses(geometry.rig, shutter, geometry.motion, source.side, source.frame)
+        self.points = np.where(self.sky, FAR, depth)[..., None] * camera.unproject(self.grid)
+        """(H, W, 3) world frame, metres."""
+        eyes = inverse(poses).t
+        if shutter.axis(source.side) == 1:
+            lines = self.grid[:, 0, 1].astype(np.int64)
+            self.points -= poses.t[lines, None]
+            self.points = self.points @ poses.R[lines]
+            eyes = eyes[lines, None]
+        else:
+            self.points -= poses.t
+            self.points = np.swapaxes(np.swapaxes(self.points, 0, 1) @ poses.R, 0, 1)
+        self.eyes = np.broadcast_to(eyes, self.points.shape)
+        """(H, W, 3) the camera's centres, world frame, metres."""
+
+    @property
+    def tau(self) -> FloatArray | None:
+        """(H W) times of the pixels; None where nothing moves."""
+        return times_at(self.geometry, self.source, self.grid).ravel() if self.geometry.objects else None
+
+
+class Carried(NamedTuple):
+    """The surfaces that the pixels of a source see, in another picture."""
+
+    landed: Reprojected
+    points: FloatArray
+    """(H, W, 3) where they are when the target sees them, world frame, metres."""
+
+
+def carry(surfaces: SeenSurfaces, target: ImageView) -> Carried:
+    """Where another picture sees what every pixel of a rolling-shutter frame sees, hidden or not."""
+    start = surfaces.grid[..., surfaces.geometry.shutter.axis(target.side)]
+    landed = find(surfaces.geometry, target, surfaces.points, start)
+    if surfaces.numbers is None or not surfaces.geometry.objects:
+        return Carried(landed, surfaces.points)
+    points = surfaces.points.copy()
+    for number in np.unique(surfaces.numbers[surfaces.numbers > 0]):
+        chosen = surfaces.numbers == number
+        points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start)
+        for whole, part in zip(landed, own, strict=True):
+            whole[chosen] = part
+    return Carried(landed, points)
+
+
+def pair_truth(surfaces: SeenSurfaces, target: ImageView, carried: Carried, blocked: Blocked) -> PairTruth:
+    """What became of the pixels that ``carry`` carried into the target; ``blocked`` is asked once."""
+    landed, points = carried
+    return PairTruth(landed.pixels - surfaces.grid, _classes(surfaces, target, landed, points, blocked))
+
+
+def _landed_with(
+    surfaces: SeenSurfaces, target: ImageView, number: int, chosen: NDArray[np.bool_], start: FloatArray
+) -> tuple[FloatArray, Reprojected]:
+    """Where an object has its chosen points (n, 3) when the target sees them, world frame, and where it does."""
+    geometry, thing = surfaces.geometry, surfaces.geometry.objects[number - 1]
+    tau = times_at(geometry, surfaces.source, surfaces.grid[chosen])
+    X = transform(inverse(thing.world_from_object(tau)), surfaces.points[chosen])
+    # Each alone: its neighbours in the row may be other things.
+    found = find(seen_from(geometry, number), target, X[:, None], start[chosen][:, None])
+    there = thing.world_from_object(times_at(geometry, target, found.pixels[:, 0]))
+    eyes = transform(there, found.eyes[:, 0])
+    return transform(there, X), Reprojected(found.pixels[:, 0], eyes, found.unsolved[:, 0])
+
+
+def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
+    """Normals (H, W, 3) and instances (H, W) of the pixels of a rolling-shutter frame; 0 in the sky."""
+    shape = surfaces.sky.shape
+    normals, instances = rays.surfaces(surfaces.eyes.reshape(-1, 3), surfaces.points.reshape(-1, 3), surfaces.tau)
+    normals, instances = normals.reshape(*shape, 3), instances.reshape(shape)
+    normals[surfaces.sky], instances[surfaces.sky] = 0.0, 0
+    return Surfaces(normals, instances)
+
+
+def _classes(
+    surfaces: SeenSurfaces, target: ImageView, landed: Reprojected, points: FloatArray, blocked: Blocked
+) -> NDArray[np.uint8]:
+    """(H, W) of ``PixelClass``; ``points`` (H, W, 3) where they are when the target sees them."""
+    inside = np.isfinite(landed.pixels[..., 0])
+    moves = bool(surfaces.geometry.objects)
+    tau = times_at(surfaces.geometry, target, landed.pixels).ravel() if moves else None
+    hidden = blocked(landed.eyes.reshape(-1, 3), points.reshape(-1, 3), tau).reshape(inside.shape)
+    classes = np.where(hidden, np.uint8(PixelClass.OCCLUDED), np.uint8(PixelClass.VISIBLE))
+    of_sky = np.where(hidden, np.uint8(PixelClass.SKY_OCCLUDED), np.uint8(PixelClass.SKY))
+    classes[surfaces.sky] = of_sky[surfaces.sky]
+    classes[~inside] = PixelClass.OUT_OF_VIEW
+    classes[landed.unsolved] = PixelClass.UNSOLVED
+    return classes

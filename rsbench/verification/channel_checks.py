@@ -15,20 +15,20 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channel_truth import Rays, SeenSurfaces, carry, pair_truth, surface_truth, target_of
-from rsbench.dataset.channel_writer import pair_values
 from rsbench.dataset.channels import (
     INSTANCE_TABLE,
+    PAIR_CHANNELS,
     STEP_PX,
+    FrameTruth,
     Layer,
-    PixelClass,
+    known,
     pair_layers,
+    pair_values,
     radiance_file,
     surface_file,
 )
-from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, ImageView, points_of, seen_from, times_at
+from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, numbers_of, points_of, seen_from, times_at
 from rsbench.renderers.image import linear_of_codes, to_srgb8
 from rsbench.verification.content import clean_picture
 from rsbench.verification.findings import Finding, rows_of
@@ -93,14 +93,14 @@ def channel_faults(
         stored: dict[ImageView, _Stored] = {}
         for side, frame in layer.views(sequence.frames):
             files, view = (layer.values(side, frame), layer.mask(side, frame)), ImageView("rs", side, frame)
-            both = {frame, target_of(layer, view, sequence.frames).frame}
+            both = {frame, layer.target(view, sequence.frames).frame}
             try:
                 if both <= {*times} and both & {*new} and not set(files) & set(reported):
                     stored[view] = _stored(sequence, layer, view)
             except RsbenchError as error:
                 yield Finding.of(error)
         for view in stored:
-            there = target_of(layer, view, sequence.frames)
+            there = layer.target(view, sequence.frames)
             used = {each for each in (view, there) if each in maps and each.depth not in reported}
             if len(used) == 2:
                 yield from _pair_faults(sequence, maps, layer, view, stored, stride)
@@ -116,39 +116,38 @@ def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
 def channels_again(
     sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
 ) -> Iterator[tuple[str, Finding | None, bool]]:
-    """Rows of the channels of a frame made again: of each file its name, fault or None, and whether all is same.
+    """Make rows of the channels of a frame again: each file, its fault or None, and whether its bits are equal.
 
     Args:
         sequence: holds them.
-        view: the frame; of a global shutter there are none.
+        view: the frame; a global-shutter one has no channels.
         rows: of the frame.
         frame: these rows rendered again.
         rays: through the scene.
-        reported: files that are not looked at.
+        reported: files that are not compared.
     """
-    frames = sequence.frames
-    for layer in pair_layers(sequence.channels, sequence.twins, frames) if view.shutter == "rs" else ():
-        files = layer.values(view.side, view.frame), layer.mask(view.side, view.frame)
-        if set(files) & set(reported) or view[1:3] not in layer.views(frames):
+    if view.shutter != "rs":
+        return
+    truth = FrameTruth(sequence, view, frame, rays, sequence.channels, sequence.twins, rows)
+    for channel in known(sequence.channels):
+        if channel.rounding is None:
             continue
-        try:
-            values, classes = (each[rows] for each in _stored(sequence, layer, view))
-        except RsbenchError:  # reported already
-            continue
-        seen = SeenSurfaces(sequence, view, frame.depth, rows, numbers_of(frame.labels))
-        target = target_of(layer, view, frames)
-        truth = pair_truth(seen, target, carry(seen, target), rays.blocked)
-        made = pair_values(layer.channel, view, truth.offset)
-        far = np.any(~((np.abs(values - made) <= _SAME_PX) | (np.isnan(values) & np.isnan(made))), axis=-1)
-        unlike = classes != truth.classes
-        everywhere = np.ones(far.shape, dtype=np.bool_)
-        for file, wrong, same in (
-            (files[0], far, np.array_equal(values, made, equal_nan=True)),
-            (files[1], unlike, not np.any(unlike)),
-        ):
+        for file, made in channel.made(truth):
+            if file in reported:
+                continue
+            try:
+                stored = sequence.channel_values(channel.name, file)[rows]
+            except RsbenchError:  # reported already
+                continue
+            off = np.abs(stored.astype(np.float64) - made)
+            alike = (off <= channel.rounding) | (np.isnan(stored) & np.isnan(made))
+            wrong = ~np.all(alike.reshape(*alike.shape[:2], -1), axis=-1)
+            everywhere = np.ones(wrong.shape, dtype=np.bool_)
+            of_a_row = _OF_A_ROW if channel.name in PAIR_CHANNELS else 1.0
+            bad = _many(wrong, everywhere, _FEW_AGAIN, of_a_row)
             what = f"{_percent(wrong, everywhere)} differ from what is made again"
-            bad = _many(wrong, everywhere, _FEW_AGAIN)
             in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
+            same = np.array_equal(stored, made.astype(stored.dtype), equal_nan=stored.dtype.kind == "f")
             yield file, Finding(file, what, rows_of(in_rows)) if bad else None, same
 
 
@@ -175,7 +174,7 @@ def _pair_faults(
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
         yield Finding(file, f"{what}, by {layer.mask(view.side, view.frame)}")
-    there, sky = target_of(layer, view, sequence.frames), maps[view].depth[::stride, ::stride] == 0
+    there, sky = layer.target(view, sequence.frames), maps[view].depth[::stride, ::stride] == 0
     yield from _mask_faults(layer, view, there, classes, sky, derived, stride)
 
 
@@ -212,7 +211,7 @@ def _derived(
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
     depth = maps[view].depth
     filled = replace(maps[view], depth=np.where(depth > 0, depth, np.float32(FAR)))
-    reprojection = reproject(sequence, filled, maps[target_of(layer, view, sequence.frames)], stride)
+    reprojection = reproject(sequence, filled, maps[layer.target(view, sequence.frames)], stride)
     grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
     values = pair_values(layer.channel, view, reprojection.pixels - grid)
     sky, relative = depth[::stride, ::stride] == 0, reprojection.relative
@@ -418,30 +417,6 @@ def _agreement_faults(
         file, there = (surface_file("instances", each.side, each.frame) for each in (view, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
         yield Finding(file, f"{share} see another instance than {there}", _worst_rows(other))
-
-
-def surfaces_again(
-    sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
-) -> Iterator[tuple[str, Finding | None, bool]]:
-    """As ``channel_checks.channels_again``, of normals and instances."""
-    names = [name for name in ("normals", "instances") if view.shutter == "rs" and name in sequence.channels]
-    seen = SeenSurfaces(sequence, view, frame.depth, rows, numbers_of(frame.labels))
-    truth = surface_truth(seen, rays) if names else None
-    for name in names:
-        file = surface_file("normals" if name == "normals" else "instances", view.side, view.frame)
-        if truth is None or file in reported:
-            continue
-        try:
-            stored: NDArray[Any] = getattr(sequence, name)(view.side, view.frame)[rows]
-        except RsbenchError:  # reported already
-            continue
-        made: FloatArray = getattr(truth, name)
-        off = np.abs(stored.astype(np.float64) - made).reshape(*frame.depth.shape, -1).max(axis=-1)
-        wrong: BoolArray = ~(off <= _UNIT)
-        in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
-        bad = np.sum(wrong) > max(_FEW_AGAIN * wrong.size, _LEAST)
-        what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} pixels differ from what is made again"
-        yield file, Finding(file, what, rows_of(in_rows)) if bad else None, bool(np.all(off == 0))
 
 
 def _worst_rows(wrong: BoolArray) -> str:

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import Geometry
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import ImageView, Times, nearby_views
+from rsbench.dataset.views import ImageView, Times, nearby_views, numbers_of
 from rsbench.verification.compiled_comparison import Evidence, Limits, weigh_rows
 from rsbench.verification.findings import DepthAgreement, Finding
 from rsbench.verification.reprojection import (

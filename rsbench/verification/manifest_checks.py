@@ -16,9 +16,8 @@ from rsbench.components.cards import list_cards, load_card, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.layout import files_of
 from rsbench.dataset.manifest import CROISSANT, DATASET, croissant_of, says
-from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, sequence_manifest
+from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, files_of, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import read_scene_card
 from rsbench.storage.files import read_json, sha256

@@ -11,8 +11,7 @@ import numpy as np
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
-from rsbench.dataset.motion_cards import numbers_of
-from rsbench.dataset.views import ImageView, view_pairs
+from rsbench.dataset.views import ImageView, numbers_of, view_pairs
 from rsbench.verification.content import Content, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject

@@ -19,8 +19,7 @@ from rsbench.core.projection import RSProjection, back_project, project_at, rs_p
 from rsbench.core.rig import FRAMES, VIEWS, View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
-from rsbench.dataset.channel_truth import Rays
-from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, PixelClass, matches_file
+from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
 from rsbench.dataset.matches import (
     MATCHED,
     Arranged,
@@ -49,7 +48,7 @@ from rsbench.dataset.tracks import (
     points_at,
     track_views,
 )
-from rsbench.dataset.views import FAR, ImageView
+from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays
 from rsbench.verification.channel_checks import FEW_BENT, LEVEL
 from rsbench.verification.findings import Finding
 from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, relative_depth

@@ -19,9 +19,8 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.geometry import Geometry, MovingRig
 from rsbench.core.projection import ROW_TOLERANCE_PX
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, ImageView, Seen, points_of, seen_by, seen_from
+from rsbench.dataset.views import FAR, ImageView, Seen, numbers_of, points_of, seen_by, seen_from
 from rsbench.vision.reprojection import Table, across_lines, line_of, look, optics_of, see
 
 T = TypeVar("T")

@@ -32,7 +32,7 @@ from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Start
 from rsbench.scenes.object_meshes import with_moving
-from rsbench.verification.channel_checks import channels_again, surfaces_again
+from rsbench.verification.channel_checks import channels_again
 from rsbench.verification.content import Content, clean_picture, stack_rows
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.image_checks import CHANGES, Picture
@@ -199,9 +199,8 @@ class Rerenderer:
             for view in [each for each in image_views(content.times) if each.shutter == "rs"]:
                 if any(f"/{view.side}_{view.frame}." in file for file in accused):
                     scene, frame = self.whole(content, view)
-                    for made in (channels_again, surfaces_again):
-                        checks = made(sequence, view, rows, frame, SceneRays(scene, sequence.objects), ())
-                        same |= {file for file, _, alike in checks if alike}
+                    checks = channels_again(sequence, view, rows, frame, SceneRays(scene, sequence.objects), ())
+                    same |= {file for file, _, alike in checks if alike}
             scene, _ = self.scene(sequence)
             for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again)):
                 if file in accused:
@@ -351,9 +350,9 @@ def _row_checks(
             yield from label_checks(content.maps[view], frame.labels, rows)
         if view in content.pictures:
             yield _picture_check(content, frame, options, view, rows)
-        for made in (channels_again, surfaces_again):
-            again = made(content.sequence, view, rows, frame, SceneRays(scene, content.sequence.objects), reported)
-            yield from (RowCheck(*check) for check in again)
+        rays = SceneRays(scene, content.sequence.objects)
+        again = channels_again(content.sequence, view, rows, frame, rays, reported)
+        yield from (RowCheck(*check) for check in again)
         if view.shutter == "rs":
             yield from _frame_checks(content, scene, options, view, rows, reported)
         elif content.sequence.exposed_twins:

@@ -18,9 +18,8 @@ from rsbench.core.projection import project_at
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import clean_file
-from rsbench.dataset.motion_cards import SHADED, numbers_of
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, ImageView, seen_from
+from rsbench.dataset.views import FAR, SHADED, ImageView, numbers_of, seen_from
 from rsbench.renderers.image import (
     Mosaic,
     Sensor,

@@ -21,20 +21,12 @@ from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES, VIEWS
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.channels import (
-    CHANNELS,
-    PAIR_CHANNELS,
-    TRACKS,
-    PairChannel,
-    PixelClass,
-    matches_file,
-    named_channels,
-)
+from rsbench.dataset.channels import CHANNELS, PAIR_CHANNELS, TRACKS, PairChannel, matches_file, named_channels
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.tracks import jacobians_of
-from rsbench.dataset.views import ImageView
+from rsbench.dataset.views import ImageView, PixelClass
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_matches import find_matches_of_rig
 from rsbench.renderers.image import to_srgb8
@@ -291,7 +283,7 @@ def test_help_names_every_channel() -> None:
 
 
 def test_values_that_are_no_class_are_refused(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rsbench.dataset import channel_reader as module
+    from rsbench.dataset import channels as module
 
     read: Callable[..., NDArray[np.uint8]] = lambda path, size: np.full((48, 64), 9, np.uint8)  # noqa: E731
     monkeypatch.setattr(module, "read_grey_png", read)

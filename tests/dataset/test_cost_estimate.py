@@ -12,7 +12,7 @@ import pytest
 from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard, SequenceCard, load_dataset_card
 from rsbench.dataset.generation import Built
-from rsbench.dataset.layout import files_of
+from rsbench.dataset.sequence import files_of
 from rsbench.renderers import scene as renderer
 
 

@@ -19,9 +19,8 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channels import Channel, channel_files
+from rsbench.dataset.channels import Channel, channel_files, write_sequence_channels
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.sequence_channels import write_sequence_channels
 from rsbench.dataset.tracks import track_views
 from rsbench.renderers import visibility
 from rsbench.renderers.visibility import Surfaces

@@ -28,10 +28,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
-from rsbench.dataset.channel_writer import write_channels
-from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers
-from rsbench.dataset.layout import files_of, is_of_sequence
-from rsbench.dataset.sequence import read_dataset, read_pairs
+from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers, write_channels
+from rsbench.dataset.sequence import files_of, is_of_sequence, read_dataset, read_pairs
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.image import Sensor
 from rsbench.renderers.render import Frame

@@ -24,10 +24,11 @@ from rsbench.core.geometry import poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
-from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel, PixelClass
+from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel
 from rsbench.dataset.generation import generate_dataset, seen_scene
-from rsbench.dataset.motion_cards import NUMBER, SHADED, TAKEN, MovingCard
+from rsbench.dataset.motion_cards import TAKEN, MovingCard
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.views import NUMBER, SHADED, PixelClass
 from rsbench.renderers.image import Sensor
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import LinePoses, render

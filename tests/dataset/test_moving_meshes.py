@@ -21,10 +21,10 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
 from rsbench.core.se3 import inverse, transform
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.channels import PairChannel, PixelClass
+from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.motion_cards import NUMBER
 from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.views import NUMBER, PixelClass
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset

@@ -18,8 +18,7 @@ from rsbench.core.se3 import inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.row_search import find
-from rsbench.dataset.views import ImageView
+from rsbench.dataset.views import ImageView, find
 
 LENSES = (
     None,

@@ -22,8 +22,8 @@ from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import picture_file
-from rsbench.dataset.motion_cards import numbers_of
 from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.views import numbers_of
 from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import inside, read_bytes
 
