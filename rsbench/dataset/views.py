@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import IntEnum
 from itertools import product
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,9 @@ from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.dataset.layout import SHUTTERS, Shutter, exposed_file, gloss_file, moving_file, picture_file
-from rsbench.renderers.visibility import Surfaces
+
+if TYPE_CHECKING:
+    from rsbench.renderers.visibility import Surfaces
 
 _NEAREST = 32
 FAR = 1e7
@@ -550,10 +552,10 @@ def _landed_with(
 def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
     """Normals (H, W, 3) and instances (H, W) of the pixels of a rolling-shutter frame; 0 in the sky."""
     shape = surfaces.sky.shape
-    normals, instances = rays.surfaces(surfaces.eyes.reshape(-1, 3), surfaces.points.reshape(-1, 3), surfaces.tau)
-    normals, instances = normals.reshape(*shape, 3), instances.reshape(shape)
+    seen = rays.surfaces(surfaces.eyes.reshape(-1, 3), surfaces.points.reshape(-1, 3), surfaces.tau)
+    normals, instances = seen.normals.reshape(*shape, 3), seen.instances.reshape(shape)
     normals[surfaces.sky], instances[surfaces.sky] = 0.0, 0
-    return Surfaces(normals, instances)
+    return seen._replace(normals=normals, instances=instances)
 
 
 def _classes(
