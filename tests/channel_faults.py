@@ -224,7 +224,7 @@ def matches_of(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Cal
 
 
 def perfect(arrays: dict[str, NDArray[Any]]) -> None:
-    """Every match moved to its true place, and told so: what no check of the labels alone can see."""
+    """Every match moved to its true place, with matching labels: what no check of the labels alone can see."""
     seen = np.isfinite(arrays["error"])
     arrays["pixels"][seen, 1], arrays["error"][seen] = arrays["truth"][seen], 0.0
     wrong = seen & (arrays["classes"] == MatchClass.WRONG)
@@ -232,7 +232,7 @@ def perfect(arrays: dict[str, NDArray[Any]]) -> None:
 
 
 class Depths:
-    """Rays that meet what they are told to, one pair of frames after the other, and nothing before it."""
+    """Rays that meet their given targets, one pair of frames after the other, and nothing before it."""
 
     def __init__(self, depth: NDArray[np.float64]) -> None:
         self.left = np.where(depth > 0, depth, np.inf)

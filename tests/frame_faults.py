@@ -37,7 +37,7 @@ def last_points_scaled(arrays: dict[str, Array]) -> None:
 
 
 def samples_of(change: Callable[[ImuSamples, Array], ImuSamples]) -> Plant:
-    """``change`` is told which samples lie beyond row 0 of frame 2."""
+    """``change`` gets the samples that lie beyond row 0 of frame 2."""
 
     def plant(folder: Path) -> None:
         sequence = read_sequence(folder)

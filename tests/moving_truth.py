@@ -40,13 +40,13 @@ class World(NamedTuple):
     still: Array
     things: Sequence[Thing]
 
-    def hit(self, origins: Array, ways: Array, tau: Array) -> tuple[Array, NDArray[np.int64]]:
+    def hit(self, origins: Array, directions: Array, tau: Array) -> tuple[Array, NDArray[np.int64]]:
         """Parameter (n,) of the first triangle along rays at times (n,), and the number of its thing; 0: still."""
-        nearest = first_hit(self.still, origins, ways)
+        nearest = first_hit(self.still, origins, directions)
         owner = np.zeros(len(nearest), dtype=np.int64)
         for number, thing in enumerate(self.things, start=1):
             start = thing.back(origins, tau)
-            own = first_hit(thing.triangles, start, thing.back(origins + ways, tau) - start)
+            own = first_hit(thing.triangles, start, thing.back(origins + directions, tau) - start)
             owner[own < nearest] = number
             nearest = np.minimum(nearest, own)
         return nearest, owner
@@ -78,10 +78,10 @@ def truth(
     width, height = sequence.rig.camera.width, sequence.rig.camera.height
     y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
     pixels, start = np.column_stack([x, y]), row_times(sequence, frame, y)
-    origins, ways = rays(sequence, side, start, pixels)
-    depth, owner = world.hit(origins, ways, start)
+    origins, directions = rays(sequence, side, start, pixels)
+    depth, owner = world.hit(origins, directions, start)
     sky = np.isinf(depth)
-    X = origins + ways * np.where(sky, 1e8, depth)[:, None]
+    X = origins + directions * np.where(sky, 1e8, depth)[:, None]
     to, there = frame, side
     if channel == "disparity":
         there, tau = ("right" if side == "left" else "left"), start

@@ -52,14 +52,14 @@ def _run(command: list[str], folder: Path, installed: Path) -> str:
 
 
 def _printed_commands() -> list[tuple[str, list[str]]]:
-    """README's commands, each with the lines that it is said to print."""
+    """README's commands, each with the lines that it should print."""
     sessions = re.findall(r"^```console\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
     commands = re.split(r"^\$ ", "".join(sessions), flags=re.MULTILINE)[1:]
     return [(lines[0], lines[1:]) for lines in map(str.splitlines, commands)]
 
 
 def _printed_python() -> tuple[str, str]:
-    """README's Python, and the line that it is said to print."""
+    """README's Python, and the line that it should print."""
     (code,) = re.findall(r"^```python\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
     code, _, printed = str(code).rpartition("\n# ")
     return code, printed.strip()
@@ -68,19 +68,19 @@ def _printed_python() -> tuple[str, str]:
 _NUMBER = re.compile(r"-?\d+\.\d+")
 
 
-def _same(shown: str, said: str) -> bool:
+def _same(shown: str, printed: str) -> bool:
     """The same words; numbers with a point to a twentieth, as machines differ. "..." stands for anything."""
     words = [re.escape(_NUMBER.sub("#", part)) for part in " ".join(shown.split()).split("...")]
-    said = " ".join(said.split())
-    if re.fullmatch(".*".join(words), _NUMBER.sub("#", said)) is None:
+    printed = " ".join(printed.split())
+    if re.fullmatch(".*".join(words), _NUMBER.sub("#", printed)) is None:
         return False
-    pairs = zip(map(float, _NUMBER.findall(shown)), map(float, _NUMBER.findall(said)), strict=True)
+    pairs = zip(map(float, _NUMBER.findall(shown)), map(float, _NUMBER.findall(printed)), strict=True)
     return all(abs(one - other) <= 0.05 * abs(one) + 0.002 for one, other in pairs)
 
 
-def _assert_shown(shown: list[str], said: str) -> None:
-    """Every line that is shown was said, in this order, from the first one on unless "..." stands between."""
-    left = [line for line in said.splitlines() if line.strip()]
+def _assert_shown(shown: list[str], printed: str) -> None:
+    """Every line that is shown was printed, in this order, from the first one on unless "..." stands between."""
+    left = [line for line in printed.splitlines() if line.strip()]
     skip = False
     for line in shown:
         if line == "...":
@@ -88,9 +88,9 @@ def _assert_shown(shown: list[str], said: str) -> None:
             continue
         while skip and left and not _same(line, left[0]):
             left.pop(0)
-        assert left and _same(line, left.pop(0)), (line, said)
+        assert left and _same(line, left.pop(0)), (line, printed)
         skip = False
-    assert skip or not left, said
+    assert skip or not left, printed
 
 
 def test_the_package_comes_from_the_wheel(installed: Path, tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ def test_what_is_wrong_is_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    words, said = {
+    words, message = {
         "public": (["--public", str(tmp_path)], "has no folder Carla"),
         "predict": (["--predict", str(tmp_path)], "no network of 1800 steps"),
         "damaged": (["--predict", str(tmp_path)], "net.pt: is no state of this program: delete it"),
@@ -164,7 +164,7 @@ def test_what_is_wrong_is_one_line(
     monkeypatch.setattr("sys.argv", ["learn_flow.py", "--out", str(tmp_path), *words])
     with pytest.raises(SystemExit) as end:
         script.main()
-    assert end.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
+    assert end.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_flow_of_larger_frames_is_in_their_pixels(script: ModuleType) -> None:

@@ -32,7 +32,7 @@ README_ROWS = {
 
 
 def test_readme_is_short_and_shows_rows_of_the_results_pages() -> None:
-    """In plainer words: solvers (without the column of what they see), models at 2 deg, frames at aggressive motion."""
+    """In plainer words: solvers (without their input column), models at 2 deg, frames at aggressive motion."""
     readme = (ROOT / "README.md").read_text("utf-8")
     assert readme.count("\n") <= 160
     pages: dict[str, list[list[str]]] = {}
@@ -116,14 +116,14 @@ def test_the_literal_correction_is_that_of_figure_4() -> None:
         [statistics.mean(float(row[column]) for row in rows) for rows in seeds.values()]
         for column in ("psnr_drawn", "psnr_rolling_drawn")
     )
-    told = f"{min(psnr):.1f} to {max(psnr):.1f} dB"
+    bounds = f"{min(psnr):.1f} to {max(psnr):.1f} dB"
     assert len(seeds) == 10
     section = " ".join(
         RESULTS["results-paper.md"].partition("## Corrected images")[2].partition("\n## ")[0].split()
     )
-    assert f"ten RANSAC seeds have {told} on the pixels that have a depth" in section
+    assert f"ten RANSAC seeds have {bounds} on the pixels that have a depth" in section
     assert f"uncorrected frame has {statistics.mean(before):.1f} dB" in section
-    assert told in " ".join((DOCS / "report.md").read_text("utf-8").split())
+    assert bounds in " ".join((DOCS / "report.md").read_text("utf-8").split())
 
 
 def test_corrections_shown_are_those_of_the_study() -> None:

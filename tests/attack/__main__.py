@@ -66,8 +66,8 @@ def main() -> int:
     extent = SAMPLE if chosen.sample else LONG
     if chosen.case:
         extent = replace(extent, cases=tuple(chosen.case))
-    asked = {k: getattr(chosen, k) for k in ("kills", "files", "inputs", "surroundings") if getattr(chosen, k)}
-    extent = replace(extent, **asked)
+    limits = {k: getattr(chosen, k) for k in ("kills", "files", "inputs", "surroundings") if getattr(chosen, k)}
+    extent = replace(extent, **limits)
     chosen.keep.mkdir(parents=True, exist_ok=True)
     rows, faults = dict[str, str](), 0
     with tempfile.TemporaryDirectory(prefix="attack-") as root, stage(Path(root), extent.cases) as arena:
@@ -114,8 +114,8 @@ def _attacks(
     results: dict[str, Path] = {}
     known = cases(arena)
     for number, name in enumerate(CASES):
-        asked = {"kills", "files", "environment"} & set(wanted) or ("fuzz" in wanted and name in READ)
-        if name not in extent.cases or not asked:
+        chosen = {"kills", "files", "environment"} & set(wanted) or ("fuzz" in wanted and name in READ)
+        if name not in extent.cases or not chosen:
             continue
         references[name] = undisturbed(arena, known[name])
         results[name] = arena.root.parent / "results" / name

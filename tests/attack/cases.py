@@ -90,8 +90,8 @@ class Tally:
     def count(self, name: str, by: int = 1) -> None:
         self.counts[name] = self.counts.get(name, 0) + by
 
-    def check(self, held: bool, fault: str) -> None:
-        if not held:
+    def check(self, passed: bool, fault: str) -> None:
+        if not passed:
             self.faults.append(" ".join(fault.split())[:400])
 
 

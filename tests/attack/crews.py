@@ -249,9 +249,9 @@ def _name(pid: int, run: Run, cluster: Cluster | None) -> str:
 
 def _check_end(run: Run, code: int, where: str, tally: Tally) -> None:
     tally.count("runs done")
-    told = run.errors.read_text("utf-8", errors="replace")
-    tally.check(code == 0, f"{where}: exit code {code}, {told[-300:]}")
-    tally.check("Traceback" not in told, f"{where}: traceback: {told[-300:]}")
+    printed = run.errors.read_text("utf-8", errors="replace")
+    tally.check(code == 0, f"{where}: exit code {code}, {printed[-300:]}")
+    tally.check("Traceback" not in printed, f"{where}: traceback: {printed[-300:]}")
 
 
 def _tree(pid: int) -> list[int]:

@@ -84,7 +84,7 @@ def _block(loader: Loader, first: int, size: int, seed: int, keep: Path, tally: 
                 word in ("read", "refused"), f"{loader.name}, input {first + done - 1} of seed {seed}: {text}"
             )
         if done == before:  # as where a loader has no seeds
-            raise RuntimeError(f"{loader.name}: the child said nothing of input {first + done}")
+            raise RuntimeError(f"{loader.name}: the child reported nothing about input {first + done}")
 
 
 def _messages(
@@ -97,24 +97,24 @@ def _messages(
         os.close(reader)
         _serve(loader, first, size, done, seed, keep, writer)
     os.close(writer)
-    pending, closed, told = b"", False, True
+    pending, closed, reported = b"", False, True
     while not closed:
         ready, _, _ = select.select([reader], (), (), HANG_S)
         if not ready:
             os.kill(pid, signal.SIGKILL)
             yield "hung", f"longer than {HANG_S:g} s"
-            told = True
+            reported = True
             break
         part = os.read(reader, 65536)
         closed = not part
         *lines, pending = (pending + part).split(b"\n")
         for line in lines:
             word, _, text = line.decode("utf-8", errors="replace").partition(" ")
-            told = word != "at"
+            reported = word != "at"
             yield word, text
     os.close(reader)
     _, status = os.waitpid(pid, 0)
-    if not told:
+    if not reported:
         yield "crashed", f"exit code {os.waitstatus_to_exitcode(status)}"
 
 

@@ -30,7 +30,7 @@ STOP_S = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Death:
-    """One way to die."""
+    """One kind of death."""
 
     name: str
     before: Callable[[], None] | None = None
@@ -66,7 +66,7 @@ def attack(arena: Arena, case: Case, reference: Reference, rng: np.random.Genera
 
 
 def draw(arena: Arena, case: Case, reference: Reference, rng: np.random.Generator) -> Death:
-    """A random way: half of them at a random moment, a third at a file operation, the rest within a file."""
+    """A random kind: half of them at a random moment, a third at a file operation, the rest within a file."""
     choice = rng.random()
     if choice < 0.5:
         number = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)[int(rng.integers(3))]
@@ -91,9 +91,9 @@ def _check_death(tally: Tally, death: Death, ending: Ending, where: str) -> None
     if death.stop is None or death.stop[1] == signal.SIGKILL:
         return
     number = death.stop[1]
-    told = ending.code == 128 + number and any(word in ending.err for word in ("resumes", "as it was before"))
+    reported = ending.code == 128 + number and any(word in ending.err for word in ("resumes", "as it was before"))
     # Before there is anything to resume a signal may end it in silence.
-    tally.check(told or ending.code == -number, f"{where}: exit code {ending.code}, {ending.err[-200:]!r}")
+    tally.check(reported or ending.code == -number, f"{where}: exit code {ending.code}, {ending.err[-200:]!r}")
     late = ending.seconds - death.stop[0]
     tally.check(late < STOP_S, f"{where}: stopped after {late:.1f} s")
 

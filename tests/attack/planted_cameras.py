@@ -324,12 +324,12 @@ def _flipped(name: str, shutter: str, view: str) -> Iterator[Fault]:
     yield Fault(f"{shutter} {view} flipped", _all(image, depth), (f"{shutter}_depth/{view}.exr", words))
 
 
-def _seen_without_lens(sequence: Sequence, values: NDArray[Any], way: int, border: int) -> NDArray[Any]:
+def _seen_without_lens(sequence: Sequence, values: NDArray[Any], interpolation: int, border: int) -> NDArray[Any]:
     """An image or map (H, W, ...) as the camera without its lens would have it, but for its row 0."""
     camera = sequence.rig.camera
     rays = replace(camera, lens=None).unproject(camera.pixel_grid())
     pixels = np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32)
-    moved = cv2.remap(values, pixels, None, way, borderMode=border)
+    moved = cv2.remap(values, pixels, None, interpolation, borderMode=border)
     moved[0] = values[0]
     return np.ascontiguousarray(moved, dtype=values.dtype)
 

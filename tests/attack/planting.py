@@ -88,8 +88,8 @@ def rehash(folder: Path) -> None:
             listed[f"{name}/{path}"] = {"sha256": sha256(file), "size": file.stat().st_size}
     write_json(folder / "dataset.json", manifest | {"files": listed})
     with suppress(KeyError, TypeError, AttributeError):  # the fault is in what it tells
-        said = croissant_of(manifest | {"files": listed}, sha256(folder / "dataset.json"))
-        write_json(folder / "croissant.json", said)
+        croissant = croissant_of(manifest | {"files": listed}, sha256(folder / "dataset.json"))
+        write_json(folder / "croissant.json", croissant)
 
 
 def planted(fault: Fault, sound: Path, out: Path) -> Path:

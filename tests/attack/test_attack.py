@@ -24,5 +24,5 @@ def test_a_sample_of_the_attack_finds_nothing(tmp_path: Path) -> None:
         timeout=500,
     )
     assert result.returncode == 0, result.stdout + result.stderr
-    told = {line.partition(":")[0] for line in result.stdout.splitlines()}
-    assert {"kills of correct", "file operations of correct", "surroundings"} <= told
+    printed = {line.partition(":")[0] for line in result.stdout.splitlines()}
+    assert {"kills of correct", "file operations of correct", "surroundings"} <= printed

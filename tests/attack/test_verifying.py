@@ -36,15 +36,15 @@ def test_a_planted_fault_is_named(smoke_dataset: Path, tmp_path: Path, fault: Fa
 
 
 def test_the_long_run_reports_what_is_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[str] = []
+    started: list[str] = []
 
     def run(command: list[str], **_: object) -> SimpleNamespace:
-        asked.extend(command)
+        started.extend(command)
         return SimpleNamespace(stdout=PRINTED, stderr="", returncode=1)
 
     monkeypatch.setattr(program, "subprocess", SimpleNamespace(run=run))
     tally = program._verify(12)
-    assert asked[1:] == ["-m", "attack.verifying", "--seed", "12"]
+    assert started[1:] == ["-m", "attack.verifying", "--seed", "12"]
     assert tally.counts == {"planted faults": 208, "sound sequences": 200}
     assert tally.faults == [line.strip() for line in PRINTED.splitlines() if line.startswith("  ")]
     document = tmp_path / "figures.md"

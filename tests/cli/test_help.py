@@ -70,8 +70,8 @@ def test_progress_prints_brackets_as_they_are(
     with progress_bar("rendering my[view]", 2) as advance:
         advance("a[0]")
         advance("[/bold]")
-    told = capsys.readouterr().err
-    assert "my[view]" in told and "[/bold]" in told
+    printed = capsys.readouterr().err
+    assert "my[view]" in printed and "[/bold]" in printed
 
 
 def _captured(action: Any) -> str:

@@ -73,7 +73,7 @@ class Run:
             time.sleep(0.02)
 
     def finish(self) -> str:
-        """What it said on standard error."""
+        """Its standard error."""
         return self.process.communicate(timeout=300.0)[1]
 
 
@@ -106,7 +106,7 @@ def test_stopped_and_a_worker_killed_it_goes_on_to_the_same_bytes(tmp_path: Path
 @pytest.mark.slow
 def test_rendering_by_several_processes_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     card = write_small_card(tmp_path, [write_box_scene(tmp_path, name) for name in "abcd"])
-    # Large enough for a minute, and larger than frames may be without being asked for.
+    # Large enough for a minute, and larger than the default limit of frames.
     monkeypatch.setenv("RSBENCH_LIMITS", "8")
     card.write_text(card.read_text().replace("width = 96", "width = 3000").replace("height = 64", "height = 3000"))
     run = Run("generate", card, tmp_path / "out")

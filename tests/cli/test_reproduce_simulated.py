@@ -103,6 +103,6 @@ def test_everything_makes_each_folder_of_results_once(
     assert lines[0].startswith(f"[1 of {len(made)}] {made[0]}: about 3 minutes; with what follows 12")
     assert lines[::2][:-1] == [each for each in lines if each.startswith("[")]
     assert lines[-3].endswith("image-claims: about 1 minutes; with what follows 0.0 hours")
-    told = [line.partition(":")[0] for line in lines if not line.startswith("[")]
-    assert told == [*made, "everything"]
+    printed = [line.partition(":")[0] for line in lines if not line.startswith("[")]
+    assert printed == [*made, "everything"]
     assert command._left([Target.fig4, Target.sgm], [0.0, 2.0]).startswith("about 18 minutes")

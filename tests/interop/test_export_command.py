@@ -97,7 +97,7 @@ def test_torch_is_imported_by_its_own_module_alone() -> None:
 
 
 def test_objects_that_move_are_told_of_and_are_no_points(tmp_path: Path) -> None:
-    """Labels by hand: the left half of every picture is said to move."""
+    """Labels by hand: the left half of every picture is labelled as moving."""
     data = dataset(tmp_path / "data")
     thing = {
         "box": [1.0, 1.0, 1.0],
@@ -116,9 +116,9 @@ def test_objects_that_move_are_told_of_and_are_no_points(tmp_path: Path) -> None
             write_png(file, labels)
     for name in FORMATS:
         _, note = exported(data, name, tmp_path / name)
-        said = any("move in the images" in word or "what moves" in word for word in note["told"])
+        reported = any("move in the images" in word or "what moves" in word for word in note["told"])
         # A trajectory has no images, and every shot of fastec-rs is one pair with its truth at its own instant.
-        assert said == (name not in ("tum", "kalibr", "fastec-rs")), name
+        assert reported == (name not in ("tum", "kalibr", "fastec-rs")), name
     points = np.loadtxt(tmp_path / "colmap/planes/sparse/points3D.txt", usecols=(1, 2, 3, 4, 5, 6))
     assert len(points) > 100
     _, poses = only(data).poses("left", 0)

@@ -390,11 +390,11 @@ def test_gsplat_sees_our_points_in_their_pixels(
     assert note["largest_row_error_px"] < SAME_PX and note["told"] == []
     for side, frame in views_of(2):
         with np.load(out / f"planes/{side}.npz") as arrays:
-            held = {name: arrays[name] for name in arrays}
+            loaded = {name: arrays[name] for name in arrays}
         about = json.loads((out / f"planes/{side}.json").read_text())
         assert about["rolling_shutter"] == f"ROLLING_{shutters[SIDES.index(side)]}"
         assert about["camera_model"] == ("fisheye" if lens == "fisheye" else "pinhole")
-        assert {name: array.shape[1:] for name, array in held.items()} == {
+        assert {name: array.shape[1:] for name, array in loaded.items()} == {
             "viewmats": (4, 4),
             "viewmats_rs": (4, 4),
             "Ks": (3, 3),
@@ -402,10 +402,10 @@ def test_gsplat_sees_our_points_in_their_pixels(
             **({"tangential_coeffs": (2,)} if lens == "brown-k3" else {}),
         }
         shown = seen(only(data), side, frame, "rs", rows=(1, 24, 47))
-        inside = np.ptp(np.stack([held["viewmats"][frame], held["viewmats_rs"][frame]]), axis=0)
+        inside = np.ptp(np.stack([loaded["viewmats"][frame], loaded["viewmats_rs"][frame]]), axis=0)
         assert np.max(inside) > 0.01, "the camera moves"
-        start, end = held["viewmats"][frame], held["viewmats_rs"][frame]
-        found = _gsplat_pixels(start, end, shown.world, held["Ks"][frame], about | {"lens": lens})
+        start, end = loaded["viewmats"][frame], loaded["viewmats_rs"][frame]
+        found = _gsplat_pixels(start, end, shown.world, loaded["Ks"][frame], about | {"lens": lens})
         # A pixel's centre is half a pixel from where the time of its line would be another's.
         np.testing.assert_allclose(found, shown.pixels + 0.5, atol=SAME_PX)
         image = out / "planes" / about["images"][frame]

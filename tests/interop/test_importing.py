@@ -174,7 +174,7 @@ START, PERIOD = 1403636579763555584, 50000000
 
 
 def body(t: float) -> Array:
-    """``world_from_body``, t in seconds: a turn at constant speed along a straight way."""
+    """``world_from_body``, t in seconds: a turn at constant speed along a straight line."""
     out = np.eye(4)
     out[:3, :3] = scipy.linalg.expm(skew(np.array([0.4, -0.2, 0.7]) * t))
     out[:3, 3] = np.array([1.0, 2.0, 3.0]) + np.array([0.5, -0.3, 0.2]) * t
@@ -227,7 +227,7 @@ def test_euroc(tmp_path: Path) -> None:
     camera = recording.cameras["left"]
     assert camera.lens is not None
     assert (camera.cx, camera.lens.k1, camera.lens.p2) == (31.2, -0.28, 1.8e-05)
-    assert np.all(np.isnan(recording.poses["left"](np.array([9.0])).t))  # where nothing is known, nothing is said
+    assert np.all(np.isnan(recording.poses["left"](np.array([9.0])).t))  # unknown outside the file's times
     assert run_here("verify", tmp_path, "--from", "euroc").returncode == 0
 
 

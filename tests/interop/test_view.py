@@ -107,8 +107,8 @@ def test_without_rerun_or_a_screen_one_line_says_so(tmp_path: Path, monkeypatch:
         monkeypatch.delenv(name, raising=False)
     run = run_here("view", dataset(tmp_path / "data"))
     assert run.returncode == 2
-    told = "there is no screen" if find_spec("rerun") else "rsbench[view]"
-    assert told in run.stderr and run.stderr.count("\n") == 1
+    words = "there is no screen" if find_spec("rerun") else "rsbench[view]"
+    assert words in run.stderr and run.stderr.count("\n") == 1
 
 
 def test_matches_without_labels_are_those_of_the_matcher(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_results_that_die_with_their_workers_before_they_are_fetched_are_made_ag
 def test_a_result_that_dies_while_it_is_fetched_is_made_again(
     there: Cluster, local: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The worker is killed when the scheduler has been asked for the result and has not asked the worker yet."""
+    """The worker is killed between the request to the scheduler and that of the scheduler to the worker."""
     gather, killed = local.scheduler.handlers["gather"], list[str]()
 
     async def kill_and_gather(keys: list[str], **others: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Other people's code in a child process: each way to go wrong is a failure with its reason, of nobody else."""
+"""Other people's code in a child process: each kind of misbehaviour is a failure of its own with its reason."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def zeros(count: int) -> bytes:
 
 
 def png(path: Path, width: int = 20_000, height: int = 20_000) -> None:
-    """A whole grey PNG file of black pixels: 400 MB, 1.2 GB as the RGB that is asked for."""
+    """A whole grey PNG file of black pixels: 400 MB, 1.2 GB as RGB."""
     data = zeros((width + 1) * height // (1 << 20) + 1)
     chunks = (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", data), (b"IEND", b"")
     content = b"".join(
@@ -182,7 +182,7 @@ BOMBS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a.glb": (glb, r"values of all accessors: 3000000000 is more than"),
     "a.ply": (ply, r"states 4000000000 elements"),
 }
-"""Of each kind: how it is made, and what is said of it."""
+"""By file name: the function that writes it, and the error."""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="measures with the resource module")

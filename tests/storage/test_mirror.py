@@ -48,7 +48,7 @@ def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 @pytest.fixture
 def open_mirrors(monkeypatch: pytest.MonkeyPatch) -> queue.Queue[Any]:
-    """Those that send only when they are told to."""
+    """Mirrors that upload only on request."""
     found: queue.Queue[Any] = queue.Queue()
     monkeypatch.setattr(mirror._Mirror, "keep_sending", lambda self, done: found.put(self))
     return found

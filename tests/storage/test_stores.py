@@ -38,7 +38,7 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> DatasetCard:
 
 @pytest.fixture(scope="module")
 def dataset(card: DatasetCard, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The files of a folder, which was rendered in the way of folders."""
+    """The files of a dataset that was rendered to a folder."""
     out = tmp_path_factory.mktemp("stores") / "dataset"
     generate_dataset(card, out)
     return bytes_below(out, HIDDEN)
