@@ -55,7 +55,7 @@ _FLOW_BYTES = 100.0
 
 
 class _Still(NamedTuple):
-    """Motion of points at rest: (H, W, 2) px, NaN where it is unknown, and (H, W) whether they are hidden there."""
+    """Motion of points at rest: (H, W, 2) px, NaN where unknown, and (H, W) whether they are hidden there."""
 
     far: F32
     """(H, W, 2) px that a point at rest moves if it is somewhat farther."""
