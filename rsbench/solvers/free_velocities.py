@@ -225,25 +225,16 @@ def refine(start: FreeMotion, rows: Rows, *, turning: bool, most: int) -> tuple[
         start = start._replace(w0=np.zeros(3), w1=np.zeros(3))
     R, vectors, focal = np.array(start.R), np.stack(start[1:]), np.array([camera.fx, camera.fy])
     slowness, exact = (camera.height / camera.fy) ** 2 / len(rows.x), len(rows.x) * _EXACT_PX**2
-    cost = descend(R, vectors, unknowns, most, exact, rows.packed(), focal, slowness, np.zeros(0), places(1))
+    target = (rows.packed(), focal, slowness, np.zeros(0), places(1))
+    cost = descend(R, vectors, unknowns, most, exact, target)
     return FreeMotion(R, *vectors), cost
 
 
 def nearest(start: FreeMotion, F: FloatArray, degree: int, most: int) -> tuple[FreeMotion, float]:
     """The motion whose unit coefficients (see ``generalised_essential``) have least across F, and its square."""
     R, vectors, unknowns = np.array(start.R), np.stack(start[1:]), 11 if degree == 1 else 17
-    cost = descend(
-        R,
-        vectors,
-        unknowns,
-        most,
-        _EXACT**2,
-        np.zeros((0, 6)),
-        np.ones(2),
-        0.0,
-        F / np.linalg.norm(F),
-        places(degree),
-    )
+    target = (np.zeros((0, 6)), np.ones(2), 0.0, F / np.linalg.norm(F), places(degree))
+    cost = descend(R, vectors, unknowns, most, _EXACT**2, target)
     return FreeMotion(R, *vectors), cost
 
 

@@ -26,6 +26,12 @@ from rsbench.components.motion_kernels import (
 )
 from rsbench.core.so3 import FloatArray
 
+Match = tuple[Vector, Vector, float, float]
+"""Rays of frame 0 and 1, z = 1, and their s."""
+Target = tuple[FloatArray, FloatArray, float, FloatArray, NDArray[np.int64]]
+"""What a descent minimises: rows (n, 6), focal (2,) and slowness of Sampson errors; or F and the ``places`` of its
+coefficients, where F is not empty."""
+
 
 @compiled
 def free_terms(
@@ -42,11 +48,11 @@ def free_terms(
         residuals: (n,), filled.
         J: (n, 18), filled, by ``FreeMotion.moved``; of no rows to leave it out.
     """
-    A0, A1, S, P = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    work = np.zeros((4, 3, 3))
     for m in range(len(rows)):
         x, y = (rows[m, 0], rows[m, 1], 1.0), (rows[m, 2], rows[m, 3], 1.0)
         s0, s1 = rows[m, 4], rows[m, 5]
-        value, q = _constraint(R, vectors, x, y, s0, s1, focal, A0, A1, P)
+        value, q = _constraint(R, vectors, (x, y, s0, s1), focal, work)
         qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
         norm = math.sqrt(qq) if qq > 0.0 else 1.0
         residuals[m] = value / norm if qq > 0.0 else 0.0
@@ -56,7 +62,7 @@ def free_terms(
         x = (x[0] - step * q[0] / focal[0], x[1] - step * q[1] / focal[1], 1.0)
         y = (y[0] - step * q[2] / focal[0], y[1] - step * q[3] / focal[1], 1.0)
         s0, s1 = s0 - step * q[1] / focal[1], s1 - step * q[3] / focal[1]
-        _derivatives(R, vectors, x, y, s0, s1, A0, A1, S, P, J[m])
+        _derivatives(R, vectors, (x, y, s0, s1), work, J[m])
         for k in range(18):
             J[m, k] /= norm
 
@@ -79,10 +85,9 @@ def _left_jacobian(phi: Vector, out: FloatArray) -> None:
 
 
 @compiled
-def _between(
-    R: FloatArray, vectors: FloatArray, s0: float, s1: float, A0: FloatArray, A1: FloatArray, P: FloatArray
-) -> tuple[Vector, Vector]:
-    """T and R(s0, s1) v0; P is filled with R(s0, s1), A0 and A1 with the rotations of the frames."""
+def _between(R: FloatArray, vectors: FloatArray, s0: float, s1: float, work: FloatArray) -> tuple[Vector, Vector]:
+    """T and R(s0, s1) v0; ``work`` is filled with the rotations of frame 0 and 1 and R(s0, s1)."""
+    A0, A1, P = work[0], work[1], work[2]
     v0, v1 = _row(vectors, 1), _row(vectors, 2)
     exponential(times(-s0, _row(vectors, 3)), A0)
     exponential(times(s1, _row(vectors, 4)), A1)
@@ -100,19 +105,11 @@ def _between(
 
 @compiled
 def _constraint(
-    R: FloatArray,
-    vectors: FloatArray,
-    x: Vector,
-    y: Vector,
-    s0: float,
-    s1: float,
-    focal: FloatArray,
-    A0: FloatArray,
-    A1: FloatArray,
-    P: FloatArray,
+    R: FloatArray, vectors: FloatArray, match: Match, focal: FloatArray, work: FloatArray
 ) -> tuple[float, tuple[float, float, float, float]]:
     """y^T [T]x R x and its derivatives by the pixels: a row that moves is another pose too."""
-    T, Rv0 = _between(R, vectors, s0, s1, A0, A1, P)
+    (x, y, s0, s1), A1, P = match, work[1], work[2]
+    T, Rv0 = _between(R, vectors, s0, s1, work)
     v1, w1 = _row(vectors, 2), _row(vectors, 4)
     p = apply(P, x)
     n = cross(p, y)
@@ -131,21 +128,10 @@ def _constraint(
 
 
 @compiled
-def _derivatives(
-    R: FloatArray,
-    vectors: FloatArray,
-    x: Vector,
-    y: Vector,
-    s0: float,
-    s1: float,
-    A0: FloatArray,
-    A1: FloatArray,
-    S: FloatArray,
-    P: FloatArray,
-    J: FloatArray,
-) -> None:
+def _derivatives(R: FloatArray, vectors: FloatArray, match: Match, work: FloatArray, J: FloatArray) -> None:
     """Derivatives (18,) of the constraint by turn, t, v0, v1, w0 and w1."""
-    T, Rv0 = _between(R, vectors, s0, s1, A0, A1, P)
+    (x, y, s0, s1), A1, P, S = match, work[1], work[2], work[3]
+    T, Rv0 = _between(R, vectors, s0, s1, work)
     p = apply(P, x)
     n = cross(p, y)
     turned = plus(plus(times(dot(T, p), y), -dot(y, p), T), -s0, cross(Rv0, n))  # by a turn left of R(s0, s1)
@@ -163,12 +149,12 @@ def _derivatives(
 @compiled
 def free_in_front(R: FloatArray, vectors: FloatArray, rows: FloatArray) -> int:
     """How many points lie in front of both cameras; T counts on the side of t."""
-    A0, A1, P, t = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), _row(vectors, 0)
+    work, t = np.zeros((3, 3, 3)), _row(vectors, 0)
     count = 0
     for m in range(len(rows)):
         y = (rows[m, 2], rows[m, 3], 1.0)
-        T, _ = _between(R, vectors, rows[m, 4], rows[m, 5], A0, A1, P)
-        p = apply(P, (rows[m, 0], rows[m, 1], 1.0))
+        T, _ = _between(R, vectors, rows[m, 4], rows[m, 5], work)
+        p = apply(work[2], (rows[m, 0], rows[m, 1], 1.0))
         if dot(T, t) < 0.0:
             T = times(-1.0, T)
         pp, yy, py, pT, yT = dot(p, p), dot(y, y), dot(p, y), dot(p, T), dot(y, T)
@@ -180,9 +166,10 @@ def free_in_front(R: FloatArray, vectors: FloatArray, rows: FloatArray) -> int:
 @compiled
 def free_from_row(R: FloatArray, vectors: FloatArray, s: float, out_R: FloatArray, out: FloatArray) -> None:
     """``free_velocities.from_row``: the motion with s = 0 at another row, filled."""
-    A0, A1 = np.zeros((3, 3)), np.zeros((3, 3))
+    work = np.zeros((3, 3, 3))
     v0, v1, w0, w1 = _row(vectors, 1), _row(vectors, 2), _row(vectors, 3), _row(vectors, 4)
-    t, Rv0 = _between(R, vectors, s, s, A0, A1, out_R)
+    t, Rv0 = _between(R, vectors, s, s, work)
+    _copy(work[2], out_R)
     # Frame 0 began at (exp(s w0), s v0); its camera is the world now.
     v0, v1 = plus(v0, -s, cross(w0, v0)), plus(v1, -s, cross(w1, Rv0))
     for k in range(3):
@@ -288,37 +275,25 @@ _LARGEST_DAMPING = 1e8
 
 
 @compiled
-def descend(
-    R: FloatArray,
-    vectors: FloatArray,
-    unknowns: int,
-    most: int,
-    exact: float,
-    rows: FloatArray,
-    focal: FloatArray,
-    slowness: float,
-    F: FloatArray,
-    place: NDArray[np.int64],
-) -> float:
+def descend(R: FloatArray, vectors: FloatArray, unknowns: int, most: int, exact: float, target: Target) -> float:
     """Levenberg and Marquardt's descent, in place; what is left of the cost.
 
     Args:
         most: evaluations; exact: a cost that is as good as 0.
-        rows, focal, slowness: of ``_sampson``, when F is empty.
-        F, place: of ``_misfit`` otherwise.
+        target: of ``_sampson``, or of ``_misfit`` when its F is not empty.
     """
     trial_R, trial = np.zeros((3, 3)), np.zeros((5, 3))
     H, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     there_H, there_gradient, step = np.zeros((unknowns, unknowns)), np.zeros(unknowns), np.zeros(unknowns)
     _unit_length(vectors)
-    cost = _evaluate(R, vectors, rows, focal, slowness, F, place, H, gradient)
+    cost = _evaluate(R, vectors, target, H, gradient)
     damping = 1e-3
     for _ in range(most):
         if cost <= exact or damping > _LARGEST_DAMPING:
             break
         if _damped_step(H, gradient, damping, step):
             _move(R, vectors, step, trial_R, trial)
-            trial_cost = _evaluate(trial_R, trial, rows, focal, slowness, F, place, there_H, there_gradient)
+            trial_cost = _evaluate(trial_R, trial, target, there_H, there_gradient)
         else:
             trial_cost = np.inf
         if not trial_cost < cost:
@@ -344,26 +319,16 @@ def _copy(source: FloatArray, target: FloatArray) -> None:
 
 
 @compiled
-def _evaluate(
-    R: FloatArray,
-    vectors: FloatArray,
-    rows: FloatArray,
-    focal: FloatArray,
-    slowness: float,
-    F: FloatArray,
-    place: NDArray[np.int64],
-    H: FloatArray,
-    gradient: FloatArray,
-) -> float:
+def _evaluate(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, gradient: FloatArray) -> float:
     """The cost; H and gradient are filled."""
     for i in range(len(H)):
         gradient[i] = 0.0
         for j in range(len(H)):
             H[i, j] = 0.0
-    if len(F) > 0:
-        cost = _misfit(R, vectors, F, place, H, gradient)
+    if len(target[3]) > 0:
+        cost = _misfit(R, vectors, target, H, gradient)
     else:
-        cost = _sampson(R, vectors, rows, focal, slowness, H, gradient)
+        cost = _sampson(R, vectors, target, H, gradient)
     for i in range(len(H)):
         for j in range(i):
             H[i, j] = H[j, i]
@@ -380,16 +345,9 @@ def _add(J: FloatArray, r: float, H: FloatArray, gradient: FloatArray) -> None:
 
 
 @compiled
-def _sampson(
-    R: FloatArray,
-    vectors: FloatArray,
-    rows: FloatArray,
-    focal: FloatArray,
-    slowness: float,
-    H: FloatArray,
-    gradient: FloatArray,
-) -> float:
+def _sampson(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, gradient: FloatArray) -> float:
     """C (1 + slowness (|v0|^2 + |v1|^2)), C the sum of squared Sampson errors, px^2, of rows (n, 6)."""
+    rows, focal, slowness, _, _ = target
     residuals, J, across, row = np.zeros(len(rows)), np.zeros((len(rows), 18)), _across(vectors), np.zeros(17)
     free_terms(R, vectors, rows, focal, residuals, J)
     squares, fast = 0.0, 1.0
@@ -414,15 +372,9 @@ def _sampson(
 
 
 @compiled
-def _misfit(
-    R: FloatArray,
-    vectors: FloatArray,
-    F: FloatArray,
-    place: NDArray[np.int64],
-    H: FloatArray,
-    gradient: FloatArray,
-) -> float:
+def _misfit(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, gradient: FloatArray) -> float:
     """Square of what the unit coefficients of a motion have across the unit vector F."""
+    F, place = target[3], target[4]
     n, across, row = len(F), _across(vectors), np.zeros(18)
     C, by, J = np.zeros(n), np.zeros((18, n)), np.zeros((n, 17))
     fill_coefficients(R, vectors, place, C, by)
@@ -567,7 +519,7 @@ def free_proposal(
     """
     near_R, near = np.zeros((4, 3, 3)), np.zeros((4, 5, 3))
     for k in range(2):
-        descend(Rs[k], vectors[k], _PROPOSAL_UNKNOWNS, most[0], 1e-28, rows[:0], focal, 0.0, F, place)
+        descend(Rs[k], vectors[k], _PROPOSAL_UNKNOWNS, most[0], 1e-28, (rows[:0], focal, 0.0, F, place))
         _with_twin(Rs[k], vectors[k], near_R[2 * k : 2 * k + 2], near[2 * k : 2 * k + 2])
     best = _most_likely(near_R, near, rows, focal)
     free_from_row(near_R[best], near[best], first, R, out)
@@ -579,7 +531,7 @@ def free_proposal(
         for i in range(1, 3):
             for j in range(3):
                 out[i, j] = 0.0
-        descend(R, out, _PROPOSAL_UNKNOWNS, most[1], 0.0, moved, focal, slowness, F[:0], place)
+        descend(R, out, _PROPOSAL_UNKNOWNS, most[1], 0.0, (moved, focal, slowness, F[:0], place))
     if free_in_front(R, -out, moved) > free_in_front(R, out, moved):
         for i in range(3):
             for j in range(3):
