@@ -41,6 +41,7 @@ import numpy as np
 from rsbench.components.compiled import compiled
 from rsbench.components.motion_kernels import (
     MotionKernel,
+    Moved,
     Vector,
     apply,
     apply_transposed,
@@ -84,12 +85,9 @@ def pair_terms(
     for m in range(len(pairs)):
         x, y, offset = (pairs[m, 0], pairs[m, 1], 1.0), (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
         tau0, tau1 = pairs[m, 4], pairs[m, 5]
-        T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
-        Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
-        T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
-        rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
         L0, L1, slope = at_pixels(pairs, m, h)
-        value, q = pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
+        moved = _camera_move(theta, kernel, tau0, tau1, offset, R, A)
+        value, q = pair_gradient(x, y, R, moved, focal, L0, L1, slope)
         qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
         residuals[m] = value / math.sqrt(qq) if qq > 0.0 else displacement(apply(R, x), y, focal)
         if not want or qq <= 0.0:
@@ -131,16 +129,23 @@ def displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
     return math.hypot(focal[0] * (y[0] - p[0] / p[2]), focal[1] * (y[1] - p[1] / p[2])) / math.sqrt(2.0)
 
 
+@compiled(inline="always")  # a call would cost as much as its work
+def _camera_move(
+    theta: FloatArray, kernel: MotionKernel, tau0: float, tau1: float, offset: float, R: FloatArray, A: FloatArray
+) -> Moved:
+    """``kernel.move`` of a camera whose x is larger than the body's by ``offset``."""
+    T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
+    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
+    return T, plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro)), spin0, spin1
+
+
 @compiled
 def pair_gradient(
     x: Vector,
     y: Vector,
     R: FloatArray,
-    T: Vector,
-    rate0: Vector,
-    rate1: Vector,
-    spin0: Vector,
-    spin1: Vector,
+    moved: Moved,
     focal: FloatArray,
     L0: Matrix,
     L1: Matrix,
@@ -150,6 +155,7 @@ def pair_gradient(
 
     The paper's (7) before its linearisation: E = [T]x R of (6). The rates are T's by the two times, the spins R's.
     """
+    T, rate0, rate1, spin0, spin1 = moved
     p = apply(R, x)
     n = cross(p, y)
     line, back = cross(T, p), apply_transposed(R, cross(y, T))
@@ -755,12 +761,9 @@ def linearise_pair(
     R, A, T_w, T_v = work[0], work[1], work[2], work[3]
     x, y, offset = (pairs[0, 0], pairs[0, 1], 1.0), (pairs[0, 2], pairs[0, 3], 1.0), pairs[0, 6]
     tau0, tau1 = pairs[0, 4], pairs[0, 5]
-    T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
-    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
-    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
-    rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
     L0, L1, slope = at_pixels(pairs, 0, 0.0)
-    value, q = pair_gradient(x, y, R, T, rate0, rate1, spin0, spin1, focal, L0, L1, slope)
+    moved = _camera_move(theta, kernel, tau0, tau1, offset, R, A)
+    value, q = pair_gradient(x, y, R, moved, focal, L0, L1, slope)
     qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     if qq <= 0.0:
         return displacement(apply(R, x), y, focal), 0.0
@@ -769,10 +772,7 @@ def linearise_pair(
     tau0 -= slope[1] * step * q[1] + slope[0] * step * q[0]
     tau1 -= slope[1] * step * q[3] + slope[0] * step * q[2]
     pair_jacobian(theta, kernel, x, y, tau0, tau1, offset, R, A, T_w, T_v, J)
-    T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
-    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
-    T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
-    rate0, rate1 = plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro))
+    T, rate0, rate1, spin0, spin1 = _camera_move(theta, kernel, tau0, tau1, offset, R, A)
     p = apply(R, x)
     n, line, back = cross(p, y), cross(T, p), apply_transposed(R, cross(y, T))
     ends[0], ends[1], ends[3], ends[4] = back[0], back[1], line[0], line[1]
