@@ -308,6 +308,12 @@ def test_parameters_come_from_the_card(tmp_path: Path) -> None:
     assert loaded.name == "mine" and loaded.description == "mine"
 
 
+def test_a_card_may_name_the_module_that_a_class_was_in_before(tmp_path: Path) -> None:
+    for name in ("dai:DaiSolver", "poselib_mono:PoselibMonoSolver", "eight_point:EightPointSolver"):
+        solver = load_solver(card(tmp_path, f'class = "rsbench.solvers.{name}"'))
+        assert type(solver).__name__ == name.partition(":")[2]
+
+
 @pytest.mark.parametrize(
     ("text", "parts"),
     [

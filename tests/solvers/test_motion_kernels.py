@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from stereo_transfer import rs_stereo_transfer
 
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
@@ -23,7 +24,7 @@ from rsbench.components.motion_models import (
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.epipolar import row_pair_pose, rs_sampson_error, rs_stereo_transfer
+from rsbench.core.epipolar import row_pair_pose, rs_sampson_error
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import rotation_error

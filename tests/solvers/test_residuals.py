@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import chi2, t
+from stereo_transfer import rs_stereo_transfer
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.epipolar import in_front, row_pair_pose, rs_sampson_error, rs_stereo_transfer
+from rsbench.core.epipolar import in_front, row_pair_pose, rs_sampson_error
 from rsbench.core.motion import Motion
 from rsbench.core.projection import back_project, project_at, rs_project_near
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
