@@ -4,6 +4,7 @@ tracks."""
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,37 +26,79 @@ _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu
 
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
-    """Run what has not run, score, add the oracles, and publish; entries of others on that board are shown too."""
+    """The board of simulated points, which may have other entries too, and the scores of the smoke run."""
     from rsbench.benchmark.leaderboard.smoke import own_solvers
-    from rsbench.cli.leaderboard import oracles, run, smoke
+    from rsbench.cli.leaderboard import smoke
 
-    board = data / BOARD
-    run("points", own_solvers(), str(board), workers=workers or os.cpu_count() or 1)
-    oracles("points", board)
+    _fill(data / BOARD, {"points": own_solvers()}, workers)
     smoke(out / "leaderboard" / "smoke", write=True)
-    publish(board, out / "leaderboard")
+    publish(data / BOARD, out / "leaderboard")
 
 
 def laws(out: Path, data: Path, workers: int | None) -> None:
-    """Points and frames under several laws of motion, rendered where they are missing, and what entries answered.
+    """Points and frames under several motion models, and what entries answered.
 
     Of pictures the site alone is published: the answers are gigabytes.
     """
     from rsbench.benchmark.leaderboard.board import splits_of, store
     from rsbench.benchmark.leaderboard.tracks import track_of_id
-    from rsbench.cli.generate import generate
-    from rsbench.cli.leaderboard import oracles, run
 
-    board, frames, folder, count = data / LAWS, data / LAWS_FRAMES, out / LAWS, workers or os.cpu_count() or 1
-    generate("laws", str(frames), None, workers=count)
-    for track, entries in entries_of_laws().items():
-        given = frames if track_of_id(track).inputs.rendered else None
-        run(track, entries, str(board), given, workers=count)
-        oracles(track, board, given)
+    board, folder = data / LAWS, out / LAWS
+    _fill(board, entries_of_laws(), workers, "laws", data / LAWS_FRAMES)
     publish(board, folder, "rsbench reproduce laws")
     for protocol, split in splits_of(board):
         if not track_of_id(protocol).pictures:
             store(board, protocol, split, folder / "predictions" / protocol)
+
+
+def boards(out: Path, data: Path, workers: int | None) -> None:
+    """The tracks of frames on the dev split of ``standard``."""
+    _fill(data / BOARD, entries_of_frames(), workers, "standard", data / "standard")
+    publish(data / BOARD, out / "leaderboard")
+
+
+def handheld(out: Path, data: Path, workers: int | None) -> None:
+    """The track of trajectories on footage from hands."""
+    from rsbench.benchmark.trajectory_methods import METHODS
+
+    board = data / f"{HANDHELD}-board"
+    _fill(board, {"trajectory": list(METHODS)}, workers, "handheld", data / HANDHELD, oracles_too=False)
+    publish(board, out / HANDHELD, "rsbench reproduce handheld")
+
+
+def footage(out: Path, data: Path, workers: int | None) -> None:
+    """The track of one camera, on frames of ``footage``, and of ``standard``, which has no gyroscope."""
+    board, without_gyro = data / f"{FOOTAGE}-board", [each for each in _OF_ONE_CAMERA if each != "gyro"]
+    for name, entries in ((FOOTAGE, list(_OF_ONE_CAMERA)), ("standard", without_gyro)):
+        _fill(board, {"correction-mono": entries}, workers, name, data / name)
+    publish(board, out / FOOTAGE, "rsbench reproduce footage")
+
+
+def _fill(
+    board: Path,
+    entries: Mapping[str, Sequence[str]],
+    workers: int | None,
+    card: str = "",
+    frames: Path | None = None,
+    *,
+    oracles_too: bool = True,
+) -> None:
+    """Run entries by track where they have not run yet, and add the oracles.
+
+    ``frames`` is the dataset of ``card``, rendered where it is missing, for the tracks of frames.
+    """
+    from rsbench.benchmark.leaderboard.tracks import track_of_name
+    from rsbench.cli.generate import generate
+    from rsbench.cli.leaderboard import oracles, run
+
+    count = workers or os.cpu_count() or 1
+    if frames is not None:
+        generate(card, str(frames), None, workers=count)
+    for track, names in entries.items():
+        given = frames if track_of_name(track).inputs.rendered else None
+        run(track, list(names), str(board), given, workers=count)
+        if oracles_too:
+            oracles(track, board, given)
 
 
 def entries_of_laws() -> dict[str, list[str]]:
@@ -67,19 +110,6 @@ def entries_of_laws() -> dict[str, list[str]]:
         [name for name in first[track] if name not in SAME_METHOD] + [CHOOSES] for track in ("pose", "readout")
     )
     return {"points-2": solvers, "pose-2": solvers, "readout-3": readers, "correction-3": first["correction"]}
-
-
-def boards(out: Path, data: Path, workers: int | None) -> None:
-    """The same of the tracks of frames, on the dev split of ``standard``, rendered where it is missing."""
-    from rsbench.cli.generate import generate
-    from rsbench.cli.leaderboard import oracles, run
-
-    board, frames, count = data / BOARD, data / "standard", workers or os.cpu_count() or 1
-    generate("standard", str(frames), None, workers=count)
-    for track, entries in entries_of_frames().items():
-        run(track, entries, str(board), frames, workers=count)
-        oracles(track, board, frames)
-    publish(board, out / "leaderboard")
 
 
 def entries_of_frames() -> dict[str, list[str]]:
@@ -102,35 +132,6 @@ def entries_of_frames() -> dict[str, list[str]]:
         "depth": own(STEREO_MATCHERS),
         "correction": images_alone,
     }
-
-
-def handheld(out: Path, data: Path, workers: int | None) -> None:
-    """The track of trajectories on footage from hands, rendered where it is missing."""
-    from rsbench.benchmark.trajectory_methods import METHODS
-    from rsbench.cli.generate import generate
-    from rsbench.cli.leaderboard import run
-
-    board, frames, count = data / f"{HANDHELD}-board", data / HANDHELD, workers or os.cpu_count() or 1
-    generate("handheld", str(frames), None, workers=count)
-    run("trajectory", list(METHODS), str(board), frames, workers=count)
-    publish(board, out / HANDHELD, "rsbench reproduce handheld")
-
-
-def footage(out: Path, data: Path, workers: int | None) -> None:
-    """The track of one camera, on frames of ``footage`` and ``standard``, rendered where they are missing."""
-    from rsbench.cli.generate import generate
-    from rsbench.cli.leaderboard import oracles, run
-
-    board, count = data / f"{FOOTAGE}-board", workers or os.cpu_count() or 1
-    # Frames of standard come without a gyroscope.
-    for name, entries in (
-        (FOOTAGE, _OF_ONE_CAMERA),
-        ("standard", [each for each in _OF_ONE_CAMERA if each != "gyro"]),
-    ):
-        generate(name, str(data / name), None, workers=count)
-        run("correction-mono", list(entries), str(board), data / name, workers=count)
-        oracles("correction-mono", board, data / name)
-    publish(board, out / FOOTAGE, "rsbench reproduce footage")
 
 
 def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboard") -> None:
