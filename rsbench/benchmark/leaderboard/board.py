@@ -299,7 +299,9 @@ def rescore(
             with contextlib.suppress(RsbenchError):
                 old = _read_scores(folder, split.track.id)
             write_table(folder / FILES[1], scores)
-            _write_doubt(folder, doubt_about(scores, _read_record(folder).header, split))
+            doubt, record = doubt_about(scores, _read_record(folder).header, split), read_json(folder / FILES[2])
+            if record.get("doubt", "") != doubt:
+                write_json(folder / FILES[2], {**record, "doubt": doubt})
             now = read_entry(folder).scores
             if columns := [str(name) for name in now if not now[name].equals(old.get(name, pd.Series()))]:
                 changed[folder.name] = columns
@@ -321,12 +323,6 @@ def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> 
             raise RsbenchError(f"{folder}: nothing speaks against it; it has a rank")
         write_json(folder / FILES[2], {**read_json(folder / FILES[2]), "accepted": reason})
     return record.doubt
-
-
-def _write_doubt(folder: Path, doubt: str) -> None:
-    record = read_json(folder / FILES[2])
-    if record.get("doubt", "") != doubt:
-        write_json(folder / FILES[2], {**record, "doubt": doubt})
 
 
 def _stored(folder: Path, split: Split) -> Submission:

@@ -53,7 +53,7 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     """
     given = list(problems)
     out.mkdir(parents=True, exist_ok=True)
-    columns = rig_columns(split.track)
+    columns = RIG if split.track.gives_readout else RIG[:-1]
     records = [_record(problem, split.track) for problem in given]
     write_bytes(out / "problems.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
     write_bytes(out / "problems.csv", _csv(("name", *columns), ((p.name, *_rig(p, columns)) for p in given)))
@@ -90,11 +90,6 @@ def split_record(split: Split) -> dict[str, Any]:
         "given": split.track.given,
         "allowed": list(split.track.allowed),
     }
-
-
-def rig_columns(track: Track) -> tuple[str, ...]:
-    """Those of ``RIG`` that a track gives."""
-    return RIG if track.gives_readout else RIG[:-1]
 
 
 def _record(problem: Problem, track: Track) -> dict[str, Any]:

@@ -241,20 +241,6 @@ def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
 
-def answer_problem(problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-    """The motion that a solver finds, as a line of a submission."""
-    seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
-    found = solve_problem(problem, entry, RobustOptions(), runner, seed, _EXTRAS, model)
-    kept = {key: found[key] for key in _ANSWER_KEYS}
-    if found["success"]:
-        length = math.hypot(*found["d"])
-        if max(length, *map(abs, found["w"])) > LARGEST:
-            return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}
-        if length < LEAST_D:
-            kept["d"] = [0.0, 0.0, 0.0]  # the rig stands still
-    return {**kept, "seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}
-
-
 def rounded(answer: dict[str, Any]) -> dict[str, Any]:
     """With w and d to twelve digits, and a covariance to six: stored predictions are half as large."""
     for name, digits in (("w", 12), ("d", 12), ("covariance", 6)):
@@ -298,8 +284,17 @@ class MotionTrack(SolverTrack):
             yield f"{count} of {len(answers)} motions are near to another reading of the truth: {words}"
 
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        found = answer_problem(problem, entry, runner)
-        return rounded(found) if self.rounds else found
+        seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
+        found = solve_problem(problem, entry, RobustOptions(), runner, seed, _EXTRAS, model)
+        kept = {key: found[key] for key in _ANSWER_KEYS}
+        if found["success"]:
+            length = math.hypot(*found["d"])
+            if max(length, *map(abs, found["w"])) > LARGEST:
+                return {"name": problem.name, "success": False, "reason": f"w or d goes beyond {LARGEST:g}"}
+            if length < LEAST_D:
+                kept["d"] = [0.0, 0.0, 0.0]  # the rig stands still
+        kept |= {"seconds": round(found["seconds"], 6), "reason": str(found["reason"])[:300]}
+        return rounded(kept) if self.rounds else kept
 
     def row(self, truth: Truth, answer: Answer | None) -> Row:
         return motion_row(truth, answer)
@@ -343,9 +338,12 @@ def motion_row(truth: Truth, answer: Answer | None) -> Row:
     )
     found = {name: float(value) for name, value in errors.items()}
     worst = float(np.fmax(found["e_R_deg"], found["e_T_deg"]))
+    metres = math.nan if success else math.inf
+    if success and metric:
+        metres = float(np.linalg.norm(d - _true_d(truth, point)))
     scores = {
         **found,
-        "metres": _metres(d, truth, point) if success and metric else math.nan if success else math.inf,
+        "metres": metres,
         "e_row_deg": _row_angle(w, truth) if success else 180.0,
         "error_deg": worst,
         **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
@@ -366,10 +364,6 @@ def _true_d(truth: Truth, point: str) -> FloatArray:
     if point == "body":
         return truth.motion.d
     return translation_of_offset(truth.motion.w, truth.motion.d, truth.rig.offset("left"))
-
-
-def _metres(d: FloatArray, truth: Truth, point: str) -> float:
-    return float(np.linalg.norm(d - _true_d(truth, point)))
 
 
 def _row_angle(w: FloatArray, truth: Truth) -> float:

@@ -14,7 +14,7 @@ import os
 import re
 import stat
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -175,17 +175,19 @@ def check_own(folder: Path, name: str) -> None:
             raise RsbenchError(f"{path}: must be a {kind} of its own, no link")
 
 
-def read_depth_map(path: Path, size: tuple[int, int], png_unit_m: float | None) -> NDArray[np.float32]:
-    """Depth (H, W), m, 0 unknown, of an EXR file or a PNG of 16 bits.
+def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | None) -> NDArray[np.float32]:
+    """Depth (H, W), m, 0 unknown, of an answer: an EXR file or a PNG of 16 bits.
 
     Args:
-        path: of the file.
-        size: width and height of the camera.
+        folder: ``pictures`` beside the file of answers.
+        pictures: of the problem.
         png_unit_m: metres of one step of a PNG.
 
     Raises:
-        RsbenchError: it is no such file, or holds what no depth can be.
+        RsbenchError: as ``find_picture``; the file is of another kind, or has values that are no depth.
     """
+    (picture,) = pictures.requested
+    path, size = find_picture(folder, pictures.sequence.name, picture), pictures.size
     if path.suffix == ".exr":
         _check_bytes(path, size)
         depth = read_exr(path, ("Z",), size)[..., 0]
@@ -204,34 +206,23 @@ def read_depth_map(path: Path, size: tuple[int, int], png_unit_m: float | None) 
     return depth
 
 
-def read_frame(path: Path, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A frame (H, W, 3) RGB, black where nothing was drawn, and where something was (H, W): alpha above 0.
+def read_answer_frame(
+    folder: Path, pictures: TruePictures, picture: RequestedPicture
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A frame (H, W, 3) RGB of an answer, black where nothing was drawn, and where alpha is above 0 (H, W).
 
     Raises:
-        RsbenchError: it is no PNG of 8 bits in colour of the camera's size.
+        RsbenchError: as ``find_picture``; the file is no PNG of 8 bits in colour of the camera's size.
     """
-    pixels = _read_png(path, size, 8, ("RGB", "RGBA"))
+    pixels = _read_png(find_picture(folder, pictures.sequence.name, picture), pictures.size, 8, ("RGB", "RGBA"))
     if pixels.shape[2] == 3:
         return pixels, np.ones(pixels.shape[:2], dtype=np.bool_)
     drawn = pixels[..., 3] > 0
     return np.where(drawn[..., None], pixels[..., :3], np.uint8(0)), drawn
 
 
-def read_answer_frame(
-    folder: Path, pictures: TruePictures, picture: RequestedPicture
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """``read_frame`` of a problem; errors as ``find_picture`` too."""
-    return read_frame(find_picture(folder, pictures.sequence.name, picture), pictures.size)
-
-
-def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | None) -> NDArray[np.float32]:
-    """``read_depth_map`` of a problem; errors as ``find_picture`` too."""
-    (picture,) = pictures.requested
-    return read_depth_map(find_picture(folder, pictures.sequence.name, picture), pictures.size, png_unit_m)
-
-
 def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:
-    """A file that ``read_frame`` reads: without alpha where all was drawn."""
+    """A file that ``read_answer_frame`` reads: without alpha where all was drawn."""
     alpha = [] if np.all(drawn) else [np.where(drawn, np.uint8(255), np.uint8(0))]
     ok, data = cv2.imencode(".png", np.dstack([image[..., ::-1], *alpha]))
     if not ok:
@@ -306,20 +297,6 @@ def columns(score: str, parting: Parting) -> list[str]:
     return [f"{score}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
 
 
-def parts_of(image: NDArray[np.uint8], row: int) -> Iterator[tuple[Parting, list[BoolArray]]]:
-    """The pixels (H, W) of each part of a picture of row ``row``'s time.
-
-    Args:
-        image: (H, W, 3) what the texture is of.
-        row: reference row.
-    """
-    height, width = image.shape[:2]
-    away = np.broadcast_to(np.abs(np.arange(height) - row)[:, None] / height, (height, width))
-    for parting, value in zip(PARTINGS, (away, texture(image)), strict=True):
-        part = np.searchsorted(parting.starts, value, side="right") - 1
-        yield parting, [part == number for number in range(len(parting.starts))]
-
-
 def texture(image: NDArray[np.uint8]) -> FloatArray:
     """(H, W) standard deviation of the mean of the colours in a window around each pixel, 8-bit levels."""
     grey = _mean(image.astype(np.float64))
@@ -334,12 +311,14 @@ Parts = dict[str, BoolArray]
 
 
 def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolArray) -> Parts:
-    """Of the ``counted`` pixels of a picture (H, W, 3) of row ``row``'s time, by the columns of a ``score``."""
-    return {
-        name: part & counted
-        for parting, parts in parts_of(image, row)
-        for name, part in zip(columns(score, parting), parts, strict=True)
-    }
+    """The ``counted`` pixels of a picture (H, W, 3) of row ``row``'s time, by the columns of a ``score``."""
+    height, width = image.shape[:2]
+    away = np.broadcast_to(np.abs(np.arange(height) - row)[:, None] / height, (height, width))
+    found = Parts()
+    for parting, value in zip(PARTINGS, (away, texture(image)), strict=True):
+        part = np.searchsorted(parting.starts, value, side="right") - 1
+        found |= {name: (part == number) & counted for number, name in enumerate(columns(score, parting))}
+    return found
 
 
 class SquareErrors:

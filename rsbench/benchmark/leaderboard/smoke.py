@@ -118,8 +118,8 @@ def smoke_frames(
         return
     card = load_dataset_card(CARD)
     card = card.only([sequence.name for sequence in card.sequence[:problems]])
-    if (backend := start_backend()).message:
-        note(backend.message)
+    if message := start_backend().message:
+        note(message)
     with tempfile.TemporaryDirectory() as folder:
         with bar(f"rendering {card.name}", steps_of(card) * len(card.sequence)) as advance:
             generate_dataset(card, Path(folder) / CARD, progress=advance)
