@@ -60,13 +60,8 @@ def test_the_truth_is_best_and_nothing_is_worst(tmp_path: Path) -> None:
     for limit in AUC_DEG:
         assert best[f"auc_{limit}"].min() > 1.0 - 1e-6 and worst[f"auc_{limit}"].max() == 0.0
         assert np.all((other[f"auc_{limit}"] >= 0.0) & (other[f"auc_{limit}"] <= 1.0))
-    for name, most in {
-        "e_R_deg": 180.0,
-        "e_T_deg": 180.0,
-        "e_s": np.inf,
-        "metres": np.inf,
-        "e_row_deg": 180.0,
-    }.items():
+    worst_of = {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": np.inf, "metres": np.inf, "e_row_deg": 180.0}
+    for name, most in worst_of.items():
         assert best[name].max() < 1e-5 and np.all(worst[name] == most)
         assert np.all(other[name].between(best[name] - 1e-9, worst[name]))
     assert worst["failure"].all() and not best["failure"].any() and not worst["success"].any()

@@ -301,13 +301,7 @@ def test_pictures_that_were_changed_are_named(splits: dict[str, Split], tmp_path
 def test_another_dataset_is_another_split(planes: Path, splits: dict[str, Split], tmp_path: Path) -> None:
     """Pictures count: of one motion, with another depth; and a byte that changed since is refused by name."""
     write_analytic_dataset(
-        tmp_path,
-        RIG,
-        SHUTTER,
-        MOTION,
-        frames=3,
-        twins=(40,),
-        true_motion=LinearMotion(MOTION.w, -MOTION.d),
+        tmp_path, RIG, SHUTTER, MOTION, frames=3, twins=(40,), true_motion=LinearMotion(MOTION.w, -MOTION.d)
     )
     assert TRACKS["pose"].split(tmp_path).name == TRACKS["pose"].split(planes).name
     split = TRACKS["depth"].split(tmp_path)
