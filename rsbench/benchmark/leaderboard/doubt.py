@@ -22,12 +22,12 @@ from rsbench.components.cards import list_cards
 from rsbench.core.errors import RsbenchError
 
 COVERAGE = 0.999
-"""Of the interval that must leave out one half: one honest method in two thousand at the bound is put in doubt."""
+"""Coverage of the interval that must exclude one half: it puts one honest method in 2000 at the bound in doubt."""
 _EXACT_SHARE = 0.1
-"""Of the problems in which an error of a method may be exact but for rounding."""
+"""Largest share of problems in which an error may be zero but for rounding."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
 _BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
-"""Names that were used, beside those of cards."""
+"""Names of former entries, beside those of cards."""
 
 
 def outline(name: str) -> str:
@@ -56,7 +56,7 @@ def refuse_reserved(header: Header, where: str) -> None:
 
 
 def doubt_about(scores: pd.DataFrame, header: Header, split: Split) -> str:
-    """Why an entry is not believed, in a line; empty where nothing speaks against it."""
+    """Why an entry is in doubt, in a line; empty where it is not."""
     if ORACLE in header.uses:
         return ""
     track = split.track

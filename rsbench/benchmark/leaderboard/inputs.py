@@ -113,7 +113,7 @@ def _requested_rows(split: Split) -> Iterator[tuple[str, str, int, float]]:
 
 
 def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
-    """Numbers with all their digits."""
+    """A CSV file; numbers have all their digits."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -122,7 +122,7 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 
 
 def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """``names`` (n,), ``rig`` (n, k), the columns; sets (m, 4 or 8), ``<set>_problem`` (m,): whose each row is."""
+    """``names`` (n,), ``rig`` (n, k columns); sets (m, 4 or 8), ``<set>_problem`` (m,): the problem of each row."""
     arrays: dict[str, NDArray[Any]] = {
         "names": np.array([problem.name for problem in problems]),
         "rig": np.array([_rig(problem, columns) for problem in problems]),
@@ -134,7 +134,7 @@ def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArra
     return arrays
 
 
-# Tracks of rendered frames: what is given of them, matches or the frames themselves.
+# Frames, and inputs of runs
 
 
 def write_frames(split: Split, data: Path, out: Path) -> None:

@@ -29,7 +29,7 @@ from rsbench.storage.work_folder import HIDDEN, files_below, work_folder
 
 ANNOUNCEMENT = "announcement.json"
 SCENES, DATA = "scenes", "data"
-"""Of the keeper's folder."""
+"""Subfolders of the keeper's folder."""
 FORMAT = 1
 
 
@@ -74,7 +74,7 @@ def drawn_split(track: Track, card: str, text: Secret) -> Split:
 
 
 def _sequences(card: DatasetCard) -> list[Sequence]:
-    """As they would be read, had they been rendered."""
+    """The sequences of a card as they would be read after rendering."""
     names = {each.scene for each in card.sequence}
     scenes = {name: read_scene_card(card_path("scenes", name))[0].name for name in names}
     manifests = [card.manifest_of(each) | {"scene": {"name": scenes[each.scene]}} for each in card.sequence]
@@ -154,7 +154,7 @@ def truth_hash(data: Path) -> str:
 
 
 def read_announcement(folder: Path) -> Announcement:
-    """Of a public part.
+    """The announcement in a public folder.
 
     Raises:
         RsbenchError: it is not there, or damaged.

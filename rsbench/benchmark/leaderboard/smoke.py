@@ -33,11 +33,11 @@ from rsbench.solvers.engine.base import BESIDE, SOLVERS, load_solver_entry
 from rsbench.storage.files import read_table, write_json, write_table
 
 CARD = "leaderboard-smoke"
-"""The dataset's, for the tracks of frames."""
+"""Card of the dataset for the tracks of frames."""
 ENTRIES = {track.name: track.smoke for track in TRACKS.values() if track.inputs.rendered and track.smoke}
-"""By track of frames."""
+"""Entries by track of frames."""
 PROBLEMS = 6
-"""Of points; a minute for all of rsbench's solvers."""
+"""Number of problems of points: a minute for all of rsbench's solvers."""
 _NAMES = ("method", "problem", "success")
 _SAME, _NOTHING = 1e-4, 1e-7
 """Relative and absolute difference of equal scores. The same code on the same machine gives the same digits; a
@@ -183,7 +183,7 @@ def _rows_of(job: Job, data: Path | None, problems: int | None) -> list[Row]:
 
 
 def track_scores(track: str, data: Path | None, entries: Sequence[str], problems: int | None) -> pd.DataFrame:
-    """Scores of entries on the first problems of a track, made as anybody's: inputs, answers, marks.
+    """Scores of entries on the first problems of a track, made as for a board: inputs, answers, scores.
 
     Raises:
         RsbenchError: no such dataset or entry, or no such number of problems.

@@ -27,11 +27,11 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 
 _ROUNDING = 1e-12
-"""Scores lie in [0, 1]; differences of their means below this are none."""
+"""Smaller differences of mean scores count as zero: scores lie in [0, 1]."""
 
 
 class Rank(NamedTuple):
-    """A place, from 1, and the places that the data do not exclude."""
+    """A place, counted from 1, and the range of places that the data do not exclude."""
 
     place: int
     low: int
@@ -90,7 +90,7 @@ def better(means: FloatArray) -> NDArray[np.bool_]:
 
 
 def _chances(differences: FloatArray) -> FloatArray:
-    """Of such differences (pairs, k), or larger ones, between equal entries: two-sided p of the paired t test."""
+    """Two-sided p values (pairs,) of the paired t test of differences (pairs, k)."""
     k = differences.shape[1]
     middle = np.abs(np.mean(differences, axis=1))
     if k < 2:
@@ -100,7 +100,7 @@ def _chances(differences: FloatArray) -> FloatArray:
 
 
 def _holm(chances: FloatArray) -> NDArray[np.bool_]:
-    """Which of the hypotheses fall at a family-wise error of 1 - COVERAGE."""
+    """Which hypotheses are rejected at a family-wise error of 1 - COVERAGE, by p value (n,)."""
     order = np.argsort(chances, kind="stable")
     limits = (1.0 - COVERAGE) / (len(chances) - np.arange(len(chances)))
     fails = np.flatnonzero(chances[order] > limits)
@@ -136,8 +136,8 @@ def ties(beats: NDArray[np.bool_], i: int) -> list[Any]:
 #
 # The squared error by the stated covariance (NEES) is chi-squared where that is right, with six degrees of freedom
 # for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-# and Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that share of problems. One
-# wild error decides about a mean, so what has an interval is the median.
+# and Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that share of problems. A
+# single wild error can dominate a mean, so the interval is that of the median.
 
 LEVELS = (0.5, 0.9, 0.95)
 _SEED = 0
@@ -146,20 +146,20 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Of the answers that state a covariance; each triple is a value with the ends of its interval."""
+    """How well stated covariances fit the errors; each triple is a value with the ends of its interval."""
 
     stated: int
-    """How many those are."""
+    """Number of answers with a covariance."""
     spread: Triple
-    """Median of NEES by that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
+    """Median of NEES over that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
     covers: tuple[Triple, ...]
-    """For each of ``LEVELS``, the share of truths within the ellipsoid that should hold so many."""
+    """For each of ``LEVELS``, the share of truths within the ellipsoid of that level."""
     mean: float
     """NEES over its degrees of freedom, without an interval."""
 
 
 def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
-    """Of the scores of an entry, whose answers have so many unknowns; None where no covariance was stated."""
+    """Calibration of an entry's scores, whose answers have ``unknowns`` numbers; None without covariances."""
     if "nees" not in scores:
         return None
     stated = scores[scores["nees"].notna()]
@@ -180,7 +180,7 @@ def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
 
 
 def _chi_squared(level: float, unknowns: int) -> float:
-    """Below which a share ``level`` of a chi-squared variable of so many degrees of freedom lies."""
+    """Quantile ``level`` of the chi-squared distribution with ``unknowns`` degrees of freedom."""
     return 2.0 * float(gammaincinv(0.5 * unknowns, level))
 
 
@@ -194,7 +194,7 @@ def named_numbers(found: Calibration | None) -> dict[str, Triple]:
     }
 
 
-# The table of a split: scores with intervals, ranks among those that use no more, ties; oracles have no rank.
+# Tables of splits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,19 +203,19 @@ class Standing:
 
     scored: Scored
     rank: Rank | None
-    """Among those that use no more; None of an oracle, and of an entry that is in doubt."""
+    """Rank among the entries that use no more; None for oracles and entries in doubt."""
     peers: int
-    """How many those are, itself included."""
+    """Number of these entries, itself included."""
     ties: tuple[str, ...]
-    """Of those, the ones that the data do not distinguish from it."""
+    """Those of them that the data do not distinguish from it."""
     means: dict[str, tuple[float, float, float]]
-    """Of the shares and means of its protocol: the mean over scenes, and the ends of its interval."""
+    """For each share or mean of its protocol, the mean over scenes and the ends of its interval."""
     medians: dict[str, float]
-    """Of the other scores: over problems; NaN where the entry gives none."""
+    """For each other score, the median over problems; NaN where the entry has none."""
     calibration: Calibration | None
-    """Of the covariances that it states."""
+    """Calibration of the covariances that it states."""
     parts: dict[str, tuple[float, float, float]]
-    """Of the primary score in the parts into which its track divides the problems, by name."""
+    """The primary score in each part into which its track divides the problems, by name."""
     worst: dict[str, tuple[str, float]]
     """The problem of each part with the largest error, and that error; "all" where there are no parts."""
 
@@ -226,7 +226,7 @@ class Standing:
 
     @property
     def rank_words(self) -> str:
-        """Such as ``2 [1, 4] of 9``; whom nobody is compared with has no place."""
+        """Such as ``2 [1, 4] of 9``, ``alone``, ``oracle`` or ``in doubt``."""
         if self.rank is None:
             return "in doubt" if self.scored.doubt else "oracle"
         if self.peers == 1:
@@ -334,7 +334,7 @@ def _parts(scores: pd.DataFrame, track: Track) -> dict[str, tuple[float, float, 
 
 
 def _median(values: FloatArray) -> float:
-    """Of the values that there are, infinite ones too."""
+    """Median of the values that are not NaN, infinite ones included."""
     there = values[~np.isnan(values)]
     return float(np.median(there)) if there.size else float("nan")
 
