@@ -122,7 +122,7 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 
 
 def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """``names`` (n,), ``rig`` (n, k columns); sets (m, 4 or 8), ``<set>_problem`` (m,): the problem of each row."""
+    """``names`` (n,), ``rig`` (n, k columns); sets (m, 4 or 8), ``<set>_problem`` (m,): the problem of a row."""
     arrays: dict[str, NDArray[Any]] = {
         "names": np.array([problem.name for problem in problems]),
         "rig": np.array([_rig(problem, columns) for problem in problems]),
