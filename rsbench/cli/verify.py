@@ -165,9 +165,9 @@ def _verify_others(folder: Path, layout: str) -> None:
             for sight in sights(recording):
                 advance(sight.what)
                 found += [sight.fault] if sight.fault else []
-                told = str(sight.count), f"{100 * sight.share:.1f}", f"{sight.typical:.2f}"
+                row = str(sight.count), f"{100 * sight.share:.1f}", f"{sight.typical:.2f}"
                 if sight.count:
-                    seen.append([recording.name, sight.what, *told])
+                    seen.append([recording.name, sight.what, *row])
             faults += [f"{recording.name}: {fault}" for fault in found]
     if depths:
         columns = ["recording", "camera", "depth of", "against", "pixels", "agree (%)", "typical difference"]

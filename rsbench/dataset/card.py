@@ -145,7 +145,7 @@ class DatasetCard(Scanning):
     readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given."""
     readout_range: tuple[float, float] | None = None
     """Two readout ratios: each sequence's is drawn evenly between them, by its seed and name, in place of all that
-    is said otherwise."""
+    other ratios."""
     frame_period_s: float = 0.1
     """Seconds from one frame to the next."""
     frames: int = len(FRAMES)
@@ -346,7 +346,7 @@ class DatasetCard(Scanning):
         return replace(self, motion=None, trajectory=replace(own, file=str(file.absolute())), sequence=sequences)
 
     def expanded(self, folder: Path = Path()) -> DatasetCard:
-        """A card that says all that it will make: one sequence per seed and part of a way, random axes drawn.
+        """A card with every sequence that it makes: one per seed and part of a trajectory, random axes drawn.
 
         Args:
             folder: of the card, where the files of a trajectory and of moving meshes are looked for.

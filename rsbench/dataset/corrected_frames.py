@@ -254,7 +254,7 @@ def rig_record(
 
 
 def written_entries(folder: Path) -> list[dict[str, Any]]:
-    """What a run before this one said of the first frames, which it finished."""
+    """The entries of the frames that an earlier run finished."""
     return [read_json(path) for path in listed(folder / _ENTRIES, ".json")]
 
 
@@ -309,7 +309,7 @@ DEFAULT_FPS = 30.0
 
 
 def is_video(out: Path) -> bool:
-    """Whether a video is asked for, by the ending of its name."""
+    """Whether the ending of a name is that of a video."""
     return out.suffix.lower() in _CODECS
 
 

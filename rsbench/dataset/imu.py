@@ -151,7 +151,7 @@ def draw_samples(
 def gyro_samples(samples: ImuSamples, frame_period_s: float) -> FloatArray:
     """(n, 4) tau, w of ``Correspondences.gyro``: what was measured, by the sensor's own clock, wrong as it is.
 
-    The motion carries points into the body, which turns the other way: w is the measured rate's negative.
+    The motion carries points into the body, so w is the negative of the measured rate.
     """
     tau = samples.stamps_ns / (_NS * frame_period_s)
     return np.column_stack([tau, -frame_period_s * samples.measured[:, :3]])

@@ -208,6 +208,6 @@ def says(data: bytes, content: dict[str, Any]) -> bool:
 
 
 def _record(card: DatasetCard) -> dict[str, Any]:
-    """The card, complete; two frames are told by nothing, as before there could be more."""
+    """The complete card; without ``frames`` where there are two, as in the first version of the format."""
     own = asdict(card)
     return own if card.frames > len(FRAMES) else {key: value for key, value in own.items() if key != "frames"}

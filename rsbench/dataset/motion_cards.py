@@ -171,7 +171,7 @@ class Trajectory(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The frames of one sequence on the way."""
+    """The frames of one sequence on the trajectory."""
 
     poses: FloatArray
     """(m, 8) as ``TrajectoryMotion`` takes them: time 0 is the start of frame 0."""

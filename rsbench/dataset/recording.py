@@ -34,7 +34,7 @@ class Recording:
     """Between the cameras; a rectified pair has no rotation and minus the baseline along x."""
     poses: Mapping[Side, PoseAt] = field(default_factory=dict)
     depths: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
-    """(H, W) z, metres, 0 where there is none; read when asked for."""
+    """(H, W) z, metres, 0 where there is none; read on demand."""
     disparities: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
     """(H, W) px, such that ``fx baseline / disparity`` is z; NaN where there is none."""
     sightings: Mapping[View, Callable[[], tuple[FloatArray, FloatArray]]] = field(default_factory=dict)

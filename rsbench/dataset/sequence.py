@@ -201,7 +201,7 @@ class Sequence(ChannelReader):
     def pairs(self) -> list[Sequence]:
         """Each two successive frames as a sequence of their own, such as ``castle.3`` of frames 3 and 4.
 
-        Its world is the body at its own time 0, and its motion is what is left of the way, seen from there. Of the
+        Its world is the body at its own time 0, and its motion is the rest of it, seen from there. Of the
         channels it has those that tell of one frame or lead to another. Of two frames there is one: the sequence.
         """
         if self.frames == len(FRAMES):
@@ -231,7 +231,7 @@ class Sequence(ChannelReader):
 
     @property
     def data_model(self) -> str:
-        """Name of the motion model that the whole way follows."""
+        """Name of the motion model of the whole sequence."""
         return (self.motion.motion if isinstance(self.motion, LaterMotion) else self.motion).name
 
     def frame_files(self, folders: Collection[str]) -> list[Path]:

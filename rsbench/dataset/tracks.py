@@ -215,7 +215,7 @@ def jacobians_of(geometry: Geometry, tracks: Tracks, normals: FloatArray) -> Flo
 
 
 def _moves(geometry: Geometry, view: View, tracks: Tracks, k: int, along: FloatArray) -> FloatArray:
-    """(n, 2, 2) derivative of the pixels of a frame by steps along two ways (n, 3, 2) from the points."""
+    """(n, 2, 2) derivative of the pixels of a frame by steps along two directions (n, 3, 2) from the points."""
     tau = np.where(np.isnan(tracks.tau[:, k]), 0.0, tracks.tau[:, k])
     moves = pixel_moves(geometry.rig, geometry.shutter, geometry.motion, view[0], tau, tracks.points, along)
     return np.where(np.isnan(tracks.tau[:, k])[:, None, None], np.nan, moves)

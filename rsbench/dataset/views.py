@@ -309,8 +309,8 @@ def reproject_rows(
 ) -> None:
     """Fill what ``Reprojected`` has; NumPy: ``core.projection.rs_project``.
 
-    Each point starts where its two neighbours in the row landed would lead, with the slope found there. That no
-    other row is heard keeps the bits of a row the same whatever rows are asked for with it.
+    Each point starts where its two neighbours in the row lead, with the slope found there. No other row has an
+    effect: the bits of a row are the same whatever rows are requested with it.
     """
     pose = np.zeros(12)
     _pose_between(table, 0.0, pose)
@@ -364,7 +364,7 @@ def _line(
             return x, y, line, slope, _SEEN
         if -0.5 <= line <= lines - 0.5:
             return x, y, line, slope, _NOT_SEEN
-    # Another crossing, or one behind a pole, cannot be told from here: the solver that looks for all of them does.
+    # Another crossing, or one behind a pole, cannot be decided here: the solver that looks for all crossings does.
     first = _off(table, per_line, camera, axis, X, -0.5, pose)
     last = _off(table, per_line, camera, axis, X, lines - 0.5, pose)
     if math.isnan(first) and math.isnan(last):
@@ -530,7 +530,7 @@ def carry(surfaces: SeenSurfaces, target: ImageView) -> Carried:
 
 
 def pair_truth(surfaces: SeenSurfaces, target: ImageView, carried: Carried, blocked: Blocked) -> PairTruth:
-    """What became of the pixels that ``carry`` carried into the target; ``blocked`` is asked once."""
+    """What became of the pixels that ``carry`` carried into the target; ``blocked`` is called once."""
     landed, points = carried
     return PairTruth(landed.pixels - surfaces.grid, _classes(surfaces, target, landed, points, blocked))
 

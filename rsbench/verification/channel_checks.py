@@ -31,7 +31,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, numbers_of, points_of, seen_from, times_at
 from rsbench.renderers.image import linear_of_codes, to_srgb8
 from rsbench.verification.content import clean_picture
-from rsbench.verification.findings import Finding, rows_of
+from rsbench.verification.findings import Finding, cheapest_cause, rows_of
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.reprojection import BoolArray, DepthMap, reproject
 
@@ -275,8 +275,8 @@ def _pair_cause(
     for words, candidate in tried.items():
         if candidate is not None and (words == "zeroed" or _explains(candidate[::stride, ::stride], derived)):
             return f"looks {words}"
-    for other, held in stored.items():
-        if other != view and np.array_equal(held.values, values, equal_nan=True):
+    for other, kept in stored.items():
+        if other != view and np.array_equal(kept.values, values, equal_nan=True):
             return f"the same as {layer.values(other.side, other.frame)}"
     ratio = float(np.nanmedian(sampled / np.where(np.abs(derived.values) < 1, np.nan, derived.values)))
     spread = np.nanmedian(np.abs(sampled - ratio * derived.values))
@@ -343,8 +343,8 @@ def _normal_faults(
         )
         return
     z = np.where(solid, depth_map.depth, 1.0).astype(np.float64)
-    X, ways, normals = _resting(sequence, depth_map, z, normals)
-    away = solid & (np.sum(ways * normals, axis=-1) > 0)
+    X, rays, normals = _resting(sequence, depth_map, z, normals)
+    away = solid & (np.sum(rays * normals, axis=-1) > 0)
     if np.sum(away) > _LEAST:
         yield Finding(file, f"{np.sum(away)} normals point away from the camera", _worst_rows(away))
     bent = np.zeros(solid.shape, dtype=np.bool_)
@@ -371,14 +371,14 @@ def _resting(
         points = points_of(own, view, pixels, depth)
         return points, points - points_of(own, view, pixels, depth * 0)
 
-    X, ways = of(0, ...)
+    X, rays = of(0, ...)
     for number, thing in enumerate(sequence.objects, start=1):
         chosen = np.zeros(z.shape, np.bool_) if labels is None else numbers_of(labels) == number
-        X[chosen], ways[chosen] = of(number, chosen)
+        X[chosen], rays[chosen] = of(number, chosen)
         turned = inverse(thing.world_from_object(times_at(sequence, view, grid[chosen]))).R
         normals = normals.copy()
         normals[chosen] = (turned @ normals[chosen][..., None])[..., 0]
-    return X, ways, normals
+    return X, rays, normals
 
 
 def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], count: int) -> Iterator[Finding]:
@@ -471,5 +471,4 @@ def _radiance_cause(light: NDArray[np.float32], picture: Picture) -> str:
         "encoded as sRGB": linear_of_codes(255.0 * light),
     }
     costs = {words: float(np.mean(np.abs(each - wanted)[open_])) for words, each in tried.items()}
-    best = min(costs, key=costs.__getitem__)
-    return f"looks {best}" if costs[best] < 0.2 * float(np.mean(np.abs(light - wanted)[open_])) else ""
+    return cheapest_cause(costs, float(np.mean(np.abs(light - wanted)[open_])))

@@ -49,7 +49,7 @@ class State:
     name: str
     stride: int = 1
     again: Rerenderer | None = None
-    """Builds the scene and renders rows again; None where nobody asked for it."""
+    """Builds the scene and renders rows again; None with `--rerender no`."""
     step: Progress = lambda name: None
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -55,7 +55,7 @@ def weigh_rows(
         even: whether each pixel (H, W) of the source lies on one flat surface; its depth (H, W); ``stride``.
         evidence: of the source.
         target: holes (H, W) of the target, of which two bands may set the same bit; its depth (H, W).
-        bits: of the target among the partners of the source, and the other way round.
+        bits: of the target among the partners of the source, and of the source among those of the target.
         limits: see there.
         near: (h, w) filled in: how far flat surfaces are apart that are not hidden; -1 elsewhere.
         first, last: rows, without the last.

@@ -395,7 +395,7 @@ in ``forest``."""
 def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: ImageView) -> bool:
     """Whether a depth map shows thin things, and two partners see them about where they are.
 
-    A map that could show flat places and shows none is spoilt. One partner alone may be spoilt in the same way:
+    A map that could show flat places and shows none is spoilt. One partner alone may be damaged likewise:
     rows of a frame and of its global-shutter twin lie hardly apart.
     """
     alike = (_roughly_alike(geometry, maps[view], maps[each]) for each in view.partners() if each in maps)
@@ -437,7 +437,7 @@ _FARTHEST = 32
 def frames_of_other_times(sequence: Sequence, apart: Collection[Times]) -> list[Finding]:
     """A finding for each frame, of those ``apart`` from one beside it, that is that of another time.
 
-    A frame is in order if it agrees with any other one near it, but for those that it is said not to.
+    A frame is in order if it agrees with any other one near it, other than those from which it is ``apart``.
     """
     maps = _MapsOverTime(sequence)
     suspects = sorted({frame for times in apart for frame in times})

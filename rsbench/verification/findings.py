@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -88,6 +88,15 @@ class SequenceReport:
 def files_of(findings: Iterable[Finding]) -> set[str]:
     """Files that findings tell of."""
     return {each.file for each in findings}
+
+
+def cheapest_cause(costs: Mapping[str, float], as_is: float, share: float = 0.2) -> str:
+    """What a file looks like instead, by the difference that undoing each candidate change leaves; "" for none.
+
+    The best candidate must leave less than this ``share`` of the difference ``as_is``.
+    """
+    best = min(costs, key=costs.__getitem__)
+    return f"looks {best}" if best and costs[best] < share * as_is else ""
 
 
 def rows_of(flags: NDArray[np.bool_]) -> str:

@@ -453,9 +453,9 @@ def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
 def matched_again(
     sequence: Sequence, reported: Collection[str], first: int = 0
 ) -> tuple[list[Finding], list[str]]:
-    """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not asked.
+    """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not run.
 
-    Only rsbench's own matcher is asked, in the versions that made them: what a dataset names is never imported.
+    Only rsbench's own matcher is run, in the versions that made them: what a dataset names is never imported.
     """
     images_of, file = [ImageView("rs", *at(view, first)) for view in VIEWS], matches_file(first)
     if "matches" not in sequence.channels or {*(each.image for each in images_of), file, MATCHER} & set(reported):

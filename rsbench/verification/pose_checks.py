@@ -29,7 +29,7 @@ from rsbench.dataset.imu import (
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.timing import TIMING_COLUMNS, TIMING_MANIFEST, table_file, timing_manifest, timing_table
 from rsbench.storage.files import read_pose_table
-from rsbench.verification.findings import Finding, rows_of
+from rsbench.verification.findings import Finding, cheapest_cause, rows_of
 
 _ROUNDING = 1e-12
 """Of row times (frame periods), quaternions and places (metres): a thousand roundings of numbers near 1."""
@@ -293,5 +293,4 @@ def _imu_cause(own: FloatArray, true: FloatArray, upward: FloatArray) -> str:
         "without gravity": own + upward,
     }
     costs = {words: float(np.median(np.abs(each - true))) for words, each in tried.items()}
-    best = min(costs, key=costs.__getitem__)
-    return f"looks {best}" if costs[best] < 0.2 * float(np.median(np.abs(own - true))) else ""
+    return cheapest_cause(costs, float(np.median(np.abs(own - true))))

@@ -162,7 +162,7 @@ def _table(geometry: MovingRig, view: ImageView, parts: int) -> PoseTable:
 
 
 def _errors(geometry: MovingRig, view: ImageView, table: PoseTable) -> float:
-    """The largest error half-way between two entries, of what is allowed; infinite where one is not finite."""
+    """The largest error midway between two entries, over the allowed one; infinite where one is not finite."""
     shutter, side = geometry.shutter, view.side
     lines = table.first + (np.arange(len(table.t) - 1) + 0.5) / table.parts
     exact = geometry.rig.cam_from_world(geometry.motion, shutter.line_time(lines, view.frame, side), side)
@@ -261,7 +261,7 @@ def _seen(
             return none
         slope = across_lines(target.columns, fx * (dx - x / z * dz) / z, fy * (dy - y / z * dz) / z) * parts - 1.0
         if _bends(lens) and place != before and np.isfinite(before):
-            slope = (value - value_before) / (place - before)  # a lens bends the way of the pixel
+            slope = (value - value_before) / (place - before)  # a lens bends the path of the pixel
         before, value_before = place, value
         place -= value / slope if slope != 0.0 else np.nan
         if not np.isfinite(place):

@@ -34,7 +34,7 @@ from rsbench.scenes.model import Start
 from rsbench.scenes.object_meshes import with_moving
 from rsbench.verification.channel_checks import channels_again
 from rsbench.verification.content import Content, clean_picture, stack_rows
-from rsbench.verification.findings import Finding, rows_of
+from rsbench.verification.findings import Finding, cheapest_cause, rows_of
 from rsbench.verification.image_checks import CHANGES, Picture
 from rsbench.verification.point_checks import affine_again, matches_again, tracks_again
 from rsbench.verification.reprojection import DepthMap
@@ -133,9 +133,11 @@ def image_check(
         f"by up to {np.max(difference):g} codes"
     )
     y, x = (each.ravel() for each in np.meshgrid(rows, np.arange(truth.shape[1]), indexing="ij"))
-    costs = [np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3))) for change in CHANGES]
+    costs = [
+        float(np.mean(np.abs(change.undone(stored.colours, y, x) - truth.reshape(-1, 3)))) for change in CHANGES
+    ]
     best = int(np.argmin(costs))
-    cause = f"looks {CHANGES[best].words}" if best and costs[best] < 0.5 * costs[0] else ""
+    cause = cheapest_cause({CHANGES[best].words: costs[best]}, costs[0], 0.5)
     return RowCheck(file, Finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
 
 

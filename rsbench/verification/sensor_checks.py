@@ -52,8 +52,8 @@ that of a bright neighbour counts up to twice."""
 _COARSE, _OFF = 4, 1.25
 """Steps from which on a coefficient tells, and how far it may be from whole steps: six standard deviations of what
 rounding to codes leaves where it differs from pixel to pixel. Of those that were not rounded to a step of 4, a
-third are farther off. In blocks of equal rows or columns rounding errors repeat and add up: coefficients count
-only where whole steps also leave more codes than this at a pixel; rounding luminance and RGB leaves at most 1."""
+third are farther off. Where values of a block repeat, as in equal rows, so do their rounding errors, which add up:
+more is allowed, by the root of how often each value is there."""
 _OPEN = 125.0
 """Luminance about grey beyond which it may have been cut off."""
 _FIRST = 1.0 / np.sqrt(2.0)
@@ -65,13 +65,13 @@ class _Counts(NamedTuple):
     """Of each row of pixels (H,) how many values are not what they should be, and how many tell."""
 
     wrong: FloatArray
-    asked: FloatArray
+    judged: FloatArray
 
     def rows(self) -> NDArray[np.bool_]:
         """(H,) those in which too many are wrong; none where the values do not tell."""
-        bad = (self.wrong > _MOST_OF_ROWS * self.asked) & (self.asked >= _LEAST_OF_ROWS)
-        if np.sum(self.asked) >= _LEAST and np.sum(self.wrong) > _MOST * np.sum(self.asked):
-            bad |= self.wrong > _MOST * self.asked
+        bad = (self.wrong > _MOST_OF_ROWS * self.judged) & (self.judged >= _LEAST_OF_ROWS)
+        if np.sum(self.judged) >= _LEAST and np.sum(self.wrong) > _MOST * np.sum(self.judged):
+            bad |= self.wrong > _MOST * self.judged
         return np.asarray(bad)
 
 
@@ -103,7 +103,7 @@ def _first(values: Iterable[T]) -> T | None:
 
 
 def _fits(counts: _Counts) -> bool:
-    return bool(np.sum(counts.asked) >= _LEAST and np.sum(counts.wrong) <= _MOST * np.sum(counts.asked))
+    return bool(np.sum(counts.judged) >= _LEAST and np.sum(counts.wrong) <= _MOST * np.sum(counts.judged))
 
 
 def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
@@ -113,7 +113,7 @@ def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
     own = filters(mosaic, width, np.arange(height))
     open_ = np.all((image > 0) & (image < 255), axis=-1).astype(np.uint8)
     inner = cv2.erode(open_, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    wrong, asked = np.zeros(height), np.zeros(height)
+    wrong, counted = np.zeros(height), np.zeros(height)
     for channel in range(3):
         across, down, corners = (
             np.abs(255 * srgb_of(cv2.filter2D(light[..., channel], -1, kernel)) - codes[..., channel]) <= _NEAR
@@ -124,8 +124,8 @@ def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
         right = np.where(level | upright, (across & level) | (down & upright), corners)
         judged = inner & (own != channel)
         wrong += np.sum(judged & ~right, axis=1)
-        asked += np.sum(judged, axis=1)
-    return _Counts(wrong, asked)
+        counted += np.sum(judged, axis=1)
+    return _Counts(wrong, counted)
 
 
 _KERNELS = [
@@ -145,6 +145,8 @@ class _Blocks(NamedTuple):
     """(..., 8, 8) of luminance."""
     open: NDArray[np.bool_]
     """(...) whether no value in them is cut off at black or white."""
+    distinct: NDArray[np.int64]
+    """(...) how many values of luminance they have."""
     rows: int
     """Of pixels in the image."""
 
@@ -155,13 +157,14 @@ class _Blocks(NamedTuple):
         blocks = image[:height, :width].reshape(shape).swapaxes(1, 2)
         luminance = blocks @ np.array([0.299, 0.587, 0.114]) - 128.0
         open_ = np.all((blocks > 0) & (blocks < 255), axis=4) & (np.abs(luminance) < _OPEN)
-        return cls(_DCT @ luminance @ _DCT.T, np.all(open_, axis=(2, 3)), len(image))
+        distinct = 1 + np.sum(np.diff(np.sort(luminance.reshape(*luminance.shape[:2], -1))) > 1e-6, axis=-1)
+        return cls(_DCT @ luminance @ _DCT.T, np.all(open_, axis=(2, 3)), distinct, len(image))
 
     def off_steps(self, quality: int) -> _Counts:
         """Coefficients that are not whole steps."""
         steps = quality_steps(quality)
-        left = np.where(steps >= _COARSE, self.coefficients - steps * np.round(self.coefficients / steps), 0.0)
-        off = (np.abs(left) > _OFF) & np.any(np.abs(_DCT.T @ left @ _DCT) > _OFF, axis=(-2, -1), keepdims=True)
+        allowed = _OFF * np.sqrt(_BLOCK**2 / self.distinct)[..., None, None]
+        off = np.abs(self.coefficients - steps * np.round(self.coefficients / steps)) > allowed
         judged = np.broadcast_to(self.open[..., None, None] & (steps >= _COARSE), off.shape)
         counts = (
             np.sum(each, axis=(1, 2, 3)).repeat(_BLOCK).astype(np.float64) for each in (off & judged, judged)
@@ -335,7 +338,7 @@ class _Bounds:
         x, y = window[0] + beside, window[1] + beside
         around = np.ones((2 * y + 1, 2 * x + 1), np.uint8)
         share = fall_off(sensor, width, height, np.arange(height))[..., None]
-        least, most = (way(clean, around) for way in (cv2.erode, cv2.dilate))
+        least, most = (extreme(clean, around) for extreme in (cv2.erode, cv2.dilate))
         low = linear_of_codes(least) * share
         # How bright white is, the twin does not say.
         high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
@@ -383,8 +386,8 @@ def _noise_fault(
         return None
     beside = ((linear_of_codes(image) - 0.5 * (low + high)) / sigma)[smooth]
     if abs(bias := float(np.mean(beside))) > _MOST_BIAS:
-        way = "brighter" if bias > 0 else "darker"
-        return Finding(_file(view), f"is {way} than its sensor shows {_twin(view)}, by {abs(bias):.2f} sigma")
+        change = "brighter" if bias > 0 else "darker"
+        return Finding(_file(view), f"is {change} than its sensor shows {_twin(view)}, by {abs(bias):.2f} sigma")
     ratio, (least, most) = float(np.var(beside)), _VARIANCE_RANGE
     if sensor.jpeg_quality:
         made = linear_of_codes(_made_of(picture.colours, sensor))
@@ -425,7 +428,7 @@ def _compression(sensor: Sensor, clean: NDArray[np.uint8] | NDArray[np.float32])
 def _sampling(clean: NDArray[np.uint8] | NDArray[np.float32], spacing: float) -> FloatArray:
     """Variance of linear values (...) that are means of 1 / spacing^2 samples of what the pixels around show."""
     around = np.ones((3, 3), np.uint8)
-    least, most = (linear_of_codes(way(clean, around)) for way in (cv2.erode, cv2.dilate))
+    least, most = (linear_of_codes(extreme(clean, around)) for extreme in (cv2.erode, cv2.dilate))
     return np.asarray((spacing * (most - least)) ** 2 / 12.0, dtype=np.float64)
 
 
