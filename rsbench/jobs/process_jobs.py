@@ -162,8 +162,18 @@ def _run_here(
         waiting.put(job)
 
     def work() -> None:
-        with processes.hire(cancel) as worker:
-            _work(processes, worker, waiting, done, seconds_of)
+        """Let a process do jobs until none is left."""
+        with processes.hire(cancel) as worker, contextlib.suppress(queue.Empty, Cancelled):
+            while True:
+                job = waiting.get_nowait()
+                try:
+                    limit = math.inf if seconds_of is None else seconds_of(job)
+                    done.put((job, processes.done_by(worker, job, limit)))
+                except Cancelled:
+                    raise
+                except BaseException as error:  # raised in the thread that waits
+                    done.put((job, error))
+                    return
 
     threads = [threading.Thread(target=work, daemon=True) for _ in range(min(workers, len(jobs)))]
     try:
@@ -178,29 +188,6 @@ def _run_here(
         cancel.set()
         for member in threads:
             member.join()
-
-
-def _work(
-    processes: WorkerProcesses,
-    worker: IsolatedWorker,
-    waiting: queue.SimpleQueue[Job],
-    done: queue.SimpleQueue[_Finished[Job]],
-    seconds_of: Callable[[Job], float] | None,
-) -> None:
-    """Let a process do jobs until none is left."""
-    while True:
-        try:
-            job = waiting.get_nowait()
-        except queue.Empty:
-            return
-        try:
-            outcome = processes.done_by(worker, job, math.inf if seconds_of is None else seconds_of(job))
-        except Cancelled:
-            return
-        except BaseException as error:  # raised in the thread that waits
-            done.put((job, error))
-            return
-        done.put((job, outcome))
 
 
 _CONNECT_S = 30

@@ -341,7 +341,9 @@ class FileHashes:
             raise RsbenchError(f"{store}: is not a regular file; remove it")
         if rehash:
             store.unlink(missing_ok=True)
-        self._known = _read_hashes(store)
+        self._known = dict[str, HashedFile]()
+        with contextlib.suppress(OSError), store.open(encoding="utf-8", errors="replace") as stream:
+            self._known = _parsed_hashes(stream)
         self._new: list[str] = []
 
     def of(self, name: str) -> HashedFile | None:
@@ -390,14 +392,6 @@ class FileHashes:
         self._known[name] = file
         self._new.append(json.dumps([name, *file]))
         return file
-
-
-def _read_hashes(store: Path) -> dict[str, HashedFile]:
-    try:
-        with store.open(encoding="utf-8", errors="replace") as stream:
-            return _parsed_hashes(stream)
-    except OSError:
-        return {}
 
 
 def _parsed_hashes(lines: Iterable[str]) -> dict[str, HashedFile]:

@@ -41,6 +41,7 @@ from rsbench.interop.writers.sequence_views import (
     first_pose,
     number,
     numbers,
+    one_by_one,
     surfaces,
     views_in_time,
     write_lines,
@@ -164,8 +165,8 @@ def write_poses(path: Path, seconds: FloatArray, cam_from_world: Pose) -> None:
     write_lines(path, [f"# {FORMAT}", *map(numbers, table)])
 
 
-COLMAP = Format(_COLMAP_ABOUT, ("gs", "rs"), _write_colmap)
-TUM = Format(_TUM_ABOUT, (), _write_tum)
+COLMAP = Format(_COLMAP_ABOUT, ("gs", "rs"), one_by_one(_write_colmap))
+TUM = Format(_TUM_ABOUT, (), one_by_one(_write_tum))
 
 
 # Frames that ``rsbench correct`` wrote

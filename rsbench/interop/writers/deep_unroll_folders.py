@@ -37,6 +37,7 @@ from rsbench.interop.writers.sequence_views import (
     first_pose,
     number,
     numbers,
+    one_by_one,
     reads_from_top,
     seen_by,
     write_lines,
@@ -184,5 +185,5 @@ def _write_fastec(sequence: Sequence, root: Path, images: Images) -> Note:
     return sentences, {}
 
 
-CARLA_RS = Format(_CARLA_ABOUT, (), _write_carla, fault=_carla_fault)
-FASTEC_RS = Format(_FASTEC_ABOUT, (), _write_fastec, fault=_fastec_fault)
+CARLA_RS = Format(_CARLA_ABOUT, (), one_by_one(_write_carla), fault=_carla_fault)
+FASTEC_RS = Format(_FASTEC_ABOUT, (), one_by_one(_write_fastec), fault=_fastec_fault)

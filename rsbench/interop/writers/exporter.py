@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from rsbench.interop.writers.colmap_and_tum import (
 from rsbench.interop.writers.deep_unroll_folders import CARLA_RS, FASTEC_RS
 from rsbench.interop.writers.frame_samples import HUGGINGFACE, WEBDATASET
 from rsbench.interop.writers.kitti_and_kalibr import KALIBR, KITTI
-from rsbench.interop.writers.sequence_views import Format, Images, Note, write_lines
+from rsbench.interop.writers.sequence_views import Images, Note, write_lines
 from rsbench.interop.writers.splatting import GSPLAT, NERFSTUDIO
 from rsbench.storage.files import check_out, write_json
 
@@ -86,7 +86,7 @@ def export_dataset(
     check_out(out)
     with fresh_folder(out, "rsbench export") as fresh:
         notes = dict[str, Note]()
-        for sequence, note in zip(sequences, _written(kind, sequences, fresh, chosen), strict=True):
+        for sequence, note in zip(sequences, kind.write(sequences, fresh, chosen), strict=True):
             notes[sequence.name] = note
             progress(sequence.name)
         return _write_record(fresh, name, kind.about, notes, {"images": chosen} if kind.images else {})
@@ -117,15 +117,6 @@ def _write_record(fresh: Path, name: str, about: str, notes: dict[str, Note], mo
     readme = [f"Written by rsbench {__version__}: rsbench export --to {name}", "", about, *sentences]
     write_lines(fresh / README, readme)
     return sentences
-
-
-def _written(kind: Format, sequences: list[Sequence], fresh: Path, images: Images) -> Iterator[Note]:
-    if kind.write_all is not None:
-        yield from kind.write_all(sequences, fresh)
-        return
-    assert kind.write is not None
-    for sequence in sequences:
-        yield kind.write(sequence, fresh, images)
 
 
 def chosen_sequences(folder: Path, only: tuple[str, ...]) -> list[Sequence]:

@@ -33,7 +33,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.dataset.layout import SHUTTERS, picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest
-from rsbench.interop.writers.sequence_views import Format, Note, View, first_second, write_lines
+from rsbench.interop.writers.sequence_views import Format, Images, Note, View, first_second, write_lines
 from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import inside, read_bytes
 
@@ -117,7 +117,7 @@ _LINE_FIELDS = ("camera", "baseline", "readout_ratio", "frame_period_s", "motion
 _SAMPLE_FIELDS = (*_LINE_FIELDS, "readout_time_s", "conventions")
 
 
-def _write_shards(sequences: list[Sequence], root: Path) -> Iterator[Note]:
+def _write_shards(sequences: list[Sequence], root: Path, images: Images) -> Iterator[Note]:
     """The samples of sequences, in shards below ``root``."""
     shards = _Shards(root)
     try:
@@ -217,7 +217,7 @@ pretty_name: {name}
 Rolling-shutter stereo, made by rsbench. {about}"""
 
 
-def _write_folder(sequences: list[Sequence], root: Path) -> Iterator[Note]:
+def _write_folder(sequences: list[Sequence], root: Path, images: Images) -> Iterator[Note]:
     """Files and lines of sequences below ``root``."""
     lines = list[str]()
     for sequence in sequences:
@@ -245,5 +245,5 @@ def _write_folder(sequences: list[Sequence], root: Path) -> Iterator[Note]:
     write_lines(root / "README.md", [_DATASET_CARD.format(licence=licence, name=name, about=_HUGGINGFACE_ABOUT)])
 
 
-WEBDATASET = Format(_WEBDATASET_ABOUT, (), write_all=_write_shards)
-HUGGINGFACE = Format(_HUGGINGFACE_ABOUT, (), write_all=_write_folder)
+WEBDATASET = Format(_WEBDATASET_ABOUT, (), _write_shards)
+HUGGINGFACE = Format(_HUGGINGFACE_ABOUT, (), _write_folder)

@@ -34,6 +34,7 @@ from rsbench.interop.writers.sequence_views import (
     matrix,
     number,
     numbers,
+    one_by_one,
     reads_from_top,
     world_from_camera,
     write_lines,
@@ -182,5 +183,5 @@ def _yaml_imu(imu: Imu) -> str:
     return "".join(f"{name}: {value}\n" for name, value in fields.items())
 
 
-KITTI = Format(_KITTI_ABOUT, ("gs", "rs"), _write_kitti, fault=_kitti_fault)
-KALIBR = Format(_KALIBR_ABOUT, (), _write_kalibr, fault=_kalibr_fault)
+KITTI = Format(_KITTI_ABOUT, ("gs", "rs"), one_by_one(_write_kitti), fault=_kitti_fault)
+KALIBR = Format(_KALIBR_ABOUT, (), one_by_one(_write_kalibr), fault=_kalibr_fault)

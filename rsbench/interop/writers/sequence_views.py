@@ -42,10 +42,8 @@ class Format(NamedTuple):
     """What its files hold, for README.txt."""
     images: tuple[Images, ...]
     """The images that it can be made of, the default first; empty where it holds none, or both."""
-    write: Callable[[Sequence, Path, Images], Note] | None = None
-    """Writes one sequence to a folder of its name below a root."""
-    write_all: Callable[[list[Sequence], Path], Iterator[Note]] | None = None
-    """Writes files that hold several sequences; yields after each."""
+    write: Callable[[list[Sequence], Path, Images], Iterator[Note]]
+    """Writes sequences to files below a root; yields after each."""
     fault: Callable[[Sequence, Images], str] = lambda sequence, images: ""
     """Why a sequence cannot be written, with a remedy; empty where it can."""
 
@@ -59,6 +57,13 @@ class View(NamedTuple):
     @property
     def name(self) -> str:
         return f"{self.side}_{self.frame:04d}.png"
+
+
+def one_by_one(
+    write: Callable[[Sequence, Path, Images], Note],
+) -> Callable[[list[Sequence], Path, Images], Iterator[Note]]:
+    """``Format.write`` from a function that writes one sequence to files of its own."""
+    return lambda sequences, root, images: (write(sequence, root, images) for sequence in sequences)
 
 
 def views_in_time(sequence: Sequence) -> list[View]:

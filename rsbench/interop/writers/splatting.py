@@ -48,6 +48,7 @@ from rsbench.interop.writers.sequence_views import (
     line_poses,
     lines_of,
     matrix,
+    one_by_one,
     reads_from_top,
     seen_by,
     views_in_time,
@@ -256,5 +257,5 @@ def _gsplat_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray
     return seen_by(sequence, poses, points.world)
 
 
-NERFSTUDIO = Format(_NERFSTUDIO_ABOUT, ("rs", "gs"), _write_nerfstudio, fault=_nerfstudio_fault)
-GSPLAT = Format(_GSPLAT_ABOUT, ("rs", "gs"), _write_gsplat)
+NERFSTUDIO = Format(_NERFSTUDIO_ABOUT, ("rs", "gs"), one_by_one(_write_nerfstudio), fault=_nerfstudio_fault)
+GSPLAT = Format(_GSPLAT_ABOUT, ("rs", "gs"), one_by_one(_write_gsplat))
