@@ -74,7 +74,7 @@ LONG = (
     "test_refined_solver.py",
     "test_sequence_jobs.py",
     "test_board.py",
-    "test_settle.py",
+    "test_shutter_decision.py",
     "test_reproduce_simulated.py",
     "test_channels.py",
 )

@@ -47,7 +47,7 @@ OFFSET = 0
 BENDS, ROWS, LENS, FOCAL = slice(1, 6), slice(6, 10), slice(10, 13), 13
 RADIAL = LENS.start
 STRETCHING = (RADIAL, FOCAL)
-"""Those that change how many pixels an error of a ray is by more than a hundredth."""
+"""Terms that change by more than a hundredth how many pixels an error of a ray is."""
 _STEP = 1e-5
 _STEPS = _STEP * np.eye(2)
 NO_ERRORS = (0.0,) * len(TERMS)
@@ -56,23 +56,23 @@ _HALF: dict[Side, float] = {"left": 0.5, "right": -0.5}
 
 @dataclass(frozen=True, kw_only=True)
 class CardSigma:
-    """How sure a card is of a camera: standard deviations; 0: it is exact."""
+    """Standard deviations of a card's values for a camera; 0: exact."""
 
     focal: float = 0.0
     """px, of fx; fy goes with it."""
     k1: float = 0.0
-    """Of the lens; where there is none, of what undistortion left."""
+    """Of the lens; without one, of the distortion that undistortion has left."""
 
     def __bool__(self) -> bool:
-        """Whether there is anything to find."""
+        """Whether there is anything to estimate."""
         return self.focal > 0.0 or self.k1 > 0.0
 
 
 def ray_shifts(rays: FloatArray, side: Side, focal: float, lens: Lens | None = None) -> FloatArray:
     """(..., 14, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
 
-    Half of an offset and of a row difference is the left camera's, half the right one's. Behind a lens, what the
-    radial coefficient and the focal length do to its distorted rays is taken back through it.
+    Half of an offset and of a row difference belongs to each camera. Behind a lens, shifts of its distorted rays by
+    the radial coefficient and the focal length are mapped back through it.
     """
     x, y, out = rays[..., 0], rays[..., 1], np.zeros((*rays.shape[:-1], len(TERMS), 2))
     half = _HALF[side] / focal
@@ -85,7 +85,7 @@ def ray_shifts(rays: FloatArray, side: Side, focal: float, lens: Lens | None = N
 
 
 def _stretching_shifts(rays: FloatArray, lens: Lens | None) -> FloatArray:
-    """(..., 2, 2) those of ``STRETCHING``: of the distorted rays, taken back through the lens."""
+    """(..., 2, 2) by ``STRETCHING``: of the distorted rays, mapped back through the lens."""
     square = np.sum(rays**2, axis=-1, keepdims=True)
     if lens is None:
         return np.stack([square * rays, rays], axis=-2)
@@ -100,7 +100,7 @@ def _stretching_shifts(rays: FloatArray, lens: Lens | None) -> FloatArray:
 def ray_stretches(rays: FloatArray, lens: Lens | None = None) -> FloatArray:
     """(..., 2, 2, 2) derivative by the ray, the last axis, of what 1 of each of ``STRETCHING`` shifts it by.
 
-    By central differences, whose own error is of the square of the step.
+    By central differences, whose own error is of second order in the step.
     """
     ends = [_stretching_shifts(rays + step, lens) - _stretching_shifts(rays - step, lens) for step in _STEPS]
     return np.stack(ends, axis=-1) / (2.0 * _STEP)
@@ -145,7 +145,7 @@ def in_words(errors: Sequence[float], rig: StereoRig) -> str:
 
 
 def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[float]) -> Correspondences:
-    """The matches, px, with the errors (14,) of their calibration taken from them; of cameras without a lens."""
+    """The matches, px, without the errors (14,) of their calibration; for cameras without a lens."""
     if not np.any(errors):
         return matches
     camera = rig.camera
@@ -169,7 +169,7 @@ def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[floa
 
 
 _FEWEST = 30
-"""Left-right matches below which nothing is said of the rig."""
+"""Fewest left-right matches for a decision on the rig."""
 _FAR_OFF_PX, _ROUNDS, _SIGMAS, _LEAST_PX = 10.0, 8, 3.0, 0.05
 _SAME_ROW = 0.68
 """Share of matches on the same row: at least 0.80 in real rectified pairs, at most 0.56 in those of two times."""
@@ -183,7 +183,7 @@ _CLEARLY = 5.0
 
 
 class RefusedFramesError(RsbenchError):
-    """Frames that cannot be what they are said to be; ``reason`` says why without naming them."""
+    """Frames that contradict what is given; ``reason`` says why without naming them."""
 
     def __init__(self, reason: str, where: str = "frames") -> None:
         super().__init__(f"{where}: {reason}")

@@ -1,7 +1,7 @@
 """The spline of largest posterior probability: robust Levenberg-Marquardt steps on banded normal equations.
 
 The descent starts from the motions of neighbouring frames, one after the other (``first_curve``). Noise, its tails
-and the strength of the prior are estimated on the way: the first two by maximum likelihood, the last by maximum
+and the strength of the prior are estimated with it: the first two by maximum likelihood, the last by maximum
 evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992), as are the knots and the kind of prior
 (``choose``).
 """

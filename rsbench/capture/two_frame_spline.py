@@ -188,8 +188,7 @@ def camera_trajectory(
 def camera_two_frame_spline(
     matches: FloatArray, law: Motion, rig: StereoRig, shutter: RollingShutter
 ) -> ContinuousMotion | None:
-    """As ``camera_trajectory``, for two frames; None where a model is as good, or they leave undetermined which
-    way.
+    """As ``camera_trajectory``, for two frames; None where a model is as good, or the shake is undetermined.
 
     Args:
         matches: (n, 4) x0, y0, x1, y1, px, with outliers.

@@ -50,7 +50,7 @@ def test_rows_of_a_shaken_rig(shake: str, frames: int) -> None:
     windows, right = matches(law, frames, rng)
     found = estimate_trajectory(windows, RIG, SHUTTER)
     errors = row_errors_deg(found, law, frames)
-    assert np.median(errors) < 0.02  # asked for by issue 30
+    assert np.median(errors) < 0.02  # the requirement of issue 30
     assert abs(found.noise_px - 0.3) < 0.02  # three deviations of 2400 errors are 0.01
     assert np.all(found.supported)
     wrong = sum(np.count_nonzero(mask != truth) for mask, truth in zip(found.inliers, right, strict=True))

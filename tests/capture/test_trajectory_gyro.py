@@ -42,7 +42,7 @@ RATE = 200.0 / 30.0
 
 
 def measured(law: Law, frames: int, rng: np.random.Generator, late: float = 0.0) -> FloatArray:
-    """Samples (n, 4) of a law; ``late`` frame periods after what they are said to be."""
+    """Samples (n, 4) of a law; ``late`` frame periods after their stated times."""
     tau = np.arange(-1.0, frames + 1.0, 1.0 / RATE)
     before, after = (law(tau + late + each)[0] for each in (-1e-4, 1e-4))
     w = Rotation.from_matrix(after @ np.swapaxes(before, 1, 2)).as_rotvec() / 2e-4
@@ -255,7 +255,7 @@ def test_silent_windows_of_a_stream_are_bridged() -> None:
 
 
 def test_a_stream_forgets_a_gyroscope_that_goes_wrong() -> None:
-    """The bias and the clock that were found with it are left out of what earlier windows said."""
+    """The bias and the clock that were found with it are left out of the summary of earlier windows."""
     rng = np.random.default_rng(301)
     law = sines(rng, *SHAKES["strong"])
     windows, _ = matches(law, 16, rng, count=80)

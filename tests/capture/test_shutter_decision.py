@@ -1,7 +1,8 @@
-"""What a correction takes from what the matches say. Truth: points projected exactly; differences of the cost."""
+"""The shutter and motion model that a correction uses. Truth: exact projections; differences of the cost."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -25,9 +26,20 @@ from rsbench.capture.hypotheses import (
     scans_of,
 )
 from rsbench.capture.model_choice import AUTO, choose_model, motion_at
-from rsbench.capture.shutter_decision import NoMotionError, known_of, runs_backwards, shutter_found
-from rsbench.capture.two_frame_estimate import Capture, conclude, examine
-from rsbench.components.motion_models import make_motion
+from rsbench.capture.shutter_decision import (
+    NoMotionError,
+    as_global,
+    conclude_alone,
+    examine_alone,
+    fits_backwards,
+    known_alone,
+    known_of,
+    runs_backwards,
+    shutter_alone,
+    shutter_found,
+)
+from rsbench.capture.two_frame_estimate import Candidate, Capture, conclude, examine, nearly_global
+from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
@@ -35,6 +47,7 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
+from rsbench.solvers.engine.robust_motion import RobustOptions
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.5)
 TOP = Scanning()
@@ -219,8 +232,8 @@ def test_what_matches_cannot_tell_is_said_and_the_papers_model_used() -> None:
     choice = choose_model(capture)
     assert choice is not None and choice.used == "linear" and not choice.decided
     assert str(choice).startswith("cannot tell, so linear is used (")
-    asked = choose_model(capture, "twist")
-    assert asked is not None and asked.used == "twist" and asked.rival != "twist"
+    requested = choose_model(capture, "twist")
+    assert requested is not None and requested.used == "twist" and requested.rival != "twist"
     motion = motion_at(capture.peaks["twist"])
     assert motion.name == "twist" and np.linalg.norm(motion.d - truth.d) < 0.05
 
@@ -252,3 +265,108 @@ def test_a_ratio_near_0_tells_no_scan() -> None:
     near = replace(best, ratio=0.25, sigma=0.09, probability=0.98)
     with pytest.raises(NoMotionError, match="cannot tell the readout ratio"):
         shutter_found(replace(capture, candidates=(near,)), RIG)
+
+
+RIG_GLOBAL = StereoRig(camera=PinholeCamera.centred(64, 48, 50.0), baseline=0.1)
+
+
+def candidate(scans: Scans, probability: float, ratio: float, sigma: float, offset: float = 0.0) -> Candidate:
+    return Candidate(
+        scans=scans,
+        probability=probability,
+        ratio=ratio,
+        sigma=sigma,
+        delay=0.0,
+        delay_sigma=0.0,
+        calibration=of_offset(offset),
+    )
+
+
+def capture_of(*candidates: Candidate) -> Capture:
+    return Capture(
+        candidates=candidates,
+        models={"linear": 1.0},
+        peaks={},
+        reason="",
+        named=True,
+        windows=1,
+        matches=100,
+        used=100,
+        noise_px=0.1,
+        moved_px=5.0,
+    )
+
+
+ONE_SIDE = candidate(Scans("left", "left"), 0.7, 0.08, 0.03)
+OTHER_SIDE = candidate(Scans("bottom", "bottom"), 0.3, 0.05, 0.01)
+
+
+def test_small_ratios_of_any_side_are_one_global_shutter_as_wide_as_all_of_them() -> None:
+    found = nearly_global(capture_of(ONE_SIDE, OTHER_SIDE))
+    assert found is not None and [each.scans for each in found] == [GLOBAL]
+    square = 0.7 * (0.08**2 + 0.03**2) + 0.3 * (0.05**2 + 0.01**2)
+    assert found[0].sigma == pytest.approx(math.sqrt(square)) and found[0].ratio == 0.0
+
+
+@pytest.mark.parametrize(
+    "capture",
+    [
+        capture_of(),
+        capture_of(candidate(GLOBAL, 1.0, 0.0, 0.0)),
+        capture_of(ONE_SIDE, candidate(Scans("top", "top"), 0.3, 0.5, 0.01)),  # clearly rolls, too probable
+        capture_of(candidate(Scans("top", "top"), 1.0, 0.2, 0.2)),  # says nothing of the ratio
+    ],
+)
+def test_what_may_roll_is_left_as_it_is(capture: Capture) -> None:
+    assert nearly_global(capture) is None
+    assert as_global(capture, [], RIG_GLOBAL, Known()) is capture
+
+
+def test_what_is_said_under_a_global_shutter_is_taken_as_it_is_said() -> None:
+    globally = capture_of(candidate(GLOBAL, 1.0, 0.0, 0.0, offset=0.4))
+    found = as_global(
+        capture_of(ONE_SIDE, OTHER_SIDE), [], RIG_GLOBAL, Known(), lambda: replace(globally, models={"twist": 1.0})
+    )
+    assert found.likeliest is not None and found.likeliest.scans == GLOBAL
+    assert found.calibration == globally.calibration and dict(found.models) == {"twist": 1.0}
+    assert found.likeliest.sigma > 0.05, "how sure the shutter is stays what was found"
+
+
+CAMERA = PinholeCamera.centred(640, 480, 500.0)
+SHUTTER = RollingShutter(height=480, readout_ratio=0.7)
+TURNING = [
+    LinearMotion(w=np.radians([3.0, -1.0, 2.0]), d=[0.2, -0.1, 0.1]),
+    LinearMotion(w=np.radians([-2.0, 2.0, -3.0]), d=[-0.1, -0.2, 0.2]),
+]
+
+
+def _matches(motion: LinearMotion, seed: int = 0) -> FloatArray:
+    rig, options = StereoRig(camera=CAMERA, baseline=0.4), SimulationOptions(pairs=200, noise_px=0.1)
+    return simulate(rig, SHUTTER, motion, options, np.random.default_rng(seed)).correspondences.left
+
+
+def _capture(matches: list[FloatArray]) -> Capture:
+    return conclude_alone([examine_alone(each, CAMERA, known_alone(), RobustOptions()) for each in matches])
+
+
+def test_a_turning_camera_shows_its_readout_whatever_the_unit_of_length() -> None:
+    capture = _capture([_matches(motion, seed) for seed, motion in enumerate(TURNING)])
+    best = capture.likeliest
+    assert best is not None and best.scans.left == "top" and best.probability > 0.95
+    # Its own deviation covers the error; 0.1 is what a correction asks for.
+    assert abs(best.ratio - 0.7) < 3.0 * best.sigma and best.sigma < 0.1
+    assert shutter_alone(capture, CAMERA).readout_ratio == best.ratio
+
+
+def test_exchanged_frames_look_read_from_the_other_side() -> None:
+    forward = _matches(TURNING[0])
+    backward = forward[:, [2, 3, 0, 1]]
+    assert not fits_backwards(forward, CAMERA, SHUTTER, RobustOptions())
+    assert fits_backwards(backward, CAMERA, SHUTTER, RobustOptions())
+    assert runs_backwards(_capture([backward]), Scans("top", "top"))
+
+
+def test_a_motion_along_the_lines_does_not_show_it() -> None:
+    capture = _capture([_matches(LinearMotion(w=[0.0, 0.0, 0.0], d=[0.3, 0.0, 0.0]))])
+    with pytest.raises(NoMotionError, match=r"cannot tell the readout ratio: the frames show .* read"):
+        shutter_alone(capture, CAMERA)

@@ -1,6 +1,9 @@
-"""What matches say of the shutters that made them. Truth: points projected exactly by those shutters."""
+"""Shutters and motions from matches. Truth: points projected exactly by those shutters."""
+
+from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from commands import run_here
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.hypotheses import (
     ALL_SCANS,
+    BEYOND_RATIO,
     DELAY,
     LEAST_RATIO,
     RATIO,
@@ -22,9 +26,15 @@ from rsbench.capture.hypotheses import (
     line_of,
     scans_of,
 )
-from rsbench.capture.hypothesis_ranking import Peak, find_lag, first_shutter
+from rsbench.capture.hypothesis_ranking import Lag, Peak, find_lag, first_shutter, without_lag, without_leaps
 from rsbench.capture.two_frame_estimate import Capture, _product, conclude, examine
-from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
+from rsbench.components.motion_models import (
+    AcceleratedMotion,
+    InertialMotion,
+    LinearMotion,
+    TwistMotion,
+    make_motion,
+)
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -260,3 +270,62 @@ def test_the_command_answers_by_its_exit_code() -> None:
     assert [json.loads(line)["told"] for line in run.stdout.splitlines()] == [False]
     assert "baseline" in run.stderr
     assert run_here("inspect").returncode == 2
+
+
+RIG_LEAPS = StereoRig(camera=PinholeCamera.centred(640, 480, 520.0), baseline=0.2)
+MOTION_LEAPS: Motion = make_motion("accelerated", [0.0, -0.009, 0.0], [0.006, 0.004, -0.2], {"acceleration": 0.06})
+"""A vehicle that speeds up: the ratio trades with the acceleration, so the valley is shallow."""
+
+
+TRUE_RATIO = 0.8
+
+
+def leap(ratio: float) -> np.ndarray:
+    """From the bottom of the image to a row that is read at the same time, a period later; (1, 4)."""
+    return np.array([[10.0, 470.0, 170.0, 470.0 - 480.0 / ratio]])
+
+
+@pytest.mark.parametrize("ratio", [1.1, BEYOND_RATIO])
+def test_a_leap_is_a_perfect_match_at_some_ratio_and_is_left_out(ratio: float) -> None:
+    wrong = Correspondences(left=leap(ratio))
+    timed = TimedMatches(wrong, RIG_LEAPS, "linear")
+    unknowns = np.zeros(17)
+    unknowns[0] = ratio
+    theta = np.concatenate([MOTION_LEAPS.w, MOTION_LEAPS.d])
+    assert abs(timed.packed(Scans("top", "top"), unknowns).pair_residuals(theta)[0]) < 1e-3
+    assert len(without_leaps(wrong, RIG_LEAPS).left) == 0
+
+
+@pytest.mark.slow
+def test_leaps_do_not_hold_the_ratio() -> None:
+    options = SimulationOptions(noise_px=0.05, pairs=300, tracks=300, depth=(3.0, 12.0))
+    made = simulate(
+        RIG_LEAPS,
+        RollingShutter(height=480, readout_ratio=TRUE_RATIO),
+        MOTION_LEAPS,
+        options,
+        np.random.default_rng(0),
+    )
+    right = made.correspondences
+    leaps = np.concatenate([leap(ratio) for ratio in np.linspace(1.02, 1.2, 10)])
+    found = []
+    for matches in (right, replace(right, left=np.concatenate([right.left, leaps]))):
+        best = conclude([examine(matches, RIG_LEAPS)], np.inf).likeliest
+        assert best is not None
+        assert abs(best.ratio - TRUE_RATIO) < 3.0 * best.sigma
+        found.append(best.ratio)
+    assert found[1] == pytest.approx(found[0], abs=1e-3)  # the start alone is found among other matches
+
+
+def test_a_lag_may_lead_to_where_a_lens_shows_nothing() -> None:
+    """A point that goes on by a period as it did: in ideal pixels that is somewhere, whatever the lens shows."""
+    lens = Lens(model="brown-conrady", k1=-0.28)
+    camera = replace(PinholeCamera.centred(640, 480, 560.0), lens=lens)
+    rig = StereoRig(camera=camera, baseline=0.2)
+    ends = np.array([[[600.0, 430.0], [638.0, 478.0]]])
+    beyond = 2.0 * ends[:, 1] - ends[:, 0]
+    assert np.all(np.isnan(camera.ideal_pixels(beyond)))
+    a_period = Lag(np.array([1.0, 0.0, 0.0]), np.eye(3))
+    taken = without_lag(Correspondences(right=ends.reshape(1, 4)), a_period, rig)
+    ideal = camera.ideal_pixels(ends)
+    np.testing.assert_allclose(taken.right[0, 2:], (2.0 * ideal[:, 1] - ideal[:, 0])[0])
