@@ -71,8 +71,8 @@ class CardSigma:
 def ray_shifts(rays: FloatArray, side: Side, focal: float, lens: Lens | None = None) -> FloatArray:
     """(..., 14, 2) by which measured rays x, y (..., 2) of one camera are too large for 1 of each of ``TERMS``.
 
-    Half of an offset and of a row difference belongs to each camera. Behind a lens, shifts of its distorted rays by
-    the radial coefficient and the focal length are mapped back through it.
+    Half of an offset and of a row difference belongs to each camera. Behind a lens, shifts of its distorted rays
+    by the radial coefficient and the focal length are mapped back through it.
     """
     x, y, out = rays[..., 0], rays[..., 1], np.zeros((*rays.shape[:-1], len(TERMS), 2))
     half = _HALF[side] / focal

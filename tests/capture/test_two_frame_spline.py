@@ -270,7 +270,7 @@ def law_of(matches: FloatArray) -> InertialMotion:
 @pytest.mark.slow
 @pytest.mark.parametrize("shake", [0.0, 0.001, 0.005])
 def test_two_frames_are_believed_that_they_shook_where_they_show_it(shake: float) -> None:
-    """By half a pixel: that motion is nearer than the best law. By more, many motions explain them: the law stays."""
+    """By half a pixel: the spline is nearer than the best law. By more, many splines fit: the law stays."""
     for seed in range(3):
         (matches,) = windows_of(1, shake, 0.1, np.random.default_rng(seed))
         law = law_of(matches)
