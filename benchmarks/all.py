@@ -81,7 +81,7 @@ def chain_over_opencv(data: Path) -> tuple[Work, Work]:
     import correct_chain
 
     from rsbench.dataset.sequence import read_dataset
-    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_depth import CorrectionOptions
 
     sequence, options = next(iter(read_dataset(data))), CorrectionOptions()
     anchor = correct_chain.opencv_alone(sequence)
@@ -158,8 +158,8 @@ def asked_over_matched(data: Path) -> tuple[Work, Work]:
     from rsbench.capture.shutter_decision import known_of
     from rsbench.capture.two_frame_estimate import conclude, examine
     from rsbench.dataset.sequence import read_dataset
-    from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_matches import match_unknown
+    from rsbench.pipeline.frame_depth import CorrectionOptions
+    from rsbench.pipeline.frame_motion import match_unknown
     from rsbench.vision.features import forget_features
 
     sequence, options = next(iter(read_dataset(data))), CorrectionOptions()

@@ -22,7 +22,7 @@ from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCa
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_dataset
 from rsbench.pipeline.chain import correct_four
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.quality import psnr
 from rsbench.vision.stereo_depth import depth_metrics
 

@@ -26,9 +26,8 @@ import numpy as np
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_matches import match_frames
-from rsbench.pipeline.frame_motion import solve_frames
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import match_frames, solve_frames
 from rsbench.vision.features import forget_features
 
 BOUND = 10.0

@@ -30,7 +30,7 @@ from rsbench.core.rig import VIEWS, View
 from rsbench.dataset import sequence as recorded
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.pipeline.array_correction import of_rig, options_of
+from rsbench.pipeline.arrays import of_rig, options_of
 from rsbench.pipeline.chain import uncorrected
 from rsbench.pipeline.mono_correction import MonoFusionCorrector
 from rsbench.renderers.backend import start_backend

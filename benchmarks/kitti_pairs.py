@@ -22,10 +22,10 @@ from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.core.errors import RsbenchError
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_matches import match_unknown
-from rsbench.pipeline.sequence_windows import window_images
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import match_unknown
+from rsbench.pipeline.sequence_capture import window_images
 
 
 def stated(folder: Path, names: tuple[str, str], every: int) -> Iterator[tuple[int, str, float, float]]:

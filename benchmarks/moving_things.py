@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.layout import moving_file
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.array_correction import of_rig, options_of
+from rsbench.pipeline.arrays import of_rig, options_of
 from rsbench.vision.correctors import FusionCorrector
 
 _VIEW, _FOUR = ("left", 1), (("left", 0), ("right", 0), ("left", 1), ("right", 1))

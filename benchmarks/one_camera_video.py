@@ -23,7 +23,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.array_correction import options_of
+from rsbench.pipeline.arrays import options_of
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
 from rsbench.pipeline.sequence_correction import correct_sequence

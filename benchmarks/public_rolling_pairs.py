@@ -33,9 +33,8 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.footage import read_frame
+from rsbench.pipeline.mono_camera import OneCameraCard, find_camera
 from rsbench.pipeline.mono_correction import find_own_motion
-from rsbench.pipeline.mono_focal import find_camera
-from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, OwnMotion, find_flows

@@ -24,7 +24,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, VIEWS
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.pipeline.array_correction import of_rig, options_of
+from rsbench.pipeline.arrays import of_rig, options_of
 from rsbench.pipeline.mono_correction import find_own_motion, refusal
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import MonoFusion, find_flows

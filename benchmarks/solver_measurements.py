@@ -58,7 +58,7 @@ from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import BESIDE, MotionEstimate, list_solvers, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.refined import warm_up

@@ -22,9 +22,9 @@ from rsbench.capture.calibration import CardSigma
 from rsbench.capture.self_calibration import FoundCamera
 from rsbench.core.camera import Lens
 from rsbench.core.rig import SIDES, StereoRig
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame, read_rig_card
-from rsbench.pipeline.found_camera import camera_of_frames
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.sequence_capture import camera_of_frames
 
 _LONGER, _LARGER = 1.05, 0.03
 _SURE, _SURE_K1 = 0.1, 0.05

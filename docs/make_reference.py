@@ -266,7 +266,7 @@ def card_classes() -> dict[str, list[tuple[str, type]]]:
     from rsbench.components.plugins import CardContent
     from rsbench.dataset.card import DatasetCard
     from rsbench.pipeline.footage import RigCard
-    from rsbench.pipeline.one_camera_card import OneCameraCard
+    from rsbench.pipeline.mono_camera import OneCameraCard
     from rsbench.renderers.options import RendererOptions
     from rsbench.scenes.load import SceneCard
 

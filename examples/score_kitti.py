@@ -29,12 +29,10 @@ from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, read_frame
-from rsbench.pipeline.found_camera import camera_of_frames, spread_windows
-from rsbench.pipeline.frame_matches import match_frames
-from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_capture import estimate_sequence_capture
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.sequence_capture import camera_of_frames, estimate_sequence_capture, spread_windows
 
 Step = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,), metres, of the body from one frame to the next."""

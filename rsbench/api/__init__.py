@@ -206,8 +206,8 @@ def match(images: Series[Image], *, features: str | Path = "sift-refined") -> Co
         ValueError: not four images that are alike, uint8 or uint16.
         RsbenchError: no such feature matcher.
     """
-    from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_matches import find_matches
+    from rsbench.pipeline.frame_depth import CorrectionOptions
+    from rsbench.pipeline.frame_motion import find_matches
     from rsbench.vision.feature_matcher import load_features
 
     return find_matches(

@@ -96,7 +96,7 @@ def correct(
         ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
         RsbenchError: frames that are not what they should be; no such component; no motion; no correction.
     """
-    from rsbench.pipeline import array_correction
+    from rsbench.pipeline import arrays as array_correction
 
     arguments.check_one_of("inpaint", inpaint, (None, True, False))
     if (rig is None) == (camera is None):

@@ -54,7 +54,7 @@ def estimate_trajectory(
         ValueError: an argument of another type or out of its range; no tracks.
         RsbenchError: no such feature matcher; a shutter that the matches do not tell; matches of no motion.
     """
-    from rsbench.pipeline.array_trajectory import matches_of, trajectory_of
+    from rsbench.pipeline.arrays import matches_of, trajectory_of
 
     arguments.check_whole("seed", seed, 0)
     arguments.check_type("rig", rig, StereoRig)

@@ -1,4 +1,4 @@
-"""Metrics of other packages in a child process: see ``rsbench.pipeline.isolated_parts``."""
+"""Metrics of other packages in a child process: see ``rsbench.pipeline.isolated_components``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 
 from rsbench.benchmark.metric_plugins import METRICS, Case, Column, Metric, MetricEntry, load_metrics
 from rsbench.benchmark.scoring import score
-from rsbench.pipeline.isolated_parts import Caller, Isolation
-from rsbench.pipeline.isolated_solver import entrys_own
+from rsbench.pipeline.isolated_components import Caller, Isolation, entrys_own
 
 
 def isolated_metrics(isolation: Isolation, metrics: tuple[MetricEntry, ...]) -> tuple[MetricEntry, ...]:

@@ -22,9 +22,9 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_motion
-from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
+from rsbench.pipeline.sequence_correction import Window, on_one_trajectory
 
 _INLIER_PX, _FEWEST, _DRAWS = 1.5, 6, 1000
 """Of P3P in RANSAC: threshold, fewest inliers, and samples."""

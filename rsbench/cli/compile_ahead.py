@@ -57,10 +57,8 @@ def parts() -> list[Callable[[], object]]:
     from rsbench.core.rig import FRAMES, StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.pipeline.chain import correct_frames, find_depth
-    from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.frame_depth import depth_of_pair
-    from rsbench.pipeline.frame_matches import match_frames
-    from rsbench.pipeline.frame_motion import solve_frames
+    from rsbench.pipeline.frame_depth import CorrectionOptions, depth_of_pair
+    from rsbench.pipeline.frame_motion import match_frames, solve_frames
 
     rig = StereoRig(camera=PinholeCamera.centred(_WIDTH, _HEIGHT, 150.0), baseline=0.3)
     shutter, motion = (

@@ -9,25 +9,24 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_input import EPILOG, given_frames, sized, target_row, with_found_camera
+from rsbench.cli.correct_input import EPILOG, GyroscopeOptions, given_frames, sized, target_row, with_found_camera
 from rsbench.cli.correct_one_camera import (
     CameraFile,
     Footage,
     Fps,
     GyroFile,
-    GyroGiven,
     GyroOffset,
     correct_one_camera,
 )
-from rsbench.cli.correct_said import readout_words, say_calibration, write_page_of
+from rsbench.cli.correct_output import readout_words, say_calibration, write_page_of
 from rsbench.cli.correct_sequence import correct_sequence_given
 from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from rsbench.cli.correct_input import Given
-    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.cli.correct_input import RigInput
     from rsbench.pipeline.footage import RigCard
+    from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.vision.corrector import CorrectorEntry
     from rsbench.vision.fusion import Fused
 
@@ -37,10 +36,16 @@ _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and 
 _FAST = "Of a rig: features and depth at half the size, which takes less time and loses little."
 _ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
 _SOLVER = "rs-stereo-refined"
+_RIG_ONLY = (
+    *("rig", "left", "right", "sky", "fill", "solver", "motion_model", "matcher", "features", "corrector", "fast"),
+    "row_poses",
+)
+"""Parameters that the correction of one camera's frames does not have."""
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
 
 
 def correct(
+    ctx: typer.Context,
     frames: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -72,10 +77,9 @@ def correct(
     gyro_offset: GyroOffset = None,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
-    log = GyroGiven(file=gyro, fps=fps, offset_s=gyro_offset)
+    log = GyroscopeOptions(file=gyro, fps=fps, offset_s=gyro_offset)
     if camera is not None or footage is not None:
-        if fast:
-            raise RsbenchError("--fast: is of a rig; leave it out for one camera")
+        _refuse_rig_options(ctx)
         correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log)
         return
     given = given_frames(frames, rig, out, left, right, log, row_poses)
@@ -84,11 +88,20 @@ def correct(
     _correct_given(given, target, options.faster() if fast else options, inpaint is None)
 
 
-def _correct_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
+def _refuse_rig_options(ctx: typer.Context) -> None:
+    """Raises RsbenchError if the command line has an option without effect on the frames of one camera."""
+    for parameter in ctx.command.params:
+        source = ctx.get_parameter_source(parameter.name or "")
+        if parameter.name in _RIG_ONLY and source is not None and source.name == "COMMANDLINE":
+            options = " and ".join([*parameter.opts, *parameter.secondary_opts])
+            raise RsbenchError(f"{options}: has no effect on frames of one camera; leave it out")
+
+
+def _correct_given(given: RigInput, target: str, options: CorrectionOptions, close: bool) -> None:
     """Exit 1 where no motion or no correction is found; ``close``: narrow holes of corrected frames."""
     from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.compile_ahead import compiling_ahead
-    from rsbench.pipeline.isolated_parts import Isolation
+    from rsbench.pipeline.isolated_components import Isolation
     from rsbench.vision.corrector import NotCorrectedError
     from rsbench.vision.fusion import finished
 
@@ -110,7 +123,7 @@ def _options(
 ) -> CorrectionOptions:
     from dataclasses import replace
 
-    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.pipeline.frame_motion import model_to_use
     from rsbench.solvers.engine.base import load_solver_entry
     from rsbench.vision.feature_matcher import load_features

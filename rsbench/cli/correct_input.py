@@ -1,4 +1,4 @@
-"""What ``rsbench correct`` is given: frames of a rig, its card, the row at whose time they are wanted."""
+"""The input of ``rsbench correct``: frames of a rig, its card, a gyroscope's log and the target row."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rsbench.cli.correct_one_camera import GyroGiven
     from rsbench.core.rig import StereoRig
-    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource, RigCard
-    from rsbench.pipeline.frame_depth import Images
+    from rsbench.pipeline.frame_depth import CorrectionOptions, Images
+
+_MOST = 1e9
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -46,7 +47,63 @@ the other camera, 64 from the other frame, 32 a narrow hole closed from around i
 
 
 @dataclass(frozen=True, kw_only=True)
-class Given:
+class GyroscopeOptions:
+    """The options of a gyroscope."""
+
+    file: Path | None
+    fps: float | None
+    offset_s: float | None
+
+    def __post_init__(self) -> None:
+        from rsbench.core.errors import RsbenchError
+
+        if self.file is None and (self.fps is not None or self.offset_s is not None):
+            raise RsbenchError("--fps, --gyro-offset: need --gyro, a gyroscope's log")
+
+    def samples(self, source: FrameSource) -> FloatArray | None:
+        """(n, 4) tau, w; None without a log.
+
+        Raises:
+            RsbenchError: a log that cannot be read, is of another time, or frames without a known rate.
+        """
+        from rsbench.core.errors import RsbenchError
+        from rsbench.interop.readers.gyro_log import read_gyro_log
+
+        if self.file is None:
+            return None
+        fps, offset_s = self._fps(source), self.offset_s or 0.0
+        if not abs(offset_s) < _MOST:
+            raise RsbenchError(f"--gyro-offset {offset_s:g}: must lie within {_MOST:g} seconds")
+        samples = read_gyro_log(self.file).samples(fps, offset_s)
+        last = max(source.count, 2)
+        if samples[-1, 0] <= 0.0 or samples[0, 0] >= last:
+            raise RsbenchError(
+                f"{self.file}: lasts from {samples[0, 0] / fps:.3g} to {samples[-1, 0] / fps:.3g} s after the "
+                f"first frame, and the frames {last / fps:.3g} s: give --gyro-offset"
+            )
+        return samples
+
+    def farthest(self, source: FrameSource) -> float:
+        """Frame periods within which its clock may be off; 0 where the offset is given."""
+        from rsbench.pipeline.mono_gyro import FARTHEST_S
+
+        return FARTHEST_S * self._fps(source) if self.offset_s is None else 0.0
+
+    def _fps(self, source: FrameSource) -> float:
+        """Raises RsbenchError where neither `--fps` nor the video gives it."""
+        from rsbench.core.errors import RsbenchError
+        from rsbench.dataset.corrected_frames import said_fps
+
+        fps = said_fps(source.path) if self.fps is None else self.fps
+        if fps is None:
+            raise RsbenchError("--fps: is required with --gyro and images, which have no frame rate")
+        if not 0.0 < fps < _MOST:
+            raise RsbenchError(f"--fps {fps:g}: must lie in (0, {_MOST:g})")
+        return fps
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigInput:
     """What is to be corrected, and where to."""
 
     card: RigCard
@@ -56,7 +113,7 @@ class Given:
     left: list[Path] | Path
     """Its images, or a folder or video."""
     right: list[Path] | Path
-    gyro: GyroGiven
+    gyro: GyroscopeOptions
     row_poses: bool = False
     """Whether the pose at every row of a sequence is wanted."""
 
@@ -77,9 +134,9 @@ def given_frames(
     out: Path | None,
     left: Path | None,
     right: Path | None,
-    gyro: GyroGiven,
+    gyro: GyroscopeOptions,
     row_poses: bool = False,
-) -> Given:
+) -> RigInput:
     """Raises RsbenchError for another combination of arguments."""
     from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.footage import read_rig_card
@@ -97,16 +154,16 @@ def given_frames(
             raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
     card = read_rig_card(rig)
     if frames is not None and len(frames) == 4 and not (left or right):
-        return Given(card=card, out=out, four=frames, left=[], right=[], gyro=gyro)
+        return RigInput(card=card, out=out, four=frames, left=[], right=[], gyro=gyro)
     if frames or not (left and right):
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(
             f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
         )
-    return Given(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
+    return RigInput(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
 
 
-def _of_sequence(folder: Path, out: Path, gyro: GyroGiven, row_poses: bool) -> Given:
+def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> RigInput:
     """The rolling-shutter frames of a sequence of a dataset."""
     from rsbench.core.errors import RsbenchError
     from rsbench.core.rig import SIDES
@@ -126,7 +183,7 @@ def _of_sequence(folder: Path, out: Path, gyro: GyroGiven, row_poses: bool) -> G
     card = rig_card_of(sequence.rig, sequence.shutter)
     if gyro.file is not None and gyro.fps is None:
         gyro = replace(gyro, fps=1.0 / sequence.frame_period_s)
-    return Given(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
+    return RigInput(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
 
 
 def target_row(target: str, height: int) -> float:
@@ -161,7 +218,7 @@ def with_found_camera(
 ) -> tuple[StereoRig, str]:
     """The rig with the focal length and k1 that frames show, where its card is not sure; and words, else empty."""
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.found_camera import camera_of_frames
+    from rsbench.pipeline.sequence_capture import camera_of_frames
 
     sigma = card.camera.sigma
     if not sigma:

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_said import listed
+from rsbench.cli.correct_input import GyroscopeOptions, target_row
+from rsbench.cli.correct_output import listed
 
 if TYPE_CHECKING:
     from rsbench.capture.self_calibration import FoundFocal
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
+    from rsbench.pipeline.mono_camera import FoundShutter, OneCameraCard
     from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions
-    from rsbench.pipeline.mono_shutter import FoundShutter
-    from rsbench.pipeline.one_camera_card import OneCameraCard
 
 CameraFile = Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")]
 Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
@@ -38,7 +38,6 @@ GyroOffset = Annotated[
         "frames show, within half a second.",
     ),
 ]
-_MOST = 1e9
 _SAME_RATE = 0.01
 """Relative difference of frame rates, up to which they are one, as 29.97 and 30."""
 _PAGE_FRAMES = 6
@@ -53,7 +52,7 @@ def correct_one_camera(
     target: str,
     inpaint: bool | None,
     seed: int,
-    gyro: GyroGiven,
+    gyro: GyroscopeOptions,
 ) -> None:
     """Correct images, or a folder or video, of one camera; exit 1 where some of many frames are not corrected.
 
@@ -62,7 +61,7 @@ def correct_one_camera(
     """
     from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.footage import FrameSource
-    from rsbench.pipeline.one_camera_card import OneCameraCard, read_one_camera
+    from rsbench.pipeline.mono_camera import OneCameraCard, read_one_camera
 
     if out is None:
         raise RsbenchError("--out: is required")
@@ -93,62 +92,6 @@ def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None
             f"and the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
             err=True,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class GyroGiven:
-    """The options of a gyroscope."""
-
-    file: Path | None
-    fps: float | None
-    offset_s: float | None
-
-    def __post_init__(self) -> None:
-        from rsbench.core.errors import RsbenchError
-
-        if self.file is None and (self.fps is not None or self.offset_s is not None):
-            raise RsbenchError("--fps, --gyro-offset: are of a gyroscope's log; give --gyro too")
-
-    def samples(self, source: FrameSource) -> FloatArray | None:
-        """(n, 4) tau, w; None without a log.
-
-        Raises:
-            RsbenchError: a log that cannot be read, is of another time, or frames whose rate nobody says.
-        """
-        from rsbench.core.errors import RsbenchError
-        from rsbench.interop.readers.gyro_log import read_gyro_log
-
-        if self.file is None:
-            return None
-        fps, offset_s = self._fps(source), self.offset_s or 0.0
-        if not abs(offset_s) < _MOST:
-            raise RsbenchError(f"--gyro-offset {offset_s:g}: must lie within {_MOST:g} seconds")
-        samples = read_gyro_log(self.file).samples(fps, offset_s)
-        last = max(source.count, 2)
-        if samples[-1, 0] <= 0.0 or samples[0, 0] >= last:
-            raise RsbenchError(
-                f"{self.file}: lasts from {samples[0, 0] / fps:.3g} to {samples[-1, 0] / fps:.3g} s after the "
-                f"first frame, and the frames {last / fps:.3g} s: give --gyro-offset"
-            )
-        return samples
-
-    def farthest(self, source: FrameSource) -> float:
-        """Frame periods within which its clock may be off; 0 where the offset is given."""
-        from rsbench.pipeline.gyro_clock import FARTHEST_S
-
-        return FARTHEST_S * self._fps(source) if self.offset_s is None else 0.0
-
-    def _fps(self, source: FrameSource) -> float:
-        """Raises RsbenchError where nobody says it."""
-        from rsbench.core.errors import RsbenchError
-        from rsbench.dataset.corrected_frames import said_fps
-
-        fps = said_fps(source.path) if self.fps is None else self.fps
-        if fps is None:
-            raise RsbenchError("--fps: is required with --gyro and images, which do not say it")
-        if not 0.0 < fps < _MOST:
-            raise RsbenchError(f"--fps {fps:g}: must lie in (0, {_MOST:g})")
-        return fps
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -245,7 +188,7 @@ def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> 
     from rsbench.capture.sequence_shutter import LONGEST
     from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.mono_shutter import IN_ORDER, find_shutter
+    from rsbench.pipeline.mono_camera import IN_ORDER, find_shutter
 
     corrector, looked = options.corrector, card.readout_ratio is None
     steps = min(max(source.count - 1, 1), LONGEST if looked else IN_ORDER) + looked
@@ -265,7 +208,7 @@ def _camera(
 ) -> tuple[PinholeCamera, FoundFocal | None]:
     """As of ``find_camera``."""
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.mono_focal import PAIRS, find_camera
+    from rsbench.pipeline.mono_camera import PAIRS, find_camera
 
     given = source, source.count, card, found.shutter, options.corrector.robust, options.corrector.seed
     if not card.focal_unknown:
@@ -279,7 +222,7 @@ def _in_time(
 ) -> tuple[FloatArray, dict[str, Any]]:
     """Its samples at the times of the frames, and what these show of its clock."""
     from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.gyro_clock import PAIRS, in_time, pair_rates
+    from rsbench.pipeline.mono_gyro import PAIRS, in_time, pair_rates
 
     known, corrector = (camera, found.shutter), options.corrector
     with progress_bar("looking at the gyroscope's clock", min(max(source.count - 1, 1), PAIRS)) as advance:
@@ -289,7 +232,6 @@ def _in_time(
 
 
 def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) -> MonoOptions:
-    from rsbench.cli.correct_input import target_row
     from rsbench.pipeline.mono_sequence import MonoOptions
 
     height = next(iter(source)).shape[0]

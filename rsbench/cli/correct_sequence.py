@@ -10,16 +10,16 @@ import typer
 
 from rsbench.cli.console import echo
 from rsbench.cli.correct_input import sized, target_row, with_found_camera
-from rsbench.cli.correct_said import listed, readout_words, say_calibration, write_page_of
+from rsbench.cli.correct_output import listed, readout_words, say_calibration, write_page_of
 
 if TYPE_CHECKING:
     from rsbench.capture.two_frame_estimate import Capture
-    from rsbench.cli.correct_input import Given
+    from rsbench.cli.correct_input import RigInput
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.core.so3 import FloatArray
-    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import FrameSource, RigCard
+    from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.pipeline.sequence_correction import CorrectedMoment
     from rsbench.vision.fusion import Fused
 
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 _PAGE_FRAMES = 6
 
 
-def correct_sequence_given(given: Given, target: str, options: CorrectionOptions, close: bool) -> None:
+def correct_sequence_given(given: RigInput, target: str, options: CorrectionOptions, close: bool) -> None:
     """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
     from dataclasses import replace
 
     from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, is_video, rig_record, video_place
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.found_camera import spread_windows
+    from rsbench.pipeline.sequence_capture import spread_windows
 
     sources, card, out = given.footage(), given.card, given.out
     gyro = _gyro(given, sources[0], options)
@@ -56,7 +56,7 @@ def correct_sequence_given(given: Given, target: str, options: CorrectionOptions
     _say(out, f"readout ratio {readout_words(shutter, capture)}", record, gyro is not None)
 
 
-def _gyro(given: Given, left: FrameSource, options: CorrectionOptions) -> FloatArray | None:
+def _gyro(given: RigInput, left: FrameSource, options: CorrectionOptions) -> FloatArray | None:
     """Samples of a gyroscope, where there is one; RsbenchError where nothing takes them."""
     from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.sequence_correction import takes_gyro
@@ -69,7 +69,7 @@ def _gyro(given: Given, left: FrameSource, options: CorrectionOptions) -> FloatA
 
 
 def _run_key(
-    given: Given, sources: Sources, options: CorrectionOptions, close: bool, gyro: FloatArray | None
+    given: RigInput, sources: Sources, options: CorrectionOptions, close: bool, gyro: FloatArray | None
 ) -> str:
     """Of all that decides what is written: a run with another key does not go on with what this one wrote."""
     import hashlib

@@ -170,8 +170,8 @@ def _with_found_camera(
 ) -> StereoRig:
     """The rig of a card that is not sure of its cameras; what was found goes to stderr."""
     from rsbench.cli.correct_input import with_found_camera
-    from rsbench.pipeline.correction_options import CorrectionOptions
-    from rsbench.pipeline.found_camera import spread_windows
+    from rsbench.pipeline.frame_depth import CorrectionOptions
+    from rsbench.pipeline.sequence_capture import spread_windows
     from rsbench.vision.feature_matcher import load_features
 
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
@@ -204,10 +204,10 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
     from rsbench.capture.hypotheses import Known
     from rsbench.capture.two_frame_estimate import examine
     from rsbench.core.shutter import Scanning
-    from rsbench.pipeline.correction_options import CorrectionOptions
     from rsbench.pipeline.footage import check_alike
-    from rsbench.pipeline.frame_matches import find_matches_of_rig
-    from rsbench.pipeline.isolated_parts import Isolation
+    from rsbench.pipeline.frame_depth import CorrectionOptions
+    from rsbench.pipeline.frame_motion import find_matches_of_rig
+    from rsbench.pipeline.isolated_components import Isolation
     from rsbench.vision.feature_matcher import load_features
 
     unknown = Scanning(scan="left")  # as where columns are read: partners may lie on any row

@@ -240,7 +240,7 @@ def _draw_real(places: dict[str, Path], folder: Path) -> Path:
     from rsbench.core.rig import VIEWS
     from rsbench.dataset.sequence import read_sequence
     from rsbench.pipeline.chain import correct_four
-    from rsbench.pipeline.correction_options import CorrectionOptions
+    from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.report.real_page import draw_frames
 
     ideal, real = (read_sequence(places[camera] / _SHOWN) for camera in ("ideal", "real"))

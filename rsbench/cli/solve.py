@@ -124,7 +124,7 @@ def _answers(
 
     from rsbench.cli.console import late_progress
     from rsbench.pipeline.answer import solve_problem
-    from rsbench.pipeline.isolated_solver import SolverRunner
+    from rsbench.pipeline.isolated_components import SolverRunner
     from rsbench.pipeline.problem import read_problems
 
     with SolverRunner(time_limit_s=time_limit) as runner, late_progress("solving") as advance:

@@ -23,8 +23,8 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import read_frame
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.mono_gyro import CONTRADICTED
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png

@@ -16,9 +16,16 @@ from rsbench.core.correspondences import Correspondences, join_stereo
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.pipeline.body_motion import body_motion
-from rsbench.pipeline.frame_motion import SHAKES, chosen_model, entry_of, or_spline, takes_models, widened
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.frame_motion import (
+    SHAKES,
+    body_motion,
+    chosen_model,
+    entry_of,
+    or_spline,
+    takes_models,
+    widened,
+)
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import MotionEstimate, SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions

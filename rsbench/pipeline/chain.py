@@ -20,8 +20,8 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.frame_depth import (
+    CorrectionOptions,
     Images,
     Pairs,
     complete_depth,
@@ -30,8 +30,7 @@ from rsbench.pipeline.frame_depth import (
     moving_pairs,
     timed_pairs,
 )
-from rsbench.pipeline.frame_matches import match_frames, match_unknown
-from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
+from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, solve_frames
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
 from rsbench.vision.features import forget_features
 from rsbench.vision.fusion import Fused, Origin, inpaint

@@ -1,4 +1,4 @@
-"""Motion and shutter of four frames, from their matches: found, or refused with the reason."""
+"""Matches of four frames of a rig: found, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, check_rig, recalibrated
 from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
 from rsbench.capture.shutter_decision import (
@@ -23,21 +23,163 @@ from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.two_frame_spline import log_odds_of_opposite, two_frame_spline
-from rsbench.components.motion_models import load_kernel
+from rsbench.components.motion_models import load_kernel, make_motion
 from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.body_motion import body_motion
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_matches import on_their_rows
-from rsbench.pipeline.isolated_solver import SolverRunner
-from rsbench.solvers.engine.base import MotionEstimate, SolverEntry
+from rsbench.pipeline.frame_depth import CorrectionOptions, Images
+from rsbench.pipeline.isolated_components import SolverRunner
+from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
+from rsbench.vision.feature_matcher import find_correspondences
+from rsbench.vision.features import ROW_TOLERANCE_PX, SiftMatcher
+from rsbench.vision.images import eight_bit
+
+_FEWEST_MATCHES = 12
+
+
+def find_matches(
+    images: Images,
+    options: CorrectionOptions,
+    sides: tuple[Side, Side] = SIDES,
+    camera: PinholeCamera | None = None,
+) -> Correspondences:
+    """Correspondences of the four frames, whatever they are; ``sides`` says which images are taken for the left's.
+
+    Those of frames that have the lens of ``camera`` are in their pixels.
+
+    Raises:
+        RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
+    """
+    levels = eight_bit([images[side, frame] for frame in (0, 1) for side in sides])
+    names = [(side, frame) for frame in (0, 1) for side in SIDES]
+    return find_correspondences(options.features, dict(zip(names, levels, strict=True)), camera)
+
+
+def find_matches_of_rig(
+    images: Images, rig: StereoRig, scanning: Scanning, options: CorrectionOptions
+) -> Correspondences:
+    """``find_matches`` of cameras as they are, in pixels of their images.
+
+    Other matchers see images without distortion. Where the cameras do not read rows together, a left-right match
+    is of two times, and its ends of two rows: rsbench's own looks for it anywhere, and of others, which may look
+    along the row, only matches over time are kept.
+
+    Raises:
+        RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
+    """
+    component = options.features.component
+    if not scanning.rows_together and isinstance(component, SiftMatcher):
+        apart = replace(options.features, component=replace(component, row_tolerance=None))
+        options = replace(options, features=apart)
+    matches = find_matches(images, options, camera=rig.camera)
+    if scanning.rows_together or isinstance(component, SiftMatcher):
+        return matches
+    return Correspondences(left=matches.left, right=matches.right)
+
+
+def match_frames(
+    images: Images,
+    rig: StereoRig,
+    options: CorrectionOptions,
+    scanning: Scanning | None = None,
+    *,
+    judge_rig: bool = True,
+) -> Correspondences:
+    """``find_matches_of_rig`` of frames that a user says to be those of a rig.
+
+    Args:
+        scanning: how the cameras read; None: rows from the top, both at once.
+        judge_rig: whether to look if frame 0 is a rectified pair in the right order.
+
+    Raises:
+        RefusedFramesError: no texture, sides exchanged, not rectified, or not of one time.
+    """
+    scanning = scanning or Scanning()
+    if judge_rig and scanning.rows_together:
+        check_rig(images["left", 0], images["right", 0], rig)
+    return _enough(find_matches_of_rig(images, rig, scanning, options))
+
+
+def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
+    """The same options, but for rsbench's own matcher giving tracks alone where there are as many as that."""
+    component = options.features.component
+    if not isinstance(component, SiftMatcher):
+        return options
+    return replace(options, features=replace(options.features, component=replace(component, enough_tracks=tracks)))
+
+
+def match_unknown(
+    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
+) -> tuple[Correspondences, RefusedFramesError | None]:
+    """``match_frames`` of cameras that may read in any way, and what speaks against a pair that reads as one.
+
+    Raises:
+        RefusedFramesError: no texture.
+    """
+    doubt = None
+    try:
+        if judge_rig:
+            check_rig(images["left", 0], images["right", 0], rig)
+    except RefusedFramesError as error:
+        doubt = error
+    anyhow = isinstance(options.features.component, SiftMatcher)
+    scanning = Scanning(scan="left") if anyhow else Scanning()
+    return _enough(find_matches_of_rig(images, rig, scanning, options)), doubt
+
+
+def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
+    """Without tracks whose left-right ends are not on one row, of cameras that read rows together."""
+    tracks = rig.camera.ideal_pixels(matches.tracks.reshape(-1, 2)).reshape(-1, 8)
+    off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
+    return replace(matches, tracks=matches.tracks[off <= ROW_TOLERANCE_PX])
+
+
+def _enough(matches: Correspondences) -> Correspondences:
+    temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
+    if temporal < _FEWEST_MATCHES:
+        raise RefusedFramesError(
+            f"only {temporal} matches between the two times; {_FEWEST_MATCHES} are needed: the frames show no "
+            "texture, or not the same scene"
+        )
+    return matches
+
+
+# From a solver's answer to the motion of the rig's body, which corrections and tables work with.
+
+
+def body_motion(estimate: MotionEstimate, spec: SolverSpec, rig: StereoRig) -> Motion | str:
+    """The body's motion in metres that an estimate stands for, or the reason why it stands for none.
+
+    A left camera's translation t becomes the body's: d = t - o + R o, with o the left camera's offset. The pose
+    after one period is then exact. Between the rows a constant twist of the camera is one of the body too; a
+    camera that moves linearly has a body that does so up to |w|^2 |o| / 8.
+
+    Args:
+        estimate: a solver's answer.
+        spec: what that solver declares: the point whose translation d is, and the motion model.
+        rig: where the left camera is.
+    """
+    if not estimate.success:
+        return estimate.reason
+    if not estimate.metric:
+        whose = "the left camera's " if spec.reference_point == "left" else ""
+        return f"the length of d is not known in metres, only {whose}direction of translation"
+    d = estimate.d
+    if spec.reference_point == "left":
+        offset = rig.offset("left")
+        d = d - offset + so3.exp(estimate.w) @ offset
+    return make_motion(spec.motion_model, estimate.w, d, spec.motion_parameters)
+
+
+# Motion and shutter of four frames, from their matches: found, or refused with the reason.
+
 
 BACKWARDS = (
     "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what "

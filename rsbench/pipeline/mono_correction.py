@@ -1,28 +1,121 @@
-"""Correction of one camera's frames by ``mono-fusion``: its motion from dense flow, then both frames."""
+"""Which law of motion one camera followed, from its matches: ``inertial`` unless they ask for another one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.two_frame_spline import camera_two_frame_spline
-from rsbench.components.motion_models import InertialMotion
+from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.hypotheses import KnownInputs
+from rsbench.capture.model_choice import motion_at
+from rsbench.capture.shutter_decision import known_of
+from rsbench.capture.trajectory_spline import ContinuousMotion
+from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
+from rsbench.capture.two_frame_spline import camera_trajectory, camera_two_frame_spline
+from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, make_motion
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.epipolar import rs_sampson_error
+from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.mono_law import asked_for
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused
 from rsbench.vision.images import eight_bit, local_variance
 from rsbench.vision.mono_fusion import Flows, MonoFusion, MonoFusionOptions, OwnMotion, find_flows
+
+_CLEARLY_LESS = 0.9
+"""Of the error of the best law of constant speed, that is left where one that accelerates is believed. It has a
+number more, which takes up what dense flow and a focal length err by."""
+_LARGEST_PX = 1.25
+"""Errors count up to here."""
+_REACH = 3.0
+"""Deviations up to which a match is right."""
+
+
+def asked_for(
+    found: RobustEstimate,
+    matches: FloatArray,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: RobustOptions,
+    seed: int = 0,
+) -> tuple[RobustEstimate, Motion]:
+    """The motion by the law that the matches ask for, and its estimate; that of ``found`` without such a one.
+
+    Args:
+        found: under ``inertial``, a success; it stays where no other law is clearly more probable.
+        matches: (n, 4) x0, y0, x1, y1, px, with outliers.
+        rig: its body is where the camera is, the left one.
+        shutter: of the camera.
+        options: RANSAC of the search.
+        seed: of the search.
+    """
+    inertial = InertialMotion(found.estimate.w, found.estimate.d)
+    given = Correspondences(left=matches)
+    known_shutter = KnownInputs(
+        readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=NO_ERRORS
+    )
+    known = known_of(given, rig, known_shutter)
+    capture = conclude([examine(given, rig, known, options, seed, inertial)])
+    laws = [name for name in capture.models if name in capture.peaks]
+    if not laws or laws[0] == inertial.name or capture.models.get(inertial.name, 0.0) > 1.0 - CERTAIN:
+        return found, inertial
+    law = motion_at(capture.peaks[laws[0]])
+    if law.name == AcceleratedMotion.name:
+        steady = [motion_at(capture.peaks[name]) for name in laws[1:] if name != inertial.name]
+        best = min([inertial, *steady], key=lambda each: error_px(each, matches, rig, shutter))
+        if error_px(law, matches, rig, shutter) > _CLEARLY_LESS * error_px(best, matches, rig, shutter):
+            law = best
+    return (found, inertial) if law is inertial else _settled(found, law, matches, rig, shutter, capture.noise_px)
+
+
+def _settled(
+    found: RobustEstimate,
+    law: Motion,
+    matches: FloatArray,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    noise_px: float,
+) -> tuple[RobustEstimate, Motion]:
+    """The maximum of likelihood next to a motion by a law, with points before the camera."""
+    right = np.abs(rs_sampson_error(rig, shutter, law, "left", matches)) <= _REACH * noise_px
+    solver = RefinedSolver(motion_model=law.name, motion_parameters=dict(law.parameters), one_camera=True)
+    near = MotionEstimate(w=law.w, d=law.d, success=True)
+    estimate = solver.improve(near, Correspondences(left=matches[right]), rig, shutter)
+    count = MatchCount(inliers=int(np.count_nonzero(right)), matches=len(matches))
+    if not (estimate.success and np.any(estimate.d)):
+        return found, InertialMotion(found.estimate.w, found.estimate.d)
+    told = replace(
+        found,
+        estimate=estimate,
+        inliers={**found.inliers, "left": right},
+        counts={"left": count},
+        motion_model=law.name,
+    )
+    return told, law.with_endpoint(estimate.w, estimate.d)
+
+
+def error_px(
+    motion: Motion, matches: FloatArray, rig: StereoRig, shutter: RollingShutter, side: Side = "left"
+) -> float:
+    """Root mean square Sampson error, px, of matches (n, 4) with outliers: each counts up to ``_LARGEST_PX``."""
+    errors = np.abs(rs_sampson_error(rig, shutter, motion, side, matches))
+    return float(np.sqrt(np.mean(np.fmin(errors, _LARGEST_PX) ** 2)))
+
+
+# Correction of one camera's frames by ``mono-fusion``: its motion from dense flow, then both frames.
+
 
 _MATCHES = 1500
 """Of the dense flow, drawn at random: what a motion of six unknowns is solved from."""
@@ -213,3 +306,170 @@ class MonoFusionCorrector(Corrector):
         if self.geometry:
             own = find_own_motion(flows, problem.rig, problem.shutter, side, self.robust, self.seed).own
         return MonoFusion(images, own, flows, self.fusion)
+
+
+# One way of a camera through neighbouring pairs of frames, in place of a law of motion for each.
+# Two frames do not show what both shake alike; several do, for each frame is in two pairs. Pairs are worked
+# on in groups with some on both sides that help: what is found of a pair does not depend on where a run
+# began, and memory does not grow with the number of frames.
+
+
+_TOLD, _BESIDE = 10, 2
+"""Pairs of a group, and those on either side that help."""
+_FEWEST_PAIRS = 3
+"""Pairs in a row, from which on they show a way."""
+PIXELS = 300
+"""As of ``way_matches``: fewer than of two frames alone do, for each frame is in two pairs."""
+_LEAST = 50
+"""Matches."""
+_FLOW_PX = 0.15
+"""Root mean square of what dense flow errs by: up to here a way explains a pair, and where it explains it as well
+as a motion of its own."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeenPair:
+    """Two successive frames."""
+
+    found: FoundOwnMotion | None
+    """None where they show none at all."""
+    matches: FloatArray
+    """(n, 4) x0, y0, x1, y1, px, see ``way_matches``."""
+
+    @property
+    def motion(self) -> Motion | None:
+        return None if self.found is None or self.found.own.far else self.found.own.motion
+
+
+def group_of(pair: int) -> tuple[int, int]:
+    """First pair that decides what is found of a pair, and the one after the last."""
+    return max(_next_group(pair) - _TOLD - _BESIDE, 0), _next_group(pair) + _BESIDE
+
+
+def on_ways(pairs: Iterable[SeenPair], begin: int = 0, first: int = 0) -> Iterator[FoundOwnMotion | None]:
+    """What is found of pairs, in order: by the way through their neighbours, where it explains them as well.
+
+    Args:
+        pairs: in order, from number ``begin`` on: ``group_of(first)[0]`` at the latest.
+        first: number of the first pair that is asked for.
+    """
+    held, told, number = dict[int, SeenPair](), first, begin - 1
+    for number, pair in enumerate(pairs, start=begin):
+        held[number] = pair
+        if number + 1 == group_of(told)[1]:
+            yield from _told(held, told)
+            told = _next_group(told)
+            held = {k: each for k, each in held.items() if k >= group_of(told)[0]}
+    while told <= number:
+        yield from _told(held, told)
+        told = _next_group(told)
+
+
+def _next_group(pair: int) -> int:
+    return pair // _TOLD * _TOLD + _TOLD
+
+
+def _told(held: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
+    """Of the group of one pair, from that pair on."""
+    low, high = group_of(first)
+    numbers = [k for k in range(low, high) if k in held]
+    found = {k: held[k].found for k in numbers}
+    for shows, run in itertools.groupby(numbers, lambda k: _shows(held[k])):
+        found |= _along([(k, held[k]) for k in run]) if shows else {}
+    return [found[k] for k in range(first, _next_group(first)) if k in found]
+
+
+def _shows(pair: SeenPair) -> bool:
+    return pair.motion is not None and len(pair.matches) >= _LEAST
+
+
+def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
+    """Of pairs in a row that show motions: those that go the way which all show together."""
+    motions = [pair.motion for _, pair in run if pair.motion is not None]
+    owns = [pair.found.own for _, pair in run if pair.found is not None]
+    if len(run) < _FEWEST_PAIRS or owns[0].shutter.readout_ratio == 0.0:
+        return {}
+    ways = camera_trajectory(
+        [pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter
+    )
+    out = dict[int, FoundOwnMotion]()
+    for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
+        errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (way, steady)]
+        if pair.found is not None and errors[0] <= max(errors[1], _FLOW_PX):
+            out[number] = on_way(pair.found, way)
+    return out
+
+
+# Frames whose lines are read from any side, as frames whose rows are read from the top: mirrored, or turned.
+# A phone held upright reads columns. A mirror leaves motions motions and times times, so what corrects rows
+# from the top corrects the others; a rotation's axis turns round in it.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Turned:
+    """A camera that reads rows from the top, and how the frames of the real one become its frames."""
+
+    camera: PinholeCamera
+    shutter: RollingShutter
+    exchanged: bool
+    """Whether x and y are."""
+    flipped: bool
+    """Whether the lines are in the opposite order after that."""
+
+    def image(self, image: NDArray[Any]) -> NDArray[Any]:
+        """A frame (H, W[, 3]) as this camera has it."""
+        lines_first = np.swapaxes(image, 0, 1) if self.exchanged else image
+        return np.ascontiguousarray(lines_first[::-1] if self.flipped else lines_first)
+
+    def line(self, row: float) -> float:
+        """The number of lines read at the time of so many rows; of columns, a like share of the width."""
+        return row * (self.camera.height - 1) / (self.camera.width - 1) if self.exchanged else row
+
+    def back(self, fused: Fused) -> Fused:
+        """A corrected frame as the real camera has it."""
+        image, origin, depth = map(self._image_back, (fused.image, fused.origin, fused.depth))
+        return replace(fused, image=image, origin=origin, depth=depth)
+
+    def _image_back(self, image: NDArray[Any]) -> NDArray[Any]:
+        lines = image[::-1] if self.flipped else image
+        return np.ascontiguousarray(np.swapaxes(lines, 0, 1) if self.exchanged else lines)
+
+    def found(self, found: FoundOwnMotion | None) -> FoundOwnMotion | None:
+        """A motion as the real camera makes it."""
+        if found is None or found.own.motion is None:
+            return found
+        motion, P = found.own.motion, self._axes()
+        w, d = np.linalg.det(P) * P.T @ motion.w, P.T @ motion.d
+        if isinstance(motion, GyroMotion):
+            real: Motion = GyroMotion(_axial(motion.samples, P.T), d)
+        elif isinstance(motion, ContinuousMotion):
+            real = motion.seen(P.T)
+        else:
+            real = make_motion(motion.name, w, d, motion.parameters)
+        return replace(found, own=replace(found.own, motion=real))
+
+    def gyro(self, samples: FloatArray) -> FloatArray:
+        """Samples (n, 4) tau, w of a gyroscope as this camera turns."""
+        return _axial(samples, self._axes())
+
+    def _axes(self) -> FloatArray:
+        """(3, 3) this camera's axes from the real one's."""
+        exchange = np.eye(3)[[1, 0, 2]] if self.exchanged else np.eye(3)
+        return np.diag([1.0, -1.0 if self.flipped else 1.0, 1.0]) @ exchange
+
+
+def _axial(samples: FloatArray, P: FloatArray) -> FloatArray:
+    """Samples (n, 4) tau, w after a change of axes (3, 3); in a mirror, a rotation's axis turns round."""
+    return np.column_stack([samples[:, 0], np.linalg.det(P) * samples[:, 1:] @ P.T])
+
+
+def turned(camera: PinholeCamera, shutter: RollingShutter) -> Turned:
+    """The camera that reads rows from the top in place of one that reads from any side."""
+    scan, c = shutter.scan_of("left"), camera
+    exchanged, flipped = scan in ("left", "right"), scan in ("bottom", "right")
+    if exchanged:
+        c = PinholeCamera(width=c.height, height=c.width, fx=c.fy, fy=c.fx, cx=c.cy, cy=c.cx)
+    if flipped:
+        c = replace(c, cy=c.height - 1 - c.cy)
+    rows = RollingShutter(height=c.height, readout_ratio=shutter.readout_ratio)
+    return Turned(camera=c, shutter=rows, exchanged=exchanged, flipped=flipped)

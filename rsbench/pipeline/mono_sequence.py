@@ -22,23 +22,25 @@ from rsbench.core.rig import FRAMES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import CameraCard, check_alike
+from rsbench.pipeline.mono_camera import OneCameraCard, find_camera, find_shutter
 from rsbench.pipeline.mono_correction import (
     CUT,
+    PIXELS,
     STILL,
     FoundOwnMotion,
     MonoFusionCorrector,
+    SeenPair,
+    Turned,
     as_asked,
     by_asked_law,
     find_steady_motion,
+    group_of,
+    on_ways,
     refusal,
+    turned,
     way_matches,
 )
-from rsbench.pipeline.mono_focal import find_camera
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
-from rsbench.pipeline.mono_shutter import find_shutter
-from rsbench.pipeline.mono_ways import PIXELS, SeenPair, group_of, on_ways
-from rsbench.pipeline.one_camera_card import OneCameraCard
-from rsbench.pipeline.turned_frames import Turned, turned
 from rsbench.vision.fusion import Fused, finished
 from rsbench.vision.images import map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows

@@ -1,26 +1,77 @@
-"""How the cameras of a sequence read, from some of its windows."""
+"""The windows of a sequence: both images of two successive times, and what is refused of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
+from typing import Any
 
-from rsbench.capture.calibration import RefusedFramesError
+from numpy.typing import NDArray
+
+from rsbench.capture.calibration import CardSigma, RefusedFramesError
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
+from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_tracks import ENOUGH
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.two_frame_estimate import Window as Examined
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import StereoRig
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.frame_matches import match_frames, match_unknown, with_enough
-from rsbench.pipeline.frame_motion import models_asked
-from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
+from rsbench.pipeline.footage import FrameSource, check_alike
+from rsbench.pipeline.frame_depth import CorrectionOptions, Images
+from rsbench.pipeline.frame_motion import match_frames, match_unknown, models_asked, with_enough
+
+JUDGED = 3
+"""First windows whose rig is looked at; when all of them are refused, so is the sequence."""
+
+
+class Refusals:
+    """Windows that were refused; when these are all that were seen first, or all, so is the sequence."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source, self._count = source, 0
+        self._last: RefusedFramesError | None = None
+
+    def add(self, number: int, error: RefusedFramesError) -> None:
+        """Window ``number`` was refused."""
+        self._count, self._last = self._count + 1, error
+        if number + 1 == JUDGED:
+            self.end(JUDGED)
+
+    def end(self, windows: int) -> None:
+        """There are no more than ``windows``."""
+        if self._last is not None and self._count == windows:
+            raise RefusedFramesError(self._last.reason, f"{self._source.path}, frames 0 to {windows}")
+
+
+def window_images(left: FrameSource, right: FrameSource) -> Iterator[Images]:
+    for pair in itertools.pairwise(_both(left, right)):
+        yield {(side, frame): both[side] for frame, both in enumerate(pair) for side in SIDES}
+
+
+def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:
+    """Left and right image of every time, all alike."""
+    first: NDArray[Any] | None = None
+    number = -1
+    for number, (a, b) in enumerate(itertools.zip_longest(left, right)):
+        if a is None or b is None:
+            shorter, longer = (left, right) if a is None else (right, left)
+            raise RsbenchError(f"{shorter.path}: has {number} frames, fewer than {longer.path}")
+        first = a if first is None else first
+        check_alike({f"{left.path}, frame 0": first, f"{left.path}, frame {number}": a})
+        check_alike({f"{left.path}, frame {number}": a, f"{right.path}, frame {number}": b})
+        yield {"left": a, "right": b}
+    if number < 1:
+        raise RsbenchError(f"{left.path}: has {number + 1} frames; at least 2 are needed")
+
+
+# How the cameras of a sequence read, from some of its windows.
+
 
 WINDOWS = 8
 """At most, of those by which the shutter is found."""
@@ -181,3 +232,50 @@ def _narrowed(known: Known, capture: Capture) -> Known:
         return known
     left = {candidate.scans for candidate in capture.candidates} | {GLOBAL}
     return replace(known, scans=tuple(each for each in known.scans if each in left))
+
+
+# The focal length and k1 of a rig whose card says how sure it is of them, from some of its frames.
+
+
+_WINDOWS = 8
+"""At most, of a sequence."""
+
+
+def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
+    """Some windows of a sequence, evenly spread."""
+    every = max((left.count - 1) // _WINDOWS, 1)
+    return islice(window_images(left, right), every // 2, None, every)
+
+
+def camera_of_frames(
+    windows: Iterable[Images],
+    rig: StereoRig,
+    sigma: CardSigma,
+    options: CorrectionOptions,
+    readout_ratio: float | None = None,
+    scanning: Scanning | None = None,
+) -> FoundCamera:
+    """``find_camera`` from the matches of a few windows; those without matches say nothing.
+
+    Args:
+        readout_ratio, scanning: see ``solve_frames``.
+    """
+    matches = list[Correspondences]()
+    for images in islice(windows, _WINDOWS):
+        try:
+            if readout_ratio is None and scanning is None:
+                matches.append(match_unknown(images, rig, options, judge_rig=False)[0])
+            else:
+                matches.append(match_frames(images, rig, options, scanning, judge_rig=False))
+        except RefusedFramesError:
+            continue  # the correction says so of each
+    if not matches:
+        return FoundCamera(rig=rig, sigma=sigma, determined=(False, False))
+    return find_camera(
+        matches,
+        rig,
+        sigma,
+        KnownInputs(readout_ratio=readout_ratio, scanning=scanning),
+        options.robust,
+        options.seed,
+    )

@@ -1,8 +1,13 @@
-"""A sliding window of two frames over a sequence: every frame is corrected with the motion to the next one."""
+"""The motion of every window of a sequence from one trajectory through all of them.
+
+Two frames do not show what both shake alike; a sequence does, for its windows overlap. Windows wait until those
+after them have been seen too, some at a time, so that memory does not grow with the length of the footage.
+"""
 
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,26 +15,125 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
 from rsbench.capture.model_choice import AUTO
 from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.capture.trajectory_estimate import StreamedWindow, stream_trajectory
+from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.trajectory_tracks import ENOUGH
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_depth import frame_pair
-from rsbench.pipeline.frame_matches import match_frames, with_enough
-from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
-from rsbench.pipeline.sequence_capture import FEWEST_FRAMES
-from rsbench.pipeline.sequence_trajectory import Window, on_one_trajectory
-from rsbench.pipeline.sequence_windows import JUDGED, Refusals, window_images
+from rsbench.pipeline.frame_depth import CorrectionOptions, Images, Pairs, frame_pair
+from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, with_enough
+from rsbench.pipeline.sequence_capture import FEWEST_FRAMES, JUDGED, Refusals, window_images
+from rsbench.solvers.engine.base import MotionEstimate
+from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate
 from rsbench.vision.fusion import Fused
 from rsbench.vision.images import ahead, map_ahead
 from rsbench.vision.stereo_matcher import needs_motion
+
+BRIDGED = "few of the matches agree with the motion"
+TURNED = "; they turn as the gyroscope says, and stay where they are"
+_LONGEST_BRIDGE = 2
+"""Windows from the nearest one with matches up to which a spline is believed: the middle one of eight without any
+is wrong by 1 deg where a hand turns by 1.5 deg a frame, that of four by 0.16 deg."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """What was found for two consecutive frames; ``found`` is None and ``reason`` says why when no motion was."""
+
+    images: Images
+    pairs: Pairs | None
+    """With depth from the other camera; None when the corrector needs none, or it is found with the motion."""
+    found: FoundMotion | None
+    reason: str = ""
+    matches: Correspondences | None = None
+    """None when the corrector needs none, or they were refused."""
+    pose: Pose | None = None
+    """Body from world at the start of its first frame, where a trajectory was found; the world: the first body."""
+
+
+def on_one_trajectory(
+    windows: Iterable[Window],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    options: CorrectionOptions,
+    calibration: tuple[float, ...],
+    gyro: FloatArray | None = None,
+) -> Iterator[Window]:
+    """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
+
+    Args:
+        windows: in order.
+        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
+        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence. It bridges any number of windows:
+            far from those with matches it alone tells how the rig turns, and nobody where it is.
+    """
+    waiting = deque[Window]()
+
+    def matches() -> Iterator[Correspondences]:
+        for window in windows:
+            waiting.append(window)
+            yield recalibrated(window.matches or Correspondences(), rig, calibration)
+
+    for streamed in stream_trajectory(matches(), rig, shutter, options.seed, gyro=gyro):
+        window = waiting.popleft()
+        found = _found(streamed, options, calibration)
+        reason = "" if streamed.supported else window.reason or BRIDGED
+        pose = streamed.body_from_world
+        if streamed.apart > _LONGEST_BRIDGE:
+            by_gyro = streamed.gyro is not None and streamed.gyro.used
+            found, pose = _turning(found) if by_gyro else None, None
+            reason += TURNED if by_gyro else ""
+        yield replace(window, found=found, reason=reason, pose=pose)
+
+
+def _found(streamed: StreamedWindow, options: CorrectionOptions, calibration: tuple[float, ...]) -> FoundMotion:
+    motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
+    estimate = MotionEstimate(
+        w=motion.w,
+        d=motion.d,
+        success=True,
+        reason="" if streamed.supported else BRIDGED,
+        metric=True,
+        noise_px=streamed.noise_px,
+        covariance=streamed.covariance,
+    )
+    robust = RobustEstimate(
+        estimate=estimate,
+        inliers={"tracks": streamed.inliers},
+        counts={"tracks": MatchCount(inliers=right, matches=len(streamed.inliers))},
+        iterations=0,
+        seconds=0.0,
+        threshold_px=0.0,
+    )
+    return FoundMotion(
+        motion=motion,
+        robust=robust,
+        solver=options.solver.name,
+        reference_point="body",
+        calibration=calibration,
+        gyro=streamed.gyro,
+    )
+
+
+def _turning(found: FoundMotion) -> FoundMotion:
+    """Of a rig that turns as it does and stays where it is."""
+    assert isinstance(found.motion, ContinuousMotion)
+    curve = found.motion.curve
+    motion = ContinuousMotion.of(curve._replace(p=np.zeros_like(curve.p)))
+    estimate = replace(found.robust.estimate, d=motion.d, covariance=None)
+    return replace(found, motion=motion, robust=replace(found.robust, estimate=estimate))
+
+
+# A sliding window of two frames over a sequence: every frame is corrected with the motion to the next one.
+
 
 _AHEAD = 4
 """Windows that are matched, and frames that are corrected, ahead: as many as leave a trajectory together."""

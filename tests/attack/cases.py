@@ -164,7 +164,7 @@ def here(arena: Arena, case: Case, trap: Trap) -> None:
 def work_here() -> None:
     """Let sweeps run in this process, not in children."""
     from rsbench.benchmark.simulated import run_sweep
-    from rsbench.pipeline.isolated_solver import SolverRunner
+    from rsbench.pipeline.isolated_components import SolverRunner
 
     def run_all(todo: Any, workers: int, limit: float | None) -> Iterator[Any]:
         with SolverRunner() as runner:

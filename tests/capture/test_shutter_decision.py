@@ -45,7 +45,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.solvers.engine.robust_motion import RobustOptions
 

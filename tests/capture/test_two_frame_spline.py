@@ -25,9 +25,9 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline import frame_motion
 from rsbench.pipeline.answer import solve_problem
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion, chosen_model, find_motion, solve_frames
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver

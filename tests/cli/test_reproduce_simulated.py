@@ -16,7 +16,7 @@ from rsbench.benchmark.studies import readings
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.cli import reproduce as command
 from rsbench.cli.reproduce import Target, reproduce
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.report import fig3
 from rsbench.report.fig3 import SWEEPS
 

@@ -16,7 +16,7 @@ from rsbench.core.rig import SIDES, Side
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import join_poses, rig_record, write_frame, write_poses, write_record
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.storage.files import read_json, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, remove
 from rsbench.vision.fusion import Fused, Origin

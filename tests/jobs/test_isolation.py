@@ -24,7 +24,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.jobs.isolation import IsolatedWorker, decode, encode
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.essential_matrix import EightPointSolver
@@ -287,7 +287,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
 
 rig = StereoRig(camera=PinholeCamera.centred(640, 480, 500.0), baseline=0.2)

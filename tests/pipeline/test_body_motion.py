@@ -13,7 +13,7 @@ from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
-from rsbench.pipeline.body_motion import body_motion
+from rsbench.pipeline.frame_motion import body_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.solvers.refined import RefinedSolver

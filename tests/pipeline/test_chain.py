@@ -18,10 +18,9 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, uncorrected
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_matches import match_frames
-from rsbench.pipeline.frame_motion import motion_of, solve_frames
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import match_frames, motion_of, solve_frames
 from rsbench.solvers.engine.base import MotionEstimate, load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS, FeatureMatcher

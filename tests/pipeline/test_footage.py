@@ -14,8 +14,8 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import correct_four
-from rsbench.pipeline.correction_options import CorrectionOptions
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.pipeline.sequence_capture import estimate_sequence_capture
 from rsbench.pipeline.sequence_correction import correct_sequence

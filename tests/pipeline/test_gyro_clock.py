@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsbench.core import so3
-from rsbench.pipeline.gyro_clock import PairRates, find_clock
+from rsbench.pipeline.mono_gyro import PairRates, find_clock
 
 Array = np.ndarray
 RATIO, FARTHEST = 0.8, 15.0

@@ -11,9 +11,8 @@ from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline import mono_shutter
-from rsbench.pipeline.mono_shutter import find_shutter
-from rsbench.pipeline.one_camera_card import OneCameraCard
+from rsbench.pipeline import mono_camera as mono_shutter
+from rsbench.pipeline.mono_camera import OneCameraCard, find_shutter
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CAMERA = PinholeCamera.centred(640, 480, 500.0)

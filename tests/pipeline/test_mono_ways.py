@@ -13,10 +13,9 @@ from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline import mono_ways
-from rsbench.pipeline.mono_correction import FoundOwnMotion
+from rsbench.pipeline import mono_correction as mono_ways
+from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, on_ways
 from rsbench.pipeline.mono_sequence import MonoMoment, correct_frames
-from rsbench.pipeline.mono_ways import SeenPair, group_of, on_ways
 from rsbench.vision.mono_fusion import OwnMotion
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 160.0

@@ -10,8 +10,8 @@ from shaken_rig import RIG, SHAKES, SHUTTER, matches, sines, times
 from rsbench.capture.calibration import NO_ERRORS
 from rsbench.core.correspondences import Correspondences
 from rsbench.dataset.corrected_frames import motion_record
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.sequence_trajectory import BRIDGED, TURNED, Window, on_one_trajectory
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.sequence_correction import BRIDGED, TURNED, Window, on_one_trajectory
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from rsbench.core.pose_errors import rotation_error, scale_error, translation_er
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.poselib import P3pSolver

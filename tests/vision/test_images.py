@@ -17,7 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.features import SiftMatcher, refine_matches
 from rsbench.vision.images import ahead, at_full_size, guided_upsample, halved, map_ahead, map_frames, resample

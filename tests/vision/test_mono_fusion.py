@@ -26,9 +26,8 @@ from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.interop.readers.gyro_log import read_gyro_log
-from rsbench.pipeline.mono_correction import MonoFusionCorrector, find_own_motion, refusal
+from rsbench.pipeline.mono_correction import MonoFusionCorrector, asked_for, find_own_motion, refusal
 from rsbench.pipeline.mono_gyro import CONTRADICTED, NOT_COVERED
-from rsbench.pipeline.mono_law import asked_for
 from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver

@@ -19,7 +19,7 @@ from rsbench.core.rig import VIEWS, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.imu import ImuSamples, gyro_samples, true_samples
 from rsbench.pipeline.chain import Given, correct_four
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, find_corrected, load_corrector
 from rsbench.vision.correctors import RotationCorrector

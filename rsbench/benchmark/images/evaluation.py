@@ -20,8 +20,7 @@ from rsbench.benchmark.provenance import dataset_record, provenance
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.jobs.process_jobs import Workers
-from rsbench.pipeline.isolated_parts import Isolation
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import Isolation, SolverRunner
 from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
 from rsbench.storage.work_folder import work_folder
 

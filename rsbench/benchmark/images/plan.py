@@ -18,7 +18,7 @@ from rsbench.components.cards import choices, list_cards
 from rsbench.components.plugins import Entry, Kind
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.solvers.engine.base import SOLVERS, SolverEntry, load_solver_entry
 from rsbench.storage.files import sha256
 from rsbench.storage.work_folder import listed

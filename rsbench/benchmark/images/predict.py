@@ -26,7 +26,6 @@ from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View
 from rsbench.dataset.corrected_frames import write_origin
 from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.body_motion import body_motion
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_depth import (
     Images,
@@ -36,8 +35,8 @@ from rsbench.pipeline.frame_depth import (
     motion_disparities,
     pair_with_motion,
 )
-from rsbench.pipeline.frame_matches import find_matches_of_rig
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.frame_motion import body_motion, find_matches_of_rig
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import SOLVERS, MotionEstimate, SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate
 from rsbench.solvers.refined import warm_up

@@ -13,7 +13,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.storage.files import HASHES, FileHashes
 
 Job = tuple[str, str, int]

@@ -37,8 +37,7 @@ from rsbench.core.rig import VIEWS, Side, View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Pairs
+from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs
 from rsbench.storage.files import read_png
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Origin

@@ -22,8 +22,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_pairs
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
-from rsbench.pipeline.isolated_parts import Isolation
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import Isolation, SolverRunner
 from rsbench.storage.files import HASHES, FileHashes
 
 

@@ -36,10 +36,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import metres, motion_disparities
-from rsbench.pipeline.frame_matches import match_frames
-from rsbench.pipeline.frame_motion import solve_frames
+from rsbench.pipeline.frame_depth import CorrectionOptions, metres, motion_disparities
+from rsbench.pipeline.frame_motion import match_frames, solve_frames
 from rsbench.storage.files import write_depth
 from rsbench.vision.stereo_depth import depth_metrics
 from rsbench.vision.stereo_matcher import load_matcher, needs_motion, sensor_disparities

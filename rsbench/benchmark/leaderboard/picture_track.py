@@ -45,9 +45,8 @@ from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, decode, encode, use_one_thread
 from rsbench.jobs.process_jobs import Workers, run_jobs
 from rsbench.pipeline.chain import Given
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Images
-from rsbench.pipeline.isolated_parts import Isolation
+from rsbench.pipeline.frame_depth import CorrectionOptions, Images
+from rsbench.pipeline.isolated_components import Isolation
 from rsbench.pipeline.problem import Problem
 from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import read_bytes

@@ -33,7 +33,7 @@ from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.core.correspondences import Correspondences, join_stereo, temporal_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustOptions

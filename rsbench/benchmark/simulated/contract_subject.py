@@ -17,7 +17,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, one_line
-from rsbench.pipeline.isolated_solver import checked_estimate
+from rsbench.pipeline.isolated_components import checked_estimate
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverEntry, SolverSpec, load_solver_entry
 
 

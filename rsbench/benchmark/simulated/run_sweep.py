@@ -30,7 +30,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entries
 from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json

@@ -19,7 +19,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
 from rsbench.jobs.isolation import EntryFailure
-from rsbench.pipeline.isolated_solver import GuardedSolver, SolverRunner
+from rsbench.pipeline.isolated_components import GuardedSolver, SolverRunner
 from rsbench.solvers.engine.base import BESIDE, MotionEstimate, Solver, SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 

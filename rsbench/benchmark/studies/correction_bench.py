@@ -20,13 +20,17 @@ from rsbench.core.geometry import FixedGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, VIEWS, Side, View
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.baseline_motions import global_shutter_motion, kept_matches, monocular_motion, solved_alone
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
-from rsbench.pipeline.correction_options import CorrectionOptions
-from rsbench.pipeline.frame_depth import Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_matches import find_matches
-from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
-from rsbench.pipeline.one_camera import ZhuangCorrector, depth_alone
+from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
+from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion, model_to_use
+from rsbench.pipeline.one_camera import (
+    ZhuangCorrector,
+    depth_alone,
+    global_shutter_motion,
+    kept_matches,
+    monocular_motion,
+    solved_alone,
+)
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import load_corrector

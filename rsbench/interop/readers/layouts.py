@@ -60,7 +60,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, from_quaternion
 from rsbench.dataset.recording import PoseAt, Recording
 from rsbench.pipeline.footage import read_frame
-from rsbench.pipeline.one_camera_card import DEFAULT_FOCAL
+from rsbench.pipeline.mono_camera import DEFAULT_FOCAL
 from rsbench.storage.files import read_grey_png
 from rsbench.storage.untrusted_files import inside, read_bytes, read_text
 

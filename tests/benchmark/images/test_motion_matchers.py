@@ -15,7 +15,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.sequence import read_dataset
 from rsbench.pipeline.chain import Given, correct_four
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.storage.files import read_json
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec
 from rsbench.vision.fusion import Fused

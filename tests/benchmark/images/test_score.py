@@ -14,7 +14,7 @@ from rsbench.benchmark.images.predict import Bench
 from rsbench.benchmark.images.score import Scorer
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.storage.files import MATCH_SETS, save_arrays
 
 

@@ -33,7 +33,7 @@ from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import Outcome
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.report.board_page import build_site
 from rsbench.solvers.engine.base import BESIDE, load_solver_entry
 from rsbench.storage.files import load_arrays

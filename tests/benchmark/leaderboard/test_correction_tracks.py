@@ -27,7 +27,7 @@ from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_dataset
-from rsbench.pipeline.correction_options import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.quality import Picture, ssim
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]

@@ -46,7 +46,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.secret_split import Secret
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
 
 ROOT = Path(__file__).parents[3]

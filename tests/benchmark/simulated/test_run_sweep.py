@@ -22,7 +22,7 @@ from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_tr
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.errors import RsbenchError
-from rsbench.pipeline.isolated_solver import SolverRunner
+from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json

@@ -1,17 +1,20 @@
-"""How the camera of a video reads its lines: as its card says, or as its frames show."""
+"""The card of a camera whose frames are corrected alone."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import scans_of
+from rsbench.capture.self_calibration import FoundFocal, PairFocal, conclude_focal, focal_of_pair
 from rsbench.capture.sequence_shutter import LONGEST, capture_of_video
 from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
@@ -24,15 +27,83 @@ from rsbench.capture.shutter_decision import (
     shutter_alone,
 )
 from rsbench.capture.two_frame_estimate import Capture, Window
+from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.footage import check_alike
+from rsbench.pipeline.footage import CameraCard, check_alike
 from rsbench.pipeline.mono_correction import flow_matches, refusal, way_matches
-from rsbench.pipeline.one_camera_card import OneCameraCard
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
+
+DEFAULT_FOCAL = 1.0
+"""Focal length in widths of the image where nothing is said: a horizontal field of view of 53 degrees."""
+_WIDEST_DEG = 170.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneCameraCard:
+    """What is known of a camera whose frames are corrected alone; the size comes from the images."""
+
+    SHORTHANDS: ClassVar = SHUTTER_KEY
+
+    readout_ratio: float | None = None
+    """Readout time over frame period, 0 to 1. Absent: found from the frames, or the command says why not."""
+    frame_period_s: float | None = None
+    """Seconds from one frame to the next, beside ``shutter`` where it is not that of its mode. A video of another
+    frame rate is told apart."""
+    scan: Scan | None = None
+    """Side of the image at which the readout begins. Absent: found with the readout ratio, or ``top`` where that
+    is given."""
+    fov_deg: float | None = None
+    """Horizontal field of view, degrees, in place of ``camera``. Absent both: the focal length is found from the
+    frames, or is that of the width of the image where they cannot tell."""
+    camera: CameraCard | None = None
+    """Intrinsics."""
+
+    def __post_init__(self) -> None:
+        if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
+            raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1]")
+        if self.frame_period_s is not None and not self.frame_period_s > 0.0:
+            raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
+        if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
+            raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
+        if self.fov_deg is not None and self.camera is not None:
+            raise ValueError("fov_deg: leave it out beside [camera], which says the focal length")
+        if self.camera is not None and self.camera.lens is not None:
+            raise ValueError("camera.lens: leave it out; undistort frames of one camera first")
+        if self.camera is not None and self.camera.sigma:
+            raise ValueError("camera.focal_sigma, k1_sigma: leave them out; of one camera neither is found")
+
+    @property
+    def focal_unknown(self) -> bool:
+        """Whether nothing is said of the focal length."""
+        return self.camera is None and self.fov_deg is None
+
+    def camera_of(self, width: int, height: int) -> PinholeCamera:
+        """The camera of images of this size; of ``DEFAULT_FOCAL`` where nothing is said."""
+        if self.camera is not None:
+            c = self.camera
+            return PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)
+        if self.fov_deg is not None:
+            focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
+            return PinholeCamera.centred(width, height, focal)
+        return PinholeCamera.centred(width, height, DEFAULT_FOCAL * width)
+
+
+def read_one_camera(path: Path) -> OneCameraCard:
+    """Card: ``readout_ratio`` or ``shutter``, ``scan``; ``[camera]`` (fx, fy, cx, cy), ``fov_deg``, or neither.
+
+    Raises:
+        RsbenchError: one line with the file, the field, the value and what is allowed.
+    """
+    table = read_toml(path)
+    return parse_card(OneCameraCard, with_shutter(table, str(path)), str(path))
+
+
+# How the camera of a video reads its lines: as its card says, or as its frames show.
+
 
 WINDOWS = 8
 """Pairs of frames, at most, by which the shutter is found; they lie evenly over the video."""
@@ -187,3 +258,41 @@ def matched_pairs(
             return
     if number == 0:
         raise RsbenchError(TOO_FEW)
+
+
+# The camera of a video: as its card says, with a focal length that its frames show, or with a stated default.
+
+
+PAIRS = 5
+"""Of frames, at most, by which the focal length is found; they lie evenly over the video."""
+
+
+def find_camera(
+    frames: Iterable[NDArray[Any]],
+    count: int,
+    card: OneCameraCard,
+    shutter: RollingShutter,
+    options: RobustOptions,
+    seed: int = 0,
+    advance: Callable[[str], None] = lambda word: None,
+) -> tuple[PinholeCamera, FoundFocal | None]:
+    """The camera, and what the frames say of its focal length; None where the card says that.
+
+    Args:
+        frames, count, card, options, seed, advance: as of ``find_shutter``.
+        shutter: of the camera.
+
+    Raises:
+        RsbenchError: fewer than two frames, or frames of two sizes.
+    """
+    camera, pairs = None, list[PairFocal | None]()
+    wanted = PAIRS if card.focal_unknown else 0
+    for matches, _, camera in matched_pairs(frames, card, max((count - 1) // PAIRS, 1), wanted, seed):
+        if matches is not None:
+            pairs.append(focal_of_pair(matches, (camera.width, camera.height), shutter, options, seed))
+            advance(f"pair {len(pairs)}")
+    assert camera is not None
+    if not card.focal_unknown:
+        return camera, None
+    found = conclude_focal(pairs, camera.width)
+    return PinholeCamera.centred(camera.width, camera.height, found.focal), found

@@ -1,0 +1,92 @@
+"""Every option of ``rsbench correct`` has an effect or is refused, with a rig and with one camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from commands import assert_refused, run_here
+
+from rsbench.cli import correct as command
+from rsbench.cli.main import app
+
+RIG = "baseline = 0.3\nreadout_ratio = 0.8\n[camera]\nfx = 150\nfy = 150\ncx = 63.5\ncy = 47.5\n"
+OTHER = {
+    "target": ["--target", "middle"],
+    "inpaint": ["--inpaint"],
+    "sky": ["--no-sky"],
+    "fill": ["--no-fill"],
+    "solver": ["--solver", "rs-stereo-refined-pairs"],
+    "motion_model": ["--motion-model", "twist"],
+    "matcher": ["--matcher", "sgm-plain"],
+    "features": ["--features", "sift"],
+    "corrector": ["--corrector", "single-view"],
+    "seed": ["--seed", "3"],
+    "fast": ["--fast"],
+    "row_poses": ["--row-poses"],
+    "rig": ["--rig", "rig.toml"],
+    "left": ["--left", "left"],
+    "right": ["--right", "right"],
+    "gyro": ["--gyro", "log.csv"],
+    "fps": ["--fps", "30"],
+    "gyro_offset": ["--gyro-offset", "0.1"],
+}
+"""A value of each option that is not its default."""
+OF_INPUT = {"frames", "out", "camera", "footage"}
+"""What every run, or one of its two kinds, has to give."""
+ONE_CAMERA = {"target", "inpaint", "seed", "gyro", "fps", "gyro_offset"}
+
+
+def _parameters() -> set[str]:
+    (found,) = (each for each in typer.main.get_group(app).commands.items() if each[0] == "correct")
+    return {parameter.name or "" for parameter in found[1].params} - {"help"}
+
+
+def test_every_option_is_walked() -> None:
+    assert _parameters() == OTHER.keys() | OF_INPUT
+
+
+@pytest.mark.parametrize("option", sorted(OTHER.keys() - ONE_CAMERA))
+def test_options_of_a_rig_are_refused_for_one_camera(option: str, tmp_path: Path) -> None:
+    result = run_here("correct", "--frames", tmp_path, "--out", tmp_path / "out", *OTHER[option])
+    assert_refused(result, OTHER[option][0], "no effect on frames of one camera")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", sorted(ONE_CAMERA))
+def test_options_of_one_camera_reach_its_correction(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Any] = []
+    monkeypatch.setattr(command, "correct_one_camera", lambda *known: calls.append(known))
+    given = ["--frames", tmp_path, "--out", tmp_path / "out"]
+    with_log = given if option == "gyro" else [*given, *OTHER["gyro"]]
+    run_here("correct", *with_log)
+    run_here("correct", *with_log, *OTHER[option])
+    default, other = calls
+    assert default != other
+
+
+@pytest.mark.parametrize("option", sorted(OTHER.keys() - {"rig", "left", "right", "row_poses", "gyro"}))
+def test_options_of_a_rig_reach_its_correction(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Any] = []
+    monkeypatch.setattr(command, "_correct_given", lambda *known: calls.append(known))
+    (tmp_path / "rig.toml").write_text(RIG)
+    given = ["--left", "left", "--right", "right", "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out"]
+    with_log = [*given, *OTHER["gyro"]]
+    run_here("correct", *with_log)
+    run_here("correct", *with_log, *OTHER[option])
+    default, other = calls
+    assert repr(default) != repr(other)
+
+
+@pytest.mark.parametrize("option", ["row_poses", "gyro", "fps", "gyro_offset"])
+def test_options_of_a_sequence_are_refused_for_two_times(option: str, tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(RIG)
+    four = [tmp_path / f"{name}.png" for name in ("l0", "r0", "l1", "r1")]
+    result = run_here("correct", *four, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out", *OTHER[option])
+    assert_refused(result, OTHER[option][0])
