@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST
+from rsbench.benchmark.studies.correction_bench import METHODS, ON_REQUEST
 from rsbench.benchmark.studies.correction_study import study_dataset
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset import sequence as recorded

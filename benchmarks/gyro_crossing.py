@@ -21,9 +21,8 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.provenance import provenance
-from rsbench.benchmark.simulated.run_sweep import read_sweep, read_trials
+from rsbench.benchmark.simulated.run_sweep import read_card, read_sweep, read_trials, score_trials
 from rsbench.benchmark.simulated.sweep_card import load_sweep
-from rsbench.benchmark.simulated.sweep_summary import read_card, score_trials
 from rsbench.benchmark.statistics import bootstrap_interval, in_words, typical_interval
 from rsbench.core.so3 import FloatArray
 from rsbench.storage.files import write_json, write_table

@@ -33,7 +33,17 @@ import pandas as pd
 
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.simulated.bound import Bound, bound_from_root, joined, motion_bound
-from rsbench.benchmark.simulated.run_sweep import read_bounds, read_trials, run_sweep
+from rsbench.benchmark.simulated.run_sweep import (
+    OBSERVABLE,
+    SUCCESS_DEG,
+    at_bound,
+    failure_reasons,
+    over_bound,
+    read_bounds,
+    read_trials,
+    run_sweep,
+    score_trials,
+)
 from rsbench.benchmark.simulated.simulation import (
     GYRO_RATE,
     Simulation,
@@ -42,14 +52,6 @@ from rsbench.benchmark.simulated.simulation import (
     simulate,
 )
 from rsbench.benchmark.simulated.sweep_card import load_sweep
-from rsbench.benchmark.simulated.sweep_summary import (
-    OBSERVABLE,
-    SUCCESS_DEG,
-    at_bound,
-    failure_reasons,
-    over_bound,
-    score_trials,
-)
 from rsbench.benchmark.simulated.trials import Entrant, enter, given_matches
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera

@@ -29,7 +29,7 @@ from foreign_motion import SINES, Array, Law, Shaken, direction
 
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.statistics import in_words, typical_interval
-from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Given, along
+from rsbench.benchmark.trajectory_scores import METHODS, Estimate, Given, along
 from rsbench.capture.trajectory_estimate import Trajectory, estimate_trajectory
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

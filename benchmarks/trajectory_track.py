@@ -32,8 +32,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Given
-from rsbench.benchmark.trajectory_scores import TrueTrajectory, trajectory_scores
+from rsbench.benchmark.trajectory_scores import METHODS, Estimate, Given, TrueTrajectory, trajectory_scores
 from rsbench.components.cards import card_path
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion

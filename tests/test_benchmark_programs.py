@@ -73,7 +73,7 @@ def test_points_are_seen_where_their_rows_are_read(sweep: ModuleType) -> None:
 
 
 def test_the_truth_errs_by_nothing_and_a_still_rig_by_the_motion(sweep: ModuleType) -> None:
-    from rsbench.benchmark.trajectory_methods import along
+    from rsbench.benchmark.trajectory_scores import along
     from rsbench.components.motion_models import LinearMotion
 
     setting = sweep.Setting(shake=0.0)

@@ -8,7 +8,7 @@ import statistics
 from pathlib import Path
 
 from rsbench.benchmark.studies.claims import CLAIMS
-from rsbench.benchmark.studies.correction_methods import METHODS
+from rsbench.benchmark.studies.correction_bench import METHODS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -165,7 +165,7 @@ def _write_rest(folder: Path, out: Path, left: FrameSource, record: dict[str, An
     import numpy as np
 
     from rsbench.dataset.corrected_frames import join_poses, write_record
-    from rsbench.report.trajectory_picture import draw_trajectory
+    from rsbench.report.corrected_page import draw_trajectory
 
     join_poses(folder, "row_poses")
     join_poses(folder, "trajectory")

@@ -160,7 +160,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
 
 def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.DataFrame:
     """Of one camera's correctors: scaled flow and ``corrector``, or ours where that is the default of a rig."""
-    from rsbench.benchmark.recorded_corrections import check_sees_one_camera, correction_scores, pairs_with_truth
+    from rsbench.benchmark.recordings import check_sees_one_camera, correction_scores, pairs_with_truth
     from rsbench.cli.console import progress_bar
     from rsbench.vision.corrector import load_corrector
 

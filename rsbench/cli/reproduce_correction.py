@@ -32,11 +32,11 @@ def fig4(out: Path, data: Path) -> None:
     That by the paper's own components comes first, see ``fig4_literal``.
     """
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_summary import numbers_table
+    from rsbench.benchmark.studies.correction_study import numbers_table
     from rsbench.benchmark.studies.fig4_panels import load_panels, make_panels, save_panels
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.fig4 import draw_fig4
+    from rsbench.report.paper_figures import draw_fig4
     from rsbench.storage.files import write_json, write_table
 
     folder = out / "fig4"
@@ -67,7 +67,7 @@ def fig4_literal(out: Path, data: Path) -> None:
     from rsbench.benchmark.studies.fig4_panels import Panels, correct_literally
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.fig4 import draw_fig4
+    from rsbench.report.paper_figures import draw_fig4
     from rsbench.storage.files import write_json, write_table
 
     folder = out / "fig4"
@@ -95,7 +95,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     import pandas as pd
 
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_summary import by_scene, summarise, summarise_bands
+    from rsbench.benchmark.studies.correction_study import by_scene, summarise, summarise_bands
     from rsbench.report.correction_page import write_study
     from rsbench.storage.files import write_json, write_table
 
@@ -121,7 +121,7 @@ def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
     import pandas as pd
 
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_summary import by_law, by_sequence
+    from rsbench.benchmark.studies.correction_study import by_law, by_sequence
     from rsbench.report.correction_page import write_laws
     from rsbench.storage.files import write_json, write_table
 
@@ -165,7 +165,7 @@ def sgm(out: Path, data: Path) -> None:
     from rsbench.benchmark.studies.sgm_timing import TIMINGS, compare
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.sgm_page import write_sgm_page
+    from rsbench.report.correction_page import write_sgm_page
     from rsbench.storage.files import read_png, write_json, write_table
 
     folder = out / "sgm"
@@ -205,7 +205,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.renderers.backend import start_backend
-    from rsbench.report.real_page import write_real_page
+    from rsbench.report.correction_page import write_real_page
     from rsbench.storage.files import write_json, write_table
 
     if seeds < real_cameras.FEWEST_SEEDS:
@@ -241,7 +241,7 @@ def _draw_real(places: dict[str, Path], folder: Path) -> Path:
     from rsbench.dataset.sequence import read_sequence
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.report.real_page import draw_frames
+    from rsbench.report.correction_page import draw_frames
 
     ideal, real = (read_sequence(places[camera] / _SHOWN) for camera in ("ideal", "real"))
     images = {view: real.image("rs", *view) for view in VIEWS}

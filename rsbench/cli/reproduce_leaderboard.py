@@ -59,7 +59,7 @@ def boards(out: Path, data: Path, workers: int | None) -> None:
 
 def handheld(out: Path, data: Path, workers: int | None) -> None:
     """The track of trajectories on footage from hands."""
-    from rsbench.benchmark.trajectory_methods import METHODS
+    from rsbench.benchmark.trajectory_scores import METHODS
 
     board = data / f"{HANDHELD}-board"
     _fill(board, {"trajectory": list(METHODS)}, workers, "handheld", data / HANDHELD, oracles_too=False)

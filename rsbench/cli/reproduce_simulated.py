@@ -20,9 +20,9 @@ _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-
 
 def fig3(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
+    from rsbench.benchmark.simulated.run_sweep import errors_of_rows
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.simulated.trial_errors import errors_of_rows
-    from rsbench.report.fig3 import SWEEPS, draw_fig3, fig3_page, setting_table
+    from rsbench.report.paper_figures import SWEEPS, draw_fig3, fig3_page, setting_table
     from rsbench.storage.files import save_arrays, write_bytes, write_json, write_table
 
     folder = out / "fig3"
@@ -49,7 +49,7 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
 def sweeps(out: Path, data: Path, workers: int | None) -> None:
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.report.sweep_pages import sweeps_page
+    from rsbench.report.claim_pages import sweeps_page
     from rsbench.storage.files import write_bytes, write_json, write_table
 
     folder = out / "sweeps"
@@ -69,10 +69,9 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     """Every claim, in every reading of the paper's solver."""
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.claims import best_readings, judge_claims
-    from rsbench.benchmark.studies.readings import LITERAL, readings_of, write_cards
-    from rsbench.report.claims_page import claims_page
-    from rsbench.report.fig3 import SWEEPS
+    from rsbench.benchmark.studies.claims import LITERAL, best_readings, judge_claims, readings_of, write_cards
+    from rsbench.report.claim_pages import claims_page
+    from rsbench.report.paper_figures import SWEEPS
     from rsbench.storage.files import write_bytes, write_json, write_table
 
     fig3(out, data, workers)
@@ -97,8 +96,8 @@ def _claim_tables(
     fig3_folder: Path, folder: Path, home: Path, workers: int | None, command: str
 ) -> dict[str, dict[str, pd.DataFrame]]:
     """Summaries of the sweeps of Figure 3 by the matches per camera, with the readings of the paper's solver."""
-    from rsbench.benchmark.studies.readings import APART
-    from rsbench.report.fig3 import SWEEPS, read_summaries
+    from rsbench.benchmark.studies.claims import APART
+    from rsbench.report.paper_figures import SWEEPS, read_summaries
     from rsbench.storage.files import write_table
 
     hundred = read_summaries(fig3_folder, SWEEPS)
@@ -120,8 +119,7 @@ def _with_readings(name: str, points: int | None, home: Path, workers: int | Non
     """Summary of a sweep of the paper run with the readings of its solver; where Figure 3 has none, also with what
     they are compared with."""
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.claims import GLOBAL, OURS
-    from rsbench.benchmark.studies.readings import readings_of, write_cards
+    from rsbench.benchmark.studies.claims import GLOBAL, OURS, readings_of, write_cards
 
     others = () if points == 100 else (OURS, GLOBAL)
     card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
@@ -133,10 +131,16 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
     """The claims in settings that the paper does not state."""
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.claims import GLOBAL, holding_settings, judge_settings
-    from rsbench.benchmark.studies.readings import LITERAL, settings_card, write_cards
-    from rsbench.report.fig3 import SWEEPS
-    from rsbench.report.readings_page import readings_page
+    from rsbench.benchmark.studies.claims import (
+        GLOBAL,
+        LITERAL,
+        holding_settings,
+        judge_settings,
+        settings_card,
+        write_cards,
+    )
+    from rsbench.report.claim_pages import readings_page
+    from rsbench.report.paper_figures import SWEEPS
     from rsbench.storage.files import write_bytes, write_json, write_table
 
     folder, home, command = out / "readings", data / "simulated", "rsbench reproduce readings"
@@ -158,7 +162,7 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
 def image_claims(out: Path) -> None:
     """The claims about images, from the results that ``out`` holds."""
     from rsbench.benchmark.studies.image_claims import judge_image_claims
-    from rsbench.report.claims_page import image_claims_page
+    from rsbench.report.claim_pages import image_claims_page
     from rsbench.storage.files import write_bytes
 
     text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"

@@ -92,8 +92,7 @@ def run_and_summarise(
 ) -> pd.DataFrame:
     """Run a sweep with a progress bar and write its summary and provenance; returns the summary."""
     from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.simulated.run_sweep import run_sweep, sweep_steps
-    from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
+    from rsbench.benchmark.simulated.run_sweep import run_sweep, summarise_sweep, sweep_steps
     from rsbench.cli.console import progress_bar
     from rsbench.storage.files import write_json
 

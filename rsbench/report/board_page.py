@@ -5,25 +5,607 @@ Everything comes from a board's stored scores. Nothing is fetched, and what entr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.board import splits_of
-from rsbench.benchmark.leaderboard.standings import LEVELS, Standing, named_numbers
-from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score
+from rsbench.benchmark.leaderboard.board import Scored, about_split, entries_of, place, splits_of
+from rsbench.benchmark.leaderboard.picture_track import PictureTrack
+from rsbench.benchmark.leaderboard.pictures import (
+    PARTINGS,
+    PICTURES,
+    TruePictures,
+    columns,
+    read_answer_depth,
+    read_answer_frame,
+)
+from rsbench.benchmark.leaderboard.standings import (
+    LEVELS,
+    Standing,
+    named_numbers,
+    score_interval,
+    standings,
+    table,
+)
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score, Split, Track, Truth
+from rsbench.benchmark.leaderboard.tracks import track_of_id
 from rsbench.benchmark.statistics import in_words
-from rsbench.report.board_entry import entry_context
-from rsbench.report.board_figures import bar
-from rsbench.report.board_pictures import albums
-from rsbench.report.board_problems import matrix_context, problem_contexts
-from rsbench.report.board_splits import Board, read_split
-from rsbench.report.board_tables import as_csv, as_latex, as_markdown
+from rsbench.core.errors import RsbenchError
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.sequence import read_pairs
+from rsbench.report.board_figures import ErrorLine, bar, curves, drawable, legend, reliability, short
+from rsbench.report.pictures import Image, colour_map, encode_jpeg, shrink
 from rsbench.storage.files import write_bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A split with its lines, and what is told of its problems."""
+
+    track: Track
+    split: str
+    fingerprint: str
+    lines: list[Standing]
+    facts: pd.DataFrame
+    """By the name of the problem; without columns where they are secret."""
+    problem_pages: bool = True
+    """Whether rendered sequences may have pages of their own."""
+
+    @property
+    def id(self) -> str:
+        """Of its part of the index, of its files, and of the folder of its pages."""
+        return f"{self.track.id}--{self.split}"
+
+    @property
+    def secret(self) -> bool:
+        """Whether nothing is told of single problems: from a few exact errors of one the truth can be computed."""
+        return self.facts.columns.empty
+
+    @cached_property
+    def problems(self) -> list[str]:
+        """Names, in the order of scores."""
+        return [str(name) for name in self.lines[0].scored.scores["problem"]]
+
+    @cached_property
+    def scenes(self) -> list[str]:
+        """Of the problems."""
+        return [str(name) for name in self.lines[0].scored.scores["scene"]]
+
+    @property
+    def several(self) -> bool:
+        """Whether scenes have several problems."""
+        return len(set(self.scenes)) < len(self.scenes)
+
+    @property
+    def pages(self) -> bool:
+        """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
+        return self.problem_pages and self.track.inputs.rendered and not self.secret
+
+    def page_of(self, problem: str) -> str:
+        """Where a problem is told, from the folder of the index."""
+        return f"{self.id}/problem/{problem}.html" if self.pages else f"{self.named['problems']}#{problem}"
+
+    @property
+    def named(self) -> dict[str, str]:
+        """Words of its own, for all pages."""
+        return {
+            "id": self.id,
+            "title": self.track.title,
+            "protocol": self.track.id,
+            "split": self.split,
+            "primary": self.track.primary.title,
+            "error": self.error,
+            "problems": "" if self.secret else f"{self.id}--problems.html",
+        }
+
+    @property
+    def error(self) -> str:
+        """What figures draw."""
+        return self.track.error_title
+
+    def known(self) -> list[tuple[str, pd.Series]]:
+        """What is known of the problems, in their order: numbers and words, each with its name, and the scene."""
+        found = [(str(name), self.facts[name].reindex(self.problems)) for name in self.facts.columns]
+        return [*found, ("scene", pd.Series(self.scenes))] if self.several else found
+
+    @property
+    def by_score(self) -> list[Standing]:
+        """Lines that have a rank, the best first, whatever they use."""
+        primary = self.track.primary
+        ranked = [line for line in self.lines if line.rank is not None]
+        return sorted(ranked, key=lambda line: -primary.sign * line.means[primary.key][0])
+
+    def figures(self, lines: Sequence[Standing]) -> dict[str, Any]:
+        """Errors of some of its lines against what is known of the problems."""
+        shown = drawable([self._line(line) for line in lines])
+        drawn = [(fact_title(name), curves(values, shown, self.scenes)) for name, values in self.known()]
+        return {
+            "legend": legend(shown),
+            "drawn": [{"title": title, "svg": svg} for title, svg in drawn if svg is not None],
+        }
+
+    def figures_within(self, lines: Sequence[Standing]) -> dict[str, Any]:
+        """Errors of some of its lines in parts of the pictures, where stored scores have them."""
+        track, drawn, shown = self.track, list[dict[str, Any]](), list[ErrorLine]()
+        if not isinstance(track, PictureTrack):
+            return {"legend": legend(shown), "drawn": drawn, "error": ""}
+        for parting in () if self.secret else PARTINGS:
+            names = columns(track.part_score, parting)
+            having = [line for line in lines if set(names) <= set(line.scored.scores)]
+            if not having:
+                continue
+            stacked = [line.scored.scores[names].to_numpy(dtype=np.float64).ravel() for line in having]
+            known = np.all(np.isfinite(stacked), axis=0)  # a picture need not have pixels of each part
+            found = [
+                ErrorLine(line.scored.header.method, errors[known], line.rank is None)
+                for line, errors in zip(having, stacked, strict=True)
+            ]
+            starts = pd.Series(np.tile(parting.starts, len(self.problems))[known])
+            scenes = np.repeat(self.scenes, len(names))[known].tolist()
+            svg = curves(starts, drawable(found), scenes) if np.any(known) else None
+            if svg is not None:
+                drawn.append({"title": parting.title, "svg": svg})
+                shown = drawable(found)
+        return {"legend": legend(shown), "drawn": drawn, "error": track.part_title}
+
+    def _line(self, line: Standing) -> ErrorLine:
+        errors = line.scored.scores[self.track.error].to_numpy(dtype=np.float64)
+        return ErrorLine(line.scored.header.method, errors, line.rank is None)
+
+
+def read_split(board: Path, protocol: str, split: str) -> Board:
+    """A split of a board; without lines where it has no entries.
+
+    Raises:
+        RsbenchError: an entry or what is said of the split is damaged.
+    """
+    about = about_split(place(board, protocol, split))
+    return Board(
+        track=track_of_id(protocol),
+        split=split,
+        fingerprint=about.fingerprint,
+        lines=standings(entries_of(board, protocol, split)),
+        facts=pd.DataFrame.from_dict(about.facts, orient="index"),
+    )
+
+
+def fact_title(name: str) -> str:
+    """``rotation_deg`` as people write it."""
+    found = re.fullmatch(r"(\w+)_(deg|m|px)", name)
+    return (f"{found[1]} ({found[2]})" if found else name).replace("_", " ")
+
+
+BRIEF = 2
+"""Medians of the tables that show few numbers."""
+
+
+def as_csv(lines: Sequence[Standing], secret: bool) -> str:
+    """All numbers of a table, with all their digits; no cell begins as a formula does, since names do not."""
+    return table(lines, worst=not secret).to_csv(index=False, lineterminator="\n")
+
+
+def as_markdown(lines: Sequence[Standing]) -> str:
+    """The most telling columns; names of methods hold nothing that Markdown reads, but underscores."""
+    head, *rows = ["| " + " | ".join(row) + " |" for row in _brief(lines)]
+    return "\n".join([head, "|" + "---|" * len(_brief(lines)[0]), *rows]).replace("_", r"\_") + "\n"
+
+
+def as_latex(lines: Sequence[Standing]) -> str:
+    """The same as a tabular with the rules of booktabs."""
+    head, *rows = [" & ".join(row).replace("_", r"\_") + r" \\" for row in _brief(lines)]
+    width = len(_brief(lines)[0])
+    begin, end = rf"\begin{{tabular}}{{ll{'r' * (width - 2)}}}", r"\end{tabular}"
+    return "\n".join([begin, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", end, ""])
+
+
+def brief_medians(track: Track) -> list[str]:
+    """Titles of the most telling ones."""
+    return [score.title for score in track.scores if score.kind == "median"][:BRIEF]
+
+
+def _brief(lines: Sequence[Standing]) -> list[list[str]]:
+    track = lines[0].track
+    assumes = ["assumes"] if track.parting else []
+    titles = {score.key: score.title for score in track.scores}
+    stated = ["in 95 %"] if any(line.calibration for line in lines) else []
+    head = ["method", *assumes, "uses", "rank", track.primary.title, *lines[0].parts]
+    rows = [[*head, *(titles[key] for key in track.beside), *brief_medians(track), *stated]]
+    for line in lines:
+        primary, *beside = [in_words(*line.means[key]) for key in (track.primary.key, *track.beside)]
+        parts = [f"{triple[0]:.2f}" for triple in line.parts.values()]
+        medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
+        assumed = [line.assumes] if track.parting else []
+        covers = [in_words(*line.calibration.covers[-1]) if line.calibration else "-"] if stated else []
+        cells = [line.name, *assumed, line.uses, line.rank_words, primary, *parts, *beside, *medians, *covers]
+        rows.append(cells)
+    return rows
+
+
+DEPTH_PX, FRAME_LEVELS = 3.0, 64.0
+"""Errors that have the last colour: of disparity, and of the mean over the colours in 8-bit levels."""
+_DIFFERENCE = f"difference, 0 (dark) to {FRAME_LEVELS:g} of 255 levels or more (bright); grey: not drawn"
+ERRORS = {
+    "depth": f"error, 0 (dark) to {DEPTH_PX:g} px of disparity or more (bright); grey: unknown, or no surface",
+    "correction": _DIFFERENCE,
+    "correction-mono": _DIFFERENCE,
+}
+Named = tuple[str, str, Image]
+"""Stem of the file, words, picture."""
+
+
+def true_images(track: str, pictures: TruePictures) -> Iterator[Named]:
+    """The true pictures of a problem."""
+    for each in pictures.requested:
+        if track == "depth":
+            yield each.stem, "true depth", _depth_image(pictures.depth(), pictures.depth())
+        else:
+            yield each.stem, f"true frame, {_row_name(each.stem)}", pictures.frame(each.row)
+
+
+def answer_images(track: str, entry: Scored, truth: Truth) -> Iterator[Named]:
+    """The pictures that an entry submitted for a problem, and their errors; nothing of a failure.
+
+    Raises:
+        RsbenchError: a picture is missing, or damaged.
+    """
+    pictures, method, folder = truth.pictures, entry.header.method, entry.folder / PICTURES
+    scores = entry.scores
+    assert pictures is not None
+    if not bool(scores.loc[scores["problem"] == truth.name, "success"].all()):
+        return
+    for each in pictures.requested:
+        if track == "depth":
+            depth = read_answer_depth(folder, pictures, entry.header.png_unit_m)
+            yield each.stem, method, _depth_image(depth, pictures.depth())
+            yield f"{each.stem}-error", f"{method}, error", depth_error_image(depth, pictures)
+        else:
+            image, drawn = read_answer_frame(folder, pictures, each)
+            words = f"{method}, {_row_name(each.stem)}"
+            yield each.stem, words, image
+            yield (
+                f"{each.stem}-error",
+                f"{words}, error",
+                frame_error_image(image, drawn, pictures.frame(each.row)),
+            )
+
+
+def _row_name(stem: str) -> str:
+    return f"{stem.rpartition('_')[2]} row"
+
+
+def _depth_image(depth: NDArray[np.float32], truth: NDArray[np.float32]) -> Image:
+    """Inverse depth in the range of the true one; unknown is grey."""
+    low, high = np.quantile(1.0 / truth[truth > 0.0], [0.01, 0.99]) if np.any(truth > 0.0) else (0.0, 1.0)
+    return colour_map(_inverse(depth), float(low), float(high))
+
+
+def _inverse(depth: NDArray[np.float32]) -> FloatArray:
+    """NaN where it is not known."""
+    return np.divide(1.0, depth, where=depth > 0.0, out=np.full(depth.shape, np.nan))
+
+
+def depth_error_image(depth: NDArray[np.float32], pictures: TruePictures) -> Image:
+    """Error of the disparity, px, in colours."""
+    rig = pictures.sequence.rig
+    error = rig.camera.fx * rig.baseline * np.abs(_inverse(depth) - _inverse(pictures.depth()))
+    return colour_map(error, 0.0, DEPTH_PX)
+
+
+def frame_error_image(image: Image, drawn: NDArray[np.bool_], truth: Image) -> Image:
+    """Mean difference of the three colours, in colours; grey where nothing was drawn."""
+    error = np.mean(np.abs(image.astype(np.float64) - truth), axis=-1)
+    return colour_map(np.where(drawn, error, np.nan), 0.0, FRAME_LEVELS)
+
+
+_LONGEST, _QUALITY = 400, 78
+"""Px, and of JPEG: 10 to 35 kB."""
+_THUMB = 120
+_MOST_BYTES = 11_000_000
+"""Of all pictures of a site, which stays below 15 MB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """A picture of a page."""
+
+    title: str
+    file: str
+    """Below the folder of the problem's pictures."""
+
+
+class Album:
+    """Writes the pictures of a split's problems into ``<id>/pictures/<problem>``."""
+
+    def __init__(self, each: Board, out: Path, data: Sequence[Path]) -> None:
+        self._each = each
+        self._split, folder = _at_hand(each, data)
+        self._sequences = {} if folder is None else {sequence.name: sequence for sequence in read_pairs(folder)}
+        self._out, self.prefix = out, f"{each.id}/pictures"
+        self.allowance = _MOST_BYTES
+        """Bytes of the pictures of a problem."""
+
+    def __len__(self) -> int:
+        """How many problems it shows."""
+        return len(self._sequences)
+
+    @property
+    def errors(self) -> str:
+        """What the colours of error maps mean; nothing where there are none."""
+        return ERRORS.get(self._each.track.name, "") if self._sequences else ""
+
+    def thumb(self, problem: str) -> str:
+        """Path from the folder of the index, or nothing."""
+        return f"{self.prefix}/{problem}/thumb.jpg" if problem in self._sequences else ""
+
+    def pictures(self, problem: str) -> list[Shown]:
+        """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room."""
+        if problem not in self._sequences:
+            return []
+        left, found = self.allowance, list[Shown]()
+        for group in self._groups(problem):
+            pictures = [
+                (stem, words, encode_jpeg(shrink(image, _LONGEST), _QUALITY)) for stem, words, image in group
+            ]
+            left -= sum(len(data) for _, _, data in pictures)
+            if left < 0:
+                break
+            for stem, words, data in pictures:
+                found.append(Shown(title=words, file=f"{stem}.jpg"))
+                self._write(problem, f"{stem}.jpg", data)
+        return found
+
+    def compared(self, problem: str) -> tuple[int, int]:
+        """Which pictures stand at the divider first: the frame as it was and the best answer, or two frames."""
+        truth = None if self._split is None else self._split.by_name[problem]
+        return (0, 1) if truth is None or truth.pictures is None else (1, 2 + len(truth.pictures.requested))
+
+    def _groups(self, problem: str) -> Iterator[list[Named]]:
+        """What stands or falls together: frames with the truth, then each entry, the best first."""
+        assert self._split is not None
+        sequence, truth, track = self._sequences[problem], self._split.by_name[problem], self._each.track.name
+        frames = [sequence.image("rs", "left", frame) for frame in (0, 1)]
+        self._write(problem, "thumb.jpg", encode_jpeg(shrink(frames[0], _THUMB), _QUALITY))
+        first = [(f"left_{k}", f"rolling-shutter frame {k}", image) for k, image in enumerate(frames)]
+        if truth.pictures is None:
+            yield first
+            return
+        yield [
+            *first,
+            *((f"true-{stem}", words, image) for stem, words, image in true_images(track, truth.pictures)),
+        ]
+        for line in self._each.by_score:
+            method = line.scored.header.method
+            answer = answer_images(track, line.scored, truth)
+            yield [(f"{method}/{stem}", words, image) for stem, words, image in answer]
+
+    def _write(self, problem: str, name: str, data: bytes) -> None:
+        path = self._out / self.prefix / problem / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, data)
+
+
+def albums(boards: Sequence[Board], out: Path, data: Sequence[Path]) -> list[Album]:
+    """One for each split; together they keep below the bound."""
+    found = [Album(each, out, data) for each in boards]
+    for album in found:
+        album.allowance = _MOST_BYTES // max(sum(map(len, found)), 1)
+    return found
+
+
+def _at_hand(each: Board, data: Sequence[Path]) -> tuple[Split | None, Path | None]:
+    """A public split with its dataset, where that is at hand.
+
+    Raises:
+        RsbenchError: there is no dataset in a folder.
+    """
+    if each.pages and not each.facts.empty:
+        for folder in data:
+            try:
+                split = each.track.split(folder)
+            except RsbenchError:
+                if not (folder / "dataset.json").is_file():
+                    raise
+                continue  # of cameras that this track does not ask
+            if split.fingerprint == each.fingerprint:
+                return split, folder
+    return None, None
+
+
+_ABOUT = ("version", "description", "authors", "paper", "code", "licence", "hardware", "tuned_on", "motion_model")
+_WORST = 10
+
+
+def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
+    """Of the template board_entry.html.j2."""
+    header = line.scored.header
+    said = asdict(header)
+    compared = [line, *_best_peer(each, line), *_oracles(each, line)]
+    return {
+        "header": header,
+        "split": each.named,
+        "about": [
+            ("uses", line.uses),
+            ("answers", "handed in as a file" if line.scored.handed_in else "made by this board"),
+            *([("in_doubt", line.scored.doubt)] if line.scored.doubt else []),
+            *((name, said[name]) for name in _ABOUT if said[name]),
+        ],
+        "scores": _entry_scores(line),
+        "ties": ", ".join(line.ties),
+        "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],
+        "worst": None if each.secret else _worst(each, line, album),
+        "figures_found": each.figures(compared),
+        "figures_within": each.figures_within(compared),
+        "calibration": _calibration(line),
+    }
+
+
+def _words(kinds: pd.Series) -> bool:
+    return not pd.api.types.is_numeric_dtype(kinds)
+
+
+def _best_peer(each: Board, line: Standing) -> list[Standing]:
+    """The best of the other entries that use no more, which the figures show beside it."""
+    uses = set(line.scored.header.uses)
+    peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
+    return peers[:1] if line.rank else []
+
+
+def _oracles(each: Board, line: Standing) -> list[Standing]:
+    return [other for other in each.lines if other.rank is None and other is not line]
+
+
+def _entry_scores(line: Standing) -> list[dict[str, str]]:
+    found = [{"title": "rank", "text": line.rank_words, "hint": "among those that use no more"}]
+    for score in line.track.scores:
+        if score.kind != "median":
+            text = in_words(*line.means[score.key])
+        else:
+            value = line.medians[score.key]
+            text = "–" if np.isnan(value) else f"{value:.3g}"
+        found.append({"title": score.title, "text": text, "hint": score.hint})
+    return found
+
+
+def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
+    scores, track, rows = line.scored.scores, each.track, list[list[object]]()
+    for kind, part in scores.groupby(kinds.astype(str).to_numpy()):
+        primary = part[track.primary.key].to_numpy()
+        value, low, high = score_interval(primary, list(part["scene"]), track.primary.kind == "share")
+        # One scene bounds nothing: an interval of it would only round its value away.
+        share = f"{value:.3g}" if part["scene"].nunique() == 1 else in_words(value, low, high)
+        medians = (part[key].median() for key in track.of_kind("median")[:BRIEF])
+        rows.append([str(kind), len(part), share, *(f"{x:.3g}" for x in medians), int(part["failure"].sum())])
+    return {
+        "title": f"By {fact_title(name)}",
+        "columns": [fact_title(name), "problems", track.primary.title, *brief_medians(track), "failed"],
+        "rows": rows,
+    }
+
+
+def _worst(each: Board, line: Standing, album: Album) -> dict[str, Any]:
+    track = each.track
+    worst = line.scored.scores.sort_values([track.error, "problem"], ascending=[False, True]).head(_WORST)
+    names = [str(name) for name in each.facts.columns]
+    rows = []
+    for case in worst.to_dict("records"):
+        numbers = [f"{case[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
+        known = [each.facts[name].get(case["problem"], "") for name in names]
+        words = [f"{value:.3g}" if isinstance(value, float) else str(value) for value in known]
+        problem = str(case["problem"])
+        thumb = album.thumb(problem)
+        rows.append(
+            {
+                "name": problem,
+                "page": f"../{each.page_of(problem)}",
+                "thumb": thumb and f"../{thumb}",
+                "cells": [*numbers, *words],
+            }
+        )
+    return {"columns": [*brief_medians(track), *map(fact_title, names)], "rows": rows}
+
+
+def _calibration(line: Standing) -> dict[str, Any] | None:
+    found = line.calibration
+    if found is None:
+        return None
+    rows = [
+        {"level": f"{100.0 * level:.0f} %", "text": in_words(*(100.0 * x for x in triple)) + " %"}
+        for level, triple in zip(LEVELS, found.covers, strict=True)
+    ]
+    return {
+        "stated": found.stated,
+        "of": len(line.scored.scores),
+        "spread": in_words(*found.spread),
+        "mean": f"{found.mean:.3g}",
+        "unknowns": line.track.unknowns,
+        "rows": rows,
+        "figure": reliability(found.covers),
+    }
+
+
+_SHADES = 5
+
+
+def matrix_context(each: Board, album: Album) -> dict[str, Any]:
+    """Of the template board_problems.html.j2: a row for each problem, a column for each entry."""
+    errors = np.stack([line.scored.scores[each.track.error].to_numpy(dtype=np.float64) for line in each.lines])
+    failed = np.stack([line.scored.scores["failure"].to_numpy() > 0.0 for line in each.lines])
+    names = [str(name) for name in each.facts.columns]
+    shades = _shades(errors)
+    rows = [
+        {
+            "name": problem,
+            "page": each.page_of(problem) if each.pages else "",
+            "thumb": album.thumb(problem),
+            "facts": [_fact(each, name, problem) for name in names],
+            "cells": [
+                {"value": repr(float(x)), "text": "failed" if lost else short(x), "shade": int(shade)}
+                for x, lost, shade in zip(errors[:, k], failed[:, k], shades[:, k], strict=True)
+            ],
+        }
+        for k, problem in enumerate(each.problems)
+    ]
+    entries = [{"method": line.scored.header.method, "oracle": line.rank is None} for line in each.lines]
+    return {"split": each.named, "facts": [_title(each, name) for name in names], "entries": entries, "rows": rows}
+
+
+def _shades(errors: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """0 for the smallest errors to ``_SHADES`` - 1 for the largest: as many of each."""
+    inner = np.quantile(errors, np.linspace(0.0, 1.0, _SHADES + 1)[1:-1], method="inverted_cdf")
+    return np.searchsorted(inner, errors, side="left")
+
+
+def _title(each: Board, name: str) -> dict[str, Any]:
+    return {"name": name, "title": fact_title(name), "text": each.facts[name].dtype == object}
+
+
+def _fact(each: Board, name: str, problem: str) -> dict[str, str]:
+    value = each.facts[name].get(problem, "")
+    if isinstance(value, str):
+        return {"value": value, "text": value}
+    return {"value": repr(float(value)), "text": f"{value:.3g}"}
+
+
+def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names of rendered sequences, and for each the context of the template board_problem.html.j2."""
+    if not each.pages:
+        return
+    for k, problem in enumerate(each.problems):
+        before, after = each.problems[k - 1], each.problems[(k + 1) % len(each.problems)]
+        yield (
+            problem,
+            {
+                "split": each.named,
+                "name": problem,
+                "before": before,
+                "after": after,
+                "facts": [(fact_title(str(n)), _fact(each, str(n), problem)["text"]) for n in each.facts.columns],
+                "columns": [{"title": score.title, "hint": score.hint} for score in each.track.scores],
+                "rows": [_problem_row(each, line, k) for line in each.lines],
+                "place": f"../pictures/{problem}",
+                "pictures": album.pictures(problem),
+                "compared": album.compared(problem),
+                "errors": album.errors,
+            },
+        )
+
+
+def _problem_row(each: Board, line: Standing, k: int) -> dict[str, Any]:
+    scores = line.scored.scores.iloc[k]
+    cells = [
+        "–" if np.isnan(value) else f"{value:.3g}"
+        for value in (float(scores[score.key]) for score in each.track.scores)
+    ]
+    method = line.scored.header.method
+    return {"method": method, "page": f"../{method}.html", "oracle": line.rank is None, "cells": cells}
 
 
 def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pages: bool = True) -> Path:

@@ -4,19 +4,119 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 from numpy.typing import NDArray
 
+from rsbench.core import so3
+from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import MARKER
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
 from rsbench.storage.files import read_json, write_bytes
 from rsbench.vision.fusion import Fused, Origin
+
+_WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
+_TOLD = 3.0
+"""Deviations from which on something is told from none."""
+_AXIS_COLOURS = {"x": "#c0392b", "y": "#27855a", "z": "#0b6bcb"}
+
+
+def draw_trajectory(poses: FloatArray, frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Drawings (SVG) of rotation and position, and what is said below; None where there is no trajectory.
+
+    Args:
+        poses: (n, 8) of the body at the starts of frames, as TUM's format has them: tau, position, quaternion.
+        frames: what motion.json says of each.
+    """
+    if len(poses) < 2:
+        return None
+    numbers, places, R = poses[:, 0], poses[:, 1:4], so3.from_quaternion(poses[:, [7, 4, 5, 6]])
+    turns = so3.log(np.swapaxes(R, 1, 2) @ R[0])
+    bridged = [int(frame["number"]) for frame in frames if "skipped" in frame]
+    return {
+        "drawings": [
+            _drawing(numbers, np.rad2deg(turns), bridged, "rotation since the first frame (deg)"),
+            _drawing(numbers, places, bridged, "position (m)"),
+        ],
+        "caption": _caption(frames, bridged),
+    }
+
+
+def _caption(frames: Sequence[Mapping[str, Any]], bridged: Sequence[int]) -> str:
+    motions = [
+        motion for frame in frames if (motion := frame.get("motion") or {}).get("covariance_w_d") is not None
+    ]
+    text = "Red x, green y, blue z."
+    if motions:
+        # Of each frame: deviations about or along the worst axis, motion, and what an even one is off by.
+        deviations = [np.sqrt(np.diagonal(np.array(each["covariance_w_d"]))).reshape(2, 3) for each in motions]
+        w, d = np.max(np.stack(deviations), axis=2).T
+        text += (
+            f" Standard deviation of the motion over a frame period, about or along the worst axis: "
+            f"{np.rad2deg(np.median(w)):.2g} deg, {1000.0 * np.median(d):.2g} mm in the median; "
+            f"{np.rad2deg(np.max(w)):.2g} deg, {1000.0 * np.max(d):.2g} mm at most. {_kind(motions, w, d)}"
+        )
+    return text + (" Grey: windows that it bridges." if bridged else "")
+
+
+def _kind(motions: Sequence[Mapping[str, Any]], w: FloatArray, d: FloatArray) -> str:
+    """Whether a rig stands, coasts or shakes, by the deviations (n,) of its motions, radians and metres."""
+    moved = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in motions]).T
+    uneven = [each["uneven"] for each in motions]
+    off = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in uneven]).T
+    if np.all(np.median(moved / [w, d], axis=1) < _TOLD):
+        return "The rig stands still."
+    verb = "coasts" if np.all(np.median(off / [w, d], axis=1) < _TOLD) else "shakes or changes its speed"
+    turn, shift = np.median(off, axis=1)
+    return (
+        f"The rig {verb}: within a period it leaves an even motion by {np.rad2deg(turn):.2g} deg and "
+        f"{1000.0 * shift:.2g} mm, root mean square, in the median."
+    )
+
+
+def _drawing(numbers: FloatArray, values: FloatArray, bridged: Sequence[int], title: str) -> Markup:
+    """Three lines over the frames, with bars where windows are bridged."""
+    low, high = float(np.min(values)), float(np.max(values))
+    spread = max(high - low, 1e-9)
+    low, high = low - 0.05 * spread, high + 0.05 * spread
+
+    def across(number: FloatArray | float) -> FloatArray:
+        return np.asarray(_LEFT + (number - numbers[0]) / (numbers[-1] - numbers[0]) * (_WIDE - _LEFT - 10.0))
+
+    def down(value: FloatArray | float) -> FloatArray:
+        return np.asarray(_TOP + (high - value) / (high - low) * (_HIGH - _TOP - 40.0))
+
+    bars = [
+        f'<rect x="{across(k):.1f}" y="{_TOP}" width="{across(k + 1.0) - across(float(k)):.1f}" '
+        f'height="{_HIGH - _TOP - 40.0}" fill="#c8ced4"/>'
+        for k in bridged
+        if k < numbers[-1]
+    ]
+    lines = []
+    for column, colour in zip(values.T, _AXIS_COLOURS.values(), strict=True):
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across(numbers), down(column), strict=True))
+        lines.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
+    ticks = [
+        f'<text x="{_LEFT - 6}" y="{down(each) + 4:.1f}" text-anchor="end">{each:.3g}</text>'
+        f'<line x1="{_LEFT}" x2="{_WIDE - 10}" y1="{down(each):.1f}" y2="{down(each):.1f}" stroke="#d8dde2"/>'
+        for each in np.linspace(float(np.min(values)), float(np.max(values)), 4)
+    ]
+    ends = "".join(
+        f'<text x="{across(each):.1f}" y="{_HIGH - 14}" text-anchor="middle">{each:.0f}</text>'
+        for each in (numbers[0], numbers[-1])
+    )
+    middle = 0.5 * (_LEFT + _WIDE)
+    title = f'<text x="{middle}" y="{_HIGH - 14}" text-anchor="middle">{title}, by frame</text>'
+    inner = "".join([*bars, *ticks, *lines, ends, title])
+    return Markup(f'<svg viewBox="0 0 {_WIDE} {_HIGH}" font-size="11" role="img">{inner}</svg>')
+
 
 _COLOURS = {
     Origin.NOBODY: (200, 40, 40),

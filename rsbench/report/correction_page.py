@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from numpy.typing import NDArray
 
-from rsbench.benchmark.studies.correction_methods import METHODS, ON_REQUEST, methods_among
-from rsbench.benchmark.studies.correction_study import ROW_BANDS
-from rsbench.benchmark.studies.correction_summary import (
+from rsbench.benchmark.statistics import share_interval
+from rsbench.benchmark.studies.correction_bench import METHODS, ON_REQUEST, methods_among
+from rsbench.benchmark.studies.correction_study import (
+    ROW_BANDS,
     by_scene,
     law_and_size,
     loss_to_true_motion,
     masks,
     verdict,
 )
-from rsbench.report import pages
+from rsbench.benchmark.studies.real_cameras import BEYOND, kept_sequences
+from rsbench.benchmark.studies.sgm_timing import DELAYS
+from rsbench.report import pictures
+
+
+def markdown(template: str, **values: Any) -> str:
+    """Text of a Markdown template of ``rsbench.report``; a value that the template lacks is an error."""
+    environment = Environment(
+        loader=PackageLoader("rsbench.report"), undefined=StrictUndefined, keep_trailing_newline=True
+    )
+    return environment.get_template(template).render(**values)
+
 
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
@@ -58,7 +74,7 @@ def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFr
         summary, sequences: as of ``by_law`` and ``by_sequence``.
         motions: errors of the estimated motions, a row for each sequence.
     """
-    return pages.markdown(
+    return markdown(
         "laws-correction.md.j2",
         methods=methods_among(set(summary["method"])),
         tables=[law_table(summary, size) for size in SIZES],
@@ -86,7 +102,7 @@ def worst_table(sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
 def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
     """The page as Markdown."""
     strata = list(dict.fromkeys(summary["stratum"]))
-    return pages.markdown(
+    return markdown(
         "correction.md.j2",
         strata=", ".join(strata),
         methods=methods_among(set(summary["method"])),
@@ -127,7 +143,7 @@ def _sections(images: pd.DataFrame, summary: pd.DataFrame, stratum: str) -> dict
         f"Covered by every method: {100 * mask['median']:.0f} % of the pixels at the median view, "
         f"{100 * mask['least']:.0f} % at the least."
     )
-    table = _table(summary[summary["stratum"] == stratum])
+    table = _correction_table(summary[summary["stratum"] == stratum])
     scores, gains = _scene_tables(by_scene(own))
     return {"stratum": stratum, "mask": said, "table": table, "scenes": scores, "gains": gains}
 
@@ -149,7 +165,7 @@ def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
     return "\n".join(scores), "\n".join(gains)
 
 
-def _table(summary: pd.DataFrame) -> str:
+def _correction_table(summary: pd.DataFrame) -> str:
     names = (
         "method",
         "PSNR covered (dB)",
@@ -242,5 +258,189 @@ def _draw_rows(rows: pd.DataFrame, path: Path) -> Path:
             axes.grid(True, which="major", linewidth=0.3)
         panels[0].set_ylabel("mean flow error (px)")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+        figure.savefig(path, metadata={"Date": None})
+    return path
+
+
+_CAMERAS = ("ideal", "real")
+_GAP = 8
+_LONGEST = 560
+
+
+def write_real_page(folder: Path, card: dict[str, Any]) -> Path:
+    """README.md from motions.csv and summary.csv in ``folder``; ``card`` is that of the real camera's dataset."""
+    summary, motions = pd.read_csv(folder / "summary.csv"), pd.read_csv(folder / "motions.csv")
+    page = folder / "README.md"
+    page.write_text(real_page(summary, motions, card), "utf-8", newline="\n")
+    return page
+
+
+def real_page(summary: pd.DataFrame, motions: pd.DataFrame, card: dict[str, Any]) -> str:
+    """The page as Markdown."""
+    return markdown(
+        "real.md.j2",
+        table=_table(summary),
+        errors=_errors(summary),
+        kept={camera: _kept(motions, camera) for camera in _CAMERAS},
+        beyond=BEYOND,
+        seeds=int(summary["seeds"].min()),
+        camera=card["camera"],
+        exposure_ms=1e3 * card["sensor"]["exposure_s"],
+        period_ms=1e3 * card["frame_period_s"],
+        readout=card["readout_ratio"],
+    )
+
+
+def _kept(motions: pd.DataFrame, camera: str) -> str:
+    found = kept_sequences(motions, camera)
+    low, high = share_interval(found.kept, found.sequences)
+    return f"{found.kept} of {found.sequences} sequences (95 % interval of the share: {low:.2f} to {high:.2f})"
+
+
+def _pairs(summary: pd.DataFrame) -> list[tuple[str, pd.Series, pd.Series]]:
+    """Scene and stratum with the rows of both cameras."""
+    found = []
+    for (scene, stratum), group in summary.groupby(["scene", "stratum"], sort=False):
+        ideal, real = (group[group["camera"] == camera].iloc[0] for camera in _CAMERAS)
+        found.append((f"{scene}, {stratum}", ideal, real))
+    return found
+
+
+def _table(summary: pd.DataFrame) -> str:
+    lines = [
+        "| scene, motion | e_R (deg): ideal, real | e_T (deg): ideal, real | PSNR (dB), ideal: before, after "
+        "| real: before, after | real, clean: after | drawn |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, ideal, real in _pairs(summary):
+        cells = [name, *(f"{ideal[e]:.3f}, {real[e]:.3f}" for e in ("e_R_deg", "e_T_deg"))]
+        cells += [f"{row['psnr_none']:.1f}, {row['psnr_median']:.1f}" for row in (ideal, real)]
+        cells += [f"{real['psnr_clean_median']:.1f}", f"{real['coverage']:.1%}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _errors(summary: pd.DataFrame) -> str:
+    lines = [
+        "| scene, motion | camera | failed | e_R of the worst seed (deg) | e_T of the worst seed (deg) "
+        "| largest error in stated sigmas | PSNR of that seed (dB) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, *rows in _pairs(summary):
+        for row in rows:
+            cells = [name, row["camera"], f"{row['failures']} of {row['sequences'] * row['seeds']}"]
+            cells += [f"{row['e_R_worst_deg']:.3f}", f"{row['e_T_worst_deg']:.3f}", f"{row['sigmas']:.1f}"]
+            cells.append(f"{row['psnr_worst']:.1f}")
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def draw_frames(frames: dict[str, NDArray[np.uint8]], path: Path) -> Path:
+    """Pictures of one size side by side, each under its name."""
+    small = [pictures.label(pictures.shrink(frame, _LONGEST).copy(), name) for name, frame in frames.items()]
+    white = np.full((small[0].shape[0], _GAP, 3), 255, dtype=np.uint8)
+    row = [part for image in small for part in (image, white)][:-1]
+    path.write_bytes(pictures.encode_jpeg(np.asarray(cv2.hconcat(row), dtype=np.uint8)))
+    return path
+
+
+_STYLES = {"mild": ("#0072B2", "o"), "moderate": ("#D55E00", "s"), "aggressive": ("#009E73", "^")}
+
+
+def write_sgm_page(folder: Path) -> list[Path]:
+    """README.md and sgm.svg from sgm.csv in ``folder``; returns the files."""
+    table = pd.read_csv(folder / "sgm.csv")
+    page = folder / "README.md"
+    page.write_text(sgm_page(table), "utf-8", newline="\n")
+    return [page, _draw(table, folder / "sgm.svg")]
+
+
+def sgm_page(table: pd.DataFrame) -> str:
+    """The page as Markdown."""
+    delayed, opposite = table[~table["opposite"]], table[table["opposite"]]
+    none = delayed[delayed["delay"] == 0.0]
+    worst = delayed.sort_values("vertical_px").iloc[-1]
+    before = none[(none["sequence"] == worst["sequence"]) & (none["stratum"] == worst["stratum"])].iloc[0]
+    return markdown(
+        "sgm.md.j2",
+        table=_markdown(table),
+        floor_low=none["error_px"].min(),
+        floor_high=none["error_px"].max(),
+        lost_rows=worst["vertical_px"],
+        lost_where=f"{worst['stratum']}, {worst['sequence']}",
+        lost_share=100 * (1 - worst["coverage"] / before["coverage"]),
+        opposite_low=100 * opposite["coverage"].min(),
+        opposite_high=100 * opposite["coverage"].max(),
+        tolerable=_tolerable(delayed),
+        **_underestimate(delayed),
+    )
+
+
+def _underestimate(delayed: pd.DataFrame) -> dict[str, Any]:
+    """Where the first-order formula, with the matcher's own error, falls short most."""
+    floors = delayed[delayed["delay"] == 0.0].set_index(["stratum", "sequence"])["error_px"]
+    later = delayed[delayed["delay"] > 0.0]
+    floor = floors.loc[list(zip(later["stratum"], later["sequence"], strict=True))].to_numpy()
+    ratio = later["error_px"] / np.hypot(later["predicted_px"], floor)
+    worst = later.loc[ratio.idxmax()]
+    return {"short_factor": ratio.max(), "short_where": f"{worst['stratum']}, {worst['sequence']}"}
+
+
+def _tolerable(delayed: pd.DataFrame) -> str:
+    """Delay of 0.1 px per sequence: the predicted error is proportional to it."""
+    longest = delayed[delayed["delay"] == max(DELAYS)]
+    parts = []
+    for _, row in longest.iterrows():
+        delay = 0.1 * row["delay"] / row["predicted_px"]
+        parts.append(f"{delay:.4f} frame periods ({row['stratum']}, {row['sequence']})")
+    return ", ".join(parts)
+
+
+def _markdown(table: pd.DataFrame) -> str:
+    names = {
+        "stratum": "motion",
+        "sequence": "sequence",
+        "timing": "right camera",
+        "coverage": "coverage",
+        "error_px": "error (px)",
+        "predicted_px": "predicted (px)",
+        "unexplained_px": "unexplained (px)",
+        "vertical_px": "rows",
+        "depth_error_m": "depth error (m)",
+        "over_2m": "> 2 m",
+    }
+    lines = ["| " + " | ".join(names.values()) + " |", "|" + "---|" * len(names)]
+    for _, row in table.iterrows():
+        cells = []
+        for name in names:
+            value = row[name]
+            cells.append(f"{value:.3f}" if isinstance(value, float) else str(value))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _draw(table: pd.DataFrame, path: Path) -> Path:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    delayed = table[~table["opposite"]]
+    with rc_context({"font.size": 8, "svg.hashsalt": "rsbench", "svg.fonttype": "none"}):
+        figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+        axes = figure.add_subplot()
+        for (stratum, sequence), rows in delayed.groupby(["stratum", "sequence"], sort=False):
+            colour, marker = _STYLES[str(stratum)]
+            floor = float(rows[rows["delay"] == 0.0]["error_px"].iloc[0])
+            later = rows[rows["delay"] > 0.0]
+            filled = str(sequence).startswith("castle")
+            label = f"{stratum}, {sequence}"
+            axes.plot(later["delay"], (later["predicted_px"] ** 2 + floor**2) ** 0.5, color=colour, linewidth=0.9)
+            style: dict[str, Any] = {"color": colour, "marker": marker, "linestyle": "none", "markersize": 4}
+            axes.plot(
+                later["delay"], later["error_px"], label=label, fillstyle="full" if filled else "none", **style
+            )
+        axes.set(xscale="log", yscale="log", xlabel="delay of the right camera (frame periods)")
+        axes.set_ylabel("median disparity error (px)")
+        axes.grid(True, which="major", linewidth=0.3)
+        axes.legend(fontsize=7, frameon=False)
         figure.savefig(path, metadata={"Date": None})
     return path

@@ -537,7 +537,7 @@ def _arguments(folder: Path) -> Loader:
 
 def _results(inputs: Path, results: dict[str, Path], folder: Path) -> Iterator[Loader]:
     from rsbench.benchmark.images.evaluation import read_headings, read_scores
-    from rsbench.benchmark.simulated.sweep_summary import read_card, summarise_sweep
+    from rsbench.benchmark.simulated.run_sweep import read_card, summarise_sweep
     from rsbench.dataset.corrected_frames import fresh_folder
     from rsbench.report.evaluation_page import write_report
 

@@ -12,9 +12,8 @@ import pytest
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
-from rsbench.benchmark.simulated.run_sweep import run_sweep
+from rsbench.benchmark.simulated.run_sweep import run_sweep, summarise_sweep
 from rsbench.benchmark.simulated.sweep_card import load_sweep
-from rsbench.benchmark.simulated.sweep_summary import summarise_sweep
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "reference" / "score-files.md").read_text("utf-8")
 

@@ -11,11 +11,16 @@ from evo.core import metrics
 from evo.core.metrics import PoseRelation, StatisticsType
 from evo.core.trajectory import PoseTrajectory3D
 
-from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Given, along, chained, pnp_motion
 from rsbench.benchmark.trajectory_scores import (
+    METHODS,
+    Estimate,
+    Given,
     TrueTrajectory,
     absolute_error,
+    along,
+    chained,
     jitter,
+    pnp_motion,
     relative_errors,
     trajectory_scores,
     turn_errors,

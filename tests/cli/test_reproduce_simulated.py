@@ -12,13 +12,13 @@ import pandas as pd
 import pytest
 
 from rsbench.benchmark.simulated import run_sweep, sweep_card
-from rsbench.benchmark.studies import readings
+from rsbench.benchmark.studies import claims
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.cli import reproduce as command
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.pipeline.isolated_components import SolverRunner
-from rsbench.report import fig3
-from rsbench.report.fig3 import SWEEPS
+from rsbench.report import paper_figures
+from rsbench.report.paper_figures import SWEEPS
 
 
 @pytest.mark.slow
@@ -43,12 +43,12 @@ def test_claims_and_figure_come_from_the_stored_tables(tmp_path: Path, monkeypat
                 yield job.part
 
     monkeypatch.setattr(sweep_card, "load_sweep", short)
-    monkeypatch.setattr(readings, "SETTINGS", {"points": (9, 20), "baseline": (0.2, 0.6)})
-    monkeypatch.setattr(readings, "GRID_TRIALS", 2)
+    monkeypatch.setattr(claims, "SETTINGS", {"points": (9, 20), "baseline": (0.2, 0.6)})
+    monkeypatch.setattr(claims, "GRID_TRIALS", 2)
     for name in ("SOLVER_READINGS", "NINE_READINGS"):
-        chosen = tuple(one for one in getattr(readings, name) if str(one) in ("literal", "symmetric"))
-        monkeypatch.setattr(readings, name, chosen)
-    monkeypatch.setattr(fig3, "_draw", touch)  # test_fig3 draws: it takes seconds
+        chosen = tuple(one for one in getattr(claims, name) if str(one) in ("literal", "symmetric"))
+        monkeypatch.setattr(claims, name, chosen)
+    monkeypatch.setattr(paper_figures, "_draw_fig3", touch)  # test_fig3 draws: it takes seconds
     monkeypatch.setattr(run_sweep, "_run_all", run_here)  # starting processes would take most of the time
     out, data = tmp_path / "results", tmp_path / "data"
     reproduce(Target.claims, out, data, workers=2)

@@ -19,7 +19,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rsbench.benchmark.recorded_corrections import correction_scores, pairs_with_truth
+from rsbench.benchmark.recordings import correction_scores, pairs_with_truth
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES

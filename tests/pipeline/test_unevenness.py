@@ -12,7 +12,7 @@ from rsbench.components.motion_models import make_motion
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray, exp
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.report.trajectory_picture import draw_trajectory
+from rsbench.report.corrected_page import draw_trajectory
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import RobustEstimate
 

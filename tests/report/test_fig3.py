@@ -13,8 +13,8 @@ import pytest
 from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.studies.claims import READINGS
 from rsbench.core.errors import RsbenchError
-from rsbench.report import fig3
-from rsbench.report.fig3 import SWEEPS, draw_fig3, setting_table
+from rsbench.report import paper_figures
+from rsbench.report.paper_figures import SWEEPS, draw_fig3, setting_table
 
 SOLVERS = {"rs-stereo-linear": 0.5, "rs-stereo-refined-pairs": 0.01, "gs-8pt": 1.0, "somebody-elses": 0.3}
 
@@ -39,8 +39,8 @@ def write_summaries(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_equal_summaries_give_equal_bytes_without_dates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fig3, "READINGS", {"1e-3 px": 1e-3})  # each figure takes seconds
-    monkeypatch.setattr(fig3, "CENTRES", ("mean",))
+    monkeypatch.setattr(paper_figures, "READINGS", {"1e-3 px": 1e-3})  # each figure takes seconds
+    monkeypatch.setattr(paper_figures, "CENTRES", ("mean",))
     drawn = []
     for name in ("a", "b"):
         folder = tmp_path / name

@@ -19,7 +19,7 @@ from rsbench.benchmark.studies.fig4_panels import (
 )
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import read_dataset
-from rsbench.report.fig4 import INVENTED, caption, depth_scale, draw_fig4, few_colours, panel_images
+from rsbench.report.paper_figures import INVENTED, caption, depth_scale, draw_fig4, few_colours, panel_images
 from rsbench.report.pictures import INVALID
 from rsbench.solvers.linear import LinearSolver
 from rsbench.vision.quality import psnr

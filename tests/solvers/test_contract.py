@@ -15,8 +15,16 @@ import numpy as np
 import pytest
 from commands import run_here
 
-from rsbench.benchmark.simulated.contract import CHECKS, RIG, D, Finding, W, check_solver, degenerate_cases
-from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.benchmark.simulated.contract import (
+    CHECKS,
+    RIG,
+    D,
+    Finding,
+    W,
+    check_solver,
+    degenerate_cases,
+    misreading,
+)
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset

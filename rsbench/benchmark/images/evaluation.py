@@ -3,26 +3,249 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from rsbench.benchmark.images.kept_scores import KeptScores, Row, kept_scores_file
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
-from rsbench.benchmark.images.repeats import repeat, repeats_of
-from rsbench.benchmark.images.score import AFTER, KEYS, TABLES
-from rsbench.benchmark.images.sequence_jobs import Scores, SequenceJob, done_apart, isolated
-from rsbench.benchmark.metric_plugins import DepthCase, ImageCase, PoseCase
+from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, KeptScores, Row, Scorer, kept_scores_file
+from rsbench.benchmark.metric_plugins import (
+    METRICS,
+    Case,
+    Column,
+    DepthCase,
+    ImageCase,
+    Metric,
+    MetricEntry,
+    PoseCase,
+    load_metrics,
+)
 from rsbench.benchmark.provenance import dataset_record, provenance
+from rsbench.benchmark.scoring import score
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.jobs.process_jobs import Workers
-from rsbench.pipeline.isolated_components import Isolation, SolverRunner
+from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.process_jobs import Workers, finished_jobs
+from rsbench.pipeline.isolated_components import Caller, Isolation, SolverRunner, entrys_own
 from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
 from rsbench.storage.work_folder import work_folder
+
+
+def isolated_metrics(isolation: Isolation, metrics: tuple[MetricEntry, ...]) -> tuple[MetricEntry, ...]:
+    """The same metrics, those of other packages answering from a child."""
+    return tuple(isolation.wrap(METRICS, metric, _serve_metric, (), _Isolated) for metric in metrics)
+
+
+class _Isolated(Metric):
+    def __init__(self, original: Metric, call: Caller) -> None:
+        self.case, self._columns, self._call = original.case, original.columns, call
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        return self._columns
+
+    def compute(self, case: Case) -> Mapping[str, float]:
+        found: Mapping[str, float] = self._call(case)
+        return found
+
+
+# In the child
+
+
+def _serve_metric(place: str) -> Callable[..., object]:
+    with entrys_own():
+        (entry,) = load_metrics([place])
+
+    def answer(case: Case) -> dict[str, float]:
+        with entrys_own():
+            return score(entry, case)
+
+    return answer
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceJob:
+    """What is to be done of one sequence."""
+
+    sequence: str
+    predict: bool
+    score: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Of one sequence."""
+
+    rows: dict[str, list[Row]]
+    """Of each table."""
+    stale: list[str]
+    """Predictions on disk that are not current, and not scored."""
+
+    @classmethod
+    def of(cls, places: Places, plan: Plan, kept: KeptScores) -> Scores:
+        """What is stored and current; ``kept`` are those of the sequence that were computed before."""
+        scorer = Scorer(places, plan, kept)
+        scorer.score()
+        return cls(rows=scorer.rows, stale=scorer.stale)
+
+
+def isolated(plan: Plan, isolation: Isolation) -> Plan:
+    """The plan with other packages' components in child processes."""
+    return replace(plan, chain=isolation.chain(plan.chain), metrics=isolated_metrics(isolation, plan.metrics))
+
+
+def done_apart(
+    dataset: Path,
+    out: Path,
+    options: EvaluationOptions,
+    jobs: list[SequenceJob],
+    workers: Workers,
+    hashes: FileHashes,
+) -> Iterator[tuple[SequenceJob, Scores | None]]:
+    """Jobs as they are done, each in a child process of one thread; with the scores that they ask for.
+
+    ``hashes`` gets those of the files that the children have read.
+
+    Raises:
+        RsbenchError: a dataset, a stored prediction or an entry is at fault.
+        LostJobsError: see ``finished_jobs``.
+    """
+    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
+    done = finished_jobs(
+        _serve_sequences, jobs, workers, one_thread, dataset, out, options, name=lambda job: job.sequence
+    )
+    with closing(done) as found:
+        for job, (scores, lines) in found:
+            hashes.append(lines)
+            yield job, None if scores is None else _collected(**scores)
+
+
+def _collected(rows: dict[str, list[Row]], stale: list[str]) -> Scores:
+    """A child's answer; its words are those of others, so that ten thousand answers hold each once."""
+
+    def once(value: Any) -> Any:
+        return sys.intern(value) if isinstance(value, str) else value
+
+    shared = {
+        table: [{once(k): once(v) for k, v in row.items()} for row in found] for table, found in rows.items()
+    }
+    return Scores(rows=shared, stale=stale)
+
+
+def _serve_sequences(
+    dataset: Path, out: Path, options: EvaluationOptions
+) -> Callable[[SequenceJob], tuple[dict[str, Any] | None, list[str]]]:
+    """What does the jobs, in a child: the fields of ``Scores``, and the hashes that are new."""
+    use_one_thread()
+    try:
+        sequences = {each.name: each for each in read_pairs(dataset)}
+        plan = make_plan(options, list(sequences.values()))
+    except RsbenchError as error:
+        raise EntryFailure(str(error)) from error
+    runner, plan = SolverRunner(single_thread=True), isolated(plan, Isolation())  # as long as this process
+    hashes = FileHashes(dataset, out / HASHES)  # the parent has forgotten them, if that was asked
+
+    def run(job: SequenceJob) -> tuple[dict[str, Any] | None, list[str]]:
+        sequence, folder = sequences[job.sequence], out / "predictions" / job.sequence
+        scores = None
+        try:
+            if job.predict:
+                Bench(sequence, folder, plan, runner, hashes.sha256).predict(lambda word: None)
+            if job.score:
+                kept = KeptScores(kept_scores_file(out, job.sequence), options.rehash)
+                scores = vars(Scores.of(Places(sequence, folder, plan.chain, hashes.sha256), plan, kept))
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+        return scores, hashes.taken()
+
+    return run
+
+
+Job = tuple[str, str, int]
+"""Names of sequence and solver, and the number of the samples."""
+
+
+def repeats_of(plan: Plan) -> list[Job]:
+    """What is planned beside the first motion of each solver; what takes long is begun early."""
+    return [
+        (sequence, solver.name, seed)
+        for solver in sorted(plan.solvers, key=lambda entry: entry.name, reverse=True)
+        if solver.name in plan.solver_names
+        for sequence in sorted(plan.sequence_names)
+        for seed in range(1, plan.seeds)
+    ]
+
+
+def repeat(
+    dataset: Path,
+    out: Path,
+    options: EvaluationOptions,
+    plan: Plan,
+    sequences: list[Sequence],
+    hashes: FileHashes,
+    step: Step,
+    workers: Workers,
+) -> None:
+    """Make the motions of ``repeats_of`` that are not current, with the matches that are stored.
+
+    Raises:
+        RsbenchError: a solver cannot be loaded.
+        LostJobsError: see ``finished_jobs``.
+    """
+    with SolverRunner() as runner:
+        benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner, hashes.sha256) for s in sequences}
+        entries = {entry.name: entry for entry in plan.solvers}
+        todo = []
+        for sequence, solver, seed in repeats_of(plan):
+            bench = benches[sequence]
+            if bench.stands(bench.places.motion(entries[solver], seed)):
+                step(f"{sequence}: {solver}")
+            else:
+                todo.append((sequence, solver, seed))
+    if not todo:
+        return
+    hashes.flush()
+    processes = (os.cpu_count() or 1) if workers == 1 else workers
+    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
+    with closing(finished_jobs(_serve, todo, processes, one_thread, dataset, out, options, name=_name)) as found:
+        for (sequence, solver, _), _ in found:
+            step(f"{sequence}: {solver}")
+
+
+def _name(job: Job) -> str:
+    sequence, solver, seed = job
+    return f"{sequence}, {solver}, seed {seed}"
+
+
+def _serve(dataset: Path, out: Path, options: EvaluationOptions) -> Callable[[Job], None]:
+    """What repeats, in a child."""
+    use_one_thread()
+    try:
+        sequences = read_pairs(dataset)
+        plan = make_plan(options, sequences)
+    except RsbenchError as error:
+        raise EntryFailure(str(error)) from error
+    runner = SolverRunner(single_thread=True)  # as long as this process
+    hashes = FileHashes(dataset, out / HASHES)
+    benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner, hashes.sha256) for s in sequences}
+    entries = {entry.name: entry for entry in plan.solvers}
+
+    def run(job: Job) -> None:
+        sequence, solver, seed = job
+        try:
+            benches[sequence].move(entries[solver], seed)
+        except RsbenchError as error:
+            raise EntryFailure(str(error)) from error
+
+    return run
+
 
 _CASES = {"pose": PoseCase, "depth": DepthCase, "correction": ImageCase}
 

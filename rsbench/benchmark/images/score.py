@@ -1,47 +1,132 @@
 """Scores of stored predictions against the truth; no solver runs here.
 
-Those of depth and of corrected frames are kept (``kept_scores``); those of motions take no time.
+Those of depth and of corrected frames are kept (``KeptScores``); those of motions take no time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property, partial
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.images.kept_scores import (
-    KeptScores,
-    Row,
-    ScoredPart,
-    hash_of_prediction,
-    metric_keys,
-    scoring_version,
-)
-from rsbench.benchmark.images.plan import (
-    NONE,
-    Places,
-    Plan,
-    stored_corrections,
-    stored_depths,
-    stored_motions,
-)
+from rsbench.benchmark.images.plan import NONE, Places, Plan, stored_corrections, stored_depths, stored_motions
 from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pairs
 from rsbench.benchmark.images.store import Artefact, identity_of, read_seconds
 from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
+from rsbench.benchmark.provenance import numeric_version, package_version
 from rsbench.benchmark.scoring import answered, score
+from rsbench.components.imports import hash_of_files
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, Side, View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs
-from rsbench.storage.files import read_png
+from rsbench.storage.files import read_json, read_png, sha256, write_bytes
+from rsbench.storage.work_folder import HIDDEN
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Origin
 from rsbench.vision.stereo_depth import seen_by_other
+
+Row = dict[str, Any]
+_PACKAGES = ("flip-evaluator", "matplotlib", "OpenEXR")
+"""Packages that scores and pictures come from, beside those that predictions come from."""
+
+
+def kept_scores_file(out: Path, sequence: str) -> Path:
+    """Where an evaluation in ``out`` keeps the scores of a sequence."""
+    return out / HIDDEN / "scores" / f"{sequence}.json"
+
+
+@cache
+def scoring_version() -> dict[str, str]:
+    """What decides a score beside its inputs: all of our source, and the packages below it."""
+    package = Path(str(resources.files("rsbench")))
+    return {
+        **numeric_version(),
+        **{name: package_version(name) for name in _PACKAGES},
+        "source": hash_of_files(package, sorted(package.rglob("*.py"))),
+    }
+
+
+def metric_keys(metrics: Iterable[MetricEntry], case: type[Case]) -> list[list[str]]:
+    """Names and keys of the metrics that read such cases, in their order."""
+    return [[metric.name, metric.key] for metric in metrics if metric.component.case is case]
+
+
+def hash_of_prediction(files: Iterable[Path]) -> str:
+    """Of the bytes of a prediction's files; one that is not there counts too."""
+    found = [f"{path.name} {sha256(path) if path.is_file() else 'is not there'}" for path in files]
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class ScoredPart:
+    """The scores of one prediction."""
+
+    rows: list[Row]
+    failures: list[Row]
+    """What the table of failures gets."""
+
+
+class KeptScores:
+    """Those of one sequence, by the name of the prediction, in one file; None as the file keeps nothing."""
+
+    def __init__(self, path: Path | None = None, forget: bool = False) -> None:
+        """
+        Args:
+            path: of the file; need not exist.
+            forget: what it holds is not used.
+        """
+        self._path = path
+        self._before = {} if path is None or forget else _read(path)
+        self._now: dict[str, Mapping[str, Any]] = {}
+
+    def find(self, name: str, key: str) -> ScoredPart | None:
+        """What is kept of a prediction under this key."""
+        found = self._before.get(name)
+        if found is None or found["key"] != key:
+            return None
+        self._now[name] = found
+        return ScoredPart(found["rows"], found["failures"])
+
+    def keep(self, name: str, key: str, part: ScoredPart) -> None:
+        self._now[name] = {"key": key, "rows": part.rows, "failures": part.failures}
+
+    def save(self) -> None:
+        """Write what was found or kept by this object; the rest is of predictions that are gone or stale."""
+        if self._path is None or self._now == self._before:
+            return
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        text = _text(self._now)
+        write_bytes(self._path, f'{{"sha256": "{_digest(text)}", "parts": {text}}}\n'.encode())
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The parts that a file holds; none where it is not there, or not as it was written."""
+    try:
+        content = read_json(path)
+        parts = content["parts"]
+        return dict(parts) if _digest(_text(parts)) == content["sha256"] else {}
+    except (RsbenchError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def _text(parts: Mapping[str, Any]) -> str:
+    return json.dumps(parts)  # with NaN and Infinity, which Python reads again
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
 
 TABLES = ("pose", "depth", "correction", "failures", "seconds")
 KEYS = {

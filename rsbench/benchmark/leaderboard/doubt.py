@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.track import ORACLE, Header, Split
 from rsbench.benchmark.statistics import share_interval
-from rsbench.benchmark.trajectory_methods import METHODS
+from rsbench.benchmark.trajectory_scores import METHODS
 from rsbench.components.cards import list_cards
 from rsbench.core.errors import RsbenchError
 

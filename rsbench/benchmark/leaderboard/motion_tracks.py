@@ -50,7 +50,7 @@ from rsbench.benchmark.leaderboard.track import (
 from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound
-from rsbench.benchmark.simulated.convention_errors import misreading
+from rsbench.benchmark.simulated.contract import misreading
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.capture.model_choice import AUTO
 from rsbench.components.motion_models import TwistMotion

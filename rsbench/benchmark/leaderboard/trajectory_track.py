@@ -38,8 +38,17 @@ from rsbench.benchmark.leaderboard.track import (
     Truth,
     score_row,
 )
-from rsbench.benchmark.trajectory_methods import METHODS, Estimate, Given, along
-from rsbench.benchmark.trajectory_scores import AUC_DEG, LINES, TrueTrajectory, scored_times, trajectory_scores
+from rsbench.benchmark.trajectory_scores import (
+    AUC_DEG,
+    LINES,
+    METHODS,
+    Estimate,
+    Given,
+    TrueTrajectory,
+    along,
+    scored_times,
+    trajectory_scores,
+)
 from rsbench.components.cards import choices
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError

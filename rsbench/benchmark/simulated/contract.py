@@ -6,16 +6,20 @@ linearised one must come nearer to the truth as the motion becomes smaller.
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from types import TracebackType
+from typing import Any, Literal
 
 import numpy as np
 
-from rsbench.benchmark.simulated.contract_subject import BrokenContractError, Subject
-from rsbench.benchmark.simulated.convention_errors import misreading
 from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, Simulation, SimulationOptions, simulate
 from rsbench.components.motion_models import make_motion
+from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -23,7 +27,196 @@ from rsbench.core.pose_errors import rotation_error, scale_error, translation_er
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import BESIDE, SENSORS, MotionEstimate, SolverEntry
+from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, one_line
+from rsbench.pipeline.isolated_components import checked_estimate
+from rsbench.solvers.engine.base import (
+    BESIDE,
+    SENSORS,
+    MotionEstimate,
+    Solver,
+    SolverEntry,
+    SolverSpec,
+    load_solver_entry,
+)
+
+_CLOSE = 0.2
+"""Of the motion's angle, and in radians of direction: nearer to one misreading than any two are to each other."""
+
+
+def misreading(
+    w: FloatArray, d: FloatArray, true_w: FloatArray, true_d: FloatArray, rig: StereoRig, point: str
+) -> str | None:
+    """The mistake that would turn the true motion into the given one; None when no usual one does.
+
+    Args:
+        w, d: (3,) the solver's motion.
+        true_w, true_d: (3,) the body's true motion.
+        rig: where the cameras are.
+        point: the point whose translation the solver says ``d`` is.
+    """
+    # Of the angle of rotation, and in radians.
+    errors = {
+        words: max(
+            float(rotation_error(w, wrong_w)) / max(float(np.linalg.norm(true_w)), 1e-12),
+            float(translation_error(d, wrong_d)),
+        )
+        for words, (wrong_w, wrong_d) in _misreadings(true_w, true_d, rig, point).items()
+    }
+    words = min(errors, key=lambda key: errors[key])
+    return words if words and errors[words] < _CLOSE else None
+
+
+def _misreadings(
+    w: FloatArray, d_body: FloatArray, rig: StereoRig, point: str
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """What each mistake makes of the true motion; the empty words are the truth itself."""
+    points = {"body": d_body}
+    for side in ("left", "right"):
+        points[side] = translation_of_offset(w, d_body, rig.offset(side))
+    d = points[point]
+    found = {
+        "": (w, d),
+        "w is inverted: X_body = exp([w]x) X_world + d, with the body that has moved": (-w, d),
+        "d is inverted: X_body = exp([w]x) X_world + d, with the body that has moved": (w, -d),
+        "w and d both have the opposite sign": (-w, -d),
+        "it is the inverse motion: give the pose of the body in frame 1, not of the world in it": (
+            -w,
+            -so3.exp(-w) @ d,
+        ),
+        "it has the paper's axes (down, right, forward): swap x and y, and change the sign of w": (
+            -w[[1, 0, 2]],
+            d[[1, 0, 2]],
+        ),
+        "x and y are swapped": (w[[1, 0, 2]], d[[1, 0, 2]]),
+        "it has axes with y up and z backward: y is down and z forward here": (w * [1, -1, -1], d * [1, -1, -1]),
+        "it is mirrored: its axes are left-handed (y up, z forward?)": (w * [-1, 1, -1], d * [1, -1, 1]),
+        "w is in degrees: give radians": (np.rad2deg(w), d),
+    }
+    for other, value in points.items():
+        if other != point:
+            whose = "body" if other == "body" else f"{other} camera"
+            found[f"d is the translation of the {whose}, but the spec says reference_point = {point!r}"] = w, value
+    return found
+
+
+class BrokenContractError(Exception):
+    """What a solver did that it must not do, in one line."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Answer:
+    """What one call of ``estimate`` gave and did."""
+
+    estimate: MotionEstimate
+    changed: tuple[str, ...] = ()
+    """Sets of matches that it wrote into."""
+    printed: str = ""
+
+
+class Subject:
+    """A solver whose answers are checked; use as a context manager.
+
+    An entry of another package runs in a child process, so that it may hang, exit or crash.
+    """
+
+    def __init__(self, entry: SolverEntry, *, isolated: bool, time_limit_s: float) -> None:
+        """
+        Args:
+            entry: the solver.
+            isolated: whether it runs in a child process.
+            time_limit_s: for one problem, in a child process.
+        """
+        self.entry = entry
+        self.spec: SolverSpec = entry.solver.spec
+        self.changed: set[str] = set()
+        self.printed = ""
+        self.hung = False
+        """Whether a problem took longer than the limit."""
+        self._time_limit_s = time_limit_s
+        self._worker: IsolatedWorker | None = None
+        if isolated:
+            place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
+            self._worker = IsolatedWorker(_serve, place, classes=(Answer, MotionEstimate))
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        """A valid answer.
+
+        Raises:
+            BrokenContractError: it raised, took too long, ended its process, or the answer is not valid.
+        """
+        if self._worker is None:
+            try:
+                answer = _looked_at(self.entry.solver, correspondences, rig, shutter)
+            except EntryFailure as error:
+                raise BrokenContractError(str(error)) from error
+        else:
+            start = time.monotonic()
+            outcome = self._worker.call(correspondences, rig, shutter, limit_s=self._time_limit_s)
+            self.printed = self.printed or outcome.output
+            if not outcome.success:
+                self.hung = time.monotonic() - start >= self._time_limit_s
+                raise BrokenContractError(outcome.reason)
+            answer = outcome.value
+        self.changed |= set(answer.changed)
+        self.printed = self.printed or answer.printed
+        self._check(answer.estimate)
+        return answer.estimate
+
+    def _check(self, estimate: MotionEstimate) -> None:
+        """What ``checked_estimate`` leaves open."""
+        if not estimate.success and not estimate.reason:
+            raise BrokenContractError("returned a failure without a reason")
+        if estimate.success and estimate.metric and not self.spec.metric:
+            raise BrokenContractError("returned metric = True, but its spec says metric = False")
+        if estimate.covariance is not None:
+            least = np.linalg.eigvalsh(estimate.covariance).min()
+            if least < -1e-12 * np.abs(estimate.covariance).max():
+                raise BrokenContractError(f"returned a covariance with the eigenvalue {least:.1e}")
+
+    def __enter__(self) -> Subject:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
+        if self._worker is not None:
+            self._worker.close()
+
+
+def _serve(place: str) -> Callable[..., object]:
+    """What answers in the child."""
+    try:
+        solver = load_solver_entry(place).solver
+    except BaseException as error:
+        raise EntryFailure(one_line(error)) from error
+
+    def answer(*arguments: Any) -> Answer:
+        return _looked_at(solver, *arguments)
+
+    return answer
+
+
+def _looked_at(
+    solver: Solver, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+) -> Answer:
+    """One answer, and what the call printed and changed.
+
+    Raises:
+        EntryFailure: it raised, or its answer is no valid one.
+    """
+    given = Correspondences(**vars(correspondences))  # arrays of its own, which refuse to be written
+    before = {field.name: getattr(given, field.name).tobytes() for field in fields(given)}
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            estimate = solver.estimate(given, rig, shutter)
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise EntryFailure(f"raised {one_line(error)}") from error
+    changed = tuple(name for name, content in before.items() if getattr(given, name).tobytes() != content)
+    return Answer(estimate=checked_estimate(estimate), changed=changed, printed=printed.getvalue()[:200])
+
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ROLLING = RollingShutter(height=900, readout_ratio=0.8)

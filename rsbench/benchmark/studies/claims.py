@@ -6,37 +6,341 @@ reading; it is refuted only where the most favourable one fails.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
-from typing import Any
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import pandas as pd
 
-from rsbench.benchmark.studies.claim_rules import (
-    MEASURES,
-    SCALE_MARGIN,
-    SUFFICIENT_SHARE,
-    TINY,
-    UNCHANGED,
-    UNIQUE_SHARE,
-    Centre,
-    Check,
-    Series,
-    always_better,
-    beats_one_camera,
-    both_grow,
-    enough_solved,
-    hardly_changes,
-    more_stable,
-    no_worse,
-    one_solution,
-    scale_known,
-    series,
-    small_increase,
-    verdict,
+from rsbench.benchmark.simulated.sweep_card import SweepCard, Variant
+from rsbench.benchmark.statistics import in_words, share_interval
+from rsbench.core.errors import RsbenchError
+from rsbench.storage.files import write_bytes
+
+MEASURES = ("e_R", "e_T")
+Centre = Literal["mean", "median"]
+TINY = 0.25
+"""Margin of an increase, as a share of what the eight-point algorithm errs without noise."""
+UNCHANGED = 1.5
+"""Margin of no change, as the quotient of the largest error and the smallest."""
+SUFFICIENT_SHARE, UNIQUE_SHARE = 0.9, 0.95
+SCALE_MARGIN = 0.1
+"""Margin of a known scale: the median of abs(log(estimated / true length of d))."""
+
+
+class Figure(NamedTuple):
+    """A statistic with its 95 % interval, of no width where it is exact; NaN where the matches do not tell it."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "not observable"
+        return f"{self.value:.3g}" if self.low == self.high else in_words(*self)
+
+
+class Check(NamedTuple):
+    """Whether a claim holds at one value of the axis, or for one quantity; None: the intervals leave it open."""
+
+    label: str
+    holds: bool | None
+    value: float | None = None
+    """Value of the axis, where the checks go over values."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Figures over the values of a sweep, in order of the values."""
+
+    values: tuple[float, ...]
+    figures: Mapping[str, tuple[Figure, ...]]
+    """``e_R`` and ``e_T`` in degrees, their root mean squares ``rms_R`` and ``rms_T`` with the bounds ``bound_R``
+    and ``bound_T`` of these, the median ``e_s``, and the shares of the trials ``solved`` and ``answered``."""
+    labels: tuple[str, ...] = ()
+    """Names of the values where these are no numbers."""
+
+    def __getitem__(self, measure: str) -> tuple[Figure, ...]:
+        return self.figures[measure]
+
+    def at(self, k: int, measures: Sequence[str]) -> str:
+        """The figures at the k-th value in words."""
+        where = self.labels[k] if self.labels else f"{self.values[k]:g}"
+        return f"{where}: " + ", ".join(f"{name} {self.figures[name][k]}" for name in measures)
+
+    def checks(self, holds: Sequence[bool | None], first: int = 0) -> list[Check]:
+        """One check per value from the first on."""
+        if self.labels:
+            return [Check(label, good) for label, good in zip(self.labels[first:], holds, strict=True)]
+        return [Check(f"{v:g}", good, v) for v, good in zip(self.values[first:], holds, strict=True)]
+
+
+def series(table: pd.DataFrame, solver: str, variant: str, centre: Centre) -> Series:
+    """Figures of a solver in one variant of a summary.
+
+    Raises:
+        RsbenchError: the summary does not have them.
+    """
+    rows = table[(table.solver == solver) & (table.variant == variant)].sort_values("value")
+    if rows.empty:
+        raise RsbenchError(f"the summary holds no rows of solver {solver!r} and variant {variant!r}")
+    ends = ("", "_low", "_high")
+    columns = {
+        **{name: [f"{name}_{centre}{end}" for end in ends] for name in MEASURES},
+        "e_s": [f"e_s_median{end}" for end in ends],
+        "solved": ["success_share", "success_low", "success_high"],
+    }
+    figures = {
+        name: tuple(Figure(*map(float, numbers)) for numbers in rows[keys].to_numpy(dtype=float))
+        for name, keys in columns.items()
+    }
+    for letter in "RT":
+        bounds = rows[f"e_{letter}_bound"].to_numpy(dtype=float)
+        quotients = rows[[f"e_{letter}_over_bound{end}" for end in ends]].to_numpy(dtype=float)
+        figures[f"rms_{letter}"] = tuple(Figure(*map(float, row)) for row in bounds[:, None] * quotients)
+        figures[f"bound_{letter}"] = tuple(Figure(*[float(bound)] * 3) for bound in bounds)
+    answered = [(int(n), int(n - f)) for n, f in zip(rows.trials, rows.failures, strict=True)]
+    figures["answered"] = tuple(Figure(good / n, *share_interval(good, n)) for n, good in answered)
+    labels = tuple(map(str, rows.label)) if "label" in rows else ()
+    return Series(tuple(map(float, rows.value)), figures, labels)
+
+
+def verdict(checks: Sequence[Check], axis: str) -> str:
+    """ "holds", "fails", "undecided" or where which of them: at values of the axis, or for quantities."""
+    parts = {
+        word: [check for check in checks if check.holds is holds]
+        for word, holds in (("holds", True), ("undecided", None), ("fails", False))
+    }
+    present = {word: part for word, part in parts.items() if part}
+    if len(present) == 1:
+        return next(iter(present))
+    shown = [word for word in ("holds", "undecided") if word in present]
+    return "; ".join(
+        f"{word}{' only' if word == 'holds' else ''} {_where(present[word], checks, axis)}" for word in shown
+    )
+
+
+def _where(good: Sequence[Check], checks: Sequence[Check], axis: str) -> str:
+    values = [check.value for check in good if check.value is not None]
+    if len(values) < len(good):
+        return f"for {', '.join(check.label for check in good)}"
+    if list(good) == list(checks[: len(good)]):
+        return f"if {axis} <= {values[-1]:g}"
+    if list(good) == list(checks[-len(good) :]):
+        return f"if {axis} >= {values[0]:g}"
+    return f"if {axis} is {', '.join(f'{value:g}' for value in values)}"
+
+
+def better(a: Figure, b: Figure) -> bool | None:
+    """Smaller or not; None when the intervals overlap. What can be observed is better than what cannot."""
+    if math.isnan(a.value) or math.isnan(b.value):
+        return None if math.isnan(a.value) and math.isnan(b.value) else math.isnan(b.value)
+    return True if a.high < b.low else False if b.high < a.low else None
+
+
+def within(low: float, high: float, margin: float) -> bool | None:
+    """Whether an interval lies below a margin; None when it lies across."""
+    return True if high <= margin else False if low > margin else None
+
+
+def all_of(parts: Sequence[bool | None]) -> bool | None:
+    """False if one fails, None if one is undecided."""
+    return False if False in parts else None if None in parts else True
+
+
+def small_increase(ours: Series, other: Series) -> list[Check]:
+    """At each value but the smallest, errors have risen by less than ``TINY`` of the other's at the smallest."""
+    later = range(1, len(ours.values))
+    rises = [[_rise(ours[m], k, TINY * other[m][0].value) for m in MEASURES] for k in later]
+    return ours.checks([all_of(rise) for rise in rises], 1)
+
+
+def _rise(figures: Sequence[Figure], k: int, margin: float) -> bool | None:
+    first, now = figures[0], figures[k]
+    return within(now.low - first.high, now.high - first.low, margin)
+
+
+def always_better(ours: Series, other: Series) -> list[Check]:
+    """At each value both errors are smaller than the other's."""
+    return _at_each(ours, other, better)
+
+
+def more_stable(ours: Series, other: Series) -> list[Check]:
+    """Per error: its range over the values is smaller than the other's."""
+    return [Check(m, better(_range(ours[m]), _range(other[m]))) for m in MEASURES]
+
+
+def both_grow(ours: Series, other: Series) -> list[Check]:
+    """Per solver and error: larger at the last value than at the first, and nowhere falling."""
+    sides = (("RS", ours), ("GS", other))
+    return [Check(f"{m} of {who}", _grows(s[m])) for who, s in sides for m in MEASURES]
+
+
+def _grows(figures: Sequence[Figure]) -> bool | None:
+    falls = any(better(b, a) for a, b in pairwise(figures))
+    return False if falls else better(figures[0], figures[-1])
+
+
+def hardly_changes(ours: Series, other: Series) -> list[Check]:
+    """Per error: the largest is at most ``UNCHANGED`` times the smallest."""
+    checks = []
+    for m in MEASURES:
+        small, large = (extreme(ours[m], key=lambda figure: figure.value) for extreme in (min, max))
+        low, high = large.low / max(small.high, 1e-300), large.high / max(small.low, 1e-300)
+        checks.append(Check(m, within(low, high, UNCHANGED)))
+    return checks
+
+
+def no_worse(ours: Series, other: Series) -> list[Check]:
+    """At each value both errors are at most ``UNCHANGED`` times the other's."""
+    return _at_each(ours, other, _quotient)
+
+
+def _at_each(ours: Series, other: Series, holds: Callable[[Figure, Figure], bool | None]) -> list[Check]:
+    places = range(len(ours.values))
+    return ours.checks([all_of([holds(ours[m][k], other[m][k]) for m in MEASURES]) for k in places])
+
+
+def _quotient(a: Figure, b: Figure) -> bool | None:
+    return within(a.low / max(b.high, 1e-300), a.high / max(b.low, 1e-300), UNCHANGED)
+
+
+def enough_solved(ours: Series, other: Series) -> list[Check]:
+    """At each value the share of solved trials is at least ``SUFFICIENT_SHARE``."""
+    return ours.checks([_at_least(share, SUFFICIENT_SHARE) for share in ours["solved"]])
+
+
+def one_solution(ours: Series, other: Series) -> list[Check]:
+    """At each value the share of trials with one solution is at least ``UNIQUE_SHARE``."""
+    return ours.checks([_at_least(share, UNIQUE_SHARE) for share in ours["answered"]])
+
+
+def scale_known(ours: Series, other: Series) -> list[Check]:
+    """At each value the median of e_s is at most ``SCALE_MARGIN``."""
+    known = [not math.isnan(f.value) and within(f.low, f.high, SCALE_MARGIN) for f in ours["e_s"]]
+    return ours.checks(known)
+
+
+def beats_one_camera(ours: Series, other: Series) -> list[Check]:
+    """Per error at the first value: root mean square below the bound of the other's matches, of one camera."""
+    return [Check(f"e_{m}", better(ours[f"rms_{m}"][0], other[f"bound_{m}"][0])) for m in "RT"]
+
+
+def _at_least(share: Figure, least: float) -> bool | None:
+    return True if share.low >= least else False if share.high < least else None
+
+
+def _range(figures: Sequence[Figure]) -> Figure:
+    values = [figure.value for figure in figures]
+    if any(map(math.isnan, values)):
+        return Figure(math.inf, math.inf, math.inf)
+    small, large = (extreme(figures, key=lambda figure: figure.value) for extreme in (min, max))
+    return Figure(large.value - small.value, max(large.low - small.high, 0.0), large.high - small.low)
+
+
+SETTINGS: dict[str, tuple[Any, Any]] = {
+    "depth": ((2.0, 10.0), (5.0, 50.0)),
+    "rotation_deg": (0.5, 5.0),
+    "translation": (0.1, 1.0),
+    "baseline": (0.2, 0.6),
+    "points": (9, 100),
+}
+"""Settings that the paper leaves open; a sweep's own axis is left out of its grid."""
+GRID_NOISE_PX, GRID_TRIALS = 1e-3, 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """One way to read the paper's solver; the fields are parameters of ``LinearSolver``, by default literal."""
+
+    scaling: str = "none"
+    baseline_unit: str = "metre"
+    extraction: str = "full"
+    sign: str = "cheirality"
+    scale: str = "rotation"
+    sampling: str = "all"
+    terms: str = "second"
+
+    def __str__(self) -> str:
+        """What differs from the literal reading."""
+        literal = asdict(LITERAL)
+        words = [f"{name} by {v}" if name in ("scale", "sign") else v for name, v in asdict(self).items()]
+        changed = [word for word, (name, v) in zip(words, asdict(self).items(), strict=True) if v != literal[name]]
+        return ", ".join(changed) or "literal"
+
+    @property
+    def name(self) -> str:
+        """Of its solver card."""
+        return f"reading-{str(self).replace(', ', '-').replace(' ', '-')}"
+
+    @property
+    def complete(self) -> Reading:
+        """The same with all 27 unknowns."""
+        return replace(self, terms="third")
+
+
+LITERAL = Reading()
+_A_AND_UNIT = (("none", "metre"), ("none", "half-baseline"), ("unit-columns", "metre"))
+"""Columns of unit length undo the unit of the baseline."""
+_EXTRACTIONS = ("full", "symmetric")
+SOLVER_READINGS = (
+    *(Reading(scaling=a, baseline_unit=unit, extraction=e) for (a, unit), e in product(_A_AND_UNIT, _EXTRACTIONS)),
+    *(Reading(extraction=extraction, sign="scale") for extraction in _EXTRACTIONS),
 )
-from rsbench.benchmark.studies.readings import LITERAL, Reading
+"""What e_R and e_T feel, given more matches than unknowns; the literal one first."""
+NINE_READINGS = tuple(r for r in SOLVER_READINGS if (r.scaling, r.baseline_unit) == _A_AND_UNIT[0])
+"""With nine matches per camera A X = 0 has an exact solution, which no scaling changes."""
+APART = tuple(Reading(extraction=extraction, sampling="nine-apart") for extraction in _EXTRACTIONS)
+"""Nine of a hundred matches, as far apart as can be."""
+
+
+def readings_of(sweep: str, points: int | None) -> tuple[Reading, ...]:
+    """The readings that a sweep is run with; ``points`` per camera, None where the sweep varies them."""
+    found = NINE_READINGS if points == 9 else SOLVER_READINGS
+    cheirality = [reading for reading in found if reading.sign == "cheirality"]
+    if sweep == "noise":
+        found += tuple(replace(reading, scale="constraint") for reading in cheirality)
+    if sweep == "rotation" and points == 100:
+        found += tuple(reading.complete for reading in found)
+    return (*found, *APART) if points == 100 else found
+
+
+def write_cards(folder: Path, readings: tuple[Reading, ...]) -> tuple[str, ...]:
+    """Paths of solver cards below ``folder``, one per reading."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for reading in readings:
+        path = folder / f"{reading.name}.toml"
+        lines = ['class = "rsbench.solvers.linear:LinearSolver"', f'description = "{reading}"', "[parameters]"]
+        lines += [f'{name} = "{value}"' for name, value in asdict(reading).items()]
+        write_bytes(path, ("\n".join(lines) + "\n").encode())
+        paths.append(str(path))
+    return tuple(paths)
+
+
+def settings_card(card: SweepCard, solvers: tuple[str, ...]) -> SweepCard:
+    """A sweep once per setting of the grid, at the paper's noise in pixels.
+
+    The grid is half of all corners, such that each two choices meet equally often (a half fraction).
+    """
+    fields = {name: values for name, values in SETTINGS.items() if name != card.axis}
+    variants = []
+    for corner in product((0, 1), repeat=len(fields)):
+        if sum(corner) % 2:
+            continue
+        setting = {name: values[k] for (name, values), k in zip(fields.items(), corner, strict=True)}
+        name = ", ".join(f"{key} {value}" for key, value in setting.items())
+        if card.axis != "noise_px":
+            setting["noise_px"] = GRID_NOISE_PX
+        variants.append(Variant(name=name, setting=setting))
+    values = tuple(v for v in card.values if card.axis != "noise_px" or v <= GRID_NOISE_PX)
+    return replace(card, solvers=solvers, variant=tuple(variants), trials=GRID_TRIALS, values=values)
+
 
 OURS, GLOBAL = "rs-stereo-refined-pairs", "gs-8pt"
 READINGS = {"1e-3 px": 1e-3, "0.81 px": 0.81}

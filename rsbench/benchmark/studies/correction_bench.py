@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.store import identity_of
+from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.studies.correction_methods import ON_REQUEST
-from rsbench.benchmark.studies.layer_methods import asked_layers
-from rsbench.benchmark.studies.resumable_rows import Row
-from rsbench.benchmark.studies.rotation_methods import asked_rotation
 from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.components.imports import hash_of_files
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry
+from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, VIEWS, Side, View
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, View
+from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
 from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion, model_to_use
+from rsbench.pipeline.layered_scene import LayersCorrector
 from rsbench.pipeline.one_camera import (
     ZhuangCorrector,
     depth_alone,
@@ -32,10 +39,233 @@ from rsbench.pipeline.one_camera import (
     solved_alone,
 )
 from rsbench.solvers.engine.base import load_solver_entry
+from rsbench.storage.files import sha256, write_json
+from rsbench.storage.untrusted_files import read_json
 from rsbench.vision.correction import correction_flow
-from rsbench.vision.corrector import load_corrector
+from rsbench.vision.corrector import CorrectionProblem, load_corrector
 from rsbench.vision.correctors import plane_depth
-from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.fusion import Fused, Origin, inpaint
+from rsbench.vision.rotation_correctors import ImageRotationCorrector
+
+Row = dict[str, Any]
+Rows = tuple[list[Row], list[Row], list[Row]]
+"""Scores of every method on every view, errors by row band, motion errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumableRows:
+    """A file for each sequence, current while code, packages, data, seed and solver are what they were."""
+
+    folder: Path
+    dataset: Path
+    seed: int
+    solver: str
+    others: tuple[str, ...] = ()
+    """Methods beside the published ones."""
+
+    def read(self, name: str) -> Rows | None:
+        """What was stored of a sequence; None when there is nothing current."""
+        try:
+            record = read_json(self._file(name))
+        except RsbenchError:
+            return None
+        if record.get("identity") != self._identity(name):
+            return None
+        images, bands, motions = ([_with_nan(row) for row in table] for table in record["tables"])
+        return images, bands, motions
+
+    def write(self, name: str, rows: Rows) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        tables = [[_without_nan(row) for row in table] for table in rows]
+        write_json(self._file(name), {"identity": self._identity(name), "tables": tables})
+
+    def _file(self, name: str) -> Path:
+        return self.folder / f"{name}.json"
+
+    def _identity(self, name: str) -> str:
+        benchmark = Path(str(resources.files("rsbench"))) / "benchmark"
+        return identity_of(
+            numeric=numeric_version(),
+            studies=hash_of_files(benchmark, sorted(benchmark.rglob("*.py"))),
+            sequence=sha256(self.dataset / name / "sequence.json"),
+            seed=self.seed,
+            solver=self.solver,
+            others=self.others,
+        )
+
+
+def _without_nan(row: Row) -> Row:
+    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+
+
+def _with_nan(row: Row) -> Row:
+    return {key: math.nan if value is None else value for key, value in row.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """One line of the table."""
+
+    key: str
+    title: str
+    kind: str
+    """``none``, ``baseline``, ``ours``, ``law`` (ours, told a law of motion) or ``oracle``."""
+    knows: str
+    """What it assumes or is given."""
+    slow_scores: bool = False
+    """Whether FLIP and the SSIM of others' protocols are computed: of the best of each family."""
+
+
+METHODS = (
+    Method(key="none", title="uncorrected", kind="none", knows="nothing", slow_scores=True),
+    Method(key="gyro", title="rotation only, true", kind="baseline", knows="true rotation, as of a perfect gyro"),
+    Method(key="rotation", title="rotation only, estimated", kind="baseline", knows="our rotation; no depth"),
+    Method(
+        key="gs",
+        title="GS motion, SGM depth",
+        kind="baseline",
+        knows="motion solved as if the shutter was global; depth as ours, with that motion",
+    ),
+    Method(
+        key="gs-scaled",
+        title="GS motion of scaled matches, SGM depth",
+        kind="baseline",
+        knows="`gs-stereo-tracks-scaled`: motion as if the shutter was global, of matches scaled to one "
+        "frame period by their rows, which suits a twist; depth as ours, with that motion",
+        slow_scores=True,
+    ),
+    Method(
+        key="gs-mono",
+        title="monocular GS of scaled matches",
+        kind="baseline",
+        knows="one camera, two frames: `gs-poselib-scaled`, the strongest monocular solver that knows no rolling "
+        "shutter but in the scale of its matches; depth from dense flow in the same unit",
+    ),
+    Method(
+        key="mono",
+        title="monocular, constant velocity",
+        kind="baseline",
+        knows="one camera, two frames: its motion up to scale (descending from ours), depth from dense flow in "
+        "the same unit",
+        slow_scores=True,
+    ),
+    Method(
+        key="plane",
+        title="one plane",
+        kind="baseline",
+        knows="our motion; the plane that fits SGM depth best",
+        slow_scores=True,
+    ),
+    Method(
+        key="ours",
+        title="ours",
+        kind="ours",
+        knows="estimated motion, of the law that the matches prefer; SGM depth, and depth from the motion where "
+        "SGM finds none",
+        slow_scores=True,
+    ),
+    Method(key="linear", title="ours, linear", kind="law", knows="the same, told that the motion is `linear`"),
+    Method(key="twist", title="ours, twist", kind="law", knows="the same, told that the motion is a `twist`"),
+    Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion; depth as ours"),
+    Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
+    Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
+)
+ON_REQUEST = (
+    Method(
+        key="gyroscope",
+        title="rotation only, measured",
+        kind="baseline",
+        knows="what the gyroscope of the channel `imu` measured, with its noise, bias and clock; no depth",
+    ),
+    Method(
+        key="zhuang",
+        title="monocular, Zhuang et al.",
+        kind="baseline",
+        knows="one camera, two frames: its motion by `rs-zhuang-8pt`, depth from dense flow in the same unit",
+    ),
+    Method(
+        key="vasu-layers",
+        title="monocular, Vasu et al.",
+        kind="baseline",
+        knows="one camera, two frames: planes of one depth each, and its motion, in turn",
+    ),
+    Method(key="lao-lines", title="lines, Lao et al.", kind="baseline", knows="one image: curves that were lines"),
+    Method(
+        key="purkait-manhattan",
+        title="Manhattan, Purkait et al.",
+        kind="baseline",
+        knows="one image: lines along three orthogonal directions",
+    ),
+)
+"""Methods that a study has when it is asked for them: docs/explanation/correctors.md compares them."""
+
+
+def methods_among(keys: Collection[str]) -> list[Method]:
+    """The methods of these keys, in the order of tables."""
+    return [method for method in (*METHODS, *ON_REQUEST) if method.key in keys]
+
+
+def asked_layers(
+    key: str, sequence: Sequence, images: Mapping[View, NDArray[Any]], matches: Correspondences, seed: int
+) -> dict[View, tuple[Fused, NDArray[np.float32]]]:
+    """Whole pictures, and where each pixel (H, W, 2) moves, px, of the cameras that did not fail.
+
+    Raises:
+        RsbenchError: there is no such card.
+        ValueError: the card is of another corrector.
+    """
+    corrector = load_corrector(key).component
+    if not isinstance(corrector, LayersCorrector):
+        raise ValueError(f"{key!r} is no corrector of layers")
+    corrector = replace(corrector, seed=seed)
+    problem = CorrectionProblem(
+        images=images,
+        rig=sequence.rig,
+        shutter=sequence.shutter,
+        target_row=0.0,
+        motion=None,
+        depth=None,
+        guess=None,
+        matches=matches,
+    )
+    found: dict[View, tuple[Fused, NDArray[np.float32]]] = {}
+    for side in SIDES:
+        scene = corrector.scene(problem, side)
+        if isinstance(scene, str):
+            continue
+        for frame in FRAMES:
+            fused = corrector.rendered(problem, (side, frame), scene)
+            rig, shutter, _, motion = scene.camera
+            flow = correction_flow(scene.depth(frame), FixedGeometry(rig, shutter, motion), (side, frame))
+            whole = inpaint(fused.image, fused.origin == Origin.NOBODY)
+            found[side, frame] = replace(fused, image=whole), flow
+    return found
+
+
+def asked_rotation(key: str, sequence: Sequence, images: Mapping[View, NDArray[Any]], view: View) -> Motion | None:
+    """The rotation of a frame by the gyroscope, or by the card of a corrector of one image; None when it fails.
+
+    Raises:
+        RsbenchError: the sequence has no channel imu, or no such card.
+        ValueError: the card is of a corrector that needs more than the image.
+    """
+    if key == "gyroscope":
+        return GyroMotion(gyro_samples(sequence.inertial(), sequence.frame_period_s), np.zeros(3))
+    corrector = load_corrector(key).component
+    if not isinstance(corrector, ImageRotationCorrector):
+        raise ValueError(f"{key!r} is no corrector of one image")
+    problem = CorrectionProblem(
+        images=images,
+        rig=sequence.rig,
+        shutter=sequence.shutter,
+        target_row=0.0,
+        motion=None,
+        depth=None,
+        guess=None,
+    )
+    motion = corrector.rotation(problem, view)
+    return motion if isinstance(motion, Motion) else None
+
 
 Depth = NDArray[np.float32]
 _SCALED, _MONOCULAR = "gs-stereo-tracks-scaled", "gs-poselib-scaled"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from rsbench.benchmark.statistics import median_and_quartiles
-from rsbench.benchmark.studies.claim_rules import Check, verdict
+from rsbench.benchmark.studies.claims import Check, verdict
 from rsbench.benchmark.studies.fig4_panels import LITERAL
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import one_line

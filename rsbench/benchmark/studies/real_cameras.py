@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.studies.resumable_rows import ResumableRows, Row
+from rsbench.benchmark.studies.correction_bench import ResumableRows, Row
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion

@@ -13,14 +13,13 @@ from typing import Any
 import pytest
 from evaluations import QUICK, contents, evaluate
 
-from rsbench.benchmark.images import kept_scores, score
-from rsbench.benchmark.images.kept_scores import KeptScores, Row, kept_scores_file
+from rsbench.benchmark.images import score
 from rsbench.benchmark.images.plan import Places, Plan, make_plan
-from rsbench.benchmark.images.score import Scorer
+from rsbench.benchmark.images.score import KeptScores, Row, Scorer, kept_scores_file
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.report.sequence_pictures import write_pictures
+from rsbench.report.evaluation_page import write_pictures
 from rsbench.storage.files import read_png, sha256, write_png
 
 RECIPES = 5
@@ -97,14 +96,14 @@ def metric_of_images(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]
 
 
 def source(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
-    patch.setattr(kept_scores, "hash_of_files", lambda folder, files: "other")
-    kept_scores.scoring_version.cache_clear()
+    patch.setattr(score, "hash_of_files", lambda folder, files: "other")
+    score.scoring_version.cache_clear()
     return ALL
 
 
 def package(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
-    patch.setattr(kept_scores, "package_version", lambda name: "other")
-    kept_scores.scoring_version.cache_clear()
+    patch.setattr(score, "package_version", lambda name: "other")
+    score.scoring_version.cache_clear()
     return ALL
 
 
@@ -148,15 +147,15 @@ def test_a_change_of_anything_computes_what_depends_on_it(
         assert repr(rows) == repr(bench.rows())  # as text, in which NaN equals itself
     finally:
         monkeypatch.undo()
-        kept_scores.scoring_version.cache_clear()
+        score.scoring_version.cache_clear()
 
 
 def test_the_whole_source_counts() -> None:
     files: list[Path] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept_scores, "hash_of_files", lambda folder, found: files.extend(found) or "")
-        kept_scores.scoring_version.__wrapped__()
-    package = Path(kept_scores.__file__).parents[2]
+        patch.setattr(score, "hash_of_files", lambda folder, found: files.extend(found) or "")
+        score.scoring_version.__wrapped__()
+    package = Path(score.__file__).parents[2]
     assert set(files) == set(package.rglob("*.py"))
 
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.benchmark.images.kept_scores import Row
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, Recipe, make_plan
 from rsbench.benchmark.images.predict import Bench
-from rsbench.benchmark.images.score import Scorer
+from rsbench.benchmark.images.score import Row, Scorer
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.isolated_components import SolverRunner

@@ -37,9 +37,7 @@ from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
-from rsbench.report.board_entry import entry_context
-from rsbench.report.board_pictures import albums
-from rsbench.report.board_splits import read_split
+from rsbench.report.board_page import albums, entry_context, read_split
 from rsbench.storage.files import read_depth, read_png, read_table, write_depth, write_exr, write_png
 
 RIG, SHUTTER, MOTION = PLANES

@@ -16,7 +16,7 @@ from rsbench.benchmark.leaderboard.publishing import drawn_split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_truth
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
-from rsbench.benchmark.trajectory_methods import METHODS
+from rsbench.benchmark.trajectory_scores import METHODS
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError

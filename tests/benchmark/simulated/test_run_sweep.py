@@ -15,9 +15,16 @@ import pytest
 from commands import bytes_below
 
 from rsbench.benchmark.simulated import run_sweep as module
-from rsbench.benchmark.simulated.run_sweep import geometry_of, read_bounds, read_trials, run_sweep, sweep_steps
+from rsbench.benchmark.simulated.run_sweep import (
+    failure_reasons,
+    geometry_of,
+    read_bounds,
+    read_trials,
+    run_sweep,
+    summarise_sweep,
+    sweep_steps,
+)
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
-from rsbench.benchmark.simulated.sweep_summary import failure_reasons, summarise_sweep
 from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.epipolar import rs_sampson_error

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsbench.benchmark.simulated.sweep_card import Cell, Setting
-from rsbench.benchmark.simulated.sweep_summary import (
+from rsbench.benchmark.simulated.run_sweep import (
     at_bound,
     over_bound,
     score_trials,
     statistics,
     summary_row,
 )
+from rsbench.benchmark.simulated.sweep_card import Cell, Setting
 
 N = 40
 SETTING = Setting(

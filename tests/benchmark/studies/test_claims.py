@@ -11,16 +11,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsbench.benchmark.studies.claim_rules import (
+from rsbench.benchmark.studies.claims import (
+    ALL,
+    CLAIMS,
+    GLOBAL,
+    LITERAL,
+    MORE,
+    NINE,
+    OURS,
+    READINGS,
     Check,
     Figure,
     Series,
     always_better,
     beats_one_camera,
+    best_readings,
     better,
     both_grow,
     enough_solved,
     hardly_changes,
+    holding_settings,
+    judge_claims,
+    judge_settings,
     more_stable,
     no_worse,
     one_solution,
@@ -29,23 +41,8 @@ from rsbench.benchmark.studies.claim_rules import (
     small_increase,
     verdict,
 )
-from rsbench.benchmark.studies.claims import (
-    ALL,
-    CLAIMS,
-    GLOBAL,
-    MORE,
-    NINE,
-    OURS,
-    READINGS,
-    best_readings,
-    holding_settings,
-    judge_claims,
-    judge_settings,
-)
-from rsbench.benchmark.studies.readings import LITERAL
 from rsbench.core.errors import RsbenchError
-from rsbench.report.claims_page import claims_page
-from rsbench.report.readings_page import readings_page
+from rsbench.report.claim_pages import claims_page, readings_page
 
 SYMMETRIC = replace(LITERAL, extraction="symmetric")
 VALUES = (1.0, 2.0, 4.0)

@@ -9,21 +9,23 @@ import pandas as pd
 import pytest
 
 from rsbench.benchmark.studies import correction_study
-from rsbench.benchmark.studies.correction_methods import METHODS
-from rsbench.benchmark.studies.correction_study import ROW_BANDS, flow_error, study_dataset, study_sequence
-from rsbench.benchmark.studies.correction_summary import (
+from rsbench.benchmark.studies.correction_bench import METHODS, Rows
+from rsbench.benchmark.studies.correction_study import (
     EXTRA,
+    ROW_BANDS,
     SCORES,
     by_law,
     by_scene,
     by_sequence,
+    flow_error,
     loss_to_true_motion,
     masks,
+    study_dataset,
+    study_sequence,
     summarise,
     summarise_bands,
     verdict,
 )
-from rsbench.benchmark.studies.resumable_rows import Rows
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.report.correction_page import laws_page, study_page, write_study

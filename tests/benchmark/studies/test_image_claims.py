@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from rsbench.benchmark.studies.claim_rules import verdict
+from rsbench.benchmark.studies.claims import verdict
 from rsbench.benchmark.studies.image_claims import (
     IMAGE_CLAIMS,
     PUBLISHED,
@@ -20,7 +20,7 @@ from rsbench.benchmark.studies.image_claims import (
     stereo_corrects_better,
 )
 from rsbench.core.errors import RsbenchError
-from rsbench.report.claims_page import image_claims_page
+from rsbench.report.claim_pages import image_claims_page
 
 ROOT = Path(__file__).parents[3]
 

@@ -10,8 +10,8 @@ import pytest
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.benchmark.simulated.sweep_card import load_sweep
-from rsbench.benchmark.studies.claims import GLOBAL
-from rsbench.benchmark.studies.readings import (
+from rsbench.benchmark.studies.claims import (
+    GLOBAL,
     LITERAL,
     NINE_READINGS,
     SETTINGS,

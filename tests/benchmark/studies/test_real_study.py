@@ -18,7 +18,7 @@ from rsbench.benchmark.studies.real_cameras import (
 )
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
-from rsbench.report.real_page import real_page
+from rsbench.report.correction_page import real_page
 
 
 def _motions(sigmas: dict[str, list[float]], camera: str = "real") -> pd.DataFrame:

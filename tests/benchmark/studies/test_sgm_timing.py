@@ -16,7 +16,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.report.sgm_page import sgm_page, write_sgm_page
+from rsbench.report.correction_page import sgm_page, write_sgm_page
 
 CAMERA = PinholeCamera.centred(60, 50, 90.0)
 RIG = StereoRig(camera=CAMERA, baseline=0.3)

@@ -1,0 +1,239 @@
+"""The tables of claims as pages of Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from typing import Any
+
+import pandas as pd
+
+from rsbench.benchmark.simulated.sweep_card import SweepCard
+from rsbench.benchmark.statistics import in_words
+from rsbench.benchmark.studies.claims import CLAIMS, GLOBAL, GRID_NOISE_PX, GRID_TRIALS, OURS, SETTINGS, Claim
+from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
+
+_CLAIMS = f"""# What became of the paper's claims
+
+Simulated points, no RANSAC, as in section 3.1 of the paper; made by `rsbench reproduce claims`. Claims about
+images: [images.md](images.md).
+
+The paper leaves open how its solver is meant in places: how A is scaled (as it is | unit columns), the unit of
+the baseline in it (metre | half the baseline), what gives w (all of E | its symmetric part), the length of d
+(the entries of X that hold w alone | the exact constraint) and its sign (cheirality | the scale), and which
+nine matches are taken (any | nine of a hundred that stand far apart). `literal` is the reading without any of
+these; `best` is the most favourable verdict over all readings, and over mean and median. **A claim is refuted
+only where its best reading fails.** With 9 + 9 matches A X = 0 has an exact solution, which no scaling changes.
+The paper also leaves open in what its noise of "10^-3" is measured: both are here. What settings it does not
+state do to the verdicts: [../readings](../readings/README.md); what was chosen here:
+[../fig3/settings.csv](../fig3/settings.csv).
+
+Every verdict follows by the rule above its table, from the 95 % intervals in brackets (median: bootstrap of
+10 000 draws, exact order statistics below 30 trials; mean and root mean square, RMS: bootstrap; shares: exact).
+`undecided`: the intervals neither show that it holds nor that it fails. Margins were fixed before these runs, when
+results of an earlier version, under other rules, were known. Errors are in degrees; the paper's statistic is the
+mean. `ours` is `{OURS}`, which is given the same matches, but descends: the paper excludes that.
+GS is `{GLOBAL}`, which is given the left camera's matches and scored against the left camera's own translation.
+
+Read "more stable" and "no impact" beside the errors: a solver that errs as much everywhere passes both.
+"""
+
+
+def claims_page(table: pd.DataFrame, best: pd.DataFrame) -> str:
+    """Markdown: an overview, then per claim the paper's words, the rule, and verdicts with their figures."""
+    claims = [line for claim in CLAIMS for line in _claim(claim, table, best)]
+    return "\n".join([_CLAIMS, *summary(best), *_overview(best), *claims])
+
+
+def summary(best: pd.DataFrame) -> list[str]:
+    """The verdicts on the paper's solver, both readings of the noise side by side."""
+    lines = [
+        "| claim | matches | 10^-3 px: literal | best reading | 0.81 px: literal | best reading |",
+        f"|{'---|' * 6}",
+    ]
+    for (claim, matches), rows in best.groupby(["claim", "matches"], sort=False):
+        verdicts = [row[name] for row in rows.to_dict("records") for name in ("literal", "best")]
+        verdicts += ["-"] * (4 - len(verdicts))
+        lines.append(f"| {claim} | {matches} | {' | '.join(verdicts)} |")
+    return [*lines, ""]
+
+
+def _overview(best: pd.DataFrame) -> list[str]:
+    """The same with the share of the readings that hold, and ours."""
+    lines = ["| claim | matches | noise | literal | best reading | of the readings | ours |", f"|{'---|' * 7}"]
+    for row in best.to_dict("records"):
+        holding = f"{row['holding']} of {row['readings']} hold"
+        cells = (row["claim"], row["matches"], row["noise"], row["literal"], row["best"], holding, row["ours"])
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return [*lines, ""]
+
+
+def _claim(claim: Claim, table: pd.DataFrame, best: pd.DataFrame) -> list[str]:
+    lines = [f"## {claim.key[0].upper()}{claim.key[1:]}", "", f"{claim.text}.", "", f"Rule: {claim.rule}.", ""]
+    where, there = f"at the first and last {claim.axis}", "with 27 unknowns" if claim.against_complete else "GS"
+    if claim.beside:
+        there = "bound of one camera"
+    lines += [f"| matches | noise | statistic | solver | verdict | {where} | {there} there |", f"|{'---|' * 7}"]
+    own = table[table.claim == claim.key]
+    for case in best[best.claim == claim.key].to_dict("records"):
+        rows = own[(own.matches == case["matches"]) & (own.noise == case["noise"])]
+        chosen = rows.solver.isin(["literal", "ours"])
+        chosen |= (rows.solver == case["best_reading"]) & (rows.statistic == case["best_statistic"])
+        lines += [_claim_row(row, claim) for row in rows[chosen].to_dict("records")]
+    return [*lines, ""]
+
+
+def _claim_row(row: dict[str, str], claim: Claim) -> str:
+    figures, other = f"{row['first']}<br>{row['last']}", f"{row['other_first']}<br>{row['other_last']}"
+    if row["first"] == row["last"]:
+        figures, other = row["first"], row["other_first"]
+    cells = (row["matches"], row["noise"], row["statistic"], row["solver"], row["verdict"], figures)
+    return f"| {' | '.join(map(str, (*cells, '-' if claim.exact else other)))} |"
+
+
+_IMAGES = """# What became of the paper's claims about images
+
+Made by `rsbench reproduce image-claims` from the tables that results hold; each claim names its own. The limits of
+the rules were chosen when earlier results were known; the figures stand beside each verdict.
+"""
+
+
+def image_claims_page(table: pd.DataFrame) -> str:
+    """Markdown: the paper's words, the rule, and verdicts with their figures."""
+    lines = [_IMAGES]
+    for claim in IMAGE_CLAIMS:
+        lines += [f"## {claim.key[0].upper()}{claim.key[1:]}", "", f"{claim.text}.", ""]
+        lines += [f"Rule: {claim.rule}. From [{claim.table}](../{claim.table}).", ""]
+        lines += ["| who | verdict | figures |", "|---|---|---|"]
+        for row in table[table.claim == claim.key].to_dict("records"):
+            lines.append(f"| {row['who']} | {row['verdict']} | {row['figures']} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+_SETTINGS = f"""# The paper's claims in settings that it does not state
+
+Depth, rotation, translation, baseline and number of matches are the paper's to choose, and not stated. How
+often a claim holds throughout, and how often it fails throughout, on a grid of settings (half of all corners of
+the values below), at {GRID_NOISE_PX:g} px, {GRID_TRIALS} trials each, on the mean; the axis of a claim's sweep
+is left out of its grid. In the literal reading of the solver, and with w from the symmetric part of E. Verdicts
+in all readings at one setting: [../claims](../claims/README.md). All settings: [settings.csv](settings.csv).
+Made by `rsbench reproduce readings`.
+"""
+_UNITS = {
+    "depth": " (m)",
+    "rotation_deg": " (deg)",
+    "translation": " (m)",
+    "baseline": " (m)",
+    "points": " per camera",
+}
+
+
+def readings_page(settings: pd.DataFrame) -> str:
+    """Markdown from the table of ``claims.holding_settings``."""
+    grid = [f"- {name}{_UNITS.get(name, '')}: {low} or {high}" for name, (low, high) in SETTINGS.items()]
+    names = list(dict.fromkeys(settings.reading))
+    head = " | ".join(f"{name}: holds | fails" for name in names)
+    lines = [_SETTINGS, *grid, "", f"| claim | settings | {head} |", f"|---|---|{'---|---|' * len(names)}"]
+    for claim, rows in settings.groupby("claim", sort=False):
+        by_reading = rows.set_index("reading")
+        counts = [str(by_reading.loc[name, key]) for name in names for key in ("holding", "failing")]
+        lines.append(f"| {claim} | {rows.settings.iloc[0]} | {' | '.join(counts)} |")
+    return "\n".join([*lines, ""])
+
+
+_INTRODUCTION = """# Simulations beyond the paper
+
+Made by `rsbench reproduce sweeps`. One row per solver and value; `information` says which matches a solver was
+given (methods that see pairs and methods that see tracks through all four images are not on a par), `_low` and
+`_high` are 95 % intervals (bootstrap of 10 000 draws; shares: exact), failures score 180 degrees, `over_bound`
+is the root mean square error over its Cramer-Rao bound for that information, `bound_median` and `bound_mean` are
+those statistics of Gaussian errors at the bound, and `unobservable` names what the matches do not determine.
+Translations of solvers of the left camera are scored against that camera's own. Every row is one draw of its
+trials and none was drawn again: of the ratios of a solver at its bound one in forty lies below 1 with its
+interval, and rows that share scenes and noise, as all noises of one number of matches do, lie there together.
+
+| table | what | varies | noise (px) | trials | RANSAC |
+|---|---|---|---|---|---|
+"""
+SHOWN_NOISE_PX = 0.3
+
+
+def sweeps_page(cards: list[SweepCard], tables: Mapping[str, pd.DataFrame]) -> str:
+    """Markdown that says what each table holds, with the figures that README shows."""
+    lines = [*_solvers(tables["solvers"]), "", *_bound(tables["limit"]), "", *_wrong(tables["wrong-readout"])]
+    lines += ["", *_wrong_motion(tables["wrong-motion"])]
+    return _INTRODUCTION + "".join(_row(card) for card in cards) + "\n" + "\n".join(lines) + "\n"
+
+
+def _row(card: SweepCard) -> str:
+    noises = sorted({cell.setting.noise_px for cell in card.cells()})
+    noise = f"{noises[0]:g}" if len(noises) == 1 else f"{noises[0]:g} to {noises[-1]:g}"
+    ransac = "yes" if card.robust else "no"
+    cells = (f"[{card.name}]({card.name}.csv)", card.description, card.axis, noise, str(card.trials), ransac)
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _solvers(table: pd.DataFrame) -> list[str]:
+    """All solvers at one noise."""
+    rows = table[table.value == SHOWN_NOISE_PX]
+    lines = [
+        f"## All solvers at {SHOWN_NOISE_PX:g} px",
+        "",
+        f"2 deg, 0.3 m, 100 matches per camera, {rows.trials.iloc[0]} trials; medians with 95 % intervals.",
+        "",
+        "| solver | sees | e_R (deg) | e_T (deg) | RMS e_T over bound |",
+        "|---|---|---|---|---|",
+    ]
+    for row in rows.to_dict("records"):
+        cells = [_words(row, name) for name in ("e_R_median", "e_T_median", "e_T_over_bound")]
+        lines.append(f"| {row['solver']} | {row['information']} | {' | '.join(cells)} |")
+    return lines
+
+
+def _bound(table: pd.DataFrame) -> list[str]:
+    """Errors over the bound."""
+    lines = ["## Errors over the Cramer-Rao bound", "", "Root mean squares.", ""]
+    lines += ["| solver | noise | matches per camera | e_R over bound | e_T over bound |", "|---|---|---|---|---|"]
+    for row in table.to_dict("records"):
+        cells = [_words(row, name) for name in ("e_R_over_bound", "e_T_over_bound")]
+        lines.append(f"| {row['solver']} | {row['variant']} | {row['value']:g} | {' | '.join(cells)} |")
+    return lines
+
+
+def _wrong(table: pd.DataFrame) -> list[str]:
+    """Errors when the solver is told a wrong readout ratio."""
+    noise = "0.1 px, 2 deg, 0.3 m, 100 matches per camera, or tracks; medians."
+    lines = [
+        "## Told a wrong readout ratio",
+        "",
+        noise,
+        "",
+        "| solver | sees | told minus true | e_R (deg) | e_T (deg) |",
+    ]
+    lines.append("|---|---|---|---|---|")
+    for row in table.to_dict("records"):
+        cells = [_words(row, name) for name in ("e_R_median", "e_T_median")]
+        lines.append(f"| {row['solver']} | {row['information']} | {row['value']:g} | {' | '.join(cells)} |")
+    return lines
+
+
+def _wrong_motion(table: pd.DataFrame) -> list[str]:
+    """Errors when the data move otherwise than the solver assumes."""
+    solvers = list(table.solver.unique())
+    lines = [
+        "## Data of another motion model",
+        "",
+        "Median e_T (deg); 0.1 px, 0.3 m, 100 matches per camera, or tracks.",
+        "",
+        f"| data follow | rotation (deg) | {' | '.join(solvers)} |",
+        f"|---|---|{'---|' * len(solvers)}",
+    ]
+    for (variant, value), rows in table.groupby(["variant", "value"], sort=False):
+        cells = [_words(row, "e_T_median") for row in rows.to_dict("records")]
+        lines.append(f"| {variant} | {value:g} | {' | '.join(cells)} |")
+    return lines
+
+
+def _words(row: Mapping[Hashable, Any], name: str) -> str:
+    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
+    return "-" if pd.isna(value) else in_words(value, low, high)
