@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_input import EPILOG, GyroscopeOptions, given_frames, sized, target_row, with_found_camera
+from rsbench.cli.correct_input import EPILOG, GyroscopeOptions, given_frames, sized, target_row
 from rsbench.cli.correct_one_camera import (
     CameraFile,
     Footage,
@@ -173,6 +173,7 @@ def _correct_four(
     )
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
+    from rsbench.pipeline.sequence_capture import with_found_camera
     from rsbench.report.corrected_page import card_of
     from rsbench.vision.corrector import demand_corrected
 
@@ -182,7 +183,9 @@ def _correct_four(
     rig = sized(card, images["left", 0])
     options = replace(options, target_row=target_row(target, rig.camera.height))
     with fresh_folder(out) as folder:
-        rig, focal = with_found_camera(card, rig, [images], options)
+        rig, focal = with_found_camera(
+            rig, card.camera.sigma, [images], options, card.readout_ratio, card.scanning, progress_bar
+        )
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
                 images,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,6 @@ if TYPE_CHECKING:
     from rsbench.core.rig import StereoRig
     from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource, RigCard
-    from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 
 _MOST = 1e9
 
@@ -211,19 +209,3 @@ def sized(card: RigCard, image: Any) -> StereoRig:
         return card.rig(width, height)
     except ValueError as error:
         raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
-
-
-def with_found_camera(
-    card: RigCard, rig: StereoRig, windows: Iterable[Images], options: CorrectionOptions
-) -> tuple[StereoRig, str]:
-    """The rig with the focal length and k1 that frames show, where its card is not sure; and words, else empty."""
-    from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.sequence_capture import camera_of_frames
-
-    sigma = card.camera.sigma
-    if not sigma:
-        return rig, ""
-    with progress_bar("looking at the calibration", 1) as advance:
-        found = camera_of_frames(windows, rig, sigma, options, card.readout_ratio, card.scanning)
-        advance("")
-    return found.rig, found.words(rig, sigma)

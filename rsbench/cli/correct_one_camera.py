@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,12 +12,9 @@ from rsbench.cli.correct_input import GyroscopeOptions, target_row
 from rsbench.cli.correct_output import listed
 
 if TYPE_CHECKING:
-    from rsbench.capture.self_calibration import FoundFocal
-    from rsbench.core.camera import PinholeCamera
-    from rsbench.core.so3 import FloatArray
     from rsbench.pipeline.footage import FrameSource
-    from rsbench.pipeline.mono_camera import FoundShutter, OneCameraCard
-    from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions
+    from rsbench.pipeline.mono_camera import OneCameraCard
+    from rsbench.pipeline.mono_sequence import Gyroscope, KnownCamera, MonoMoment, MonoOptions
 
 CameraFile = Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")]
 Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
@@ -62,6 +58,7 @@ def correct_one_camera(
     from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.mono_camera import OneCameraCard, read_one_camera
+    from rsbench.pipeline.mono_sequence import Gyroscope
 
     if out is None:
         raise RsbenchError("--out: is required")
@@ -71,7 +68,7 @@ def correct_one_camera(
     source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
     _say_other_rate(card, source, gyro.fps)
     samples = gyro.samples(source)
-    log = None if samples is None else Gyroscope(samples=samples, farthest=gyro.farthest(source))
+    log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro.farthest(source))
     record = _correct(source, card, out, _options(source, target, inpaint, seed), log)
     _say(record, out)
 
@@ -92,16 +89,6 @@ def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None
             f"and the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
             err=True,
         )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Gyroscope:
-    """A log beside the frames of one camera."""
-
-    samples: FloatArray
-    """(n, 4) tau, w."""
-    farthest: float
-    """Frame periods within which its clock may be off."""
 
 
 def _correct(
@@ -146,7 +133,7 @@ def _run_key(
     from rsbench.core.version import __version__
 
     said = [__version__, repr(card), repr(options), repr(video), *source.identity()]
-    said += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.farthest)]
+    said += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.clock_error)]
     return hashlib.sha256("\n".join(said).encode()).hexdigest()
 
 
@@ -164,71 +151,24 @@ def _correct_into(
     Args:
         whole: whether masks and depth are wanted, not the images alone.
     """
+    from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import written_entries
-    from rsbench.pipeline.mono_sequence import correct_frames
+    from rsbench.pipeline.mono_sequence import correct_frames, know_camera
 
-    found = _shutter(source, card, options)
-    camera, focal = _camera(source, card, found, options)
-    record: dict[str, Any] = {**_known(camera, focal, found, options), "gyro": gyro is not None}
-    samples = None if gyro is None else gyro.samples
-    if gyro is not None and gyro.farthest > 0.0:
-        samples, record["gyro_clock"] = _in_time(source, camera, found, options, gyro)
+    try:
+        known = know_camera(source, source.count, card, options, gyro, progress_bar)
+    except NoMotionError as error:
+        echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
+    record = _record(known, options)
     entries = written_entries(folder)
     with progress_bar("correcting", max(source.count, 1)) as advance:
         for entry in entries:
             advance(f"frame {entry['number']}")
-        moments = correct_frames(source, camera, found.shutter, options, len(entries), samples)
+        moments = correct_frames(source, known.camera, known.readout.shutter, options, len(entries), known.gyro)
         record["frames"] = entries + _write(folder, moments, advance, whole=whole)
     return record
-
-
-def _shutter(source: FrameSource, card: OneCameraCard, options: MonoOptions) -> FoundShutter:
-    """Exit 1 where the frames do not show it."""
-    from rsbench.capture.sequence_shutter import LONGEST
-    from rsbench.capture.shutter_decision import NoMotionError
-    from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.mono_camera import IN_ORDER, find_shutter
-
-    corrector, looked = options.corrector, card.readout_ratio is None
-    steps = min(max(source.count - 1, 1), LONGEST if looked else IN_ORDER) + looked
-    try:
-        with progress_bar("looking at the shutter", steps) as advance:
-            found = find_shutter(source, source.count, card, corrector.robust, corrector.seed, advance)
-            if looked:
-                advance("all pairs together")
-            return found
-    except NoMotionError as error:
-        echo(f"rsbench: not corrected: {error}", err=True)
-        raise typer.Exit(1) from None
-
-
-def _camera(
-    source: FrameSource, card: OneCameraCard, found: FoundShutter, options: MonoOptions
-) -> tuple[PinholeCamera, FoundFocal | None]:
-    """As of ``find_camera``."""
-    from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.mono_camera import PAIRS, find_camera
-
-    given = source, source.count, card, found.shutter, options.corrector.robust, options.corrector.seed
-    if not card.focal_unknown:
-        return find_camera(*given)
-    with progress_bar("looking at the focal length", min(max(source.count - 1, 1), PAIRS)) as advance:
-        return find_camera(*given, advance)
-
-
-def _in_time(
-    source: FrameSource, camera: PinholeCamera, found: FoundShutter, options: MonoOptions, gyro: Gyroscope
-) -> tuple[FloatArray, dict[str, Any]]:
-    """Its samples at the times of the frames, and what these show of its clock."""
-    from rsbench.cli.console import progress_bar
-    from rsbench.pipeline.mono_gyro import PAIRS, in_time, pair_rates
-
-    known, corrector = (camera, found.shutter), options.corrector
-    with progress_bar("looking at the gyroscope's clock", min(max(source.count - 1, 1), PAIRS)) as advance:
-        pairs = pair_rates(source, source.count, *known, corrector.robust, corrector.seed, advance)
-    samples, clock = in_time(pairs, gyro.samples, *known, gyro.farthest)
-    return samples, clock._asdict()
 
 
 def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) -> MonoOptions:
@@ -238,13 +178,12 @@ def _options(source: FrameSource, target: str, inpaint: bool | None, seed: int) 
     return MonoOptions.of(inpaint, seed, None if target == "middle" else target_row(target, height))
 
 
-def _known(
-    camera: PinholeCamera, focal: FoundFocal | None, found: FoundShutter, options: MonoOptions
-) -> dict[str, Any]:
-    """What the correction assumed or found."""
+def _record(known: KnownCamera, options: MonoOptions) -> dict[str, Any]:
+    """What motion.json says of the camera, as given or estimated, without its frames."""
     from rsbench.capture.shutter_decision import record_of
     from rsbench.dataset.corrected_frames import MASK_VALUES
 
+    camera, focal, found = known.camera, known.focal, known.readout
     best = None if found.capture is None else found.capture.likeliest
     return {
         "units": {"length": _UNIT, "angle": "rad", "time": "frame period", "depth": f"{_UNIT}, 0 = unknown"},
@@ -260,6 +199,8 @@ def _known(
         "corrector": "mono-fusion",
         "target_row": options.target_row,
         "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
+        "gyro": known.gyro is not None,
+        **({} if known.clock is None else {"gyro_clock": known.clock._asdict()}),
     }
 
 

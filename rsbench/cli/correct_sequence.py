@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_input import sized, target_row, with_found_camera
+from rsbench.cli.correct_input import sized, target_row
 from rsbench.cli.correct_output import listed, readout_words, say_calibration, write_page_of
 
 if TYPE_CHECKING:
@@ -33,10 +33,11 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
     """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
     from dataclasses import replace
 
+    from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, is_video, rig_record, video_place
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.sequence_capture import spread_windows
+    from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
 
     sources, card, out = given.footage(), given.card, given.out
     gyro = _gyro(given, sources[0], options)
@@ -45,7 +46,15 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
     check_cameras(rig, card.scanning or Scanning(), options, card.disparity_offset)
     run = _run_key(given, sources, options, close, gyro)
     with video_place(out, run) if is_video(out) else fresh_folder(out, run=run) as folder:
-        rig, focal = with_found_camera(card, rig, spread_windows(*sources), options)
+        rig, focal = with_found_camera(
+            rig,
+            card.camera.sigma,
+            spread_windows(*sources),
+            options,
+            card.readout_ratio,
+            card.scanning,
+            progress_bar,
+        )
         shutter, calibration, capture = found = _look(sources, rig, card, options)
         record = {**rig_record(rig, shutter, capture, options, calibration), "camera_note": focal}
         record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses, gyro)

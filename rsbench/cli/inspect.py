@@ -169,13 +169,15 @@ def _with_found_camera(
     left: FrameSource, right: FrameSource, rig: StereoRig, said: RigCard, options: _Options
 ) -> StereoRig:
     """The rig of a card that is not sure of its cameras; what was found goes to stderr."""
-    from rsbench.cli.correct_input import with_found_camera
+    from rsbench.cli.console import progress_bar
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.sequence_capture import spread_windows
+    from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
     from rsbench.vision.feature_matcher import load_features
 
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
-    rig, words = with_found_camera(said, rig, spread_windows(left, right), chain)
+    rig, words = with_found_camera(
+        rig, said.camera.sigma, spread_windows(left, right), chain, said.readout_ratio, said.scanning, progress_bar
+    )
     echo(words, err=True)
     return rig
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rsbench.capture.calibration import CardSigma
 from rsbench.capture.sequence_shutter import shutter_of_sequence
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, Trajectory, estimate_trajectory
@@ -25,7 +26,8 @@ from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches, model_to_use
 from rsbench.pipeline.isolated_components import Isolation
-from rsbench.pipeline.mono_sequence import correct_all
+from rsbench.pipeline.mono_sequence import Gyroscope, correct_all
+from rsbench.pipeline.sequence_capture import with_found_camera
 from rsbench.solvers.engine.base import Solver, entry_of
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
@@ -64,17 +66,19 @@ def of_rig(
     options: CorrectionOptions,
     gyro: ArrayLike | None = None,
     *,
+    sigma: CardSigma,
     close: bool = False,
 ) -> CorrectedFrames:
     """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``.
 
-    ``close``: narrow holes too.
+    ``sigma``: of the focal length and k1, which are estimated where it is not 0. ``close``: narrow holes too.
     """
-    arguments.check_type("rig", rig, StereoRig)
     check_times(readout_ratio, options.target_row, rig)
     views, known = four_images(images, rig), Given(gyro=gyro_samples(gyro))
     with Isolation() as isolation:
-        found = correct_four(views, rig, readout_ratio, isolation.chain(options), given=known)
+        chain = isolation.chain(options)
+        rig, _ = with_found_camera(rig, sigma, [views], chain, readout_ratio)
+        found = correct_four(views, rig, readout_ratio, chain, given=known)
     demand_corrected(found.frames, options.corrector.name)
     if not close:
         return found
@@ -89,6 +93,7 @@ def of_one_camera(
     inpaint: bool | None,
     seed: int,
     gyro: ArrayLike | None = None,
+    gyro_clock_error: float = 0.0,
 ) -> list[Fused]:
     """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
     known = StereoRig(camera=camera, baseline=1.0) if isinstance(camera, PinholeCamera) else None
@@ -102,7 +107,8 @@ def of_one_camera(
     if camera is not None and not isinstance(camera, PinholeCamera):
         arguments.check_number("camera", camera)  # degrees, whose range the card of a camera checks
     samples = gyro_samples(gyro)
-    return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=samples)
+    log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro_clock_error)
+    return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=log)
 
 
 # The trajectory of arrays, as ``rsbench.estimate_trajectory`` finds it.

@@ -68,6 +68,8 @@ class CorrectedFrames:
     matches: Correspondences | None
     pairs: Pairs | None
     """The frames with the depth that they were corrected with."""
+    rig: StereoRig
+    """The cameras, with estimated values where ``rsbench.correct`` estimated some."""
     frames: dict[View, Fused]
     at_rows: list[dict[View, Fused]]
     """At each of the further rows that were asked for."""
@@ -136,6 +138,7 @@ def correct_four(
         capture=capture,
         matches=matches,
         pairs=pairs,
+        rig=rig,
         frames=frames,
         at_rows=at_rows,
         seconds=clock.seconds,

@@ -6,10 +6,11 @@ into columns, and rows are what a rolling shutter reads.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import cv2
 import numpy as np
@@ -30,6 +31,15 @@ _LARGEST_OFFSET_PX = 10.0
 _MOST_FRAMES = 1e9
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
+"""Opens a display of a step, from its label and its number of parts; what it yields is called after each part."""
+
+
+def no_progress(label: str, total: int) -> AbstractContextManager[Callable[[str], None]]:
+    """A ``Progress`` that shows nothing."""
+    return nullcontext(lambda word: None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,14 +15,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.capture.self_calibration import FoundFocal
+from rsbench.capture.sequence_shutter import LONGEST
 from rsbench.components.motion_models import AcceleratedMotion, InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.footage import CameraCard, check_alike
-from rsbench.pipeline.mono_camera import OneCameraCard, find_camera, find_shutter
+from rsbench.pipeline.footage import CameraCard, Progress, check_alike, no_progress
+from rsbench.pipeline.mono_camera import (
+    IN_ORDER,
+    PAIRS,
+    FoundShutter,
+    OneCameraCard,
+    find_camera,
+    find_shutter,
+)
 from rsbench.pipeline.mono_correction import (
     CUT,
     PIXELS,
@@ -40,7 +49,8 @@ from rsbench.pipeline.mono_correction import (
     turned,
     way_matches,
 )
-from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
+from rsbench.pipeline.mono_gyro import NOT_COVERED, Clock, around, in_time, pair_rates, rotation_alone, with_gyro
+from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
 from rsbench.vision.fusion import Fused, finished
 from rsbench.vision.images import map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
@@ -81,6 +91,68 @@ class MonoOptions:
         """``inpaint``: whether all that no frame shows is invented, or nothing; None: what is narrow."""
         corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=bool(inpaint)), seed=seed)
         return cls(corrector=corrector, target_row=target_row, close=inpaint is None)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gyroscope:
+    """A gyroscope's log beside the frames of one camera."""
+
+    samples: FloatArray
+    """(n, 4) tau, w, as of ``Correspondences.gyro``; tau 0 is the first row of the first frame."""
+    clock_error: float = 0.0
+    """Frame periods by which its clock may be off; 0: the times are exact."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownCamera:
+    """How one camera's frames were taken: given, or estimated from them. The correction needs nothing more."""
+
+    camera: PinholeCamera
+    focal: FoundFocal | None
+    """How the focal length was estimated; None where it is given."""
+    readout: FoundShutter
+    gyro: FloatArray | None
+    """(n, 4) samples at the times of the frames; None without a gyroscope."""
+    clock: Clock | None
+    """Error of the gyroscope's clock; None where its times are exact."""
+
+
+def know_camera(
+    frames: Iterable[NDArray[Any]],
+    count: int,
+    card: OneCameraCard,
+    options: MonoOptions,
+    gyro: Gyroscope | None = None,
+    progress: Progress = no_progress,
+) -> KnownCamera:
+    """Estimates from frames (H, W[, 3]) what the card leaves open: shutter, focal length, gyroscope's clock.
+
+    Args:
+        frames: in order; gone through once for each quantity that is estimated.
+        count: of the frames, about; 0 where it is unknown.
+
+    Raises:
+        NoMotionError: the frames do not show how their lines are read.
+        RsbenchError: as of ``find_shutter``.
+    """
+    robust, seed, pairs = options.corrector.robust, options.corrector.seed, max(count - 1, 1)
+    unknown = card.readout_ratio is None
+    with progress("looking at the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
+        readout = find_shutter(frames, count, card, robust, seed, advance)
+        if unknown:
+            advance("all pairs together")
+    shutter = readout.shutter
+    if card.focal_unknown:
+        with progress("looking at the focal length", min(pairs, PAIRS)) as advance:
+            camera, focal = find_camera(frames, count, card, shutter, robust, seed, advance)
+    else:
+        camera, focal = find_camera(frames, count, card, shutter, robust, seed)
+    samples, clock = None if gyro is None else gyro.samples, None
+    if gyro is not None and gyro.clock_error > 0.0:
+        with progress("looking at the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
+            rates = pair_rates(frames, count, camera, shutter, robust, seed, advance)
+        samples, clock = in_time(rates, gyro.samples, camera, shutter, gyro.clock_error)
+    return KnownCamera(camera=camera, focal=focal, readout=readout, gyro=samples, clock=clock)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,7 +292,7 @@ def correct_all(
     *,
     inpaint: bool | None = None,
     seed: int = 0,
-    gyro: FloatArray | None = None,
+    gyro: Gyroscope | None = None,
 ) -> list[Fused]:
     """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
     known: dict[str, Any] = {}
@@ -233,9 +305,8 @@ def correct_all(
     except ValueError as error:
         raise RsbenchError(str(error)) from error
     options = MonoOptions.of(inpaint, seed, target_row)
-    shutter = find_shutter(frames, len(frames), card, options.corrector.robust, seed).shutter
-    found, _ = find_camera(frames, len(frames), card, shutter, options.corrector.robust, seed)
-    moments = correct_frames(frames, found, shutter, options, gyro=gyro)
+    found = know_camera(frames, len(frames), card, options, gyro)
+    moments = correct_frames(frames, found.camera, found.readout.shutter, options, gyro=found.gyro)
     return [moment.fused for moment in moments]
 
 

@@ -22,7 +22,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.pipeline.footage import FrameSource, check_alike
+from rsbench.pipeline.footage import FrameSource, Progress, check_alike, no_progress
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.frame_motion import match_frames, match_unknown, models_asked, with_enough
 
@@ -279,3 +279,21 @@ def camera_of_frames(
         options.robust,
         options.seed,
     )
+
+
+def with_found_camera(
+    rig: StereoRig,
+    sigma: CardSigma,
+    windows: Iterable[Images],
+    options: CorrectionOptions,
+    readout_ratio: float | None = None,
+    scanning: Scanning | None = None,
+    progress: Progress = no_progress,
+) -> tuple[StereoRig, str]:
+    """The rig with the focal length and k1 that are estimated where ``sigma`` is not 0, and words on both."""
+    if not sigma:
+        return rig, ""
+    with progress("looking at the calibration", 1) as advance:
+        found = camera_of_frames(windows, rig, sigma, options, readout_ratio, scanning)
+        advance("")
+    return found.rig, found.words(rig, sigma)
