@@ -33,7 +33,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import CameraCard, check_alike
-from rsbench.pipeline.mono_correction import flow_matches, refusal, way_matches
+from rsbench.pipeline.mono_correction import flow_matches, refusal, trajectory_matches
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
 
@@ -213,7 +213,7 @@ def _settled(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> Fo
 def _in_a_row(
     frames: Iterable[NDArray[Any]], card: OneCameraCard, seed: int, advance: Callable[[str], None]
 ) -> tuple[list[FloatArray], PinholeCamera]:
-    """Matches of the first pairs in a row that can be judged, as of ``way_matches``, ``LONGEST`` at most.
+    """Matches of the first pairs in a row that can be judged, as of ``trajectory_matches``, ``LONGEST`` at most.
 
     Raises RsbenchError as of ``matched_pairs``.
     """
@@ -223,7 +223,7 @@ def _in_a_row(
         camera = card.camera_of(image.shape[1], image.shape[0])
         flows = find_flows([before, image])
         if not refusal([before, image], flows):
-            run.append(way_matches(flows, seed))
+            run.append(trajectory_matches(flows, seed))
             advance(f"pair {number}")
         elif len(run) >= _LEAST_IN_A_ROW:
             break

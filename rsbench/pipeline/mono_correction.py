@@ -43,7 +43,7 @@ _REACH = 3.0
 """Deviations up to which a match is right."""
 
 
-def asked_for(
+def select_motion_model(
     found: RobustEstimate,
     matches: FloatArray,
     rig: StereoRig,
@@ -181,7 +181,7 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
     return np.concatenate([here + flow.reshape(-1, 2)[chosen], here], axis=-1)
 
 
-def way_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatArray:
+def trajectory_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatArray:
     """Matches (n, 4) by the flow, from the same random pixels of both frames; in random order.
 
     One that ends at such a pixel goes on in the next pair with the one that begins there.
@@ -205,7 +205,7 @@ def find_own_motion(
 
     Of laws of constant speed, and one that accelerates.
     """
-    return as_asked(find_steady_motion(flows, rig, shutter, side, robust, seed), flows, robust, seed)
+    return with_best_motion(find_steady_motion(flows, rig, shutter, side, robust, seed), flows, robust, seed)
 
 
 def find_steady_motion(
@@ -228,28 +228,30 @@ def find_steady_motion(
     return FoundOwnMotion(own=OwnMotion(rig=own, shutter=shutter, side=side, motion=motion), robust=found)
 
 
-def by_asked_law(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
+def with_selected_model(
+    found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0
+) -> FoundOwnMotion:
     """A steady motion by the law that the flow asks for, if another one; what else is found stays."""
     own = found.own
     if found.robust is None or own.motion is None:
         return found
     matches = flow_matches(flows, np.random.default_rng(seed))
-    told, motion = asked_for(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
+    told, motion = select_motion_model(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
     motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
     return replace(found, own=replace(own, motion=motion), robust=told)
 
 
-def as_asked(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
-    """As ``by_asked_law``, or shaken, where two frames show how (``camera_two_frame_spline``)."""
-    lawful = by_asked_law(found, flows, robust, seed)
+def with_best_motion(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
+    """As ``with_selected_model``, or shaken, where two frames show how (``camera_two_frame_spline``)."""
+    lawful = with_selected_model(found, flows, robust, seed)
     own = lawful.own
     if lawful.robust is None or own.motion is None:
         return lawful
-    way = camera_two_frame_spline(way_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
-    return lawful if way is None else on_way(lawful, way)
+    way = camera_two_frame_spline(trajectory_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
+    return lawful if way is None else with_motion(lawful, way)
 
 
-def on_way(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
+def with_motion(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
     """What is found of two frames, with another motion."""
     robust = found.robust
     if robust is not None:
@@ -314,12 +316,12 @@ class MonoFusionCorrector(Corrector):
 # began, and memory does not grow with the number of frames.
 
 
-_TOLD, _BESIDE = 10, 2
+_GROUP, _BESIDE = 10, 2
 """Pairs of a group, and those on either side that help."""
 _FEWEST_PAIRS = 3
 """Pairs in a row, from which on they show a way."""
 PIXELS = 300
-"""As of ``way_matches``: fewer than of two frames alone do, for each frame is in two pairs."""
+"""As of ``trajectory_matches``: fewer than of two frames alone do, for each frame is in two pairs."""
 _LEAST = 50
 """Matches."""
 _FLOW_PX = 0.15
@@ -334,7 +336,7 @@ class SeenPair:
     found: FoundOwnMotion | None
     """None where they show none at all."""
     matches: FloatArray
-    """(n, 4) x0, y0, x1, y1, px, see ``way_matches``."""
+    """(n, 4) x0, y0, x1, y1, px, see ``trajectory_matches``."""
 
     @property
     def motion(self) -> Motion | None:
@@ -343,10 +345,12 @@ class SeenPair:
 
 def group_of(pair: int) -> tuple[int, int]:
     """First pair that decides what is found of a pair, and the one after the last."""
-    return max(_next_group(pair) - _TOLD - _BESIDE, 0), _next_group(pair) + _BESIDE
+    return max(_next_group(pair) - _GROUP - _BESIDE, 0), _next_group(pair) + _BESIDE
 
 
-def on_ways(pairs: Iterable[SeenPair], begin: int = 0, first: int = 0) -> Iterator[FoundOwnMotion | None]:
+def with_shared_trajectory(
+    pairs: Iterable[SeenPair], begin: int = 0, first: int = 0
+) -> Iterator[FoundOwnMotion | None]:
     """What is found of pairs, in order: by the way through their neighbours, where it explains them as well.
 
     Args:
@@ -357,19 +361,19 @@ def on_ways(pairs: Iterable[SeenPair], begin: int = 0, first: int = 0) -> Iterat
     for number, pair in enumerate(pairs, start=begin):
         held[number] = pair
         if number + 1 == group_of(told)[1]:
-            yield from _told(held, told)
+            yield from _group_motions(held, told)
             told = _next_group(told)
             held = {k: each for k, each in held.items() if k >= group_of(told)[0]}
     while told <= number:
-        yield from _told(held, told)
+        yield from _group_motions(held, told)
         told = _next_group(told)
 
 
 def _next_group(pair: int) -> int:
-    return pair // _TOLD * _TOLD + _TOLD
+    return pair // _GROUP * _GROUP + _GROUP
 
 
-def _told(held: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
+def _group_motions(held: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
     """Of the group of one pair, from that pair on."""
     low, high = group_of(first)
     numbers = [k for k in range(low, high) if k in held]
@@ -396,7 +400,7 @@ def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
     for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
         errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (way, steady)]
         if pair.found is not None and errors[0] <= max(errors[1], _FLOW_PX):
-            out[number] = on_way(pair.found, way)
+            out[number] = with_motion(pair.found, way)
     return out
 
 

@@ -40,14 +40,14 @@ from rsbench.pipeline.mono_correction import (
     MonoFusionCorrector,
     SeenPair,
     Turned,
-    as_asked,
-    by_asked_law,
     find_steady_motion,
     group_of,
-    on_ways,
     refusal,
+    trajectory_matches,
     turned,
-    way_matches,
+    with_best_motion,
+    with_selected_model,
+    with_shared_trajectory,
 )
 from rsbench.pipeline.mono_gyro import NOT_COVERED, Clock, around, in_time, pair_rates, rotation_alone, with_gyro
 from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
@@ -177,7 +177,7 @@ class _Seen(NamedTuple):
     reason: str
     """Why they cannot be corrected; empty where they can."""
     matches: FloatArray
-    """See ``way_matches``."""
+    """See ``trajectory_matches``."""
 
 
 def correct_frames(
@@ -279,7 +279,7 @@ def _pairs(
     for number, (before, image) in itertools.islice(pairs, begin):
         yield number + 1, before, image, None
     seen = kept(map_ahead(look, pairs, _AT_ONCE, _AT_ONCE))
-    ways = (each.found for each in seen) if gyro is not None else on_ways(seen, begin, first)
+    ways = (each.found for each in seen) if gyro is not None else with_shared_trajectory(seen, begin, first)
     for each, pair in map_ahead(ready, found_in_order(ways), _AT_ONCE, _AT_ONCE):
         yield each.number + 1, *each.images, pair
 
@@ -328,7 +328,7 @@ def _seen(
     found, reason = _found(given, flows, turn, corrector, local)
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
-    matches = way_matches(flows, corrector.seed, PIXELS) if gyro is None else np.zeros((0, 4))
+    matches = trajectory_matches(flows, corrector.seed, PIXELS) if gyro is None else np.zeros((0, 4))
     small = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _HELD_BYTES
     return _Seen(number, images, flows if small else None, found, reason, matches)
 
@@ -351,7 +351,7 @@ def _found(
     if gyro is None:
         return found, ""
     options = corrector.robust, corrector.seed
-    return with_gyro(by_asked_law(found, flows, *options), flows, gyro, *options), ""
+    return with_gyro(with_selected_model(found, flows, *options), flows, gyro, *options), ""
 
 
 def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: MonoOptions) -> _Pair:
@@ -360,7 +360,7 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Mon
     images = [turn.image(image) for image in seen.images]
     flows, corrector = seen.flows or find_flows(images), options.corrector
     if isinstance(found.own.motion, InertialMotion):  # on no way
-        found = as_asked(found, flows, corrector.robust, corrector.seed)
+        found = with_best_motion(found, flows, corrector.robust, corrector.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 

@@ -26,7 +26,7 @@ from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.interop.readers.gyro_log import read_gyro_log
-from rsbench.pipeline.mono_correction import MonoFusionCorrector, asked_for, find_own_motion, refusal
+from rsbench.pipeline.mono_correction import MonoFusionCorrector, find_own_motion, refusal, select_motion_model
 from rsbench.pipeline.mono_gyro import CONTRADICTED, NOT_COVERED
 from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
@@ -215,7 +215,7 @@ def test_a_camera_that_accelerates_is_told(acceleration: float) -> None:
         true = make_motion("accelerated", 0.07 * w, 0.4 * d, {"acceleration": acceleration})
         matches = matches_of(true, rng)
         before = found_of(matches, RIG)
-        robust, motion = asked_for(before, matches, RIG, SHUTTER, RobustOptions())
+        robust, motion = select_motion_model(before, matches, RIG, SHUTTER, RobustOptions())
         assert motion.name == "accelerated" and robust.estimate.success
         constant = make_motion("inertial", before.estimate.w, before.estimate.d)
         assert turns_between(motion, true) < 0.2 * turns_between(constant, true)
@@ -231,7 +231,7 @@ def test_constant_speed_stays_constant_speed(model: str) -> None:
         w, d = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         true = make_motion(model, 0.07 * w, 0.4 * d)
         matches = matches_of(true, rng)
-        motion = asked_for(found_of(matches, RIG), matches, RIG, SHUTTER, RobustOptions())[1]
+        motion = select_motion_model(found_of(matches, RIG), matches, RIG, SHUTTER, RobustOptions())[1]
         assert motion.name != "accelerated" and turns_between(motion, true) < 0.02 * 4.0
 
 
@@ -243,7 +243,7 @@ def test_a_wrong_focal_length_is_not_taken_for_an_acceleration(focal: float) -> 
         rng = np.random.default_rng(seed)
         w, d = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         matches = matches_of(make_motion("inertial", 0.03 * w, 0.4 * d), rng)
-        motion = asked_for(found_of(matches, wrong), matches, wrong, SHUTTER, RobustOptions())[1]
+        motion = select_motion_model(found_of(matches, wrong), matches, wrong, SHUTTER, RobustOptions())[1]
         assert motion.name != "accelerated"
 
 

@@ -14,7 +14,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_correction as mono_ways
-from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, on_ways
+from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, with_shared_trajectory
 from rsbench.pipeline.mono_sequence import MonoMoment, correct_frames
 from rsbench.vision.mono_fusion import OwnMotion
 
@@ -96,7 +96,7 @@ def test_pairs_are_told_in_order_with_those_beside_them(monkeypatch: pytest.Monk
     monkeypatch.setattr(mono_ways, "_shows", lambda pair: pair.found is not None)
     marks = [FoundOwnMotion(own=OWN, robust=None, reason=str(k)) for k in range(25)]
     pairs = [SeenPair(found=None if k == 14 else mark, matches=np.zeros((0, 4))) for k, mark in enumerate(marks)]
-    told = list(on_ways(pairs))
+    told = list(with_shared_trajectory(pairs))
     assert [None if each is None else each.reason for each in told] == [
         None if k == 14 else str(k) for k in range(25)
     ]
@@ -109,8 +109,8 @@ def test_pairs_are_told_in_order_with_those_beside_them(monkeypatch: pytest.Monk
     first = 16
     begin = group_of(first)[0]
     assert begin == 8
-    assert list(on_ways(pairs[begin:], begin, first)) == told[first:]
-    assert list(on_ways([], 0, 0)) == []
+    assert list(with_shared_trajectory(pairs[begin:], begin, first)) == told[first:]
+    assert list(with_shared_trajectory([], 0, 0)) == []
 
 
 def test_a_pair_that_a_way_does_not_explain_keeps_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,8 +122,8 @@ def test_a_pair_that_a_way_does_not_explain_keeps_its_own_motion(monkeypatch: py
     )
     along, across = InertialMotion([0.0] * 3, [-1.0, 0.0, 0.0]), InertialMotion([0.0] * 3, [0.0, 1.0, 0.0])
     monkeypatch.setattr(mono_ways, "camera_trajectory", lambda *rest: [along, across, along])
-    told = list(on_ways([pair] * 3))
+    told = list(with_shared_trajectory([pair] * 3))
     assert [each is pair.found for each in told] == [False, True, False]
-    assert all(each is pair.found for each in on_ways([pair] * 2))
+    assert all(each is pair.found for each in with_shared_trajectory([pair] * 2))
     monkeypatch.setattr(mono_ways, "camera_trajectory", lambda *rest: None)
-    assert all(each is pair.found for each in on_ways([pair] * 3))
+    assert all(each is pair.found for each in with_shared_trajectory([pair] * 3))
