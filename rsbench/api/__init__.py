@@ -239,7 +239,7 @@ def stereo_depth(
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:
-    """Sequences of a dataset on disk; their images, depth and row poses are read when asked for.
+    """Sequences of a dataset on disk; their images, depth and row poses are read when they are used.
 
     Raises:
         RsbenchError: not a finished dataset, or a sequence that cannot be read.

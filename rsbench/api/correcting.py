@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rsbench.vision.fusion import Fused
 
 _COMPONENTS = ("rs-stereo-refined", None, "sgm", "sift-refined", "fusion")
-"""What a rig has where nothing is said: solver, motion model, matcher, features and corrector."""
+"""Defaults for a rig: solver, motion model, matcher, features and corrector."""
 
 
 @overload

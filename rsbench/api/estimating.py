@@ -1,4 +1,4 @@
-"""``rsbench.estimate_trajectory``: the way of a rig through a whole sequence."""
+"""``rsbench.estimate_trajectory``: the trajectory of a rig through a whole sequence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def estimate_trajectory(
     seed: int = 0,
     gyro: ArrayLike | None = None,
 ) -> Trajectory:
-    """The way of the rig through a sequence, one continuous-time spline, from matches that may hold outliers.
+    """The rig's trajectory through a sequence, one continuous-time spline, from matches with or without outliers.
 
     Args:
         sequence: the matches of frames 0 and 1, 1 and 2, ..., of which ``tracks`` must be there; or the frames: of
@@ -68,7 +68,7 @@ def estimate_trajectory(
 
 
 def under_model(
-    asked: str,
+    requested: str,
     found: RobustEstimate,
     entry: SolverEntry,
     matches: Correspondences,
@@ -77,7 +77,7 @@ def under_model(
     options: RobustOptions,
     seed: int,
 ) -> RobustEstimate:
-    """An estimate again, under the motion model that is asked for or that the matches prefer (``auto``).
+    """An estimate again, under the motion model that is requested or that the matches prefer (``auto``).
 
     Raises:
         RsbenchError: no such model, or the solver can take no other than its own.
@@ -86,16 +86,16 @@ def under_model(
     from rsbench.pipeline.frame_motion import check_model, chosen_model, entry_of, motion_of, or_spline, widened
     from rsbench.solvers.engine.robust_motion import estimate_motion
 
-    check_model(asked, entry)
+    check_model(requested, entry)
     if not found.estimate.success:
         return found
     start = motion_of(found.estimate, entry, rig)
-    choice = chosen_model(asked, start, matches, rig, shutter, options, seed)
+    choice = chosen_model(requested, start, matches, rig, shutter, options, seed)
     if choice is not None:
         entry, rng = entry_of(entry, choice), np.random.default_rng(seed)
         found = estimate_motion(matches, rig, shutter, entry.solver, options, rng, entry.options.robust)
         found = widened(found, choice.spread)
-    if asked == AUTO and found.estimate.success:
+    if requested == AUTO and found.estimate.success:
         law = motion_of(found.estimate, entry, rig)
         found, choice, _ = or_spline(found, choice, law, matches, rig, shutter, seed)
     return found if choice is None else replace(found, motion_model=choice.used)

@@ -66,18 +66,18 @@ def correct_one_camera(
         raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
     card = OneCameraCard() if camera is None else read_one_camera(camera)
     source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
-    _say_other_rate(card, source, gyro.fps)
+    _warn_of_other_rate(card, source, gyro.fps)
     samples = gyro.samples(source)
     log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro.farthest(source))
     record = _correct(source, card, out, _options(source, target, inpaint, seed), log)
     _say(record, out)
 
 
-def _say_other_rate(card: OneCameraCard, source: FrameSource, said: float | None) -> None:
+def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: float | None) -> None:
     """A line where a ratio is of another frame rate than the frames: it is a share of the frame period."""
     from rsbench.dataset.corrected_frames import said_fps
 
-    fps = said_fps(source.path) if said is None else said
+    fps = said_fps(source.path) if fps_option is None else fps_option
     if card.frame_period_s is None or card.readout_ratio is None or fps is None or not fps > 0.0:
         return
     share = card.frame_period_s * fps
@@ -132,9 +132,9 @@ def _run_key(
 
     from rsbench.core.version import __version__
 
-    said = [__version__, repr(card), repr(options), repr(video), *source.identity()]
-    said += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.clock_error)]
-    return hashlib.sha256("\n".join(said).encode()).hexdigest()
+    parts = [__version__, repr(card), repr(options), repr(video), *source.identity()]
+    parts += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.clock_error)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def _correct_into(
@@ -217,7 +217,9 @@ def _focal(record: dict[str, Any]) -> str:
     if sigma is None:
         return f"{text} px (given)"
     how = (
-        "assumed: the width of the image; the frames do not tell it" if record["focal_length_assumed"] else "found"
+        "assumed: the width of the image; the frames do not determine it"
+        if record["focal_length_assumed"]
+        else "found"
     )
     return f"{text} +- {sigma:.1f} px ({how})"
 
@@ -225,19 +227,19 @@ def _focal(record: dict[str, Any]) -> str:
 def _clock(record: dict[str, Any]) -> str:
     clock = record["gyro_clock"]
     if not clock["told"]:
-        return "the frames do not tell how far it is off; --gyro-offset gives it"
+        return "the frames do not show its offset; give `--gyro-offset`"
     seen = f"{clock['shift']:+.3f} +- {clock['sigma']:.3f} frame periods off"
     return f"{seen}, and set right" if clock["used"] else f"{seen}, and left as it is"
 
 
 def _say(record: dict[str, Any], out: Path) -> None:
     """Exit 1 where some frames are not corrected."""
-    told = {
+    frames = {
         key: listed((each["number"], each[key]) for each in record["frames"] if key in each)
         for key in ("skipped", "reason")
     }
     motions = ((each["number"], each.get("motion", {})) for each in record["frames"])
-    told["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
+    frames["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
     echo(f"readout ratio {_readout(record)}")
     echo(f"focal length {_focal(record)}")
@@ -246,12 +248,12 @@ def _say(record: dict[str, Any], out: Path) -> None:
     echo(f"{corrected} of {len(record['frames'])} frames corrected")
     place = out if out.is_file() else out / "report.html"
     echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
-    if told["gyro"]:
-        echo(f"rsbench: corrected without the gyroscope: {told['gyro']}", err=True)
-    if told["skipped"]:
-        echo(f"rsbench: corrected with the frame after them: {told['skipped']}", err=True)
-    if told["reason"]:
-        echo(f"rsbench: not corrected: {told['reason']}", err=True)
+    if frames["gyro"]:
+        echo(f"rsbench: corrected without the gyroscope: {frames['gyro']}", err=True)
+    if frames["skipped"]:
+        echo(f"rsbench: corrected with the frame after them: {frames['skipped']}", err=True)
+    if frames["reason"]:
+        echo(f"rsbench: not corrected: {frames['reason']}", err=True)
         raise typer.Exit(1)
 
 

@@ -87,10 +87,10 @@ def _run_key(
     from rsbench.dataset.corrected_frames import is_video
 
     flags = close, given.row_poses, is_video(given.out)
-    said = [__version__, repr(given.card), repr(options), repr(flags)]
-    said += [each for source in sources for each in source.identity()]
-    said += [] if gyro is None else [hashlib.sha256(gyro.tobytes()).hexdigest()]
-    return hashlib.sha256("\n".join(said).encode()).hexdigest()
+    parts = [__version__, repr(given.card), repr(options), repr(flags)]
+    parts += [each for source in sources for each in source.identity()]
+    parts += [] if gyro is None else [hashlib.sha256(gyro.tobytes()).hexdigest()]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def _look(sources: Sources, rig: StereoRig, card: RigCard, options: CorrectionOptions) -> Found:
@@ -139,7 +139,7 @@ def _correct_into(
 
 
 def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShutter | None) -> dict[str, Any]:
-    """Write a corrected time, and then what is said of it: a time that has that is complete.
+    """Write a corrected time, and then its record: a time with a record is complete.
 
     Args:
         rows: the shutter, where the pose at every row is wanted.

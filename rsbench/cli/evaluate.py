@@ -193,7 +193,7 @@ _ON_REQUEST = (
 
 
 def every_solver() -> list[str]:
-    """Names of those that come with rsbench or are installed, each solver once, but those to be asked for."""
+    """Names of shipped and installed solvers, each solver once, without those that run only by request."""
     from rsbench.solvers.engine.base import list_solvers
 
     return [name for name in list_solvers() if name not in _ON_REQUEST]

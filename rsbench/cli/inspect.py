@@ -30,7 +30,7 @@ EPILOG = """[bold]Examples[/bold]
 
 The shutter that a card or problem gives is not used; it is printed beside the estimate.
 
-Exit codes: 0 every rig was estimated, 1 one cannot be told from its matches, 2 one input is wrong.
+Exit codes: 0 every rig was estimated, 1 one cannot be determined from its matches, 2 one input is wrong.
 More: [bold]rsbench docs inspect[/bold]"""
 
 _MODEL = "Motion model to try; repeatable. Default: linear and twist"
@@ -41,7 +41,7 @@ class _Case(NamedTuple):
 
     name: str
     windows: Iterator[Window]
-    said: RollingShutter | None
+    given: RollingShutter | None
     """What its card, problem or dataset says."""
 
 
@@ -82,20 +82,20 @@ def inspect(
     options = _Options(tuple(motion_model or MODELS), windows, features, seed)
     for model in options.models:
         load_kernel(model)
-    answers, wrong, told = list[dict[str, Any]](), False, True
+    answers, wrong, determined = list[dict[str, Any]](), False, True
     for case in _cases(given or [], rig, left, right, options):
         if isinstance(case, RsbenchError):
             wrong = True
             echo(f"rsbench: error: {' '.join(str(case).split())}", err=True)
             continue
         found = conclude(list(case.windows), max_sigma)
-        told = told and found.determined
+        determined = determined and found.determined
         answers.append(_record(case, found))
         if json:
             _print_json(answers[-1])
     if not json:
         _show(answers)
-    if wrong or not told:
+    if wrong or not determined:
         raise typer.Exit(2 if wrong else 1)
 
 
@@ -151,22 +151,22 @@ def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, option
     """Frames of a user, whose card says the rig."""
     from rsbench.pipeline.footage import read_rig_card
 
-    said = read_rig_card(card)
+    given = read_rig_card(card)
     height, width = next(iter(left)).shape[:2]
     try:
-        rig = said.rig(width, height)
-        ratio = said.readout_ratio
-        scanning = said.scanning
+        rig = given.rig(width, height)
+        ratio = given.readout_ratio
+        scanning = given.scanning
         shutter = None if ratio is None or scanning is None else scanning.shutter_of(width, height, ratio)
     except ValueError as error:
         raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
-    if said.camera.sigma:
-        rig = _with_found_camera(left, right, rig, said, options)
+    if given.camera.sigma:
+        rig = _with_found_camera(left, right, rig, given, options)
     return _Case(name, _frame_windows(left, right, rig, options), shutter)
 
 
 def _with_found_camera(
-    left: FrameSource, right: FrameSource, rig: StereoRig, said: RigCard, options: _Options
+    left: FrameSource, right: FrameSource, rig: StereoRig, given: RigCard, options: _Options
 ) -> StereoRig:
     """The rig of a card that is not sure of its cameras; what was found goes to stderr."""
     from rsbench.cli.console import progress_bar
@@ -176,7 +176,13 @@ def _with_found_camera(
 
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
     rig, words = with_found_camera(
-        rig, said.camera.sigma, spread_windows(left, right), chain, said.readout_ratio, said.scanning, progress_bar
+        rig,
+        given.camera.sigma,
+        spread_windows(left, right),
+        chain,
+        given.readout_ratio,
+        given.scanning,
+        progress_bar,
     )
     echo(words, err=True)
     return rig
@@ -230,7 +236,7 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
 
 
 def _record(case: _Case, found: Capture) -> dict[str, Any]:
-    """What JSON says of one rig; what is not told is null."""
+    """The JSON answer for one rig; what is not determined is null."""
     from rsbench.capture.shutter_decision import candidates_of
 
     named, best = (found.likeliest if known else None for known in (found.named, found.determined))
@@ -252,11 +258,11 @@ def _record(case: _Case, found: Capture) -> dict[str, Any]:
         "used": found.used,
         "noise_px": found.noise_px if found.used else None,
         "moved_px": found.moved_px,
-        "said": _said(case.said),
+        "said": _given_shutter(case.given),
     }
 
 
-def _said(shutter: RollingShutter | None) -> dict[str, Any] | None:
+def _given_shutter(shutter: RollingShutter | None) -> dict[str, Any] | None:
     from rsbench.capture.hypotheses import scans_of
 
     if shutter is None:
@@ -283,18 +289,18 @@ def _show(answers: list[dict[str, Any]]) -> None:
 
 
 def _row(answer: dict[str, Any]) -> dict[str, str]:
-    said, told = answer["said"], answer["told"]
-    late = told and abs(answer["right_delay"]) > max(3.0 * answer["right_delay_sigma"], 0.01)
+    given, determined = answer["said"], answer["told"]
+    late = determined and abs(answer["right_delay"]) > max(3.0 * answer["right_delay_sigma"], 0.01)
     note = f"right camera late by {answer['right_delay']:+.3f} frame periods" if late else answer["reason"]
     ratio = "-" if {answer["left"], answer["right"]} == {"global"} else "cannot tell"
-    if told and answer["readout_ratio"] > 0.0:
+    if determined and answer["readout_ratio"] > 0.0:
         ratio = f"{answer['readout_ratio']:.3f} +- {answer['readout_ratio_sigma']:.3f}"
     return {
         "rig": answer["name"],
         "left": answer["left"] or "cannot tell",
         "right": answer["right"] or "cannot tell",
         "readout ratio": ratio,
-        "said": "-" if said is None else f"{said['left']}, {said['right']}, {said['readout_ratio']:.2f}",
+        "said": "-" if given is None else f"{given['left']}, {given['right']}, {given['readout_ratio']:.2f}",
         "matches": f"{answer['used']}/{answer['matches']}",
         "moved (px)": f"{answer['moved_px']:.1f}",
         "note": note,

@@ -69,7 +69,7 @@ _ORDER = (
     *(each for each in Target if each not in ("fig3", "fig4-literal", "image-claims", "everything")),
     Target.image_claims,
 )
-"""Claims make Figure 3 on their way, and fig4 its literal part; those about images judge what is stored."""
+"""Claims make Figure 3 in passing, and fig4 its literal part; those about images judge what is stored."""
 _SEEDS = {Target.images: 20, Target.real: 10}
 """Runs of each solver in what is committed."""
 _MINUTES = {

@@ -97,7 +97,7 @@ Given = tuple[Correspondences, StereoRig, RollingShutter, RobustOptions, np.rand
 def _shutter_of(
     problem: Problem, matches: Correspondences, entry: SolverEntry, options: RobustOptions, seed: int
 ) -> tuple[RollingShutter, Capture | None, str]:
-    """The shutter of a problem, how it was found where the problem does not say it, and why it cannot be told."""
+    """The shutter of a problem; if it is not given, how it was found, or why it cannot be determined."""
     camera = problem.rig.camera
     still = Scanning().shutter_of(camera.width, camera.height, 0.0)
     if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
@@ -131,7 +131,7 @@ def _unsolved(reason: str, options: RobustOptions) -> RobustEstimate:
 
 
 def _under_model(
-    asked: str,
+    requested: str,
     entry: SolverEntry,
     result: RobustEstimate,
     runner: SolverRunner,
@@ -139,17 +139,17 @@ def _under_model(
     capture: Capture | None,
     seed: int,
 ) -> tuple[SolverEntry, RobustEstimate, ModelChoice | None]:
-    """The answer under the motion model that the matches prefer, or that is asked for."""
+    """The answer under the motion model that the matches prefer, or that is requested."""
     matches, rig, shutter, options, _ = given
     start = body_motion(result.estimate, entry.solver.spec, rig)
-    choice = None if capture is None else choose_model(capture, asked)
+    choice = None if capture is None else choose_model(capture, requested)
     if choice is None and isinstance(start, Motion):
-        choice = chosen_model(asked, start, matches, rig, shutter, options, seed)
+        choice = chosen_model(requested, start, matches, rig, shutter, options, seed)
     other = entry if choice is None else entry_of(entry, choice)
     result = result if other is entry else runner.robust(other, *given)
     result = result if choice is None else widened(result, choice.spread)
     law = body_motion(result.estimate, other.solver.spec, rig)
-    if asked == AUTO and isinstance(law, Motion):
+    if requested == AUTO and isinstance(law, Motion):
         result, choice, motion = or_spline(result, choice, law, matches, rig, shutter, seed)
         if capture is not None and motion is not law:
             return other, _unsolved(SHAKES, options), None

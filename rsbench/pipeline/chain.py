@@ -72,7 +72,7 @@ class CorrectedFrames:
     """The cameras, with estimated values where ``rsbench.correct`` estimated some."""
     frames: dict[View, Fused]
     at_rows: list[dict[View, Fused]]
-    """At each of the further rows that were asked for."""
+    """At each of the further requested rows."""
     seconds: dict[str, float]
     """Of each of ``STEPS``."""
 
@@ -106,7 +106,7 @@ def correct_four(
         rows: further target rows, at whose times the frames are wanted too.
 
     Raises:
-        RsbenchError: frames that cannot be what they are said to be, cameras that the options do not take (see
+        RsbenchError: frames that cannot be what the arguments state, cameras that the options do not take (see
             ``check_cameras``), or a component of another package failed.
         NoMotionError: the matches determine no motion or readout ratio.
         ValueError: a motion is given and no readout ratio.
@@ -116,8 +116,8 @@ def correct_four(
     if given.motion is not None and readout_ratio is None:
         raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    asked = (readout_ratio, scanning, disparity_offset)
-    matches, found, shutter, capture = _solve(images, rig, asked, options, given, clock)
+    shutter_inputs = (readout_ratio, scanning, disparity_offset)
+    matches, found, shutter, capture = _solve(images, rig, shutter_inputs, options, given, clock)
     offset = disparity_offset or 0.0 if found is None else found.disparity_offset
     if capture is not None:
         check_cameras(rig, shutter.scanning, options, disparity_offset, given.pairs is not None)
@@ -190,7 +190,7 @@ def _check_matcher(options: CorrectionOptions, disparity_offset: float | None) -
 def _solve(
     images: Images,
     rig: StereoRig,
-    asked: tuple[float | None, Scanning | None, float | None],
+    shutter_inputs: tuple[float | None, Scanning | None, float | None],
     options: CorrectionOptions,
     given: Given,
     clock: _Clock,
@@ -198,9 +198,9 @@ def _solve(
     """Matches, motion and shutter, as far as they are needed and not given.
 
     Args:
-        asked: readout ratio, scanning and disparity offset, as of ``correct_four``.
+        shutter_inputs: readout ratio, scanning and disparity offset, as of ``correct_four``.
     """
-    readout_ratio, scanning, disparity_offset = asked
+    readout_ratio, scanning, disparity_offset = shutter_inputs
     needs = options.corrector.component.spec.needs
     wanted = given.motion is None and "motion" in needs
     matched = given.matches is not None or "matches" not in needs
@@ -278,7 +278,7 @@ def correct_known(
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float = 0.0,
 ) -> dict[View, Fused]:
-    """Corrected frames of the views asked for, at the time of ``options.target_row``, through the same lens.
+    """Corrected frames of the requested views, at the time of ``options.target_row``, through the same lens.
 
     A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
 

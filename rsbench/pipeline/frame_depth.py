@@ -256,7 +256,7 @@ def timed_pairs(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: M
 def complete_depth(
     pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: tuple[int, ...] = FRAMES
 ) -> Pairs:
-    """The same frames with depth from the motion where the other camera gave none, in those asked for."""
+    """The same frames with depth from the motion where the other camera gave none, in the requested ones."""
 
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])

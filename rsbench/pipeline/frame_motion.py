@@ -118,7 +118,7 @@ def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
 def match_unknown(
     images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
 ) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` of cameras that may read in any way, and what speaks against a pair that reads as one.
+    """``match_frames`` for cameras of any scan, and the evidence against a pair that reads rows at one time.
 
     Raises:
         RefusedFramesError: no texture.
@@ -183,7 +183,7 @@ def body_motion(estimate: MotionEstimate, spec: SolverSpec, rig: StereoRig) -> M
 
 BACKWARDS = (
     "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what "
-    "is said (scan in the rig's card)"
+    "is given (`scan` in the rig's card)"
 )
 
 SHAKES = (
@@ -261,8 +261,8 @@ def find_motion(
     robust = _solved(entry if choice is None else entry_of(entry, choice), matches, rig, shutter, options, rng)
     if capture is None and options.motion_model is not None and robust.estimate.success:
         start = motion_of(robust.estimate, entry, rig)
-        asked, seed = options.motion_model, options.seed
-        choice = chosen_model(asked, start, matches, rig, shutter, options.robust, seed)
+        requested, seed = options.motion_model, options.seed
+        choice = chosen_model(requested, start, matches, rig, shutter, options.robust, seed)
         if choice is not None and choice.used != entry.solver.spec.motion_model:
             robust = _solved(entry_of(entry, choice), matches, rig, shutter, options, rng)
     if choice is not None:
@@ -326,7 +326,7 @@ def _solved(
 
 
 def chosen_model(
-    asked: str,
+    requested: str,
     start: Motion,
     matches: Correspondences,
     rig: StereoRig,
@@ -334,24 +334,24 @@ def chosen_model(
     robust: RobustOptions,
     seed: int,
 ) -> ModelChoice | None:
-    """The motion model that matches prefer, of a shutter that is known; None where nothing can be said.
+    """The motion model that matches prefer, of a shutter that is known; None where nothing can be concluded.
 
     Args:
-        asked: ``auto`` or the one to take.
+        requested: ``auto`` or a name.
         start: a motion near theirs, of any model.
     """
     given = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=NO_ERRORS)
     known = known_of(matches, rig, given)
     capture = conclude([examine(matches, rig, known, robust, seed, start)])
-    if asked not in (AUTO, *capture.peaks):  # one that the matches exclude, or another package's
-        alone = conclude([examine(matches, rig, replace(known, models=(asked,)), robust, seed, start)])
-        models, peaks = {**capture.models, asked: 0.0}, {**capture.peaks, **alone.peaks}
+    if requested not in (AUTO, *capture.peaks):  # one that the matches exclude, or another package's
+        alone = conclude([examine(matches, rig, replace(known, models=(requested,)), robust, seed, start)])
+        models, peaks = {**capture.models, requested: 0.0}, {**capture.peaks, **alone.peaks}
         capture = replace(capture, models=models, peaks=peaks)
-    return choose_model(capture, asked)
+    return choose_model(capture, requested)
 
 
 def models_asked(motion_model: str | None) -> tuple[str, ...]:
-    """Those that ``auto`` chooses from, or the one that is asked for."""
+    """Those that ``auto`` chooses from, or the one that is requested."""
     return MODELS if motion_model in (None, AUTO) else (str(motion_model),)
 
 
@@ -361,23 +361,23 @@ def takes_models(entry: SolverEntry) -> bool:
     return isinstance(solver, RefinedSolver) and solver.shutter == "rolling" and not solver.one_camera
 
 
-def check_model(asked: str, entry: SolverEntry) -> None:
+def check_model(requested: str, entry: SolverEntry) -> None:
     """Raises RsbenchError when there is no such model to ask for, or the solver cannot take another one."""
-    if asked != AUTO:
-        load_kernel(asked)
+    if requested != AUTO:
+        load_kernel(requested)
     if not takes_models(entry):
         spec = entry.solver.spec
         known_to = f"solver {entry.name!r} knows only {spec.motion_model} motion and a {spec.shutter} shutter"
         known_to += "" if spec.metric else ", without a length"
-        raise RsbenchError(f"--motion-model {asked}: {known_to}; take rs-stereo-refined")
+        raise RsbenchError(f"--motion-model {requested}: {known_to}; take rs-stereo-refined")
 
 
-def model_to_use(asked: str | None, entry: SolverEntry) -> str | None:
-    """The one that is asked for; else ``auto`` where the solver takes it. RsbenchError as of ``check_model``."""
-    if asked is None:
+def model_to_use(requested: str | None, entry: SolverEntry) -> str | None:
+    """The one that is requested; else ``auto`` where the solver takes it. RsbenchError as of ``check_model``."""
+    if requested is None:
         return AUTO if takes_models(entry) else None
-    check_model(asked, entry)
-    return asked
+    check_model(requested, entry)
+    return requested
 
 
 def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
@@ -412,7 +412,7 @@ class SolvedFrames:
     """Motion and shutter of four frames."""
 
     found: FoundMotion | None
-    """None where none was asked for."""
+    """None if none was requested."""
     shutter: RollingShutter
     matches: Correspondences
     """Those that it rests on; disparities as matched."""
@@ -440,7 +440,7 @@ def solve_frames(
         scanning: how the cameras read; None: found with the readout ratio; rows from the top where that is given.
         doubt: raised where the cameras read rows together, see ``match_unknown``.
         in_order: whether the frames are known to be in the order of time.
-        with_motion: whether a motion is asked for, beside the shutter.
+        with_motion: whether a motion is requested beside the shutter.
 
     Raises:
         RefusedFramesError: time runs backwards in the frames.
@@ -518,8 +518,8 @@ def _runs_backwards(
 ) -> bool:
     """Whether time runs backwards in the frames: their lines then seem to be read from the opposite side.
 
-    The laws must find the opposite scan beyond doubt, and near the ratio that is said: they find any where none of
-    them holds. Of a rig that shakes splines under both scans tell, unless the laws find the shutter that is said.
+    The laws must find the opposite scan beyond doubt, and near the given ratio: where no law fits they find any
+    ratio. For a shaken rig splines under both scans decide, unless the laws find the given shutter.
     """
     if shutter.readout_ratio < LEAST_BACKWARDS or not shutter.plain:
         return False

@@ -147,7 +147,7 @@ class SolverRunner:
         known = (place, entry.key)  # a card may be edited meanwhile
         if known not in self._workers:
             with suppress(RsbenchError):  # of a motion that does not exist, as the child will tell
-                warm_up([entry.solver.spec.motion_model])  # here, where it is said that this takes a while
+                warm_up([entry.solver.spec.motion_model])  # here, where the progress line announces it
             worker = IsolatedWorker(
                 _serve_solver,
                 place,
@@ -221,7 +221,7 @@ def _compile(solver: Solver) -> None:
 
 
 class GuardedSolver(Solver):
-    """Another package's solver, held to the contract: what it does wrong is an ``EntryFailure``.
+    """Another package's solver, checked against the contract: each violation is an ``EntryFailure``.
 
     Methods that it leaves as ``Solver`` has them run here, on the guarded ``estimate``.
     """

@@ -38,7 +38,7 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
 
 DEFAULT_FOCAL = 1.0
-"""Focal length in widths of the image where nothing is said: a horizontal field of view of 53 degrees."""
+"""Focal length in widths of the image if none is given: a horizontal field of view of 53 degrees."""
 _WIDEST_DEG = 170.0
 
 
@@ -52,7 +52,7 @@ class OneCameraCard:
     """Readout time over frame period, 0 to 1. Absent: found from the frames, or the command says why not."""
     frame_period_s: float | None = None
     """Seconds from one frame to the next, beside ``shutter`` where it is not that of its mode. A video of another
-    frame rate is told apart."""
+    frame rate is recognised."""
     scan: Scan | None = None
     """Side of the image at which the readout begins. Absent: found with the readout ratio, or ``top`` where that
     is given."""
@@ -78,11 +78,11 @@ class OneCameraCard:
 
     @property
     def focal_unknown(self) -> bool:
-        """Whether nothing is said of the focal length."""
+        """Whether no focal length is given."""
         return self.camera is None and self.fov_deg is None
 
     def camera_of(self, width: int, height: int) -> PinholeCamera:
-        """The camera of images of this size; of ``DEFAULT_FOCAL`` where nothing is said."""
+        """The camera of images of this size; of ``DEFAULT_FOCAL`` if none is given."""
         if self.camera is not None:
             c = self.camera
             return PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)
@@ -111,11 +111,11 @@ IN_ORDER = 5
 """First pairs that must all fit better backwards before frames of a known shutter are called so. One that trembles
 may look like either: 14 of 50 pairs of ten rendered sequences did, four of these chosen because one pair did."""
 _LEAST_IN_A_ROW, _LOOKED_AT = 6, 60
-"""Pairs in a row that show a way, and so many are looked at for such a row."""
+"""Successive pairs that determine a trajectory; so many pairs are examined."""
 TOO_FEW = "frames: fewer than two; one camera shows its motion in at least two"
 BACKWARDS = (
     "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to what "
-    "is said (scan in the camera's card)"
+    "is given (`scan` in the camera's card)"
 )
 
 
@@ -187,7 +187,7 @@ def _found(
     seed: int,
     advance: Callable[[str], None],
 ) -> FoundShutter:
-    """The shutter that the frames show: many in a row along one way, else each two under laws of motion."""
+    """The shutter that the frames show: from successive pairs along one trajectory, else from single pairs."""
     run, camera = _in_a_row(frames, card, seed, advance)
     along = capture_of_video(run, camera, card.scan, seed) if len(run) >= _LEAST_IN_A_ROW else None
     if along is not None:

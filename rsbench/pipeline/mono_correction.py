@@ -96,14 +96,14 @@ def _settled(
     count = MatchCount(inliers=int(np.count_nonzero(right)), matches=len(matches))
     if not (estimate.success and np.any(estimate.d)):
         return found, InertialMotion(found.estimate.w, found.estimate.d)
-    told = replace(
+    robust_of_law = replace(
         found,
         estimate=estimate,
         inliers={**found.inliers, "left": right},
         counts={"left": count},
         motion_model=law.name,
     )
-    return told, law.with_endpoint(estimate.w, estimate.d)
+    return robust_of_law, law.with_endpoint(estimate.w, estimate.d)
 
 
 def error_px(
@@ -120,7 +120,7 @@ def error_px(
 _MATCHES = 1500
 """Of the dense flow, drawn at random: what a motion of six unknowns is solved from."""
 _PIXELS = 600
-"""Of each frame, at random and the same in all, that are followed to the frames before and after it, for a way."""
+"""Random pixels, the same in each frame, that are followed to the frames before and after it for a trajectory."""
 _FEWEST = 50
 _RETURNS_PX = 0.3
 """Flow there and back ends so near where it began, for a match; DIS errs by about 0.1 px where it does."""
@@ -236,9 +236,11 @@ def with_selected_model(
     if found.robust is None or own.motion is None:
         return found
     matches = flow_matches(flows, np.random.default_rng(seed))
-    told, motion = select_motion_model(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
+    robust_of_law, motion = select_motion_model(
+        found.robust, matches, own.rig.about("left"), own.shutter, robust, seed
+    )
     motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
-    return replace(found, own=replace(own, motion=motion), robust=told)
+    return replace(found, own=replace(own, motion=motion), robust=robust_of_law)
 
 
 def with_best_motion(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
@@ -247,17 +249,17 @@ def with_best_motion(found: FoundOwnMotion, flows: Flows, robust: RobustOptions,
     own = lawful.own
     if lawful.robust is None or own.motion is None:
         return lawful
-    way = camera_two_frame_spline(trajectory_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
-    return lawful if way is None else with_motion(lawful, way)
+    path = camera_two_frame_spline(trajectory_matches(flows, seed), own.motion, own.rig.about("left"), own.shutter)
+    return lawful if path is None else with_motion(lawful, path)
 
 
-def with_motion(found: FoundOwnMotion, way: Motion) -> FoundOwnMotion:
+def with_motion(found: FoundOwnMotion, path: Motion) -> FoundOwnMotion:
     """What is found of two frames, with another motion."""
     robust = found.robust
     if robust is not None:
-        estimate = replace(robust.estimate, w=way.w, d=way.d, covariance=None)
-        robust = replace(robust, estimate=estimate, motion_model=way.name)
-    return replace(found, own=replace(found.own, motion=way), robust=robust)
+        estimate = replace(robust.estimate, w=path.w, d=path.d, covariance=None)
+        robust = replace(robust, estimate=estimate, motion_model=path.name)
+    return replace(found, own=replace(found.own, motion=path), robust=robust)
 
 
 @final
@@ -310,7 +312,7 @@ class MonoFusionCorrector(Corrector):
         return MonoFusion(images, own, flows, self.fusion)
 
 
-# One way of a camera through neighbouring pairs of frames, in place of a law of motion for each.
+# One trajectory of a camera through neighbouring pairs of frames, in place of a motion model for each pair.
 # Two frames do not show what both shake alike; several do, for each frame is in two pairs. Pairs are worked
 # on in groups with some on both sides that help: what is found of a pair does not depend on where a run
 # began, and memory does not grow with the number of frames.
@@ -319,14 +321,14 @@ class MonoFusionCorrector(Corrector):
 _GROUP, _BESIDE = 10, 2
 """Pairs of a group, and those on either side that help."""
 _FEWEST_PAIRS = 3
-"""Pairs in a row, from which on they show a way."""
+"""Fewest successive pairs that determine a trajectory."""
 PIXELS = 300
 """As of ``trajectory_matches``: fewer than of two frames alone do, for each frame is in two pairs."""
 _LEAST = 50
 """Matches."""
 _FLOW_PX = 0.15
-"""Root mean square of what dense flow errs by: up to here a way explains a pair, and where it explains it as well
-as a motion of its own."""
+"""Root mean square error of dense flow, px: up to here a trajectory explains a pair, and where it explains it as
+well as a motion of its own."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -351,35 +353,35 @@ def group_of(pair: int) -> tuple[int, int]:
 def with_shared_trajectory(
     pairs: Iterable[SeenPair], begin: int = 0, first: int = 0
 ) -> Iterator[FoundOwnMotion | None]:
-    """What is found of pairs, in order: by the way through their neighbours, where it explains them as well.
+    """Motions of pairs, in order: from the trajectory through their neighbours where it explains them as well.
 
     Args:
         pairs: in order, from number ``begin`` on: ``group_of(first)[0]`` at the latest.
-        first: number of the first pair that is asked for.
+        first: number of the first pair that is requested.
     """
-    held, told, number = dict[int, SeenPair](), first, begin - 1
+    pending, group, number = dict[int, SeenPair](), first, begin - 1
     for number, pair in enumerate(pairs, start=begin):
-        held[number] = pair
-        if number + 1 == group_of(told)[1]:
-            yield from _group_motions(held, told)
-            told = _next_group(told)
-            held = {k: each for k, each in held.items() if k >= group_of(told)[0]}
-    while told <= number:
-        yield from _group_motions(held, told)
-        told = _next_group(told)
+        pending[number] = pair
+        if number + 1 == group_of(group)[1]:
+            yield from _group_motions(pending, group)
+            group = _next_group(group)
+            pending = {k: each for k, each in pending.items() if k >= group_of(group)[0]}
+    while group <= number:
+        yield from _group_motions(pending, group)
+        group = _next_group(group)
 
 
 def _next_group(pair: int) -> int:
     return pair // _GROUP * _GROUP + _GROUP
 
 
-def _group_motions(held: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
+def _group_motions(pending: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
     """Of the group of one pair, from that pair on."""
     low, high = group_of(first)
-    numbers = [k for k in range(low, high) if k in held]
-    found = {k: held[k].found for k in numbers}
-    for shows, run in itertools.groupby(numbers, lambda k: _shows(held[k])):
-        found |= _along([(k, held[k]) for k in run]) if shows else {}
+    numbers = [k for k in range(low, high) if k in pending]
+    found = {k: pending[k].found for k in numbers}
+    for shows, run in itertools.groupby(numbers, lambda k: _shows(pending[k])):
+        found |= _along([(k, pending[k]) for k in run]) if shows else {}
     return [found[k] for k in range(first, _next_group(first)) if k in found]
 
 
@@ -388,24 +390,24 @@ def _shows(pair: SeenPair) -> bool:
 
 
 def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
-    """Of pairs in a row that show motions: those that go the way which all show together."""
+    """Motions of successive pairs that follow the one trajectory of all of them."""
     motions = [pair.motion for _, pair in run if pair.motion is not None]
     owns = [pair.found.own for _, pair in run if pair.found is not None]
     if len(run) < _FEWEST_PAIRS or owns[0].shutter.readout_ratio == 0.0:
         return {}
-    ways = camera_trajectory(
+    trajectories = camera_trajectory(
         [pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter
     )
     out = dict[int, FoundOwnMotion]()
-    for (number, pair), own, steady, way in zip(run, owns, motions, ways or [], strict=False):
-        errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (way, steady)]
+    for (number, pair), own, steady, path in zip(run, owns, motions, trajectories or [], strict=False):
+        errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (path, steady)]
         if pair.found is not None and errors[0] <= max(errors[1], _FLOW_PX):
-            out[number] = with_motion(pair.found, way)
+            out[number] = with_motion(pair.found, path)
     return out
 
 
 # Frames whose lines are read from any side, as frames whose rows are read from the top: mirrored, or turned.
-# A phone held upright reads columns. A mirror leaves motions motions and times times, so what corrects rows
+# A phone pending upright reads columns. A mirror keeps motions and times valid, so what corrects rows
 # from the top corrects the others; a rotation's axis turns round in it.
 
 

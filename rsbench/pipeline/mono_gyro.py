@@ -48,7 +48,7 @@ _LEAST_RATE = 2e-4
 _APART = 1.0
 """Frame periods beyond which a shift is another one."""
 _CERTAIN, _MOST_SIGMA, _FEWEST = 0.99, 0.15, 6
-"""Probability of the shift that is told, its standard deviation, frame periods, and the pairs it rests on."""
+"""Least probability, largest deviation (frame periods) and fewest pairs of a shift that counts as determined."""
 _CLEARLY = 2.5
 """Deviations from 0 of a shift that is used: who recorded both together knows the clock better than frames do."""
 _EXPLAINED = 0.2
@@ -226,12 +226,12 @@ def with_gyro(
     few = matches[:_MATCHES]  # they are in random order
     given = Correspondences(left=few, gyro=samples)
     quick = replace(robust, max_iterations=min(robust.max_iterations, _SAMPLES))
-    told = estimate_motion(given, rig, shutter, GyroSolver(), quick, rng)
-    if not told.estimate.success:
+    first = estimate_motion(given, rig, shutter, GyroSolver(), quick, rng)
+    if not first.estimate.success:
         if own.motion is None:
             return rotation_alone(rig, shutter, side, samples)
         return replace(found, unused=CONTRADICTED)
-    noise_px = max(told.threshold_px / _PX_PER_SIGMA, _NOISE_PX)
+    noise_px = max(first.threshold_px / _PX_PER_SIGMA, _NOISE_PX)
     weight = float(np.sqrt(min(_WORTH, len(few)) / len(few))) / noise_px
 
     def moving(x: FloatArray) -> GyroMotion:
@@ -242,7 +242,7 @@ def with_gyro(
         tamed = np.sign(errors) * np.sqrt(2.0 * (np.sqrt(1.0 + errors**2) - 1.0))  # linear where they are large
         return np.concatenate([tamed, x[:3], [float(np.linalg.norm(x[3:])) - 1.0]])
 
-    start = np.concatenate([np.zeros(3), told.estimate.d])
+    start = np.concatenate([np.zeros(3), first.estimate.d])
     bias_d = scipy.optimize.least_squares(residuals, start, method="lm", max_nfev=200, xtol=1e-6).x
     motion = moving(bias_d)
 
@@ -252,4 +252,4 @@ def with_gyro(
     worse = _WORSE if float(np.linalg.norm(bias_d[:3])) > _BIASED else _FAR_WORSE
     if own.motion is not None and miss_px(motion) > worse * miss_px(own.motion):
         return replace(found, unused=CONTRADICTED)
-    return FoundOwnMotion(own=replace(own, motion=motion), robust=told)
+    return FoundOwnMotion(own=replace(own, motion=motion), robust=first)

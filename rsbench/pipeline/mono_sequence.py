@@ -205,19 +205,19 @@ def correct_frames(
     """
     options = options or MonoOptions()
     turn = turned(camera, shutter)
-    held: MonoMoment | None = None
+    pending: MonoMoment | None = None
     each: _Frame | None = None
     for each in _with_neighbours(_pairs(frames, turn, options, done, gyro)):
         if each.number < done:
             continue
         if each.number == 1 and each.after is None and each.before and not each.before.fusion:
             raise RsbenchError(f"frames: {each.before.reason}")
-        if held is not None:
-            yield held
-        held = _moment(each, turn, options)
+        if pending is not None:
+            yield pending
+        pending = _moment(each, turn, options)
         if each.number > 0:  # a first one waits for whether others follow the second
-            yield held
-            held = None
+            yield pending
+            pending = None
     if each is None:
         raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
 
@@ -267,8 +267,8 @@ def _pairs(
         seen, found = at
         return seen, None if seen.number < first else _ready(seen, found, turn, options)
 
-    def found_in_order(ways: Iterator[FoundOwnMotion | None]) -> Iterator[tuple[_Seen, FoundOwnMotion | None]]:
-        for found in ways:
+    def found_in_order(motions: Iterator[FoundOwnMotion | None]) -> Iterator[tuple[_Seen, FoundOwnMotion | None]]:
+        for found in motions:
             while waiting[0].number < first:
                 yield waiting.popleft(), None
             yield waiting.popleft(), found
@@ -279,8 +279,8 @@ def _pairs(
     for number, (before, image) in itertools.islice(pairs, begin):
         yield number + 1, before, image, None
     seen = kept(map_ahead(look, pairs, _AT_ONCE, _AT_ONCE))
-    ways = (each.found for each in seen) if gyro is not None else with_shared_trajectory(seen, begin, first)
-    for each, pair in map_ahead(ready, found_in_order(ways), _AT_ONCE, _AT_ONCE):
+    motions = (each.found for each in seen) if gyro is not None else with_shared_trajectory(seen, begin, first)
+    for each, pair in map_ahead(ready, found_in_order(motions), _AT_ONCE, _AT_ONCE):
         yield each.number + 1, *each.images, pair
 
 
@@ -359,7 +359,7 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Mon
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
     flows, corrector = seen.flows or find_flows(images), options.corrector
-    if isinstance(found.own.motion, InertialMotion):  # on no way
+    if isinstance(found.own.motion, InertialMotion):  # on no trajectory
         found = with_best_motion(found, flows, corrector.robust, corrector.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
@@ -374,11 +374,11 @@ def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
     """A frame corrected with one neighbour, filled from both; or as it was read, with the reason."""
     line = (turn.camera.height - 1) / 2 if options.target_row is None else turn.line(options.target_row)
     times = [float(turn.shutter.time_after(line, place, "left")) for place in FRAMES]
-    ways = [(each.before, 1), (each.after, 0)]
+    sources = [(each.before, 1), (each.after, 0)]
     if line > (turn.camera.height - 1) / 2:
-        ways.reverse()
+        sources.reverse()
     good = [
-        (pair.fusion, place, pair.found) for pair, place in ways if pair is not None and pair.fusion is not None
+        (pair.fusion, place, pair.found) for pair, place in sources if pair is not None and pair.fusion is not None
     ]
     why = "" if each.before is None else each.before.reason
     # A camera that stood still is in place; the same frame twice stands for one that was not taken.

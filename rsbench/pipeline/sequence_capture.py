@@ -99,7 +99,7 @@ def estimate_sequence_capture(
         advance: called for each window.
 
     Raises:
-        RefusedFramesError: the first windows cannot be what they are said to be.
+        RefusedFramesError: the first windows contradict the given rig.
         NoMotionError: the windows do not determine the shutter.
     """
 
@@ -107,8 +107,8 @@ def estimate_sequence_capture(
         return estimate_sequence_capture(left, right, rig, options, 0.0, Scanning(), calibration, advance)[0]
 
     scanning = scanning if readout_ratio is None else scanning or Scanning()
-    asked = (rig, options, readout_ratio, scanning, calibration)
-    look, refusals = _Look(*asked, under_global), Refusals(left)
+    inputs = (rig, options, readout_ratio, scanning, calibration)
+    look, refusals = _Look(*inputs, under_global), Refusals(left)
     doubts = list[RefusedFramesError | None]()
     every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(window_images(left, right)):
@@ -221,8 +221,8 @@ class _Look:
         if self._ratio is not None or len(self._first) + 1 < FEWEST_FRAMES:
             return capture
         if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
-            said = None if self._scanning is None else (self._scanning,)
-            return capture_of_sequence(capture, self._first, self._rig, said, self._options.seed)
+            given = None if self._scanning is None else (self._scanning,)
+            return capture_of_sequence(capture, self._first, self._rig, given, self._options.seed)
         return capture
 
 

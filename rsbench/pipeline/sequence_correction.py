@@ -182,7 +182,7 @@ def correct_sequence(
         gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; of one that ``takes_gyro``.
 
     Raises:
-        RefusedFramesError: the first three windows, or all, cannot be what they are said to be.
+        RefusedFramesError: the first three windows, or all, contradict the given rig.
         RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
     """
     scanning = scanning or Scanning()
@@ -216,8 +216,8 @@ def _has_trajectory(left: FrameSource, shutter: RollingShutter, options: Correct
 
 def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
     """Whether a trajectory is fitted if the shutter rolls: of four frames and more whose motion model is open."""
-    asked = options.motion_model == AUTO and "motion" in options.corrector.component.spec.needs
-    return asked and not 0 < left.count < FEWEST_FRAMES
+    chosen = options.motion_model == AUTO and "motion" in options.corrector.component.spec.needs
+    return chosen and not 0 < left.count < FEWEST_FRAMES
 
 
 def _windows(
