@@ -23,6 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
@@ -50,7 +51,7 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
     forget_features()
     matches = timed("match", lambda: match_frames(images, rig, options))
     ratio = sequence.shutter.readout_ratio
-    solved = timed("solve", lambda: solve_frames(matches, rig, ratio, options))
+    solved = timed("solve", lambda: solve_frames(matches, rig, KnownInputs(readout_ratio=ratio), options))
     found, shutter = solved.found, solved.shutter
     pairs = timed("depth", lambda: find_depth(images, rig, shutter, found.motion, options))
     timed("correct", lambda: correct_frames(images, pairs, rig, shutter, found.motion, options))

@@ -18,6 +18,7 @@ import numpy as np
 from rsbench.capture.calibration import NO_ERRORS, STRETCHING, TERMS, ray_shifts, ray_stretches
 from rsbench.components.motion_kernels import MotionKernel
 from rsbench.components.motion_models import AcceleratedKernel, any_law, load_kernel
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
@@ -140,6 +141,16 @@ class KnownInputs:
     calibration: tuple[float, ...] | None = None
     """Errors of the calibration, see ``calibration.TERMS``."""
     models: tuple[str, ...] = MODELS
+
+    def shutter_of(self, camera: PinholeCamera) -> RollingShutter:
+        """The shutter of a given readout ratio; without a scanning, rows from the top.
+
+        Raises:
+            ValueError: there is no readout ratio.
+        """
+        if self.readout_ratio is None:
+            raise ValueError("readout_ratio: must be given")
+        return (self.scanning or Scanning()).shutter_of(camera.width, camera.height, self.readout_ratio)
 
 
 @dataclass(frozen=True, kw_only=True)

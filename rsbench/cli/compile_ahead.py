@@ -51,6 +51,7 @@ def compile_all(line: int) -> None:
 def parts() -> list[Callable[[], object]]:
     """Calls that compile the spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
+    from rsbench.capture.hypotheses import KnownInputs
     from rsbench.capture.two_frame_spline import two_frame_spline
     from rsbench.components.motion_models import LinearMotion
     from rsbench.core.camera import PinholeCamera
@@ -83,7 +84,7 @@ def parts() -> list[Callable[[], object]]:
         lambda: two_frame_spline(data.correspondences, rig, shutter, motion),
         lambda: find_depth(images, rig, shutter, motion, options),
         corrected,
-        lambda: solve_frames(data.correspondences, rig, shutter.readout_ratio, options),
+        lambda: solve_frames(data.correspondences, rig, KnownInputs(readout_ratio=shutter.readout_ratio), options),
         lambda: match_frames(images, rig, options),
     ]
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsbench.capture.calibration import of_offset
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -116,8 +117,9 @@ def correct_four(
     if given.motion is not None and readout_ratio is None:
         raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    shutter_inputs = (readout_ratio, scanning, disparity_offset)
-    matches, found, shutter, capture = _solve(images, rig, shutter_inputs, options, given, clock)
+    calibration = None if disparity_offset is None else of_offset(disparity_offset)
+    inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration)
+    matches, found, shutter, capture = _solve(images, rig, inputs, options, given, clock)
     offset = disparity_offset or 0.0 if found is None else found.disparity_offset
     if capture is not None:
         check_cameras(rig, shutter.scanning, options, disparity_offset, given.pairs is not None)
@@ -190,36 +192,27 @@ def _check_matcher(options: CorrectionOptions, disparity_offset: float | None) -
 def _solve(
     images: Images,
     rig: StereoRig,
-    shutter_inputs: tuple[float | None, Scanning | None, float | None],
+    inputs: KnownInputs,
     options: CorrectionOptions,
     given: Given,
     clock: _Clock,
 ) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, Capture | None]:
-    """Matches, motion and shutter, as far as they are needed and not given.
-
-    Args:
-        shutter_inputs: readout ratio, scanning and disparity offset, as of ``correct_four``.
-    """
-    readout_ratio, scanning, disparity_offset = shutter_inputs
+    """Matches, motion and shutter, as far as they are needed and not given."""
     needs = options.corrector.component.spec.needs
     wanted = given.motion is None and "motion" in needs
     matched = given.matches is not None or "matches" not in needs
-    camera, doubt, matches = rig.camera, None, given.matches
-    if readout_ratio is not None and not wanted and matched:
+    doubt, matches = None, given.matches
+    if inputs.readout_ratio is not None and not wanted and matched:
         clock("matching")
         clock("motion")
-        shutter = (scanning or Scanning()).shutter_of(camera.width, camera.height, readout_ratio)
-        return matches, None, shutter, None
+        return matches, None, inputs.shutter_of(rig.camera), None
     forget_features()
-    if matches is None and readout_ratio is None and scanning is None:
+    if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
         matches, doubt = match_unknown(images, rig, options)
     elif matches is None:
-        matches = match_frames(images, rig, options, scanning)
+        matches = match_frames(images, rig, options, inputs.scanning)
     clock("matching")
-    calibration = None if disparity_offset is None else of_offset(disparity_offset)
-    solved = solve_frames(
-        matches, rig, readout_ratio, options, calibration, scanning, doubt=doubt, with_motion=wanted
-    )
+    solved = solve_frames(matches, rig, inputs, options, doubt=doubt, with_motion=wanted)
     clock("motion")
     return solved.matches, solved.found, solved.shutter, solved.capture
 

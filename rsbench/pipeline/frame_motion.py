@@ -423,21 +423,18 @@ class SolvedFrames:
 def solve_frames(
     matches: Correspondences,
     rig: StereoRig,
-    readout_ratio: float | None,
+    given: KnownInputs,
     options: CorrectionOptions,
-    calibration: tuple[float, ...] | None = None,
-    scanning: Scanning | None = None,
     *,
     doubt: RefusedFramesError | None = None,
     in_order: bool = False,
     with_motion: bool = True,
 ) -> SolvedFrames:
-    """Motion and shutter from matches; what is None of the shutter is found with the motion.
+    """Motion and shutter from matches; what ``given`` lacks of the shutter is estimated with the motion.
 
     Args:
-        calibration: what the calibration is wrong by (``calibration.TERMS``); None has it found where the
-            row differences of the matches show that it is wrong.
-        scanning: how the cameras read; None: found with the readout ratio; rows from the top where that is given.
+        given: without a calibration its errors are estimated if the row differences of the matches show some;
+            without a scanning it is estimated with the readout ratio, or is rows from the top where that is given.
         doubt: raised where the cameras read rows together, see ``match_unknown``.
         in_order: whether the frames are known to be in the order of time.
         with_motion: whether a motion is requested beside the shutter.
@@ -446,8 +443,9 @@ def solve_frames(
         RefusedFramesError: time runs backwards in the frames.
         NoMotionError: no motion explains the matches, or they do not determine the shutter.
     """
-    if readout_ratio is None:
-        capture = find_capture(matches, rig, options, None, scanning, calibration)
+    scanning = given.scanning
+    if given.readout_ratio is None:
+        capture = find_capture(matches, rig, given, options)
         if scanning is not None and runs_backwards(
             capture, scans_of(scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0))
         ):
@@ -459,9 +457,9 @@ def solve_frames(
                 raise doubt
             matches = on_their_rows(matches, rig)
     else:
-        scanning, capture = scanning or Scanning(), None
-        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
-        used, errors = _calibrated(matches, rig, readout_ratio, options, scanning, calibration)
+        given, capture = replace(given, scanning=scanning or Scanning()), None
+        shutter = given.shutter_of(rig.camera)
+        used, errors = _calibrated(matches, rig, given, options)
     if not with_motion:
         return SolvedFrames(found=None, shutter=shutter, matches=matches, capture=capture)
     at_rest = recalibrated(matches, rig, errors)
@@ -476,37 +474,31 @@ def solve_frames(
 def _calibrated(
     matches: Correspondences,
     rig: StereoRig,
-    readout_ratio: float,
+    given: KnownInputs,
     options: CorrectionOptions,
-    scanning: Scanning,
-    calibration: tuple[float, ...] | None,
 ) -> tuple[Capture | None, tuple[float, ...]]:
     """What the matches say of a calibration that may be wrong, with a known shutter; None where it is right."""
-    if calibration is not None or not scanning.rows_together:
-        return None, calibration or NO_ERRORS
-    known = known_of(matches, rig, KnownInputs(readout_ratio=readout_ratio, scanning=scanning))
-    if not any(known.calibration_sigma):
+    if given.calibration is not None or not (given.scanning or Scanning()).rows_together:
+        return None, given.calibration or NO_ERRORS
+    if not any(known_of(matches, rig, given).calibration_sigma):
         return None, NO_ERRORS
-    capture = find_capture(matches, rig, options, readout_ratio, scanning)
+    capture = find_capture(matches, rig, given, options)
     return (capture, capture.calibration) if capture.peaks else (None, NO_ERRORS)
 
 
 def find_capture(
     matches: Correspondences,
     rig: StereoRig,
+    given: KnownInputs,
     options: CorrectionOptions,
-    readout_ratio: float | None = None,
-    scanning: Scanning | None = None,
-    calibration: tuple[float, ...] | None = None,
 ) -> Capture:
-    """What the matches of two times say of the motion, and of what is None of the shutter and the calibration."""
+    """Motion of two times, and what ``given`` lacks of shutter and calibration, from matches."""
     entry, models = options.solver, models_asked(options.motion_model)
     if options.motion_model is None and isinstance(entry.solver, RefinedSolver):
         models = (entry.solver.motion_model,)
-    given = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration, models=models)
-    known = known_of(matches, rig, given)
+    known = known_of(matches, rig, replace(given, models=models))
     capture = conclude([examine(matches, rig, known, options.robust, options.seed)])
-    return as_global(capture, [matches], rig, known) if readout_ratio is None else capture
+    return as_global(capture, [matches], rig, known) if given.readout_ratio is None else capture
 
 
 def _runs_backwards(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.model_choice import AUTO
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import StreamedWindow, stream_trajectory
@@ -233,15 +234,15 @@ def _windows(
     needs, refusals = options.corrector.component.spec.needs, Refusals(left)
     matching = options if with_motion or "matches" in needs else with_enough(options, ENOUGH)
     number = -1
+    inputs = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=calibration)
     for number, images in enumerate(window_images(left, right)):
         found, reason, matches = None, "", None
         if needs & {"motion", "matches"}:
             try:
-                judged, scanning = number < JUDGED, shutter.scanning
-                matches = match_frames(images, rig, matching, scanning, judge_rig=judged)
+                judged = number < JUDGED
+                matches = match_frames(images, rig, matching, shutter.scanning, judge_rig=judged)
                 if "motion" in needs and with_motion:
-                    ratio = shutter.readout_ratio
-                    found = solve_frames(matches, rig, ratio, options, calibration, scanning, in_order=True).found
+                    found = solve_frames(matches, rig, inputs, options, in_order=True).found
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:

@@ -165,7 +165,9 @@ def test_frames_in_the_wrong_order_are_noticed() -> None:
         assert runs_backwards(found_in(given, MODELS), scans_of(data.shutter)) == backwards
     for ratio in (None, 0.8):
         with pytest.raises(RefusedFramesError, match="backwards"):
-            solve_frames(turned, RIG, ratio, CorrectionOptions(motion_model=AUTO), scanning=TOP)
+            solve_frames(
+                turned, RIG, KnownInputs(readout_ratio=ratio, scanning=TOP), CorrectionOptions(motion_model=AUTO)
+            )
 
 
 def test_a_disparity_offset_is_found_with_the_ratio() -> None:
@@ -204,7 +206,7 @@ def matches_of(model: str, seed: int = 0) -> Correspondences:
 def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     """Among outliers; chi-squared with 6 degrees of freedom: beyond 22.5 in one of a thousand."""
     options = CorrectionOptions(motion_model=AUTO)
-    solved = solve_frames(matches_of(model), RIG, 0.8, options, scanning=TOP, in_order=True)
+    solved = solve_frames(matches_of(model), RIG, AT_TOP, options, in_order=True)
     assert solved.found is not None and solved.found.choice is not None
     choice, found = solved.found.choice, solved.found.robust.estimate
     assert choice.used == model and sum(choice.probability.values()) == pytest.approx(1.0)
@@ -212,7 +214,7 @@ def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     error = np.concatenate([found.w - W, found.d - D])
     assert error @ np.linalg.solve(_known(found.covariance), error) < 22.5
     if model != "linear":
-        linear = solve_frames(matches_of(model), RIG, 0.8, CorrectionOptions(), scanning=TOP, in_order=True).found
+        linear = solve_frames(matches_of(model), RIG, AT_TOP, CorrectionOptions(), in_order=True).found
         assert linear is not None
         assert np.linalg.norm(linear.motion.d - D) > 2 * np.sqrt(np.trace(_known(found.covariance)[3:, 3:]))
 

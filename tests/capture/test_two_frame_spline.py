@@ -9,7 +9,7 @@ from shaken_rig import HEIGHT, RATIO, RIG, SHAKES, SHUTTER, Law, matches, sines,
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import RefusedFramesError
-from rsbench.capture.hypotheses import MODELS
+from rsbench.capture.hypotheses import MODELS, KnownInputs
 from rsbench.capture.sequence_shutter import capture_of_video
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_spline import ContinuousMotion
@@ -32,6 +32,7 @@ from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
+GIVEN = KnownInputs(readout_ratio=RATIO)
 OPTIONS = CorrectionOptions(motion_model="auto")
 
 
@@ -134,11 +135,11 @@ def test_exchanged_times_of_a_rig_that_shakes_are_refused_and_right_ones_are_not
     for seed in range(3):
         rng = np.random.default_rng(seed)
         (window,), _ = matches(sines(rng, *SHAKES[shake]), 2, rng, noise=0.1, count=600)
-        found = solve_frames(window, RIG, RATIO, OPTIONS).found
+        found = solve_frames(window, RIG, GIVEN, OPTIONS).found
         assert found is not None and found.motion.name == "continuous"  # and it was not refused
         exchanged = Correspondences(tracks=np.roll(window.tracks, 4, axis=1))
         with pytest.raises(RefusedFramesError, match="backwards"):
-            solve_frames(exchanged, RIG, RATIO, OPTIONS)
+            solve_frames(exchanged, RIG, GIVEN, OPTIONS)
 
 
 def test_where_the_laws_find_the_shutter_that_is_said_no_spline_makes_time_run_backwards(
@@ -147,7 +148,7 @@ def test_where_the_laws_find_the_shutter_that_is_said_no_spline_makes_time_run_b
     """Matches among trees err together: a spline may be preferred to the law, and the opposite one to it."""
     rng = np.random.default_rng(0)
     (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=100)
-    spline = solve_frames(window, RIG, RATIO, OPTIONS).found
+    spline = solve_frames(window, RIG, GIVEN, OPTIONS).found
     motion = make_motion("accelerated", 0.05 * rng.normal(size=3), 0.2 * rng.normal(size=3), {"acceleration": 0.3})
     data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=300, noise_px=0.3), rng).correspondences
     exchanged = Correspondences(tracks=np.roll(data.tracks, 4, axis=1))
@@ -164,7 +165,7 @@ def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
         rng = np.random.default_rng(seed)
         (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=400)
         with pytest.raises(NoMotionError, match="cannot tell"):
-            solve_frames(window, RIG, None, OPTIONS)
+            solve_frames(window, RIG, KnownInputs(), OPTIONS)
         problem = Problem(name="", correspondences=window, rig=RIG, known_shutter=None)
         with SolverRunner() as runner:
             answer = solve_problem(problem, OPTIONS.solver, OPTIONS.robust, runner, motion_model="auto")

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
@@ -282,7 +283,7 @@ def test_matches_without_a_motion_say_why(castle: Sequence) -> None:
     rng = np.random.default_rng(0)
     noise = Correspondences(left=rng.uniform(0, 90, (8, 4)), right=rng.uniform(0, 90, (8, 4)))
     with pytest.raises(NoMotionError, match="found no motion: "):
-        solve_frames(noise, castle.rig, 0.8, CorrectionOptions())
+        solve_frames(noise, castle.rig, KnownInputs(readout_ratio=0.8), CorrectionOptions())
 
 
 def test_sixteen_bits_use_one_factor_for_all() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -184,7 +183,7 @@ def unpainted(names: Iterable[str], seed: int) -> dict[str, Surface]:
 @pytest.mark.slow
 def test_the_seed_decides_the_arrays(scene: Scene, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     card, builder = read_scene_card(card_path("scenes", name))
-    monkeypatch.setattr(sys.modules[type(builder).__module__], "paint_palette", unpainted)
+    monkeypatch.setattr("rsbench.scenes.parts.paint_palette", unpainted)
     for mesh, again in zip(scene.meshes, builder.build(card.seed, Path()), strict=True):
         assert mesh.uv is not None and again.uv is not None
         assert np.array_equal(mesh.vertices, again.vertices)

@@ -29,6 +29,7 @@ from rsbench.benchmark.leaderboard.pictures import (
 )
 from rsbench.benchmark.leaderboard.splits import Frames
 from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Track
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
@@ -157,7 +158,8 @@ def _motion(work: SharedWork, chain: CorrectionOptions) -> Motion:
     if work.known.motion is None:
         matches = match_frames(work.images, rig, chain, shutter.scanning)
         matched = time.perf_counter()
-        found = solve_frames(matches, rig, shutter.readout_ratio, chain, scanning=shutter.scanning).found
+        given = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning)
+        found = solve_frames(matches, rig, given, chain).found
         assert found is not None
         work.known = Given(motion=found.motion)
         work.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
