@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import itertools
 import re
 import subprocess
@@ -209,6 +210,15 @@ def test_lines_of_documents_wrap_at_100_columns(document: Path) -> None:
     prose = re.sub(r"^( *)(`{3,}).*?^\1\2$", "", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
     whole = re.compile(r"\||    |.*\]\(|.*://")
     assert [line for line in prose.splitlines() if len(line) > 100 and not whole.match(line)] == []
+
+
+def test_the_five_functions_of_a_correction_exist() -> None:
+    text = (DOCS / "explanation" / "one-frame.md").read_text("utf-8")
+    names = re.findall(r"^\| \d\. \w+ \| `([\w.]+)` \|", text, re.MULTILINE)
+    assert len(names) == 5
+    for name in names:
+        module, _, function = name.rpartition(".")
+        assert callable(getattr(importlib.import_module(module), function)), name
 
 
 def test_the_conversion_to_the_papers_axes_holds() -> None:
