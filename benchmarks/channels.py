@@ -21,7 +21,7 @@ from rsbench.components.cards import load_card
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import CHANNELS, write_sequence_channels
-from rsbench.dataset.generation import build_scene, render_camera
+from rsbench.dataset.generation import build_scene, render_camera, sequence_truth
 from rsbench.dataset.sequence import files_of
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
@@ -42,7 +42,8 @@ def seconds(card: DatasetCard, options: RendererOptions, scene: MitsubaScene, vi
             for view in VIEWS:
                 for _ in render_camera(card, sequence, options, scene, *view, Path(folder), later):
                     pass
-            write_sequence_channels(Path(folder), card, sequence, scene, asdict(viewpoint))
+            truth = sequence_truth(Path(folder), card, sequence, scene, asdict(viewpoint))
+            write_sequence_channels(card.channels, truth)
         return time.perf_counter() - begun, time.process_time() - used
 
 

@@ -77,7 +77,7 @@ from rsbench.storage.files import (
 from rsbench.storage.untrusted_files import inside
 
 if TYPE_CHECKING:
-    from rsbench.dataset.card import DatasetCard, SequenceCard
+    from rsbench.renderers.image import Sensor
     from rsbench.renderers.render import Frame
     from rsbench.renderers.scene import MitsubaScene
     from rsbench.renderers.visibility import Surfaces
@@ -202,8 +202,13 @@ class SequenceTruth:
     """What the channels of a whole sequence are made of, when its frames are there."""
 
     folder: Path
-    card: DatasetCard
-    sequence: SequenceCard
+    geometry: FixedGeometry
+    seed: str
+    """Of the random draws of its channels."""
+    frame_period_s: float
+    sensor: Sensor | None
+    imu: Imu
+    matching: Matching
     scene: MitsubaScene
     record: Mapping[str, Any]
     """What sequence.json says of the scene."""
@@ -211,19 +216,8 @@ class SequenceTruth:
     """``SceneRays`` through the scene."""
 
     @cached_property
-    def geometry(self) -> FixedGeometry:
-        card, sequence = self.card, self.sequence
-        return FixedGeometry(
-            card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence), card.frames
-        )
-
-    @property
-    def seed(self) -> str:
-        return f"{self.card.seed_of(self.sequence)}/{self.sequence.name}"
-
-    @cached_property
     def tracks(self) -> Tracks:
-        views = views_of(self.card.frames)
+        views = views_of(self.geometry.frames)
         depths = {view: read_depth(self.folder / ImageView("rs", *view).depth) for view in views}
         return make_tracks(self.geometry, depths, self.rays.blocked, self.seed)
 
@@ -319,9 +313,8 @@ class _Timing(TruthChannel):
         return timing_files(frames)
 
     def write_whole(self, whole: SequenceTruth) -> None:
-        card, sequence = whole.card, whole.sequence
-        sensor, period = card.sensor_of(sequence), card.period_of(sequence)
-        write_timing(whole.folder, card.shutter_for(sequence), period, sensor, card.frames)
+        shutter, frames = whole.geometry.shutter, whole.geometry.frames
+        write_timing(whole.folder, shutter, whole.frame_period_s, whole.sensor, frames)
 
 
 class _Normals(TruthChannel):
@@ -357,9 +350,9 @@ class _Inertial(TruthChannel):
         return IMU_FILES
 
     def write_whole(self, whole: SequenceTruth) -> None:
-        card, sequence, geometry = whole.card, whole.sequence, whole.geometry
-        imu, gravity, period = card.imu or Imu(), gravity_of(whole.record), card.period_of(sequence)
-        times = sample_times_ns(imu, geometry.shutter, period, card.sensor_of(sequence), card.frames)
+        imu, geometry, period = whole.imu, whole.geometry, whole.frame_period_s
+        gravity = gravity_of(whole.record)
+        times = sample_times_ns(imu, geometry.shutter, period, whole.sensor, geometry.frames)
         samples = draw_samples(imu, geometry.motion, times, period, gravity, whole.seed)
         write_imu(whole.folder, imu, gravity, samples)
 
@@ -414,9 +407,9 @@ class _Matches(TruthChannel):
         return (MATCHER, *map(matches_file, range(frames - 1)))
 
     def write_whole(self, whole: SequenceTruth) -> None:
-        matching, folder = whole.card.matches or Matching(), whole.folder
+        matching, folder = whole.matching, whole.folder
         write_json(folder / MATCHER, matcher_record(matching))
-        for first in range(whole.card.frames - 1):
+        for first in range(whole.geometry.frames - 1):
             views = [(side, first + frame) for side, frame in VIEWS]
             images = {view: read_png(folder / ImageView("rs", *view).image) for view in views}
             made = make_matches(whole.geometry, first, images, matching, whole.rays)
@@ -490,16 +483,9 @@ def write_channels(
             later(channel.write_values, folder / file, values)
 
 
-def write_sequence_channels(
-    folder: Path, card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, record: Mapping[str, Any]
-) -> None:
-    """Write the files of a card's channels that belong to no one frame, as of ``SequenceTruth``."""
-    from rsbench.renderers.visibility import SceneRays
-
-    whole = SequenceTruth(
-        folder=folder, card=card, sequence=sequence, scene=scene, record=record, rays=SceneRays(scene)
-    )
-    for channel in known(card.channels):
+def write_sequence_channels(names: Sequence[Channel], whole: SequenceTruth) -> None:
+    """Write the files of named channels that belong to no one frame."""
+    for channel in known(names):
         channel.write_whole(whole)
 
 

@@ -7,7 +7,7 @@ import secrets
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,14 +21,15 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import load_card
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import Geometry, poses_of
+from rsbench.core.geometry import FixedGeometry, Geometry, poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.channels import write_channels, write_sequence_channels
+from rsbench.dataset.channels import SequenceTruth, write_channels, write_sequence_channels
 from rsbench.dataset.destinations import Target, open_destination
+from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import clean_file
 from rsbench.dataset.manifest import Files
 from rsbench.dataset.matches import Matching
@@ -249,7 +250,9 @@ def _render_sequence(
     with background_writer() as later:
         for side, frame in views_of(card.frames):
             yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial, later)
-        write_sequence_channels(partial, card, sequence, mitsuba_scene, plan["scene"])
+        write_sequence_channels(
+            card.channels, sequence_truth(partial, card, sequence, mitsuba_scene, plan["scene"])
+        )
     files = {name: sha256(partial / name) for name in files_below(partial)}
     made_by = {
         "rsbench": __version__,
@@ -317,6 +320,29 @@ def render_camera(
             write_channels(folder, card.channels, geometry, view, rendered, SceneRays(scene, things), later, twins)
         if view.row == 0:
             yield
+
+
+def sequence_truth(
+    folder: Path, card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, record: Mapping[str, Any]
+) -> SequenceTruth:
+    """The truth of a rendered sequence, as its card gives it; ``record`` is that of the scene."""
+    from rsbench.renderers.visibility import SceneRays
+
+    geometry = FixedGeometry(
+        card.rig_of(sequence), card.shutter_for(sequence), card.motion_of(sequence), card.frames
+    )
+    return SequenceTruth(
+        folder=folder,
+        geometry=geometry,
+        seed=f"{card.seed_of(sequence)}/{sequence.name}",
+        frame_period_s=card.period_of(sequence),
+        sensor=card.sensor_of(sequence),
+        imu=card.imu or Imu(),
+        matching=card.matches or Matching(),
+        scene=scene,
+        record=record,
+        rays=SceneRays(scene),
+    )
 
 
 def render_view(

@@ -20,6 +20,7 @@ from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Channel, channel_files, write_sequence_channels
+from rsbench.dataset.generation import sequence_truth
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.tracks import track_views
 from rsbench.renderers import visibility
@@ -73,7 +74,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).parent.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(visibility, "SceneRays", PlaneRays)
-        write_sequence_channels(folder, card, card.sequence[0], None, own["scene"])  # pyrefly: ignore[bad-argument-type]
+        whole = sequence_truth(folder, card, card.sequence[0], None, own["scene"])  # pyrefly: ignore[bad-argument-type]
+        write_sequence_channels(card.channels, whole)
     own |= {key: card.manifest_of(card.sequence[0])[key] for key in ("channels", "imu", "matches")}
     own["files"] |= dict.fromkeys(channel_files(CHANNELS, (), COUNT), "")
     write_json(folder / "sequence.json", own)
