@@ -182,7 +182,7 @@ def section(
     source = f"{REPOSITORY}/{module.replace('.', '/')}.py"
     lines = [
         f"- Paper: {spec.reference}.",
-        f"- Equations: `{equations[module.rpartition('.')[2]]}` ([source]({source})).",
+        f"- Equations: `{equations[type(entry.solver).__name__]}` ([source]({source})).",
         f"- Needs at least {needs}. Gives {gives}.",
         f"- Assumes {spec.assumes}; motion model `{spec.motion_model}`.",
         *(measured(row) if row else ["- Bias, noise, time and success: not measured yet."]),

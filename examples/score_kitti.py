@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS, CardSigma, RefusedFramesError, recalibrated
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.trajectory_estimate import stream_trajectory
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
@@ -208,7 +209,8 @@ def score(given: argparse.Namespace) -> list[str]:
             (side, n): read_frame(files[i][k + n]) for n in (0, 1) for i, side in enumerate(("left", "right"))
         }
         try:
-            motion = solve_frames(match_frames(images, rig, options), rig, ratio, options, calibration).found
+            inputs = KnownInputs(readout_ratio=ratio, calibration=calibration)
+            motion = solve_frames(match_frames(images, rig, options), rig, inputs, options).found
             assert motion is not None
         except RsbenchError as error:
             refused += 1

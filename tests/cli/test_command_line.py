@@ -336,7 +336,7 @@ REFUSED = {
     f"{GENERATE} --channels=": ["--channels : ''"],
     f"{GENERATE} --channels nix": ["--channels nix: 'nix'"],
     f"{GENERATE} --channels timing,timing": ["each once"],
-    f"{GENERATE} --channels all": ["dataset small: channels: 'disparity' is made of cameras without a lens"],
+    f"{GENERATE} --channels all": ["dataset small: channels: 'disparity' needs cameras without a lens"],
     f"{GENERATE} --only b": ["no sequence 'b'"],
     f"{GENERATE} --estimate --full-frames": ["--estimate: not with --full-frames"],
     "simulate nois --out {out}": ["did you mean 'noise'?"],

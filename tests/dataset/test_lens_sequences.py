@@ -291,8 +291,8 @@ def test_flow_is_that_of_the_points(made: dict[str, Path], name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "channel", "message"),
     [
-        ("barrel", "disparity", "'disparity' is made of cameras without a lens"),
-        ("late", "disparity", "'disparity' is made of cameras that read rows from the top at once"),
+        ("barrel", "disparity", "'disparity' needs cameras without a lens"),
+        ("late", "disparity", "'disparity' needs cameras that both read rows from the top at the same time"),
     ],
 )
 def test_channels_that_cameras_cannot_have_are_refused_by_name(name: str, channel: Channel, message: str) -> None:
