@@ -41,8 +41,15 @@ def test_of_a_rig(known: bool, sigmas: dict[str, Any], castle: Sequence, tmp_pat
     lines += [f"{name} = {value}" for name, value in sigmas.items()]
     (tmp_path / "rig.toml").write_text("\n".join(lines))
     paths = [castle.folder / "rs" / f"{name}.png" for name in ORDER]
+    images = [read_png(path) for path in paths]
+    if not known:  # these frames do not determine it, and both refuse for the same reason
+        result = run_here("correct", *paths, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out")
+        with pytest.raises(rsbench.RsbenchError, match="cannot tell the readout ratio") as refused:
+            rsbench.correct(images, castle.rig, None, **sigmas)
+        assert result.returncode == 1 and str(refused.value) in result.stderr
+        return
     record = _run(tmp_path / "out", *paths, "--rig", tmp_path / "rig.toml")
-    found = rsbench.correct([read_png(path) for path in paths], castle.rig, ratio if known else None, **sigmas)
+    found = rsbench.correct(images, castle.rig, ratio, **sigmas)
     assert found.motion is not None
     # JSON keeps every digit of a number: the same steps on the same inputs leave no difference.
     assert record["readout_ratio"] == found.shutter.readout_ratio

@@ -452,5 +452,5 @@ def test_the_command_takes_a_log(tmp_path: Path, world: Any, shapes: Any, u8: An
     early = [f"{int(row.split(',')[0]) - 1_500_000_000},{row.partition(',')[2]}" for row in rows]
     (tmp_path / "early.csv").write_text("stamp_ns,wx,wy,wz\n" + "\n".join(early), encoding="utf-8")
     shown = run("--gyro", tmp_path / "early.csv", "--fps", 20)
-    assert "gyroscope's clock: the frames do not tell" in shown.stdout  # two of them
+    assert "gyroscope's clock: the frames do not show its offset" in shown.stdout  # two of them
     assert read_json(tmp_path / "out" / "motion.json")["gyro_clock"]["used"] is False
