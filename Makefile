@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
-COMPILE := from rsbench.solvers.engine.warm_up import warm_up; warm_up(["linear", "twist"])
+COMPILE := from rsbench.solvers.refined import warm_up; warm_up(["linear", "twist"])
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
 .PHONY: help demo test test-extras test-gpu attack sample docs reference lock clean

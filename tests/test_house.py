@@ -145,6 +145,14 @@ def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+def test_the_makefile_imports_what_exists() -> None:
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    found = re.findall(r"from (rsbench[\w.]*) import (\w+)", makefile)
+    assert len(found) == 2
+    for module, name in found:
+        assert hasattr(importlib.import_module(module), name), (module, name)
+
+
 def test_make_help_lists_every_target() -> None:
     text = (ROOT / "Makefile").read_text("utf-8")
     (phony,) = re.findall(r"^\.PHONY: (.*)$", text, re.MULTILINE)

@@ -101,12 +101,13 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Callable[
                 "corrector": "fusion",
                 "target_row": 0.0,
             }
-            | {"inpaint": None, "seed": 0, "gyro": None},
+            | {"inpaint": None, "seed": 0, "gyro": None, "focal_sigma": 0.0, "k1_sigma": 0.0},
         ),
         "correct one camera": (
             rsbench.correct,
             {"images": [image] * 2, "camera": camera, "readout_ratio": 0.8, "target_row": 0.0, "inpaint": None}
-            | {"seed": 0, "gyro": None, "solver": "rs-stereo-refined", "corrector": "fusion"},
+            | {"seed": 0, "gyro": None, "solver": "rs-stereo-refined", "corrector": "fusion"}
+            | {"gyro_clock_error": 0.0},
         ),
         "estimate_trajectory": (
             rsbench.estimate_trajectory,

@@ -124,14 +124,14 @@ def correct(
             raise ValueError("gyro_clock_error: has no effect without gyro; leave it out")
         known = None if isinstance(camera, str) and camera == "unknown" else camera
         return array_correction.of_one_camera(
-            images, known, readout_ratio, target_row, inpaint, seed, gyro, gyro_clock_error
+            images, known, readout_ratio, target_row, inpaint, seed, gyro, float(gyro_clock_error)
         )
     arguments.check_type("rig", rig, StereoRig)
     if gyro_clock_error:
         raise ValueError("gyro_clock_error: is estimated for one camera; leave it out with rig")
     arguments.check_number("focal_sigma", focal_sigma, 0.0, 0.3 * abs(rig.camera.fx))
     arguments.check_number("k1_sigma", k1_sigma, 0.0, 0.3)
-    sigma = CardSigma(focal=focal_sigma, k1=k1_sigma)
+    sigma = CardSigma(focal=float(focal_sigma), k1=float(k1_sigma))
     components = solver, motion_model, matcher, features, corrector
     options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
     return array_correction.of_rig(images, rig, readout_ratio, options, gyro, sigma=sigma, close=inpaint is None)

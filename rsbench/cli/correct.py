@@ -93,7 +93,7 @@ def _refuse_rig_options(ctx: typer.Context) -> None:
     for parameter in ctx.command.params:
         source = ctx.get_parameter_source(parameter.name or "")
         if parameter.name in _RIG_ONLY and source is not None and source.name == "COMMANDLINE":
-            options = " and ".join([*parameter.opts, *parameter.secondary_opts])
+            options = "/".join([*parameter.opts, *parameter.secondary_opts])
             raise RsbenchError(f"{options}: has no effect on frames of one camera; leave it out")
 
 

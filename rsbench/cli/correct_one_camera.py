@@ -74,21 +74,22 @@ def correct_one_camera(
 
 
 def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: float | None) -> None:
-    """A line where a ratio is of another frame rate than the frames: it is a share of the frame period."""
+    """Warn if the card's readout ratio assumes another frame rate than the frames have."""
     from rsbench.dataset.corrected_frames import said_fps
 
     fps = said_fps(source.path) if fps_option is None else fps_option
     if card.frame_period_s is None or card.readout_ratio is None or fps is None or not fps > 0.0:
         return
     share = card.frame_period_s * fps
-    if abs(share - 1.0) > _SAME_RATE:
-        ratio, other = card.readout_ratio, card.readout_ratio * share
-        there = f"; the same readout is {other:.3g} of them" if other <= 1.0 else ", which no frame of it lasts"
-        echo(
-            f"rsbench: camera: readout ratio {ratio:.3g} is of {1.0 / card.frame_period_s:.4g} frames a second, "
-            f"and the frames have {fps:.4g}{there}: frame_period_s = {1.0 / fps:.4g} beside shutter says so",
-            err=True,
-        )
+    if abs(share - 1.0) <= _SAME_RATE:
+        return
+    ratio, other = card.readout_ratio, card.readout_ratio * share
+    there = f"at that rate the ratio is {other:.3g}" if other <= 1.0 else "a frame is shorter than that readout"
+    echo(
+        f"rsbench: camera: readout ratio {ratio:.3g} assumes {1.0 / card.frame_period_s:.4g} frames/s, but the "
+        f"frames have {fps:.4g} ({there}): set `frame_period_s = {1.0 / fps:.4g}` beside `shutter`",
+        err=True,
+    )
 
 
 def _correct(

@@ -144,8 +144,8 @@ class DatasetCard(Scanning):
     """Readout time over frame period, 0 (global shutter) to 1: row y of frame k is exposed at the time k +
     readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given."""
     readout_range: tuple[float, float] | None = None
-    """Two readout ratios: each sequence's is drawn evenly between them, by its seed and name, in place of all that
-    other ratios."""
+    """Two readout ratios: each sequence's is drawn evenly between them, by its seed and name; all other ratios
+    of the card are ignored."""
     frame_period_s: float = 0.1
     """Seconds from one frame to the next."""
     frames: int = len(FRAMES)

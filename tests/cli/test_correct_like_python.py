@@ -60,6 +60,12 @@ def test_of_a_rig(known: bool, sigmas: dict[str, Any], castle: Sequence, tmp_pat
         assert np.array_equal(read_png(tmp_path / "out" / "corrected" / f"{side}_{frame}.png"), fused.image)
 
 
+def test_a_deviation_may_be_a_scalar_of_numpy(castle: Sequence) -> None:
+    blank = [np.zeros((96, 128, 3), dtype=np.uint8)] * 4
+    with pytest.raises(rsbench.RsbenchError, match="matches"):
+        rsbench.correct(blank, castle.rig, 0.8, focal_sigma=np.float16(20.0))
+
+
 def _angle(tau: np.ndarray) -> np.ndarray:
     """Rotation about the optical axis, rad, at times in frame periods."""
     return 0.02 * np.sin(1.9 * tau) + 0.015 * np.sin(0.8 * tau)
