@@ -63,7 +63,7 @@ def test_of_a_rig(known: bool, sigmas: dict[str, Any], castle: Sequence, tmp_pat
 def test_a_deviation_may_be_a_scalar_of_numpy(castle: Sequence) -> None:
     blank = [np.zeros((96, 128, 3), dtype=np.uint8)] * 4
     with pytest.raises(rsbench.RsbenchError, match="matches"):
-        rsbench.correct(blank, castle.rig, 0.8, focal_sigma=np.float16(20.0))
+        rsbench.correct(blank, castle.rig, 0.8, focal_sigma=np.float16(20.0))  # pyrefly: ignore[bad-argument-type]
 
 
 def _angle(tau: np.ndarray) -> np.ndarray:
