@@ -222,7 +222,7 @@ def test_lines_of_documents_wrap_at_100_columns(document: Path) -> None:
 
 def test_the_five_functions_of_a_correction_exist() -> None:
     text = (DOCS / "explanation" / "one-frame.md").read_text("utf-8")
-    names = re.findall(r"^\| \d\. \w+ \| `([\w.]+)` \|", text, re.MULTILINE)
+    names = re.findall(r"^\d\. \*\*\w+\*\*: `([\w.]+)`", text, re.MULTILINE)
     assert len(names) == 5
     for name in names:
         module, _, function = name.rpartition(".")
