@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 from small_scenes import write_box_scene
 
-from attack.planting import WET_CASTLE
+from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import card_path, list_cards
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError

@@ -19,7 +19,6 @@ from attack.planted_faults import depth_faults, image_faults, scene_of_victim, t
 from attack.planting import (
     RNG,
     VICTIM,
-    WET_CASTLE,
     Fault,
     Plant,
     depth_of,
@@ -36,6 +35,7 @@ from attack.planting import (
     swapped,
     times,
 )
+from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import load_card
 from rsbench.core.camera import Lens
 from rsbench.core.projection import row_poses

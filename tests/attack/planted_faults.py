@@ -20,7 +20,6 @@ from attack.planting import (
     OTHER,
     RNG,
     VICTIM,
-    WET_CASTLE,
     Fault,
     Plant,
     below_row_0,
@@ -48,6 +47,7 @@ from attack.planting import (
     times,
     written,
 )
+from attack.wet_castle import WET_CASTLE
 from rsbench.components.cards import load_card
 from rsbench.components.motion_models import TwistMotion
 from rsbench.core.projection import row_poses

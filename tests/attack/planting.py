@@ -9,7 +9,7 @@ import json
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from attack.wet_castle import WET_CASTLE
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.manifest import croissant_of
 from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
 from rsbench.dataset.timing import write_timing
-from rsbench.scenes.castle import CastleBuilder
-from rsbench.scenes.model import SceneMesh
 from rsbench.storage.files import (
     read_depth,
     read_json,
@@ -37,22 +36,6 @@ from rsbench.storage.files import (
 from rsbench.verification import verify_sequence
 from rsbench.verification.manifest_checks import Listing, dataset_faults
 from rsbench.verification.rerender import Rerenderer
-
-_WET = {"glass": 0.1, "cobbles": 0.3, "tiles_0": 0.2, "tiles_1": 0.2, "tiles_2": 0.2, "planks": 0.4}
-"""Roughness by the names of materials."""
-WET_CASTLE = Path(__file__).with_name("wet-castle.toml")
-
-
-@dataclass(frozen=True, kw_only=True)
-class WetCastleBuilder(CastleBuilder):
-    """The same meshes of other materials."""
-
-    def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes in the scene frame."""
-        dry = super().build(seed, folder)
-        wet = {id(mesh.material): replace(mesh.material, roughness=_WET.get(mesh.material.name)) for mesh in dry}
-        return tuple(replace(mesh, material=wet[id(mesh.material)]) for mesh in dry)
-
 
 VICTIM, OTHER = "castle", "room-twist"
 Plant = Callable[[Path], None]

@@ -11,6 +11,8 @@ from attack import __main__ as program
 from attack.clean_sequences import false_alarms
 from attack.planted_faults import FAULTS
 from attack.planting import Fault, found, planted
+from attack.wet_castle import WET_CASTLE
+from rsbench.scenes.load import read_scene_card
 
 PRINTED = """  missed: depth scaled: ()
 planted faults: 208, 1 missed; 300 s
@@ -22,6 +24,10 @@ SAMPLE = [fault for fault in FAULTS if not (fault.rendered or fault.slow)][4::9]
 
 def test_the_names_of_the_faults_differ() -> None:
     assert len({fault.name for fault in FAULTS}) == len(FAULTS) >= 102
+
+
+def test_the_card_of_the_glossy_scene_finds_its_builder() -> None:
+    assert type(read_scene_card(WET_CASTLE)[1]).__name__ == "WetCastleBuilder"
 
 
 def test_a_sound_sequence_of_a_random_card_passes(tmp_path: Path) -> None:
