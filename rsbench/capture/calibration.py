@@ -145,7 +145,10 @@ def in_words(errors: Sequence[float], rig: StereoRig) -> str:
 
 
 def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[float]) -> Correspondences:
-    """The matches, px, without the errors (14,) of their calibration; for cameras without a lens."""
+    """The matches, px, without the errors (14,) of their calibration; for cameras without a lens.
+
+    Errors of a rig that is not ideal are shifts of its ideal pixels.
+    """
     if not np.any(errors):
         return matches
     camera = rig.camera
@@ -153,10 +156,15 @@ def recalibrated(matches: Correspondences, rig: StereoRig, errors: Sequence[floa
 
     def taken(ends: FloatArray, sides: tuple[Side, ...]) -> FloatArray:
         points = ends.reshape(-1, len(sides), 2)
+        if not rig.aligned:
+            points = np.stack([rig.eye(side).ideal_pixels(points[:, k]) for k, side in enumerate(sides)], axis=1)
         rays = (points - centre) / focal
         shifts = [ray_shifts(rays[:, k], side, camera.fx) for k, side in enumerate(sides)]
         moved = np.stack([np.einsum("ncx,c->nx", each, errors) for each in shifts], axis=1) * focal
-        return np.asarray((points - moved).reshape(ends.shape))
+        points = points - moved
+        if not rig.aligned:
+            points = np.stack([rig.eye(side).lens_pixels(points[:, k]) for k, side in enumerate(sides)], axis=1)
+        return np.asarray(points.reshape(ends.shape))
 
     return replace(
         matches,
@@ -204,7 +212,7 @@ class RowPattern:
 
 
 def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
-    """Pattern of left-right matches (n, 4) xl, yl, xr, yr with outliers; None of too few.
+    """Pattern of left-right matches (n, 4) xl, yl, xr, yr, ideal px, with outliers; None of too few.
 
     To first order errors of relative rotation and of focal length give 1, x, y and xy; equal lenses with radial
     distortion give k y (xl^2 - xr^2).

@@ -18,7 +18,6 @@ import numpy as np
 from rsbench.capture.calibration import NO_ERRORS, STRETCHING, TERMS, ray_shifts, ray_stretches
 from rsbench.components.motion_kernels import MotionKernel
 from rsbench.components.motion_models import AcceleratedKernel, any_law, load_kernel
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
@@ -142,7 +141,7 @@ class KnownInputs:
     """Errors of the calibration, see ``calibration.TERMS``."""
     models: tuple[str, ...] = MODELS
 
-    def shutter_of(self, camera: PinholeCamera) -> RollingShutter:
+    def shutter_of(self, rig: StereoRig) -> RollingShutter:
         """The shutter of a given readout ratio; without a scanning, rows from the top.
 
         Raises:
@@ -150,7 +149,7 @@ class KnownInputs:
         """
         if self.readout_ratio is None:
             raise ValueError("readout_ratio: must be given")
-        return (self.scanning or Scanning()).shutter_of(camera.width, camera.height, self.readout_ratio)
+        return rig.shutter_of(self.scanning or Scanning(), self.readout_ratio)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,8 +356,7 @@ def _accelerated(kernel: MotionKernel, acceleration: float) -> MotionKernel:
 
 def _late(rig: StereoRig, scan: Scan) -> RollingShutter:
     """Both cameras read alike, the right one a period late: no two ends of a match are of one time."""
-    camera = rig.camera
-    return RollingShutter(height=camera.height, width=camera.width, readout_ratio=1.0, scan=scan, right_delay=1.0)
+    return rig.shutter_of(Scanning(scan=scan, right_delay=1.0), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -36,7 +36,7 @@ from rsbench.capture.hypotheses import (
     line_of,
 )
 from rsbench.core.correspondences import BoolArray, Correspondences, without_lens
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.packed import each_term, heavy_tailed
@@ -105,7 +105,8 @@ def _sampled(A: FloatArray, e: FloatArray) -> FloatArray:
 
 
 def _columns(pixels: FloatArray, rig: StereoRig) -> FloatArray:
-    size = np.array([rig.camera.width, rig.camera.height])
+    camera = rig.sensor("left")
+    size = np.array([camera.width, camera.height])
     return np.column_stack([np.ones(len(pixels)), pixels / size])
 
 
@@ -114,7 +115,7 @@ def without_lag(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspon
 
     In ideal pixels, for a lens shows no ray at some of the pixels that a lag may lead to.
     """
-    ideal = without_lens(matches, rig.camera)
+    ideal = without_lens(matches, rig)
     tracks, right = ideal.tracks.copy(), ideal.right.copy()
     moved = tracks[:, 6:8] - tracks[:, 2:4]
     tracks[:, 2:4] += lag.at(matches.tracks[:, 0:2], rig)[:, None] * moved
@@ -131,10 +132,10 @@ def without_leaps(matches: Correspondences, rig: StereoRig) -> Correspondences:
     Ends of a pair that lie a share 1 / ratio of the image apart are read at one time: between them is no
     motion, and no error, whatever was matched. One such pair kept the estimate of a ratio of 0.8 at 1.17.
     """
-    longest = _LONGEST_LEAP * np.array([rig.camera.width, rig.camera.height])
+    sizes = [np.array([rig.sensor(side).width, rig.sensor(side).height]) for side in SIDES]
     left, right = (
-        pairs[np.all(np.abs(pairs[:, 2:] - pairs[:, :2]) <= longest, axis=1)]
-        for pairs in (matches.left, matches.right)
+        pairs[np.all(np.abs(pairs[:, 2:] - pairs[:, :2]) <= _LONGEST_LEAP * size, axis=1)]
+        for pairs, size in zip((matches.left, matches.right), sizes, strict=True)
     )
     return Correspondences(left=left, right=right, tracks=matches.tracks)
 
@@ -148,7 +149,8 @@ def find_start(
     """
     lag = find_lag(matches.tracks, rig)
     taken = without_lag(matches, lag, rig)
-    rig, camera, found = rig.ideal, rig.camera, list[RobustEstimate]()
+    rig, found = rig.ideal, list[RobustEstimate]()
+    camera = rig.camera
     for scan, ratio in _coarse(known):
         shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
         with np.errstate(invalid="ignore", over="ignore"):

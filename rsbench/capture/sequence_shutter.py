@@ -103,7 +103,7 @@ def capture_of_sequence(
     if found is None:
         return capture
     candidate = Candidate(
-        scans=scans_of(found.scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0)),
+        scans=scans_of(rig.shutter_of(found.scanning, 1.0)),
         probability=found.probability,
         ratio=found.ratio,
         sigma=found.sigma,
@@ -236,8 +236,7 @@ class _Profile:
         self._near = fit(curve, tracks, options.prior, True, _WIDE, np.ones(len(tracks)))
 
     def _shutter(self, ratio: float) -> RollingShutter:
-        camera = self._rig.camera
-        return self._scanning.shutter_of(camera.width, camera.height, ratio)
+        return self._rig.shutter_of(self._scanning, ratio)
 
     def _tracks(self, ratio: float) -> TimedTracks:
         return pack_windows(self._windows, self._rig, self._shutter(ratio), share=self._share)

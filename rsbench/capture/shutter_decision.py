@@ -32,7 +32,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
@@ -71,7 +71,7 @@ def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Kn
     """
     ratio, scanning, scans = given.readout_ratio, given.scanning, ALL_SCANS
     if scanning is not None:
-        rolling = scans_of(scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0))
+        rolling = scans_of(rig.shutter_of(scanning, 1.0))
         scans = (GLOBAL, rolling, reversed_scans(rolling))
         if ratio is not None:
             scans = (rolling if ratio > 0.0 else GLOBAL,)
@@ -92,6 +92,9 @@ def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, .
     """
     tracks, stereo = matches.tracks, np.concatenate([matches.stereo_0, matches.stereo_1])
     stereo = stereo if len(stereo) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
+    if not rig.aligned:
+        ends = [rig.eye(side).ideal_pixels(stereo[:, k : k + 2]) for k, side in zip((0, 2), SIDES, strict=True)]
+        stereo = np.concatenate(ends, axis=1)
     pattern = row_pattern(stereo, rig) if rig.camera.lens is None and len(stereo) >= _FEWEST else None
     sigma = 0.0 if pattern is None else min(_PRIOR_FACTOR * pattern.systematic_px, _MOST_PRIOR_PX)
     if sigma <= _LEAST_PRIOR_PX:
@@ -155,14 +158,14 @@ def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
     Raises:
         NoMotionError: one camera alone rolls.
     """
-    camera, scans = rig.camera, candidate.scans
+    scans = candidate.scans
     if scans.rolls and "global" in (scans.left, scans.right):
         raise NoMotionError(f"{scans}: a rig of which one camera alone rolls cannot be corrected")
     delay = candidate.delay if abs(candidate.delay) > 2.0 * candidate.delay_sigma else 0.0
     if not scans.rolls:
-        return RollingShutter(height=camera.height, readout_ratio=0.0, right_delay=delay)
+        return rig.shutter_of(Scanning(right_delay=delay), 0.0)
     scanning = Scanning(scan=scans.left, right_scan=scans.right, right_delay=delay)  # pyrefly: ignore[bad-argument-type]
-    return scanning.shutter_of(camera.width, camera.height, candidate.ratio)
+    return rig.shutter_of(scanning, candidate.ratio)
 
 
 def cannot_tell(capture: Capture) -> str:

@@ -549,7 +549,8 @@ def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
 def pack_ends(pixels: FloatArray, frame: int, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
     """Ends (n, 10) of pixels (n, 2) of one image."""
     out = np.zeros((len(pixels), END))
-    out[:, :2], out[:, 2] = rig.camera.unproject(pixels)[:, :2], shutter.pixel_time(pixels, frame, side)
-    out[:, 3:7], out[:, 7:9] = rig.camera.ideal_by_pixel(pixels).reshape(-1, 4), shutter.rate(side)
+    eye = rig.eye(side)
+    out[:, :2], out[:, 2] = eye.unproject(pixels)[:, :2], shutter.pixel_time(pixels, frame, side)
+    out[:, 3:7], out[:, 7:9] = eye.ideal_by_pixel(pixels).reshape(-1, 4), shutter.rate(side)
     out[:, 9] = rig.offset(side)[0]
     return out

@@ -102,7 +102,7 @@ def _look(sources: Sources, rig: StereoRig, card: RigCard, options: CorrectionOp
 
     ratio, calibration, scanning = card.readout_ratio, card.calibration, card.scanning
     if ratio is not None and calibration is not None:
-        return (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, ratio), calibration, None
+        return rig.shutter_of(scanning or Scanning(), ratio), calibration, None
     with progress_bar("looking at the shutter", min(max(sources[0].count - 1, 1), WINDOWS)) as advance:
         capture, shutter = estimate_sequence_capture(*sources, rig, options, ratio, scanning, calibration, advance)
     nothing = capture is None or not shutter.rows_together

@@ -239,6 +239,11 @@ class PinholeCamera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
+    def is_ideal(self) -> bool:
+        """Whether its pixels are ideal ones."""
+        return self.lens is None
+
+    @property
     def ideal(self) -> PinholeCamera:
         """The same camera without its lens."""
         return self if self.lens is None else replace(self, lens=None)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core import arguments
 from rsbench.core.camera import PinholeCamera, inverse_2x2
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig
 from rsbench.core.so3 import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -82,25 +82,40 @@ def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
     return rows
 
 
-def without_lens(correspondences: Correspondences, camera: PinholeCamera) -> Correspondences:
-    """The matches as the camera without its lens has them, in ideal pixels.
+_ENDS: dict[str, tuple[Side, ...]] = {
+    "left": ("left", "left"),
+    "right": ("right", "right"),
+    "stereo_0": ("left", "right"),
+    "stereo_1": ("left", "right"),
+    "tracks": ("left", "right", "left", "right"),
+    "lines": ("left", "left", "right", "right", "left", "left", "right", "right"),
+}
+"""The cameras whose pixels a match of each set has, one after the other."""
+
+
+def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspondences:
+    """The matches in ideal pixels: as the rectified pair ``rig.ideal`` has them.
 
     Raises:
-        ValueError: a match at which the lens shows no ray; names it.
+        ValueError: a match at which a camera shows no ray; names it.
     """
-    if camera.lens is None:
+    if rig.rectified:
         return correspondences
     sets = {}
-    for name, columns in SET_COLUMNS.items():
+    for name, sides in _ENDS.items():
         rows: FloatArray = getattr(correspondences, name)
-        sets[name] = camera.ideal_pixels(rows.reshape(-1, columns // 2, 2)).reshape(rows.shape)
+        ends = rows.reshape(-1, len(sides), 2).copy()
+        for side in SIDES:
+            own = [k for k, each in enumerate(sides) if each == side]
+            ends[:, own] = rig.eye(side).ideal_pixels(ends[:, own])
+        sets[name] = ends.reshape(rows.shape)
         lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
         if len(lost):
             raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
-    return replace(correspondences, **sets, affine=_ideal_affine(correspondences, camera))
+    return replace(correspondences, **sets, affine=_ideal_affine(correspondences, rig.eye("left")))
 
 
-def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera) -> FloatArray:
+def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | AlignedCamera) -> FloatArray:
     """Affine frames (n, 4) of pixels of the image from those of ideal pixels; none of none.
 
     Args:
@@ -112,7 +127,7 @@ def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera) -> 
     return (inverse_2x2(by_1) @ affine.reshape(-1, 2, 2) @ by_0).reshape(-1, 4)
 
 
-def _ideal_affine(correspondences: Correspondences, camera: PinholeCamera) -> FloatArray:
+def _ideal_affine(correspondences: Correspondences, camera: PinholeCamera | AlignedCamera) -> FloatArray:
     """The inverse of ``lens_affine``."""
     if len(correspondences.affine) == 0:
         return correspondences.affine
@@ -120,7 +135,7 @@ def _ideal_affine(correspondences: Correspondences, camera: PinholeCamera) -> Fl
     return (by_1 @ correspondences.affine.reshape(-1, 2, 2) @ inverse_2x2(by_0)).reshape(-1, 4)
 
 
-def _ideal_by_pixels(left: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
+def _ideal_by_pixels(left: FloatArray, camera: PinholeCamera | AlignedCamera) -> tuple[FloatArray, FloatArray]:
     return camera.ideal_by_pixel(left[:, :2]), camera.ideal_by_pixel(left[:, 2:])
 
 

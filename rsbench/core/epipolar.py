@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import AlignedCamera, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
@@ -51,16 +51,17 @@ def rs_constraint(
     Pixels are those of the image, distorted by its lens. The derivative counts that a shifted row is also read at
     another time.
     """
-    x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+    eye = rig.eye(side)
+    x0, x1 = eye.unproject(matches[:, :2]), eye.unproject(matches[:, 2:])
     tau0, tau1 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
-    R0, t0 = rig.cam_from_world(motion, tau0, side)
-    R1, t1 = rig.cam_from_world(motion, tau1, side)
+    R0, t0 = rig.eye_from_world(motion, tau0, side)
+    R1, t1 = rig.eye_from_world(motion, tau1, side)
     R = R1 @ np.swapaxes(R0, -1, -2)
     Rt0 = _apply(R, t0)
     T, p = t1 - Rt0, _apply(R, x0)
     (w0, v0), (w1, v1) = motion.velocity(tau0), motion.velocity(tau1)
     value = np.einsum("...i,...i->...", x1, so3.cross(T, p))
-    gradient = _by_pixels(epipolar_gradient(hat(T) @ R, x0, x1, rig.camera), rig.camera, matches)
+    gradient = _by_pixels(epipolar_gradient(hat(T) @ R, x0, x1, rig.camera), eye, matches)
     # T = t1 - R t0 with dR/dtau1 = [w1]x R and dR/dtau0 = -R [w0]x.
     T_rate1, p_rate1 = v1 - so3.cross(w1, Rt0), so3.cross(w1, p)
     T_rate0, p_rate0 = _apply(R, so3.cross(w0, t0) - v0), -_apply(R, so3.cross(w0, x0))
@@ -70,9 +71,9 @@ def rs_constraint(
     return value, gradient
 
 
-def _by_pixels(gradient: FloatArray, camera: PinholeCamera, matches: FloatArray) -> FloatArray:
+def _by_pixels(gradient: FloatArray, camera: PinholeCamera | AlignedCamera, matches: FloatArray) -> FloatArray:
     """Derivatives (n, ..., 4) by the pixels of matches (n, 4) from those by the pixels of an ideal camera."""
-    if camera.lens is None:
+    if camera.is_ideal:
         return gradient
     L = [camera.ideal_by_pixel(matches[:, columns]) for columns in (slice(0, 2), slice(2, 4))]
     halves = zip(np.split(gradient, 2, axis=-1), L, strict=True)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core import arguments, so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
-from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, View
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -151,8 +151,14 @@ def check_times(readout_ratio: float | None, target_row: float, rig: StereoRig) 
     arguments.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
 
 
+UNALIGNED = "the rig's cameras differ or look in different directions"
+"""Why a part that takes the ideal rig alone refuses another."""
+
+
 def check_ideal(rig: StereoRig, what: str) -> None:
-    """Raises RsbenchError where cameras have a lens, which ``what`` does not take."""
+    """Raises RsbenchError where cameras have a lens or are not aligned, which ``what`` does not take."""
+    if not rig.aligned:
+        raise RsbenchError(f"{UNALIGNED}: {what} takes two equal cameras in perfect alignment")
     if rig.camera.lens is not None:
         raise RsbenchError(
             f"camera.lens = {rig.camera.lens.model!r}: {what} takes images without distortion; undistort first"
@@ -165,8 +171,9 @@ def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
     if not shutter.plain:
         s = shutter.scanning
         raise RsbenchError(
-            f"scan = {s.scan!r}, right_scan = {s.right_scan!r}, right_delay = {s.right_delay}: {what} takes rows "
-            "from the top, read by both cameras at once"
+            f"scan = {s.scan!r}, right_scan = {s.right_scan!r}, right_delay = {s.right_delay}"
+            + (f", right_readout_ratio = {s.right_readout_ratio}" if s.right_readout_ratio is not None else "")
+            + f": {what} takes rows from the top, read by both cameras at once"
         )
 
 
@@ -192,14 +199,14 @@ def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
     """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
     arguments.check_type("rig", rig, StereoRig)
     arguments.check_type("shutter", shutter, RollingShutter)
-    if shutter.width not in (None, rig.camera.width):
-        raise ValueError(
-            f"shutter.width = {shutter.width}: must be that of the camera, {rig.camera.width} columns"
-        )
-    if shutter.height != rig.camera.height:
-        raise ValueError(
-            f"shutter.height = {shutter.height}: must be that of the camera, {rig.camera.height} rows"
-        )
+    for side in SIDES:
+        camera, axis = rig.sensor(side), shutter.axis(side)
+        size, name = (camera.width, camera.height)[axis], ("columns", "rows")[axis]
+        if shutter.lines(side) != size:
+            field = "right_size" if shutter.right_size and side == "right" else ("width", "height")[axis]
+            raise ValueError(
+                f"shutter.{field} = {shutter.lines(side)}: must be that of the {side} camera, {size} {name}"
+            )
 
 
 def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) -> dict[View, NDArray[Any]]:
@@ -212,16 +219,17 @@ def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) ->
         raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
     views: dict[View, NDArray[Any]] = {}
     for (side, frame), image in zip(((s, f) for f in FRAMES for s in SIDES), images, strict=True):
-        views[side, frame] = check_image(f"image {side} {frame}", image, rig)
+        views[side, frame] = check_image(f"image {side} {frame}", image, rig, side)
     first = views["left", 0]
     for (side, frame), image in views.items():
-        if image.shape != first.shape or image.dtype != first.dtype:
+        shape = first.shape if rig is None else (*views[side, 0].shape[:2], *first.shape[2:])
+        if image.shape != shape or image.dtype != first.dtype:
             what = f"{image.dtype} {image.shape}, but image left 0 is {first.dtype} {first.shape}"
             raise ValueError(f"image {side} {frame}: is {what}; all must be alike")
     return views
 
 
-def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArray[Any]:
+def check_image(name: str, image: NDArray[Any], rig: StereoRig | None, side: Side = "left") -> NDArray[Any]:
     """The image; raises ValueError unless it is (H, W) or (H, W, 3), uint8 or uint16, of the cameras' size."""
     if not isinstance(image, np.ndarray) or image.dtype not in _IMAGE_TYPES:
         kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
@@ -230,7 +238,9 @@ def check_image(name: str, image: NDArray[Any], rig: StereoRig | None) -> NDArra
         raise ValueError(f"{name}: must have pixels, got shape {image.shape}")
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise ValueError(f"{name}: must have shape (H, W) or (H, W, 3), got {image.shape}")
-    if rig is not None and image.shape[:2] != (rig.camera.height, rig.camera.width):
+    camera = None if rig is None else rig.sensor(side)
+    if camera is not None and image.shape[:2] != (camera.height, camera.width):
         size = f"{image.shape[1]} x {image.shape[0]}"
-        raise ValueError(f"{name}: is {size} pixels, the rig's cameras {rig.camera.width} x {rig.camera.height}")
+        what = "rig's cameras" if rig is not None and rig.aligned else f"rig's {side} camera"
+        raise ValueError(f"{name}: is {size} pixels, the {what} {camera.width} x {camera.height}")
     return image

@@ -57,7 +57,7 @@ class RSProjection:
 def project_at(rig: StereoRig, motion: Motion, side: Side, tau: ArrayLike, points: FloatArray) -> FloatArray:
     """Pixels and depth (..., 3) of world points (..., 3) at given times: a global-shutter projection."""
     x_in_cam = transform(rig.cam_from_world(motion, tau, side), points)
-    return np.concatenate([rig.camera.project(x_in_cam), x_in_cam[..., 2:]], axis=-1)
+    return np.concatenate([rig.sensor(side).project(x_in_cam), x_in_cam[..., 2:]], axis=-1)
 
 
 class _RowEquation(NamedTuple):
@@ -70,16 +70,16 @@ class _RowEquation(NamedTuple):
     frame: int
 
     def __call__(self, X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """f (...) in px, f' (...) and the point (..., 3) in the camera of rows (...); NaN behind the camera."""
+        """f (...) in px, f' (...) and the point (..., 3) seen from the camera of rows (...); NaN behind it."""
         axis = self.shutter.axis(self.side)
         tau = self.shutter.line_time(y, self.frame, self.side)
-        R, t = self.rig.cam_from_world(self.motion, tau, self.side)
+        R, t = self.rig.eye_from_world(self.motion, tau, self.side)
         rotated = (R @ X[..., None])[..., 0]
-        x = rotated + t
+        x, eye = rotated + t, self.rig.eye(self.side)
         w_rate, t_rate = self.motion.velocity(tau)
         x_rate = so3.cross(w_rate, rotated) + t_rate
-        value = self.rig.camera.project(x)[..., axis] - y
-        velocity = self.rig.camera.velocity(x, x_rate)[..., axis]
+        value = eye.project(x)[..., axis] - y
+        velocity = eye.velocity(x, x_rate)[..., axis]
         return value, self.shutter.rate(self.side)[axis] * velocity - 1.0, x
 
 
@@ -137,7 +137,7 @@ def rs_project(
     y, converged = _solve_rows(equation, X[index], low, high)
     times = shutter.line_time(y, frame, side)
     seen = project_at(rig, motion, side, times, X[index])
-    inside = converged & rig.camera.contains(seen[:, :2])
+    inside = converged & rig.sensor(side).contains(seen[:, :2])
     rows_that_see = np.bincount(index[inside], minlength=len(X))
     status = np.select(
         [rows_that_see > 1, rows_that_see == 1, np.bincount(index[~converged], minlength=len(X)) > 0],
@@ -177,19 +177,19 @@ def rs_project_near(
     y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
     equation = _RowEquation(rig, shutter, motion, side, frame)
     for _ in range(_MAX_NEWTON_STEPS):
-        value, slope, x_in_cam = equation(X, y)
+        value, slope, x = equation(X, y)
         converged = np.abs(value) <= ROW_TOLERANCE_PX
         # Points behind the camera have no residual and need no further steps.
         if np.all(converged | np.isnan(value)):
             break
         y = np.where(converged | np.isnan(value), y, y - value / np.where(slope == 0.0, np.nan, slope))
-    pixels = rig.camera.project(x_in_cam)
-    inside = converged & rig.camera.contains(pixels)
+    pixels = rig.eye(side).project(x)
+    inside = converged & rig.sensor(side).contains(pixels)
     lost = np.isfinite(value) & ~converged
     status = np.where(inside, ProjectionStatus.SEEN, ProjectionStatus.NEVER)
     return RSProjection(
         pixels=np.where(inside[..., None], pixels, np.nan),
-        depth=np.where(inside, x_in_cam[..., 2], np.nan),
+        depth=np.where(inside, x @ rig.own(side).R[2] if rig.left is not None else x[..., 2], np.nan),
         tau=np.where(inside, shutter.line_time(y, frame, side), np.nan),
         status=np.where(lost, ProjectionStatus.NOT_CONVERGED, status).astype(np.uint8),
     )
@@ -225,7 +225,7 @@ def back_project(
 ) -> FloatArray:
     """World points (..., 3) of pixels (..., 2) with depth z (...) in their own row's camera (paper, eq. 11a)."""
     p = np.asarray(pixels, dtype=np.float64)
-    x_in_cam = np.asarray(depth, dtype=np.float64)[..., None] * rig.camera.unproject(p)
+    x_in_cam = np.asarray(depth, dtype=np.float64)[..., None] * rig.sensor(side).unproject(p)
     R, t = rig.cam_from_world(motion, shutter.pixel_time(p, frame, side), side)
     return (np.swapaxes(R, -1, -2) @ (x_in_cam - t)[..., None])[..., 0]
 
@@ -244,8 +244,8 @@ def pixel_moves(
     That of the implicit row equation q = proj(pose(time(q)) X): (1 - v r')^-1 J, with J the derivative of the
     projection at that time, v the velocity of the pixel and r the derivative of the time by the pixel.
     """
-    camera = rig.camera
-    R, t = rig.cam_from_world(motion, tau, side)
+    camera = rig.eye(side)
+    R, t = rig.eye_from_world(motion, tau, side)
     turned = (R @ points[..., None])[..., 0]
     w_rate, t_rate = motion.velocity(tau)
     velocity = camera.velocity(turned + t, so3.cross(w_rate, turned) + t_rate)

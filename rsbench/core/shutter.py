@@ -26,20 +26,33 @@ class Scanning:
     """Side at which the readout of the right camera begins. Absent: as the left camera's."""
     right_delay: float = 0.0
     """Frame periods by which the right camera reads later than the left one, from -1 to 1."""
+    right_readout_ratio: float | None = None
+    """Readout time over frame period of the right camera, 0 to 1. Absent: as the left camera's."""
 
     @property
     def plain(self) -> bool:
         """Whether both cameras read rows from the top at the same times."""
-        return self.scan == "top" and self.right_scan in (None, "top") and self.right_delay == 0.0
+        return self.scan == "top" and self.right_scan in (None, "top") and self._at_once
 
     @property
     def rows_together(self) -> bool:
         """Whether both cameras read each row at one time, from the top or from the bottom."""
-        return self.scan in ("top", "bottom") and self.right_scan in (None, self.scan) and self.right_delay == 0.0
+        return self.scan in ("top", "bottom") and self.right_scan in (None, self.scan) and self._at_once
 
-    def shutter_of(self, width: int, height: int, readout_ratio: float) -> RollingShutter:
-        """The shutter of images of this size; ValueError for values that cannot be."""
+    @property
+    def _at_once(self) -> bool:
+        return self.right_delay == 0.0 and self.right_readout_ratio is None
+
+    def shutter_of(
+        self, width: int, height: int, readout_ratio: float, right_size: tuple[int, int] | None = None
+    ) -> RollingShutter:
+        """The shutter of images of this size, and of another (width, height) of the right camera where it differs.
+
+        Raises:
+            ValueError: values that cannot be.
+        """
         columns = {self.scan, self.right_scan} & {"left", "right"}
+        ratio = None if self.right_readout_ratio == readout_ratio else self.right_readout_ratio
         return RollingShutter(
             height=height,
             readout_ratio=readout_ratio,
@@ -47,6 +60,8 @@ class Scanning:
             right_scan=self.right_scan,
             right_delay=self.right_delay,
             width=width if columns else None,
+            right_readout_ratio=ratio,
+            right_size=None if right_size == (width, height) else right_size,
         )
 
 
@@ -63,9 +78,15 @@ class StatedShutter(Scanning):
     @property
     def scanning(self) -> Scanning | None:
         """How the cameras read their lines; None where that is estimated with the readout ratio."""
-        stated = (self.readout_ratio, self.scan, self.right_scan) != (None, None, None) or self.right_delay != 0.0
-        scan = self.scan or "top"
-        return Scanning(scan=scan, right_scan=self.right_scan, right_delay=self.right_delay) if stated else None
+        values = (self.readout_ratio, self.scan, self.right_scan, self.right_readout_ratio)
+        if all(value is None for value in values) and self.right_delay == 0.0:
+            return None
+        return Scanning(
+            scan=self.scan or "top",
+            right_scan=self.right_scan,
+            right_delay=self.right_delay,
+            right_readout_ratio=self.right_readout_ratio,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +108,10 @@ class RollingShutter:
     """Frame periods by which the right camera reads later than the left one, from -1 to 1."""
     width: int | None = None
     """Number of columns; needed where columns are read."""
+    right_readout_ratio: float | None = None
+    """That of the right camera; None: as the left camera's."""
+    right_size: tuple[int, int] | None = None
+    """Columns and rows of the right camera; None: as the left camera's."""
 
     def __post_init__(self) -> None:
         arguments.check_whole("shutter height", self.height, 1, arguments.LARGEST_SIZE)
@@ -97,6 +122,10 @@ class RollingShutter:
         arguments.check_number("right_delay", self.right_delay, -_LONGEST_DELAY, _LONGEST_DELAY)
         if self.width is not None:
             arguments.check_whole("shutter width", self.width, 1, arguments.LARGEST_SIZE)
+        if self.right_readout_ratio is not None:
+            arguments.check_number("right_readout_ratio", self.right_readout_ratio, 0.0, 1.0)
+        for size in self.right_size or ():
+            arguments.check_whole("shutter right_size", size, 1, arguments.LARGEST_SIZE)
         if self.width is None and not {self.scan, self.scan_of("right")} <= {"top", "bottom"}:
             raise ValueError("shutter width must be given where columns are read")
         arguments.keep_plain(self)
@@ -104,12 +133,12 @@ class RollingShutter:
     @property
     def plain(self) -> bool:
         """Whether both cameras read rows from the top at the same times, as ``row_time`` says."""
-        return self.scanning.plain
+        return self.scanning.plain and self.right_size is None
 
     @property
     def rows_together(self) -> bool:
         """Whether both cameras read each row at one time, from the top or from the bottom."""
-        return self.scanning.rows_together
+        return self.scanning.rows_together and self.right_size is None
 
     @property
     def h(self) -> float:
@@ -127,7 +156,22 @@ class RollingShutter:
     @property
     def scanning(self) -> Scanning:
         """The part of it that ``Scanning.shutter_of`` takes."""
-        return Scanning(scan=self.scan, right_scan=self.right_scan, right_delay=self.right_delay)
+        return Scanning(
+            scan=self.scan,
+            right_scan=self.right_scan,
+            right_delay=self.right_delay,
+            right_readout_ratio=self.right_readout_ratio,
+        )
+
+    @property
+    def still(self) -> bool:
+        """Whether both shutters are global."""
+        return self.readout_ratio == 0.0 and self.right_readout_ratio in (None, 0.0)
+
+    def ratio_of(self, side: str) -> float:
+        """Readout ratio of one camera."""
+        right = self.right_readout_ratio
+        return self.readout_ratio if side == "left" or right is None else right
 
     def scan_of(self, side: str) -> Scan:
         """Side of the image at which a camera's readout begins."""
@@ -139,13 +183,16 @@ class RollingShutter:
 
     def lines(self, side: str) -> int:
         """Number of lines."""
-        return self.height if self.axis(side) == 1 else int(self.width or 0)
+        size = (self.width, self.height)
+        if side == "right" and self.right_size is not None:
+            size = self.right_size
+        return int(size[self.axis(side)] or 0)
 
     def rate(self, side: str) -> FloatArray:
         """Derivative (2,) of the time by the pixel, frame periods per px."""
         sign = 1.0 if self.scan_of(side) in ("top", "left") else -1.0
         out = np.zeros(2)
-        out[self.axis(side)] = sign * self.readout_ratio / self.lines(side)
+        out[self.axis(side)] = sign * self.ratio_of(side) / self.lines(side)
         return out
 
     def first_line(self, side: str) -> int:
@@ -159,7 +206,7 @@ class RollingShutter:
 
     def time_after(self, lines: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
         """Time (...) at which a camera has read so many lines (...) of a frame."""
-        return self.start(frame, side) + self.readout_ratio / self.lines(side) * np.asarray(
+        return self.start(frame, side) + self.ratio_of(side) / self.lines(side) * np.asarray(
             lines, dtype=np.float64
         )
 

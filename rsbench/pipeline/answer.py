@@ -98,8 +98,7 @@ def _shutter_of(
     problem: Problem, matches: Correspondences, entry: SolverEntry, options: RobustOptions, seed: int
 ) -> tuple[RollingShutter, Capture | None, str]:
     """The shutter of a problem; if it is not given, how it was found, or why it cannot be determined."""
-    camera = problem.rig.camera
-    still = Scanning().shutter_of(camera.width, camera.height, 0.0)
+    still = problem.rig.shutter_of(Scanning(), 0.0)
     if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
         return problem.known_shutter or still, None, ""
     known = known_of(matches, problem.rig, KnownInputs(scanning=problem.scanning))

@@ -205,7 +205,7 @@ def _solve(
     if inputs.readout_ratio is not None and not wanted and matched:
         clock("matching")
         clock("motion")
-        return matches, None, inputs.shutter_of(rig.camera), None
+        return matches, None, inputs.shutter_of(rig), None
     forget_features()
     if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
         matches, doubt = match_unknown(images, rig, options)

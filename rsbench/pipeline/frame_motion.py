@@ -446,9 +446,7 @@ def solve_frames(
     scanning = given.scanning
     if given.readout_ratio is None:
         capture = find_capture(matches, rig, given, options)
-        if scanning is not None and runs_backwards(
-            capture, scans_of(scanning.shutter_of(rig.camera.width, rig.camera.height, 1.0))
-        ):
+        if scanning is not None and runs_backwards(capture, scans_of(rig.shutter_of(scanning, 1.0))):
             raise RefusedFramesError(BACKWARDS)
         shutter = shutter_found(capture, rig)
         used, errors = capture, capture.calibration if shutter.rows_together else NO_ERRORS
@@ -458,7 +456,7 @@ def solve_frames(
             matches = on_their_rows(matches, rig)
     else:
         given, capture = replace(given, scanning=scanning or Scanning()), None
-        shutter = given.shutter_of(rig.camera)
+        shutter = given.shutter_of(rig)
         used, errors = _calibrated(matches, rig, given, options)
     if not with_motion:
         return SolvedFrames(found=None, shutter=shutter, matches=matches, capture=capture)

@@ -130,7 +130,7 @@ def estimate_sequence_capture(
             advance(f"window {number}")
     refusals.end(number + 1)
     if readout_ratio is not None:
-        shutter = (scanning or Scanning()).shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+        shutter = rig.shutter_of(scanning or Scanning(), readout_ratio)
         return (None if look.is_right else look.concluded()), shutter
     capture = look.concluded()
     shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)

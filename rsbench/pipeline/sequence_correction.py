@@ -188,7 +188,7 @@ def correct_sequence(
     """
     scanning = scanning or Scanning()
     check_cameras(rig, scanning, options, calibration[OFFSET])
-    shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, readout_ratio)
+    shutter = rig.shutter_of(scanning, readout_ratio)
     along = _has_trajectory(left, shutter, options)
     windows = ahead(_windows(left, right, rig, shutter, options, calibration, not along), _AHEAD)
     if along:

@@ -108,7 +108,7 @@ def system_rows(
     ``third_order`` appends the columns (n, 27) of S: of the matrix w (w cross d)^T, whose trace is zero, all
     entries but the last.
     """
-    x, y = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+    x, y = (rig.eye(side).unproject(matches[:, k : k + 2]) for k in (0, 2))
     k1, k3 = shutter.pixel_time(matches[:, :2], 0, side), shutter.pixel_time(matches[:, 2:], 1, side)
     a = (k3 - k1)[:, None]
     sb = rig.offset(side)[0]
@@ -178,7 +178,7 @@ class LinearSolver(Solver):
             metric=True,
             motion_model="linear",
             shutter="rolling",
-            cameras="any",
+            cameras="rig",
             reference_point="body",
             reference="Wang, Fan, Dai: Relative Pose Estimation for Stereo Rolling Shutter Cameras, eq. 7-10",
             assumes="small rotation, constant velocity, readout ratio above 0, generic motion, very low noise",
@@ -319,7 +319,7 @@ class IteratedSolver(Solver):
             metric=True,
             motion_model="linear",
             shutter="rolling",
-            cameras="any" if self.scale == "pairs" else "ideal",
+            cameras="rig" if self.scale == "pairs" else "ideal",
             reference_point="body",
             reference="rsbench; after Wang, Fan, Dai, eq. 7-10, with the antisymmetric part of E folded into d",
             assumes="small rotation, constant velocity, a scene that is not planar, translation",

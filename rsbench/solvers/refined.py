@@ -200,7 +200,7 @@ class RefinedSolver(Solver):
             motion_model=self.motion_model,
             motion_parameters=self.motion_parameters,
             shutter=self.shutter,
-            cameras="any",
+            cameras="rig",
             reference_point="left" if self.one_camera else "body",
             reference="rsbench; maximum likelihood of Wang, Fan, Dai, eq. 1-6 without linearisation",
             assumes="constant velocity of the chosen motion model, Gaussian noise, no outliers",

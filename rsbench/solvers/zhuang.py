@@ -71,7 +71,7 @@ class Flow(NamedTuple):
     @classmethod
     def of(cls, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Flow:
         matches = temporal_pairs(correspondences, "left")
-        x, y = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+        x, y = (rig.eye("left").unproject(matches[:, k : k + 2]) for k in (0, 2))
         tau0 = shutter.pixel_time(matches[:, :2], 0, "left")
         tau1 = shutter.pixel_time(matches[:, 2:], 1, "left")
         focal = np.array([rig.camera.fx, rig.camera.fy])
@@ -241,7 +241,7 @@ class ZhuangSolver(Solver):
             metric=False,
             motion_model="twist" if self._least == 8 else "accelerated",
             shutter="rolling",
-            cameras="any",
+            cameras="rig",
             reference_point="left",
             reference="Zhuang, Cheong, Lee: Rolling-Shutter-Aware Differential SfM, ICCV 2017",
             assumes="small motion; a scene that is not planar; translation; "
@@ -337,7 +337,7 @@ _LEAST_DURATION = 0.05
 
 def scale_flow(correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Correspondences:
     """Matches, without a lens, whose frame-1 ends are moved to where they are after exactly one frame period."""
-    ideal = without_lens(correspondences, rig.camera)
+    ideal = without_lens(correspondences, rig)
     halves = [
         _scaled(track_pairs(correspondences.tracks, side), track_pairs(ideal.tracks, side), side, shutter)
         for side in SIDES
@@ -396,7 +396,7 @@ class FlowScaledSolver(Solver):
             inner,
             motion_model="twist",
             shutter="rolling",
-            cameras="any" if inner.needs == {"left"} else "lens",
+            cameras="rig" if inner.needs == {"left"} else "lens",
             reference=f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}",
             assumes=f"constant twist, small motion; {inner.assumes}",
         )

@@ -20,6 +20,7 @@ from rsbench.core.correspondences import (
     unlinked_pairs,
     without_lens,
 )
+from rsbench.core.rig import StereoRig
 
 COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
 
@@ -83,7 +84,7 @@ def test_affine_frames_without_the_lens_are_those_of_ideal_pixels() -> None:
     given = Correspondences(
         left=np.hstack([first, second]), affine=np.tile(A.ravel(), (2, 1)), gyro=np.ones((1, 4))
     )
-    ideal = without_lens(given, camera)
+    ideal = without_lens(given, StereoRig(camera=camera, baseline=1.0))
     at = camera.ideal_pixels(first)
     for k, step in enumerate(h * np.eye(2)):
         ends = []

@@ -412,7 +412,7 @@ def test_matches_where_a_lens_shows_nothing_are_named() -> None:
     left = np.array([[10.0, 20.0, 30.0, 40.0], [10.0, 20.0, 3000.0, 40.0]])
     matches = Correspondences(left=np.repeat(left, 5, axis=0))
     with pytest.raises(ValueError, match=r"left\[5\] = \[10.0, 20.0, 3000.0, 40.0\]: the lens shows no ray"):
-        without_lens(matches, rig.camera)
+        without_lens(matches, rig)
     found = estimate_motion(
         matches,
         rig,

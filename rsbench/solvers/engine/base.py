@@ -26,6 +26,7 @@ from rsbench.core.arguments import name_or_path as name_or_path_of
 from rsbench.core.arguments import real_array, shown
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import UNALIGNED
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -142,7 +143,7 @@ class SolverSpec:
         for name, allowed in (
             ("shutter", ("rolling", "global")),
             ("reference_point", ("body", "left")),
-            ("cameras", ("ideal", "lens", "any")),
+            ("cameras", ("ideal", "lens", "any", "rig")),
         ):
             if not isinstance(getattr(self, name), str) or getattr(self, name) not in allowed:
                 raise ValueError(f"{name} = {shown(getattr(self, name))}: must be one of {', '.join(allowed)}")
@@ -158,7 +159,11 @@ class SolverSpec:
 
     def refusal(self, rig: StereoRig, shutter: RollingShutter) -> str:
         """Why it does not accept such cameras; empty when it does."""
-        if self.shutter == "global" or self.cameras == "any":
+        if self.shutter == "global" or self.cameras == "rig":
+            return ""
+        if not rig.aligned:
+            return f"it takes two equal cameras in perfect alignment, and {UNALIGNED}"
+        if self.cameras == "any":
             return ""
         if rig.camera.lens is not None and self.cameras == "ideal":
             return f"it does not take a lens, and the cameras have one ({rig.camera.lens.model})"

@@ -231,12 +231,12 @@ def pack(
 
 def _rectified(rig: StereoRig, shutter: RollingShutter) -> bool:
     """Whether a left-right match is one row of both images, read at one time."""
-    return rig.camera.lens is None and shutter.rows_together
+    return rig.rectified and shutter.rows_together
 
 
 def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
     """(n, 7) or (n, 17) for ``kernels.pair_terms`` from matches (n, 4) of one camera."""
-    camera, ends = rig.camera, (matches[:, :2], matches[:, 2:])
+    camera, ends = rig.eye(side), (matches[:, :2], matches[:, 2:])
     out = np.zeros((len(matches), 7 if _rectified(rig, shutter) else 17))
     out[:, :2], out[:, 2:4] = (camera.unproject(end)[:, :2] for end in ends)
     _check_rays(out[:, :4], rig)
@@ -253,17 +253,17 @@ def _pack_timed_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutt
     _check_origin(tracks, rig)
     out = np.zeros((len(tracks), 4, 9))
     for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
-        end = tracks[:, 2 * k : 2 * k + 2]
-        out[:, k, :2], out[:, k, 2] = rig.camera.unproject(end)[:, :2], shutter.pixel_time(end, frame, side)
+        end, eye = tracks[:, 2 * k : 2 * k + 2], rig.eye(side)
+        out[:, k, :2], out[:, k, 2] = eye.unproject(end)[:, :2], shutter.pixel_time(end, frame, side)
         _check_rays(out[:, k, :2], rig)
-        out[:, k, 3:7], out[:, k, 7:] = rig.camera.ideal_by_pixel(end).reshape(-1, 4), shutter.rate(side)
+        out[:, k, 3:7], out[:, k, 7:] = eye.ideal_by_pixel(end).reshape(-1, 4), shutter.rate(side)
     return out
 
 
 def _check_rays(rays: FloatArray, rig: StereoRig) -> None:
-    if rig.camera.lens is not None and np.any(np.isnan(rays)):
+    if not rig.rectified and np.any(np.isnan(rays)):
         raise ValueError(
-            f"{np.count_nonzero(np.isnan(rays[:, 0]))} matches: the lens shows no ray at their pixels"
+            f"{np.count_nonzero(np.isnan(rays[:, 0]))} matches: the camera shows no ray at their pixels"
         )
 
 

@@ -384,7 +384,7 @@ def estimate_motion(
         given, note = joined.correspondences, joined.note
     start = time.perf_counter()
     try:
-        ideal = without_lens(given, rig.camera)
+        ideal = without_lens(given, rig)
         refusal = solver.spec.refusal(rig, shutter)
     except ValueError as error:
         return _refused(correspondences, str(error), solver, options)
