@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
-from rsbench.core.rig import AlignedCamera, Side, StereoRig
+from rsbench.core.rig import FRAMES, AlignedCamera, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
@@ -28,9 +28,22 @@ def essential_matrix(pose: Pose) -> FloatArray:
 def row_pair_pose(
     rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, y0: ArrayLike, y1: ArrayLike
 ) -> Pose:
-    """Pose of the camera at row ``y1`` of frame 1 from the camera at row ``y0`` of frame 0, batch (...)."""
-    R0, t0 = rig.cam_from_world(motion, shutter.row_time(y0, 0), side)
-    R1, t1 = rig.cam_from_world(motion, shutter.row_time(y1, 1), side)
+    """Pose of the camera at row ``y1`` of frame 1 from the camera at row ``y0`` of frame 0, batch (...).
+
+    Here and below in the body's axes, as the rays of ``rig.eye`` are.
+    """
+    return _pose_between(rig, motion, side, shutter.row_time(y0, 0), shutter.row_time(y1, 1))
+
+
+def match_pose(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, matches: FloatArray) -> Pose:
+    """The same between the times at which a camera reads both ends of matches (n, 4), of any shutter."""
+    ends = (shutter.pixel_time(matches[:, 2 * frame : 2 * frame + 2], frame, side) for frame in FRAMES)
+    return _pose_between(rig, motion, side, *ends)
+
+
+def _pose_between(rig: StereoRig, motion: Motion, side: Side, tau0: FloatArray, tau1: FloatArray) -> Pose:
+    R0, t0 = rig.eye_from_world(motion, tau0, side)
+    R1, t1 = rig.eye_from_world(motion, tau1, side)
     R = R1 @ np.swapaxes(R0, -1, -2)
     return Pose(R, t1 - (R @ t0[..., None])[..., 0])
 

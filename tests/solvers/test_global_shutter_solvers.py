@@ -484,7 +484,9 @@ def test_lines_pass_the_lens_the_loop_and_the_runner() -> None:
         for name, rows in (("tracks", s.correspondences.tracks), ("lines", s.correspondences.lines))
     }
     seen = Correspondences(**{name: rows[np.all(np.isfinite(rows), axis=1)] for name, rows in bent.items()})
-    np.testing.assert_allclose(without_lens(seen, StereoRig(camera=lens, baseline=1.0)).lines, s.correspondences.lines, atol=1e-6)
+    np.testing.assert_allclose(
+        without_lens(seen, StereoRig(camera=lens, baseline=1.0)).lines, s.correspondences.lines, atol=1e-6
+    )
     entry, rng = load_solver_entry("gs-stereo-triplets-lines"), np.random.default_rng(0)
     with SolverRunner() as runner:
         for given in (seen, Correspondences(lines=seen.lines)):

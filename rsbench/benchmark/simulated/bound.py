@@ -10,17 +10,19 @@ its root B, F = B^T B: a point is eliminated by an orthogonal projection (Golub 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
 
 from rsbench.core import so3
+from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.epipolar import ray_depths, row_pair_pose
+from rsbench.core.epipolar import match_pose, ray_depths
 from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.projection import back_project
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
@@ -180,13 +182,15 @@ def _pair_root(
 ) -> FloatArray:
     if len(matches) == 0:
         return np.zeros((0, 6))
-    pose = row_pair_pose(rig, shutter, motion, side, matches[:, 1], matches[:, 3])
-    x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+    pose, eye, axis = match_pose(rig, shutter, motion, side, matches), rig.eye(side), shutter.axis(side)
+    x0, x1 = eye.unproject(matches[:, :2]), eye.unproject(matches[:, 2:])
     depth = ray_depths(pose, x0, x1)[:, 0]
     # Without parallax the depth is open; any says the same about the motion.
     depth = np.where(np.isfinite(depth) & (depth > 0.0), np.minimum(depth, _FAR_M), _FAR_M)
+    depth = depth * rig.own_depth(side, matches[:, :2])
     points = back_project(rig, shutter, motion, side, 0, matches[:, :2], depth)
-    return root_information(rig, shutter, motion, points, [(side, 0, matches[:, 1]), (side, 1, matches[:, 3])])
+    ends: list[tuple[Side, int, FloatArray]] = [(side, k, matches[:, 2 * k + axis]) for k in FRAMES]
+    return root_information(rig, shutter, motion, points, ends)
 
 
 def _track_root(
@@ -194,16 +198,30 @@ def _track_root(
 ) -> FloatArray:
     if len(tracks) == 0:
         return np.zeros((0, 6))
-    disparity = np.maximum(tracks[:, 0] - tracks[:, 2], rig.camera.fx * rig.baseline / _FAR_M)
-    points = back_project(rig, shutter, motion, "left", 0, tracks[:, :2], rig.depth(disparity))
     seen: list[tuple[Side, int, FloatArray]] = [
-        ("left", 0, tracks[:, 1]),
-        ("right", 0, tracks[:, 3]),
-        ("left", 1, tracks[:, 5]),
+        (side, frame, tracks[:, 4 * frame + 2 * k + shutter.axis(side)])
+        for frame in FRAMES
+        for k, side in enumerate(SIDES)
     ]
-    if views == "four-view":
-        seen.append(("right", 1, tracks[:, 7]))
-    return root_information(rig, shutter, motion, points, seen)
+    if rig.rectified and shutter.rows_together:
+        disparity = np.maximum(tracks[:, 0] - tracks[:, 2], rig.camera.fx * rig.baseline / _FAR_M)
+        points = back_project(rig, shutter, motion, "left", 0, tracks[:, :2], rig.depth(disparity))
+    else:
+        points = _triangulated(tracks, rig, shutter, motion)
+    return root_information(rig, shutter, motion, points, seen if views == "four-view" else seen[:3])
+
+
+def _triangulated(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> FloatArray:
+    """Points (n, 3) nearest to the four rays of exact tracks (n, 8), each from where its camera was."""
+    A, b = np.zeros((len(tracks), 3, 3)), np.zeros((len(tracks), 3))
+    for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
+        pixels = tracks[:, 2 * k : 2 * k + 2]
+        R, t = rig.eye_from_world(motion, shutter.pixel_time(pixels, frame, side), side)
+        ray = rig.eye(side).unproject(pixels)
+        across = np.eye(3) - ray[:, :, None] * ray[:, None] / np.sum(ray**2, axis=1)[:, None, None]
+        M = np.swapaxes(R, 1, 2) @ across
+        A, b = A + M @ R, b - (M @ t[:, :, None])[:, :, 0]
+    return np.asarray(np.linalg.solve(A, b[:, :, None])[:, :, 0], dtype=np.float64)
 
 
 def root_information(
@@ -216,9 +234,9 @@ def root_information(
     """Root (m, 6) of the Fisher information of (w, d) at a noise of 1 px, for points (n, 3) of unknown position.
 
     Args:
-        seen: for each image that sees all the points, its side, frame and their rows (n,).
+        seen: for each image that sees all the points, its side, frame and their lines (n,).
     """
-    taus = [shutter.row_time(rows, frame) for _, frame, rows in seen]
+    taus = [shutter.line_time(lines, frame, side) for side, frame, lines in seen]
     # Of all images at once: on a few points the calls take longer than the arithmetic.
     everywhere = np.concatenate(taus), np.tile(points, (len(seen), 1))
     moved = np.split(np.stack([_derivative(motion, *everywhere, axis) for axis in np.eye(6)], axis=-1), len(seen))
@@ -252,12 +270,17 @@ def _projection_jacobian(
         tau: when each point is seen, (n,).
         moved: derivatives (n, 3, 6) of the points in the body then, by (w, d).
     """
-    R, t = rig.cam_from_world(motion, tau, side)
+    R, t = rig.eye_from_world(motion, tau, side)
     rotated = (R @ points[:, :, None])[:, :, 0]
     x = rotated + t
     w_rate, t_rate = motion.velocity(tau)
     velocity = so3.cross(w_rate, rotated) + t_rate
     camera, z = rig.camera, x[:, 2]
+    if not (rig.rectified and shutter.plain):
+        eye = rig.eye(side)
+        P = np.stack([eye.velocity(x, np.broadcast_to(axis, x.shape)) for axis in np.eye(3)], axis=-1)
+        follow = inverse_2x2(np.eye(2) - (P @ velocity[:, :, None]) * shutter.rate(side))
+        return follow @ P @ moved, follow @ P @ R
     P = np.zeros((len(points), 2, 3))
     P[:, 0, 0], P[:, 0, 2] = camera.fx / z, -camera.fx * x[:, 0] / z**2
     P[:, 1, 1], P[:, 1, 2] = camera.fy / z, -camera.fy * x[:, 1] / z**2

@@ -276,7 +276,7 @@ def _exact(
     sides: tuple[Side, ...],
 ) -> tuple[FloatArray, FloatArray]:
     """Noise-free pixels (count, views, 2 frames, 2) of points (count, 3) that every view sees once."""
-    camera = rig.camera
+    camera = rig.sensor(sides[0])
     found, places = [np.zeros((0, len(sides), 2, 2))], [np.zeros((0, 3))]
     total = 0
     for _ in range(60):
@@ -321,7 +321,7 @@ def _exact_lines(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Noise-free ends (lines, 16) of lines that all four images see."""
-    camera, count = rig.camera, options.lines
+    camera, count = rig.sensor("left"), options.lines
     found = [np.zeros((0, 16))]
     for _ in range(60):
         total = sum(len(each) for each in found)
@@ -374,7 +374,7 @@ def _seen_once(
         slope = np.where(f != f0, (f - f0) / np.where(y != y0, y - y0, 1.0), -1.0)
         y0, f0, y = y, f, np.where(np.abs(f) <= ROW_TOLERANCE_PX, y, y - f / slope)
     converged = np.abs(seen[:, 1] - y) <= ROW_TOLERANCE_PX
-    pixels[slow] = np.where((converged & rig.camera.contains(seen[:, :2]))[:, None], seen[:, :2], np.nan)
+    pixels[slow] = np.where((converged & rig.sensor(side).contains(seen[:, :2]))[:, None], seen[:, :2], np.nan)
     if not np.all(slow):
         rest = rs_project(rig, shutter, motion, side, frame, points[~slow])
         pixels[~slow] = np.where((rest.status == ProjectionStatus.SEEN)[:, None], rest.pixels, np.nan)
@@ -390,7 +390,7 @@ def _slower_than_readout(
     speed over the frame, none is.
     """
     camera = rig.camera
-    if camera.lens is not None or not shutter.plain:
+    if not (rig.rectified and shutter.plain):
         return np.zeros(len(points), dtype=np.bool_)
     rows = (-0.5, 0.5 * shutter.height, shutter.height - 0.5)
     first, middle, last = (float(shutter.row_time(row, frame)) for row in rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from general_rigs import RIGS, SCANS
 
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_point, motion_bound, root_information
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
@@ -14,7 +15,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
 from rsbench.core.rig import Side, StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.refined import RefinedSolver
@@ -54,27 +55,59 @@ def test_equals_a_numeric_fit_of_motion_and_points(views: tuple[Side, ...]) -> N
     frames = [0, 1] if len(views) == 2 else [0, 0, 1, 1][: len(views)]
     pixels = np.random.default_rng(0).uniform(200, 700, (8, 2))
     points = back_project(RIG, SHUTTER, motion, "left", 0, pixels, np.linspace(3, 8, 8))
-
-    def project(parameters: FloatArray) -> FloatArray:
-        moving, X = LinearMotion(parameters[:3], parameters[3:6]), parameters[6:].reshape(-1, 3)
-        seen = [
-            rs_project(RIG, SHUTTER, moving, side, frame, X) for side, frame in zip(views, frames, strict=True)
-        ]
-        assert all(np.all(view.status == ProjectionStatus.SEEN) for view in seen)
-        return np.concatenate([view.pixels.ravel() for view in seen])
-
-    truth = np.concatenate([W, D, points.ravel()])
-    step = 1e-5
-    shifts = step * np.eye(len(truth))
-    J = np.column_stack([(project(truth + shift) - project(truth - shift)) / (2 * step) for shift in shifts])
-    F = J.T @ J
-    expected = F[:6, :6] - F[:6, 6:] @ np.linalg.pinv(F[6:, 6:], rcond=1e-11) @ F[6:, :6]
+    expected = numeric_information(RIG, SHUTTER, motion, points, list(zip(views, frames, strict=True)))
     rows = [
         (side, frame, rs_project(RIG, SHUTTER, motion, side, frame, points).pixels[:, 1])
         for side, frame in zip(views, frames, strict=True)
     ]
     root = root_information(RIG, SHUTTER, motion, points, rows)
     measured = root.T @ root
+    scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
+    np.testing.assert_allclose(measured / scale, expected / scale, atol=1e-5)
+
+
+def numeric_information(
+    rig: StereoRig, shutter: RollingShutter, motion: Motion, points: FloatArray, views: list[tuple[Side, int]]
+) -> FloatArray:
+    """(6, 6) of (w, d) at a noise of 1 px in each camera's own pixels, points (n, 3) eliminated."""
+
+    def project(parameters: FloatArray) -> FloatArray:
+        moving, X = LinearMotion(parameters[:3], parameters[3:6]), parameters[6:].reshape(-1, 3)
+        seen = [rs_project(rig, shutter, moving, side, frame, X) for side, frame in views]
+        assert all(np.all(view.status == ProjectionStatus.SEEN) for view in seen)
+        return np.concatenate([view.pixels.ravel() for view in seen])
+
+    truth = np.concatenate([motion.w, motion.d, points.ravel()])
+    step = 1e-5
+    shifts = step * np.eye(len(truth))
+    J = np.column_stack([(project(truth + shift) - project(truth - shift)) / (2 * step) for shift in shifts])
+    F = J.T @ J
+    return F[:6, :6] - F[:6, 6:] @ np.linalg.pinv(F[6:, 6:], rcond=1e-11) @ F[6:, :6]
+
+
+@pytest.mark.parametrize("scanning", SCANS.values(), ids=SCANS)
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
+def test_equals_a_numeric_fit_on_any_rig(rig: StereoRig, scanning: Scanning) -> None:
+    motion, shutter = LinearMotion(0.5 * W, 0.3 * D), rig.shutter_of(scanning, 0.8)
+    options = SimulationOptions(tracks=6, pairs=6, depth=(3.0, 6.0))
+    c = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
+    X = {}
+    for name, rays in (("tracks", 4), ("left", 2), ("right", 2)):
+        # Where the exact rays of a match meet: the linear equations of their pixels.
+        views: list[tuple[Side, int]] = [("left", 0), ("right", 0), ("left", 1), ("right", 1)]
+        views = views if rays == 4 else [(side, frame) for side, frame in views if side == name]
+        found = []
+        for row in getattr(c, name):
+            A, b = [], []
+            for (side, frame), pixel in zip(views, row.reshape(-1, 2), strict=True):
+                R, t = rig.cam_from_world(motion, shutter.pixel_time(pixel, frame, side), side)
+                x, y, _ = rig.sensor(side).unproject(pixel)
+                A += [R[0] - x * R[2], R[1] - y * R[2]]
+                b += [x * t[2] - t[0], y * t[2] - t[1]]
+            found.append(np.linalg.lstsq(np.array(A), np.array(b), rcond=None)[0])
+        X[name] = numeric_information(rig, shutter, motion, np.array(found), views)
+    expected = sum(X.values())
+    measured = motion_bound(c, rig, shutter, motion, 1.0).information
     scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
     np.testing.assert_allclose(measured / scale, expected / scale, atol=1e-5)
 
