@@ -8,7 +8,8 @@ such frames cannot be right by a mistake that both share.
 
 Each case gets a folder ROW-SEED: left_0.png, right_0.png ... of two times, or left/ and right/ of more; the same
 below gs/, at the time of each frame's first line, without noise; told.toml and untold.toml, rigs for ``rsbench
-correct`` with and without what the shutter does; and truth.json.
+correct`` with and without what the shutter does; of the rows of general rigs camchain.yaml, the same as Kalibr
+writes it, without the shutter; and truth.json.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,104 +27,54 @@ import cv2
 import foreign_motion as motion
 import numpy as np
 from foreign_motion import Array, Law
-from foreign_world import Image, Quad, World, random_world, read_photographs
+from foreign_rig import (
+    FRAME_SECONDS,
+    KANNALA,
+    SIDES,
+    Camera,
+    Rays,
+    Rig,
+    camchain,
+    card,
+    equal,
+    rays,
+    short_card,
+    turned,
+)
+from foreign_world import Image, Quad, World, random_world, read_photographs, turned_world
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-SIDES = ("left", "right")
+_RIM = 1e-6
+"""Of a ray, which has few digits."""
 _FAR = 1e-6
 """Inverse metres from which on something is seen."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rig:
-    """Two cameras and how they read their lines."""
-
-    ratio: float
-    scans: tuple[str, str] = ("top", "top")
-    """Of the left and the right camera: where reading begins."""
-    k1: float = 0.0
-    """Brown and Conrady's first coefficient."""
-    width: int = 640
-    height: int = 480
-    focal: float = 520.0
-    baseline: float = 0.2
-
-    @property
-    def centre(self) -> tuple[float, float]:
-        """The principal point."""
-        return (self.width - 1) / 2, (self.height - 1) / 2
-
-    def scan(self, side: str) -> str:
-        return self.scans[SIDES.index(side)]
-
-    def rows(self, side: str) -> bool:
-        """Whether a camera reads rows, not columns."""
-        return self.scan(side) in ("top", "bottom")
-
-    def times(self, side: str, frame: int) -> Array:
-        """Times (lines,) of the lines from the top or the left."""
-        lines = self.height if self.rows(side) else self.width
-        order = np.arange(lines) if self.scan(side) in ("top", "left") else np.arange(lines)[::-1]
-        return frame + self.ratio * order / lines
-
-    def camera(self, law: Law, side: str, tau: Array) -> tuple[Array, Array]:
-        """Poses (n, 3, 3), (n, 3) of a camera: half the baseline left or right of the body's centre."""
-        R, t = law.body(tau)
-        return R, t + np.array([self.baseline / 2 if side == "left" else -self.baseline / 2, 0.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Of the samples of an image: x / z (rows or 1, columns) and y / z (rows, columns or 1)."""
-
-    x: Image
-    y: Image
-
-
-@lru_cache(maxsize=4)
-def rays(rig: Rig, samples: int) -> Rays:
-    """Of ``samples`` by ``samples`` points of every pixel, spread evenly over it."""
-    column, row = (
-        ((np.arange(size * samples) + 0.5) / samples - 0.5 - middle) / rig.focal
-        for size, middle in zip((rig.width, rig.height), rig.centre, strict=True)
-    )
-    x, y = column[None, :], row[:, None]
-    if rig.k1 == 0.0:
-        return Rays(x.astype(np.float32), y.astype(np.float32))
-    distorted = np.hypot(x, y)
-    radius = distorted.copy()
-    for _ in range(30):
-        radius -= (radius + rig.k1 * radius**3 - distorted) / (1.0 + 3.0 * rig.k1 * radius**2)
-    gain = radius / np.maximum(distorted, 1e-12)
-    return Rays((x * gain).astype(np.float32), (y * gain).astype(np.float32))
-
-
-def trace(world: World, rig: Rig, poses: tuple[Array, Array], rows: bool = True, samples: int = 2) -> Image:
+def trace(world: World, camera: Camera, poses: tuple[Array, Array], samples: int = 2) -> Image:
     """The image (height, width), grey values from 0 to 255, black where nothing is.
 
     Args:
         poses: of the camera, one for each line, or one for all.
-        rows: whether lines are rows.
         samples: points of a pixel in each direction.
     """
-    ray = rays(rig, samples)
-    shape = rig.height * samples, rig.width * samples
+    ray = rays(camera, samples)
+    shape = camera.height * samples, camera.width * samples
     near = np.full(shape, _FAR, dtype=np.float32)
     texels = np.zeros((3, *shape), dtype=np.float32)
     for quad, place in zip(world.quads, world.places, strict=True):
-        _draw(quad, place, rig, poses, rows, ray, near, texels)
-    values = _sample(world.atlas, texels[0], texels[1], texels[2] - 1.5 * np.log2(near))
+        _draw(quad, place, camera, poses, ray, near, texels)
+    values = _sample(world.atlas, texels[0], texels[1], texels[2] + ray.blur - 1.5 * np.log2(near))
     values[near <= _FAR] = 0.0
-    mean = values.reshape(rig.height, samples, rig.width, samples).mean(axis=(1, 3), dtype=np.float64)
+    mean = values.reshape(camera.height, samples, camera.width, samples).mean(axis=(1, 3), dtype=np.float64)
     return np.asarray(mean, dtype=np.float32)
 
 
 def _draw(
     quad: Quad,
     place: tuple[int, int, int, int],
-    rig: Rig,
+    camera: Camera,
     poses: tuple[Array, Array],
-    rows: bool,
     ray: Rays,
     near: Image,
     texels: Image,
@@ -136,15 +86,17 @@ def _draw(
     """
     R, t = poses
     frame = np.stack([R @ quad.across, R @ quad.down, R @ quad.corner + t], axis=-1)
-    box = _box(frame, rig, near.shape)
+    box = _box(frame, ray, near.shape)
     if box is None:
         return
-    samples = near.shape[0] // rig.height
+    rows, samples = camera.rows, near.shape[0] // camera.height
     normal = np.cross(frame[:, :, 0], frame[:, :, 1])
     area = np.linalg.norm(normal, axis=-1)
     distance = np.abs(np.sum(normal * frame[:, :, 2], axis=-1)) / area
     # A pixel at depth z covers z^3 / (focal^2 distance) of the plane.
-    detail = 0.5 * np.log2(place[2] * place[3] / area / np.maximum(distance, 1e-9)) - np.log2(rig.focal * samples)
+    detail = 0.5 * np.log2(place[2] * place[3] / area / np.maximum(distance, 1e-9)) - np.log2(
+        camera.focal * samples
+    )
     lines = np.concatenate([np.linalg.inv(frame).reshape(-1, 9), detail[:, None]], axis=1).astype(np.float32)
     down, over = box
     if len(lines) > 1:
@@ -161,7 +113,7 @@ def _draw(
     np.copyto(texels[2][box], m[9], where=seen)
 
 
-def _box(frame: Array, rig: Rig, shape: tuple[int, ...]) -> tuple[slice, slice] | None:
+def _box(frame: Array, ray: Rays, shape: tuple[int, ...]) -> tuple[slice, slice] | None:
     """Rows and columns of samples that may show a quad; None when none does."""
     edges = np.array([[0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0]])
     corners = frame @ edges
@@ -171,25 +123,16 @@ def _box(frame: Array, rig: Rig, shape: tuple[int, ...]) -> tuple[slice, slice] 
         return slice(0, shape[0]), slice(0, shape[1])
     points = (corners[:, :2] / corners[:, 2:]).transpose(0, 2, 1).reshape(-1, 2)
     low, high = points.min(axis=0), points.max(axis=0)
-    if rig.k1 != 0.0:
-        share = np.linspace(0.0, 1.0, 65)
-        rim = [
-            np.where(k, side, low + share[:, None] * (high - low)) for side in (low, high) for k in np.eye(2) > 0
-        ]
-        ideal = np.concatenate(rim)
-        largest = 1e9 if rig.k1 > 0.0 else np.sqrt(-1.0 / (3.0 * rig.k1))
-        radius = np.minimum(np.linalg.norm(ideal, axis=-1, keepdims=True), largest)
-        points = (
-            ideal
-            / np.maximum(np.linalg.norm(ideal, axis=-1, keepdims=True), 1e-12)
-            * (radius + rig.k1 * radius**3)
-        )
-        low, high = points.min(axis=0), points.max(axis=0)
-    samples = shape[0] // rig.height
-    first = np.floor((low * rig.focal + rig.centre - 1.0) * samples)
-    last = np.ceil((high * rig.focal + rig.centre + 2.0) * samples)
-    (left, top), (right, bottom) = (np.clip(ends, 0, shape[::-1]).astype(int) for ends in (first, last))
-    return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))
+    within = [(low[k] - _RIM <= axis) & (axis <= high[k] + _RIM) for k, axis in enumerate((ray.x, ray.y))]
+    if len(ray.x) == 1:
+        taken = within[1][:, 0], within[0][0]
+    else:
+        both = within[0] & within[1]
+        taken = both.any(axis=1), both.any(axis=0)
+    if not (np.any(taken[0]) and np.any(taken[1])):
+        return None
+    first, last = ([axis.argmax() for axis in taken], [len(axis) - axis[::-1].argmax() for axis in taken])
+    return slice(first[0], last[0]), slice(first[1], last[1])
 
 
 def _sample(atlas: list[Image], x: Image, y: Image, level: Image) -> Image:
@@ -214,6 +157,12 @@ class Case:
     model: str | None = None
     """rsbench's name of the law; None for laws that it does not know."""
     frames: int = 2
+    noise: float | None = None
+    """Grey levels; None: drawn."""
+    focal: float | None = None
+    """Pixels, that textures are fine enough for; None: the left camera's."""
+    upright: Array = field(default_factory=lambda: np.eye(3))
+    """(3, 3), from axes in which the ground lies below to the world's."""
 
 
 def _vectors(rng: np.random.Generator, degrees: float, metres: tuple[float, float]) -> tuple[Array, Array]:
@@ -225,41 +174,41 @@ def _vectors(rng: np.random.Generator, degrees: float, metres: tuple[float, floa
 def _linear(degrees: float, **rig: Any) -> Callable[[np.random.Generator], Case]:
     """Cases of the linear law."""
     return lambda rng: Case(
-        law=motion.Linear(*_vectors(rng, degrees, (0.1, 0.25))), rig=Rig(**rig), model="linear"
+        law=motion.Linear(*_vectors(rng, degrees, (0.1, 0.25))), rig=equal(**rig), model="linear"
     )
 
 
 def _twist(rng: np.random.Generator) -> Case:
-    return Case(law=motion.Twist(*_vectors(rng, 4.0, (0.1, 0.25))), rig=Rig(ratio=0.8), model="twist")
+    return Case(law=motion.Twist(*_vectors(rng, 4.0, (0.1, 0.25))), rig=equal(ratio=0.8), model="twist")
 
 
 def _inertial(rng: np.random.Generator) -> Case:
-    return Case(law=motion.Inertial(*_vectors(rng, 3.0, (0.15, 0.3))), rig=Rig(ratio=0.8), model="inertial")
+    return Case(law=motion.Inertial(*_vectors(rng, 3.0, (0.15, 0.3))), rig=equal(ratio=0.8), model="inertial")
 
 
 def _accelerated(rng: np.random.Generator) -> Case:
     law = motion.Accelerated(*_vectors(rng, 2.0, (0.1, 0.25)), k=rng.uniform(0.1, 0.5))
-    return Case(law=law, rig=Rig(ratio=0.7), model="accelerated")
+    return Case(law=law, rig=equal(ratio=0.7), model="accelerated")
 
 
 def _forward(rng: np.random.Generator) -> Case:
     w = np.radians(0.5) * motion.direction(rng, (1.0, 1.0, 0.6))
     d = np.array([*rng.normal(0.0, 0.01, 2), -rng.uniform(0.2, 0.35)])  # forward, what stands still comes nearer
-    return Case(law=motion.Linear(w, d), rig=Rig(ratio=0.9), model="linear")
+    return Case(law=motion.Linear(w, d), rig=equal(ratio=0.9), model="linear")
 
 
 def _drive(rng: np.random.Generator) -> Case:
     """Eight frames from a vehicle that brakes or speeds up on a wide bend."""
     w = np.radians(0.5) * motion.direction(rng, (0.1, 1.0, 0.1))
     d = np.array([*rng.normal(0.0, 0.01, 2), -rng.uniform(0.15, 0.25)])  # as in _forward
-    return Case(law=motion.Accelerated(w, d, k=rng.uniform(-0.08, 0.1)), rig=Rig(ratio=0.8), frames=8)
+    return Case(law=motion.Accelerated(w, d, k=rng.uniform(-0.08, 0.1)), rig=equal(ratio=0.8), frames=8)
 
 
 def _shaken(strength: float, slowest: float, fastest: float, frames: int = 8) -> Callable[..., Case]:
     """Sequences from a hand."""
 
     def case(rng: np.random.Generator) -> Case:
-        return Case(law=motion.shaken(rng, strength, slowest, fastest), rig=Rig(ratio=0.8), frames=frames)
+        return Case(law=motion.shaken(rng, strength, slowest, fastest), rig=equal(ratio=0.8), frames=frames)
 
     return case
 
@@ -285,35 +234,105 @@ ROWS: dict[str, Callable[[np.random.Generator], Case]] = {
 }
 
 
+def _two(R: Array | None = None, t: tuple[float, float, float] = (-0.2, 0.0, 0.0), **sides: dict[str, Any]) -> Rig:
+    """A rig whose cameras differ from the ideal ones by what is given."""
+    left, right = (Camera(**sides.get(side, {})) for side in SIDES)
+    return Rig(left=left, right=right, R=np.eye(3) if R is None else R, t=np.array(t))
+
+
+RIGS = {
+    "ideal": _two(),
+    "turned": _two(turned(0.3, 0.3, 0.26)),  # 0.5 deg
+    "focal": _two(right={"fx": 532.0, "fy": 532.0}),
+    "printed": _two(
+        turned(0.4, 0.8, -0.6),
+        (-0.2, 0.001, -0.002),
+        left={"coefficients": (-0.22,), "shift": (3.2, -4.1)},
+        right={"fx": 527.0, "fy": 527.0, "coefficients": (-0.20,), "shift": (-5.3, 2.4)},
+    ),
+    "toed-in": _two(turned(0.0, 3.0, 1.0)),
+    "vertical": _two(turned(0.3, -0.2, 0.4), (0.0, -0.2, 0.0)),
+    "sizes": _two(turned(0.2, 0.3, -0.2), right={"width": 1280, "height": 720, "fx": 1010.0, "fy": 1010.0}),
+    "global-left": _two(turned(0.2, -0.3, 0.1), left={"ratio": 0.0}),
+    "global-right": _two(turned(0.2, -0.3, 0.1), right={"ratio": 0.0}),
+    "fisheye": _two(
+        turned(-0.3, 0.4, 0.2),
+        left={"lens": KANNALA, "fx": 420.0, "fy": 421.0, "coefficients": (0.02, -0.012, 0.004, -0.001)},
+        right={"fx": 515.0, "fy": 516.0, "coefficients": (-0.2, 0.03, 0.0005, -0.0004)},
+    ),
+    "late": _two(turned(0.1, 0.2, -0.2), right={"delay": 0.003 / FRAME_SECONDS}),
+}
+"""Rigs as calibrations give them. A seed has the same world, motion and noise for all of them."""
+
+
+def _seen_by(rig: Rig) -> Callable[[np.random.Generator], Case]:
+    """The linear law of 2 deg and 0.25 m."""
+    upright = np.rint(rig.body_from_left())  # of a vertical rig a quarter turn
+    focal = 1010.0 if rig.right.width > 640 else 520.0
+
+    def case(rng: np.random.Generator) -> Case:
+        law = motion.Linear(*(upright @ vector for vector in _vectors(rng, 2.0, (0.25, 0.25))))
+        return Case(law=law, rig=rig, model="linear", noise=1.5, focal=focal, upright=upright)
+
+    return case
+
+
+ROWS |= {name: _seen_by(rig) for name, rig in RIGS.items()}
+
+
 def draw_case(row: str, seed: int) -> tuple[Case, np.random.Generator]:
     """The case of a row and seed, and the generator for what surrounds it."""
-    rng = np.random.default_rng([seed, *row.encode()])
+    rng = np.random.default_rng([seed, *("rig" if row in RIGS else row).encode()])
     return ROWS[row](rng), rng
+
+
+@dataclass(frozen=True)
+class Traced:
+    """Images (height, width), grey values, of each side and frame."""
+
+    rolling: dict[tuple[str, int], Image]
+    still: dict[tuple[str, int], Image]
+    """At the time of the frame's first line, without noise."""
+    noise: float
+    world: World
+
+
+def trace_case(case: Case, rng: np.random.Generator, photographs: list[Image]) -> Traced:
+    """What both cameras see of a world that the generator makes."""
+    rig, rolling, still = case.rig, {}, {}
+    path = motion.centres(case.law, np.linspace(0.0, case.frames, 20 * case.frames)) @ case.upright
+    focal = case.focal or rig.left.focal
+    world = turned_world(random_world(rng, path, focal, photographs), case.upright)
+    noise = float(rng.uniform(1.0, 2.0)) if case.noise is None else case.noise
+    for view in ((side, frame) for frame in range(case.frames) for side in SIDES):
+        camera = rig.camera(view[0])
+        seen = trace(world, camera, rig.poses(case.law, view[0], camera.times(view[1])))
+        rolling[view] = seen + rng.normal(0.0, noise, seen.shape).astype(np.float32)
+        still[view] = trace(world, camera, rig.poses(case.law, view[0], camera.start(view[1])))
+    return Traced(rolling, still, noise, world)
 
 
 def write_case(row: str, seed: int, folder: Path, photographs: list[Image]) -> float:
     """Everything of one case; truth.json comes last. Returns the seconds of a traced frame."""
     case, rng = draw_case(row, seed)
-    rig = case.rig
-    path = motion.centres(case.law, np.linspace(0.0, case.frames, 20 * case.frames))
-    world = random_world(rng, path, rig.focal, photographs)
-    noise = float(rng.uniform(1.0, 2.0))
     begin = time.perf_counter()
-    for frame in range(case.frames):
-        for side in SIDES:
-            tau = rig.times(side, frame)
-            rolling = trace(world, rig, rig.camera(case.law, side, tau), rig.rows(side))
-            rolling += rng.normal(0.0, noise, rolling.shape).astype(np.float32)
-            start = np.array([float(frame)])
-            _write(picture(folder, case.frames, side, frame), rolling)
-            _write(
-                picture(folder / "gs", case.frames, side, frame),
-                trace(world, rig, rig.camera(case.law, side, start)),
-            )
+    traced = trace_case(case, rng, photographs)
     seconds = (time.perf_counter() - begin) / (4 * case.frames)
+    for (side, frame), image in traced.rolling.items():
+        _write(picture(folder, case.frames, side, frame), image)
+        _write(picture(folder / "gs", case.frames, side, frame), traced.still[side, frame])
     for name, told in (("told", True), ("untold", False)):
-        (folder / f"{name}.toml").write_text(rig_card(rig, told), "utf-8")
-    truth = {"row": row, "seed": seed, "noise": noise, "quads": len(world.quads), **_truth(case)}
+        text = (card if row in RIGS else short_card)(case.rig, told)
+        (folder / f"{name}.toml").write_text(text, "utf-8")
+    if row in RIGS:
+        (folder / "camchain.yaml").write_text(camchain(case.rig), "utf-8")
+    truth = {
+        "row": row,
+        "seed": seed,
+        "noise": traced.noise,
+        "quads": len(traced.world.quads),
+        **_truth(case),
+    }
     (folder / "truth.json").write_text(json.dumps(truth), "utf-8")
     return seconds
 
@@ -323,17 +342,14 @@ def picture(folder: Path, frames: int, side: str, frame: int) -> Path:
     return folder / f"{side}_{frame}.png" if frames == 2 else folder / side / f"{frame:03d}.png"
 
 
+def grey(image: Image) -> NDArray[np.uint8]:
+    """As a file has it."""
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
 def _write(path: Path, image: Image) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.clip(np.rint(image), 0, 255).astype(np.uint8))
-
-
-def rig_card(rig: Rig, told: bool) -> str:
-    """The rig as ``rsbench correct --rig`` takes it."""
-    shutter = f'readout_ratio = {rig.ratio}\nscan = "{rig.scans[0]}"\nright_scan = "{rig.scans[1]}"\n'
-    lens = f'lens = {{ model = "brown-conrady", k1 = {rig.k1} }}\n' if rig.k1 else ""
-    camera = f"fx = {rig.focal}\nfy = {rig.focal}\ncx = {rig.centre[0]}\ncy = {rig.centre[1]}\n"
-    return f"baseline = {rig.baseline}\n{shutter if told else ''}[camera]\n{camera}{lens}"
+    cv2.imwrite(str(path), grey(image))
 
 
 def _truth(case: Case) -> dict[str, Any]:
@@ -343,7 +359,7 @@ def _truth(case: Case) -> dict[str, Any]:
     poses: dict[str, Any] = {side: [] for side in SIDES}
     for frame in range(case.frames):
         for side in SIDES:
-            R, t = case.law.body(rig.times(side, frame))
+            R, t = case.law.body(rig.camera(side).times(frame))
             vectors = Rotation.from_matrix(R).as_rotvec()
             poses[side].append(np.round(np.concatenate([vectors, t], axis=1), 12).tolist())
     return {
@@ -351,9 +367,9 @@ def _truth(case: Case) -> dict[str, Any]:
         "law_parameters": {name: np.asarray(value).tolist() for name, value in vars(case.law).items()},
         "motion_model": case.model,
         "frames": case.frames,
-        "ratio": rig.ratio,
-        "scans": dict(zip(SIDES, rig.scans, strict=True)),
-        "k1": rig.k1,
+        "ratio": max(rig.camera(side).ratio for side in SIDES),
+        "cameras": {side: asdict(rig.camera(side)) for side in SIDES},
+        "right_from_left": {"R": rig.R.tolist(), "t": rig.t.tolist()},
         "w": motions[0][0].tolist(),
         "d": motions[0][1].tolist(),
         "motions": [{"w": w.tolist(), "d": d.tolist()} for w, d in motions],

@@ -115,6 +115,12 @@ def random_world(
     return assemble(quads, textures)
 
 
+def turned_world(world: World, R: Array) -> World:
+    """All of it turned about the origin by R (3, 3)."""
+    quads = [Quad(R @ quad.corner, R @ quad.across, R @ quad.down) for quad in world.quads]
+    return World(quads, world.places, world.atlas)
+
+
 def _room(rng: np.random.Generator, path: Array) -> list[Quad]:
     """Front, back, ground, ceiling, left and right, around a path (n, 3)."""
     front, back = rng.uniform(8.0, 15.0), -4.0

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from programs import ROOT
 from scipy.optimize import brentq
 
 from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
-from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -24,12 +24,16 @@ from rsbench.pipeline.footage import read_rig_card
 
 SMALL = {"width": 160, "height": 120, "focal": 130.0}
 W, D = np.array([0.03, -0.055, 0.02]), np.array([-0.12, 0.05, -0.15])
+RIGS = ["ideal", "turned", "focal", "printed", "toed-in", "vertical", "sizes", "fisheye", "late"]
+RIGS += ["global-left", "global-right"]
 CASES = [(0.8, ("top", "top"), 0.0), (0.7, ("bottom", "left"), -0.15), (0.6, ("right", "bottom"), 0.1)]
 
 
 class Programs(NamedTuple):
+    case: ModuleType
     frames: ModuleType
     motion: ModuleType
+    rig: ModuleType
     table: ModuleType
     world: ModuleType
 
@@ -40,24 +44,6 @@ def programs_() -> Iterator[Programs]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
         yield Programs(*(importlib.import_module(f"foreign_{name}") for name in Programs._fields))
-
-
-def _ours(rig: Any) -> tuple[StereoRig, RollingShutter]:
-    """The same rig and shutter in rsbench."""
-    lens = Lens(model="brown-conrady", k1=rig.k1) if rig.k1 else None
-    camera = PinholeCamera(
-        width=rig.width,
-        height=rig.height,
-        fx=rig.focal,
-        fy=rig.focal,
-        cx=rig.centre[0],
-        cy=rig.centre[1],
-        lens=lens,
-    )
-    shutter = RollingShutter(
-        height=rig.height, width=rig.width, readout_ratio=rig.ratio, scan=rig.scans[0], right_scan=rig.scans[1]
-    )
-    return StereoRig(camera=camera, baseline=rig.baseline), shutter
 
 
 def _laws(motion: ModuleType) -> list[tuple[Any, type[Motion], dict[str, float]]]:
@@ -98,14 +84,14 @@ def test_a_shaken_body_starts_at_rest_in_the_world_and_shakes_as_strongly_as_sai
 def test_dots_are_drawn_where_the_row_equation_has_them(
     programs_: Programs, ratio: float, scans: tuple[str, str], k1: float, side: Side
 ) -> None:
-    frames, rng = programs_.frames, np.random.default_rng(7)
-    foreign = frames.Rig(ratio=ratio, scans=scans, k1=k1, **SMALL)
-    rig, shutter = _ours(foreign)
+    rng = np.random.default_rng(7)
+    foreign = programs_.rig.equal(ratio=ratio, scans=scans, k1=k1, **SMALL)
+    rig, shutter = programs_.case.ours(foreign)
     motion = TwistMotion(*programs_.motion.between(programs_.motion.Twist(W, D), 0.0, 1.0))
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 4))
     depth = rng.uniform(3.0, 12.0, x.shape)
     points = np.stack([x * depth, y * depth, depth], axis=-1).reshape(-1, 3)
-    image = _dots(programs_, foreign, points, side)
+    image = _dots(programs_, foreign, programs_.motion.Twist(W, D), points, side)
     found = 0
     for point in points:
         true = _seen(rig, shutter, motion, side, point)
@@ -116,17 +102,17 @@ def test_dots_are_drawn_where_the_row_equation_has_them(
     assert found >= 8
 
 
-def _dots(programs_: Programs, rig: Any, points: NDArray[np.float64], side: Side) -> NDArray[np.float32]:
-    """Frame 1 of a camera that moves by a twist and sees a soft dot at each point."""
+def _dots(programs_: Programs, rig: Any, law: Any, points: NDArray[np.float64], side: Side) -> NDArray[np.float32]:
+    """Frame 1 of a moving camera that sees a soft dot at each point."""
     at = np.linspace(-1.0, 1.0, 33)
     dot = 200.0 * np.exp(-0.5 * (at**2 + at[:, None] ** 2) / 0.23**2)
     quads = [
         programs_.world.Quad(point - [size, size, 0.0], np.array([2.0 * size, 0, 0]), np.array([0, 2.0 * size, 0]))
-        for point, size in zip(points, points[:, 2] * 6.0 / rig.focal, strict=True)
+        for point, size in zip(points, points[:, 2] * 6.0 / rig.camera(side).focal, strict=True)
     ]
     world = programs_.world.assemble(quads, [dot.astype(np.float32)] * len(quads))
-    poses = rig.camera(programs_.motion.Twist(W, D), side, rig.times(side, 1))
-    image: NDArray[np.float32] = programs_.frames.trace(world, rig, poses, rig.rows(side))
+    camera = rig.camera(side)
+    image: NDArray[np.float32] = programs_.frames.trace(world, camera, rig.poses(law, side, camera.times(1)))
     return image
 
 
@@ -147,6 +133,60 @@ def _seen(
     return pixel(float(brentq(late, 0.9, 2.1, xtol=1e-12)))
 
 
+@pytest.mark.parametrize("row", RIGS)
+@pytest.mark.parametrize("side", SIDES)
+def test_rigs_show_dots_where_opencv_projects_them(programs_: Programs, row: str, side: Side) -> None:
+    rig, law = programs_.frames.RIGS[row], programs_.motion.Linear(W, D)
+    camera, rng = rig.camera(side), np.random.default_rng(7)
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.4, 0.4, 5))
+    depth = rng.uniform(3.0, 12.0, x.shape)
+    points = np.stack([x * depth, y * depth, depth], axis=-1).reshape(-1, 3)
+    image = _dots(programs_, rig, law, points, side)
+    found = 0
+    for point in points:
+        true = _seen_by_opencv(rig, camera, side, point)
+        if np.all((true > 15.0) & (true < np.array([camera.width, camera.height]) - 15.0)):
+            np.testing.assert_allclose(_centroid(image, true), true, atol=0.03)
+            found += 1
+    assert found >= 10
+
+
+def _seen_by_opencv(rig: Any, camera: Any, side: Side, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The pixel of frame 1 at the time of its row, from R and t of the calibration alone."""
+    centre = -rig.R.T @ rig.t  # of the right camera, in the left one
+    across = centre / np.linalg.norm(centre)
+    ahead = np.array([0.0, 0.0, 1.0]) + rig.R.T @ [0.0, 0.0, 1.0]
+    ahead -= (ahead @ across) * across
+    ahead /= np.linalg.norm(ahead)
+    axes = np.stack([across, np.cross(ahead, across), ahead])
+    K = np.array([[camera.fx, 0.0, camera.centre[0]], [0.0, camera.fy, camera.centre[1]], [0.0, 0.0, 1.0]])
+    pixel = np.array(camera.centre)
+    for _ in range(30):
+        tau = 1.0 + camera.delay + camera.ratio * pixel[1] / camera.height
+        in_left = axes.T @ (cv2.Rodrigues(tau * W)[0] @ point + tau * D) + centre / 2.0
+        seen = in_left if side == "left" else rig.R @ in_left + rig.t
+        if camera.lens == "kannala-brandt":
+            k = np.array(camera.coefficients)
+            pixel = cv2.fisheye.projectPoints(seen.reshape(1, 1, 3), np.zeros(3), np.zeros(3), K, k)[0].ravel()
+        else:
+            k = np.array([*camera.coefficients, *[0.0] * (5 - len(camera.coefficients))])
+            pixel = cv2.projectPoints(seen.reshape(1, 1, 3), np.zeros(3), np.zeros(3), K, k)[0].ravel()
+    return np.asarray(pixel)
+
+
+def test_rsbench_has_the_poses_that_rigs_were_traced_with(programs_: Programs) -> None:
+    tau = np.linspace(0.0, 2.0, 7)
+    for row, foreign in programs_.frames.RIGS.items():
+        rig, shutter = programs_.case.ours(foreign)
+        law = programs_.motion.Linear(W, D)
+        for side in SIDES:
+            R, t = foreign.poses(law, side, tau)
+            pose = rig.cam_from_world(LinearMotion(W, D), tau, side)
+            np.testing.assert_allclose(pose.R, R, atol=1e-12, err_msg=row)
+            np.testing.assert_allclose(pose.t, t, atol=1e-12, err_msg=row)
+            np.testing.assert_allclose(shutter.line_times(1, side), foreign.camera(side).times(1), atol=1e-12)
+
+
 def _centroid(image: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of the grey values within 8 px."""
     x, y = np.meshgrid(np.arange(image.shape[1]), np.arange(image.shape[0]))
@@ -158,14 +198,14 @@ def _centroid(image: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[
 def test_each_pixel_shows_the_nearest_quad_of_its_ray_at_its_time(
     programs_: Programs, ratio: float, scans: tuple[str, str], k1: float
 ) -> None:
-    rng, foreign = np.random.default_rng(5), programs_.frames.Rig(ratio=ratio, scans=scans, k1=k1, **SMALL)
+    rng, foreign = np.random.default_rng(5), programs_.rig.equal(ratio=ratio, scans=scans, k1=k1, **SMALL)
     quads = programs_.world.random_world(rng, np.zeros((1, 3)), 20.0).quads
     greys = [np.full((9, 9), 10.0 * (k + 1), dtype=np.float32) for k in range(len(quads))]
     world = programs_.world.assemble(quads, greys)
-    law, (rig, shutter) = programs_.motion.Linear(W, D), _ours(foreign)
+    law, (rig, shutter) = programs_.motion.Linear(W, D), programs_.case.ours(foreign)
     for side in SIDES:
-        poses = foreign.camera(law, side, foreign.times(side, 0))
-        image = programs_.frames.trace(world, foreign, poses, foreign.rows(side), samples=1)
+        camera = foreign.camera(side)
+        image = programs_.frames.trace(world, camera, foreign.poses(law, side, camera.times(0)), samples=1)
         for pixel in rng.integers(0, (160, 120), (60, 2)):
             R, t = rig.cam_from_world(LinearMotion(W, D), shutter.pixel_time(pixel, 0, side), side)
             start, ray = -R.T @ t, R.T @ rig.camera.unproject(pixel)
@@ -185,12 +225,13 @@ def _nearest(quads: list[Any], start: NDArray[np.float64], ray: NDArray[np.float
 def test_a_line_of_a_rolling_frame_is_that_of_the_global_frame_at_its_time(programs_: Programs) -> None:
     frames, law = programs_.frames, programs_.motion.Twist(W, D)
     world = programs_.world.random_world(np.random.default_rng(2), np.zeros((1, 3)), 25.0)
-    rig = frames.Rig(ratio=0.8, scans=("bottom", "left"), k1=-0.2, **SMALL)
+    rig = programs_.rig.equal(ratio=0.8, scans=("bottom", "left"), k1=-0.2, **SMALL)
     for side, line in (("left", 0), ("left", 77), ("right", 31), ("right", 159)):
-        tau = rig.times(side, 0)
-        rolling = frames.trace(world, rig, rig.camera(law, side, tau), rig.rows(side))
-        still = frames.trace(world, rig, rig.camera(law, side, tau[line : line + 1]))
-        at = np.s_[line] if rig.rows(side) else np.s_[:, line]
+        camera = rig.camera(side)
+        tau = camera.times(0)
+        rolling = frames.trace(world, camera, rig.poses(law, side, tau))
+        still = frames.trace(world, camera, rig.poses(law, side, tau[line : line + 1]))
+        at = np.s_[line] if camera.rows else np.s_[:, line]
         np.testing.assert_allclose(rolling[at], still[at], atol=1e-3)  # grey levels; rounding of float32
         assert np.mean(np.abs(rolling - still)) > 1.0  # elsewhere they differ
         assert np.min(rolling) > 0.0  # the room is closed
@@ -200,16 +241,16 @@ def test_a_case_is_written_with_rigs_that_the_command_reads_and_poses_that_are_t
     programs_: Programs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames = programs_.frames
-    small = frames.Rig(ratio=0.6, scans=("top", "right"), k1=-0.1, width=48, height=36, focal=40.0)
+    small = programs_.rig.equal(ratio=0.6, scans=("top", "right"), k1=-0.1, width=48, height=36, focal=40.0)
     case = frames.Case(law=programs_.motion.Linear(W, D), rig=small, frames=3)
     monkeypatch.setitem(frames.ROWS, "tiny", lambda rng: case)
     frames.write_case("tiny", 0, tmp_path, [])
     told, untold = (read_rig_card(tmp_path / f"{name}.toml") for name in ("told", "untold"))
     assert (told.readout_ratio, told.scan, told.right_scan) == (0.6, "top", "right")
     assert untold.readout_ratio is None and untold.scanning is None
-    assert told.rig(48, 36) == untold.rig(48, 36) == _ours(small)[0]
+    assert told.rig(48, 36) == untold.rig(48, 36) == programs_.case.ours(small)[0]
     truth = json.loads((tmp_path / "truth.json").read_text("utf-8"))
-    times = _ours(small)[1].line_times(2, "right")
+    times = programs_.case.ours(small)[1].line_times(2, "right")
     R, t = LinearMotion(W, D).body_from_world(times)
     poses = np.array(truth["poses"]["right"][2])
     np.testing.assert_allclose(programs_.motion.matrices(poses[:, :3]), R, atol=1e-10)

@@ -1,0 +1,73 @@
+"""A row of ``foreign_frames.py`` in memory, as ``rsbench.correct`` takes it.
+
+from foreign_case import case  # with benchmarks/ on the path
+seen = case("printed", 0)
+rsbench.correct(seen.images, seen.rig, seen.shutter.readout_ratio)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import foreign_frames as frames
+import foreign_motion as motion
+import numpy as np
+from foreign_rig import NAMES, SIDES, Camera, Rig
+from foreign_world import Image, read_photographs
+from numpy.typing import NDArray
+
+from rsbench.components.motion_models import LinearMotion
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Of left 0, right 0, left 1, right 1."""
+
+    images: list[NDArray[np.uint8]]
+    still: list[NDArray[np.uint8]]
+    """At the time of each frame's first line, without noise."""
+    rig: StereoRig
+    shutter: RollingShutter
+    motion: LinearMotion
+    """Of the body over one frame period; the law that was traced in the rows of rigs."""
+
+
+def our_camera(c: Camera) -> PinholeCamera:
+    """The same intrinsics in rsbench."""
+    named: dict[str, Any] = dict(zip(NAMES[c.lens], c.coefficients, strict=False))
+    lens = Lens(model=c.lens, **named) if any(c.coefficients) else None  # type: ignore[arg-type]
+    cx, cy = c.centre
+    return PinholeCamera(width=c.width, height=c.height, fx=c.fx, fy=c.fy, cx=cx, cy=cy, lens=lens)
+
+
+def ours(rig: Rig) -> tuple[StereoRig, RollingShutter]:
+    """The same rig and shutter in rsbench."""
+    left, right = rig.left, rig.right
+    scanning = Scanning(
+        scan=left.scan,  # type: ignore[arg-type]
+        right_scan=right.scan,  # type: ignore[arg-type]
+        right_delay=right.delay - left.delay,
+        right_readout_ratio=None if right.ratio == left.ratio else right.ratio,
+    )
+    made = StereoRig.of_cameras(our_camera(left), our_camera(right), rig.R, rig.t)
+    return made, made.shutter_of(scanning, left.ratio)
+
+
+@cache
+def case(row: str, seed: int = 0) -> Seen:
+    """A row and seed, as ``foreign_frames.py`` writes them."""
+    drawn, rng = frames.draw_case(row, seed)
+    traced = frames.trace_case(drawn, rng, _photographs())
+    views = [(side, frame) for frame in (0, 1) for side in SIDES]
+    rolling, still = ([frames.grey(images[view]) for view in views] for images in (traced.rolling, traced.still))
+    return Seen(rolling, still, *ours(drawn.rig), LinearMotion(*motion.between(drawn.law, 0.0, 1.0)))
+
+
+@cache
+def _photographs() -> list[Image]:
+    return read_photographs(None)
