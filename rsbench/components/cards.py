@@ -40,6 +40,7 @@ CardKind = Literal[
     "correctors",
     "metrics",
     "shutters",
+    "rigs",
 ]
 
 FORMER_NAMES: Mapping[str, Mapping[str, str]] = {"solvers": {"rs-stereo": "rs-stereo-refined"}}

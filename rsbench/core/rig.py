@@ -193,12 +193,18 @@ class StereoRig:
         z /= np.linalg.norm(z)
         to_body = np.stack([x, np.cross(z, x), z])  # body_from_left
         turns = so3.log(np.stack([to_body.T, R @ to_body.T]))
-        if left == right and np.max(np.abs(turns)) < _ALIGNED_RAD:
-            return cls(camera=left, baseline=baseline)
-        cameras = [
+        first, second = (
             RigCamera(camera=each, rotation=tuple(turn)) for each, turn in zip((left, right), turns, strict=True)
-        ]
-        return cls(camera=_ideal_camera(*cameras), baseline=baseline, left=cameras[0], right=cameras[1])
+        )
+        return cls.of_body(first, second, baseline)
+
+    @classmethod
+    def of_body(cls, left: RigCamera, right: RigCamera, baseline: float) -> StereoRig:
+        """The rig of cameras ``baseline`` metres apart along the body's x; the ideal one where they are alike."""
+        turned = max(map(abs, (*left.rotation, *right.rotation)))
+        if left.camera == right.camera and turned < _ALIGNED_RAD:
+            return cls(camera=left.camera, baseline=baseline)
+        return cls(camera=_ideal_camera(left, right), baseline=baseline, left=left, right=right)
 
     @property
     def aligned(self) -> bool:

@@ -1,0 +1,224 @@
+"""Rigs of two calibrated cameras as tables: ``[left]``, ``[right]``, ``[right_from_left]`` of rig.toml and cards.
+
+A card in ``cards/rigs/`` is such a rig under a name, with its source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml, with_shutter
+from rsbench.core import so3
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import StatedShutter
+from rsbench.core.so3 import FloatArray
+
+Size = tuple[int, int]
+Vector = tuple[float, float, float]
+_READOUT_KEYS = {
+    **SHUTTER_KEY,
+    "readout_ratio": "Readout time over frame period of this camera, 0 to 1.",
+    "scan": "Side of the image at which the readout of this camera begins.",
+    "delay_s": "Seconds by which this camera reads later than the other one.",
+}
+"""Shorthands of ``CameraTable`` that ``with_readouts`` replaces."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTable:
+    """One camera of a rig; the centre of the top-left pixel is (0, 0)."""
+
+    SHORTHANDS: ClassVar = _READOUT_KEYS
+
+    width: int | None = None
+    """Width of the images, pixels. Absent: that of the frames."""
+    height: int | None = None
+    """Height of the images, pixels. Absent: that of the frames."""
+    fx: float
+    """Focal length across, pixels."""
+    fy: float
+    """Focal length down, pixels."""
+    cx: float
+    """Column of the principal point, pixels."""
+    cy: float
+    """Row of the principal point, pixels."""
+    lens: Lens | None = None
+    """Distortion of the lens. Absent: images without distortion."""
+
+    def camera(self, size: Size | None = None) -> PinholeCamera:
+        """The camera, of images of this size (width, height).
+
+        Raises:
+            ValueError: no size or two, or a lens that cannot be one of such images.
+        """
+        width, height = size or (self.width, self.height)
+        if width is None or height is None:
+            raise ValueError("width and height are required")
+        if (self.width or width, self.height or height) != (width, height):
+            raise ValueError(
+                f"width, height = {self.width}, {self.height}: the frames are {width} x {height}; give the "
+                "calibration of that size"
+            )
+        return PinholeCamera(
+            width=width, height=height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, lens=self.lens
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RightFromLeft:
+    """``X_right = R X_left + t``, as OpenCV's stereoCalibrate and Kalibr's T_cn_cnm1 have it.
+
+    R is one of ``rotation``, ``quaternion_wxyz`` and ``rotation_deg``; without any the cameras look the same way.
+    """
+
+    translation: Vector
+    """t, metres."""
+    rotation: tuple[Vector, Vector, Vector] | None = None
+    """R, row by row."""
+    quaternion_wxyz: tuple[float, float, float, float] | None = None
+    """R as a quaternion, the real part first."""
+    rotation_deg: Vector | None = None
+    """R as three angles, degrees: R = Rz Ry Rx of (x, y, z)."""
+
+    def __post_init__(self) -> None:
+        named = [name for name in ("rotation", "quaternion_wxyz", "rotation_deg") if getattr(self, name)]
+        if len(named) > 1:
+            raise ValueError(f"{named[0]} and {named[1]} exclude each other")
+        if self.quaternion_wxyz is not None and abs(np.linalg.norm(self.quaternion_wxyz) - 1.0) > 1e-3:
+            raise ValueError(f"quaternion_wxyz = {list(self.quaternion_wxyz)}: must have the length 1")
+
+    @property
+    def R(self) -> FloatArray:
+        """Rotation matrix (3, 3), as given."""
+        if self.rotation is not None:
+            return np.array(self.rotation)
+        if self.quaternion_wxyz is not None:
+            w, *v = np.array(self.quaternion_wxyz) / np.linalg.norm(self.quaternion_wxyz)
+            V = so3.hat(v)
+            return np.eye(3) + 2.0 * (w * V + V @ V)
+        turns = np.deg2rad(self.rotation_deg or (0.0, 0.0, 0.0))
+        about_x, about_y, about_z = so3.exp(np.diag(turns))
+        return about_z @ about_y @ about_x
+
+
+def rig_of_tables(
+    left: CameraTable,
+    right: CameraTable,
+    right_from_left: RightFromLeft,
+    sizes: Mapping[Side, Size] | None = None,
+) -> StereoRig:
+    """The rig that these tables describe; ``sizes`` (width, height) are those of the frames, where known.
+
+    Raises:
+        ValueError: one line with the table and what is wrong.
+    """
+    cameras = []
+    for side, table in zip(SIDES, (left, right), strict=True):
+        try:
+            cameras.append(table.camera(None if sizes is None else sizes[side]))
+        except ValueError as error:
+            raise ValueError(f"{side}: {error}") from error
+    try:
+        return StereoRig.of_cameras(*cameras, right_from_left.R, right_from_left.translation)
+    except ValueError as error:
+        raise ValueError(f"right_from_left: {error}") from error
+
+
+def with_readouts(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A rig's table; keys of ``[left]`` and ``[right]`` about the readout become those of ``StatedShutter``.
+
+    ``readout_ratio``, ``shutter`` and ``scan`` of the rig are those of both cameras, unless a camera has its own;
+    ``delay_s`` of the right camera less that of the left one becomes ``right_delay``, in frame periods.
+
+    Raises:
+        RsbenchError: one line with ``where``, the key and what is wrong.
+    """
+    made = with_shutter(table, where)
+    cameras = {side: dict(made[side]) for side in SIDES if isinstance(made.get(side), dict)}
+    if len(cameras) < len(SIDES):
+        return made
+    for side, camera in cameras.items():
+        if "shutter" in camera:
+            period = {key: made[key] for key in ("frame_period_s",) if key in made}
+            cameras[side] = with_shutter(camera | period, f"{where}: {side}")
+            made["frame_period_s"] = cameras[side].pop("frame_period_s")
+    for key in ("readout_ratio", "scan"):
+        both = made.pop(key, None)
+        left = cameras["left"].pop(key, both)
+        right = cameras["right"].pop(key, made.pop(f"right_{key}", both))
+        made |= {} if left is None else {key: left}
+        made |= {} if right in (left, None) else {f"right_{key}": right}
+    delays = [camera.pop("delay_s", 0.0) for camera in cameras.values()]
+    if any(delays):
+        period = made.get("frame_period_s")
+        if "right_delay" in made or not isinstance(period, int | float) or not period > 0.0:
+            raise RsbenchError(f"{where}: delay_s: needs frame_period_s, and excludes right_delay")
+        if not all(isinstance(delay, int | float) for delay in delays):
+            raise RsbenchError(f"{where}: delay_s = {delays}: must be seconds")
+        made["right_delay"] = (delays[1] - delays[0]) / period
+    return made | cameras
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigTables(StatedShutter):
+    """A calibrated rig: a card in ``cards/rigs/``, or the table ``rig`` of a dataset card."""
+
+    SHORTHANDS: ClassVar = SHUTTER_KEY
+
+    description: str = ""
+    """Cameras and mode, for ``rsbench list rigs``."""
+    source: str = ""
+    """Where the calibration comes from."""
+    left: CameraTable
+    """The left camera."""
+    right: CameraTable
+    """The right camera; above or below the left one in a vertical rig."""
+    right_from_left: RightFromLeft
+    """Where the right camera is, and how it is turned."""
+    frame_period_s: float | None = None
+    """Seconds from one frame to the next, where the rig has one rate."""
+
+    def __post_init__(self) -> None:
+        self.rig()
+
+    def rig(self) -> StereoRig:
+        """The rig; ValueError as of ``rig_of_tables``."""
+        return rig_of_tables(self.left, self.right, self.right_from_left)
+
+
+def read_rig_table(name_or_path: str) -> dict[str, Any]:
+    """The tables of a rig card, by name or path, as ``RigTables`` takes them.
+
+    Raises:
+        RsbenchError: no such card, or a wrong one.
+    """
+    path = card_path("rigs", name_or_path)
+    table = with_readouts(read_toml(path), str(path))
+    parse_card(RigTables, table, str(path))
+    return table
+
+
+def load_rig(name_or_path: str) -> RigTables:
+    """A rig card by name or path; RsbenchError as of ``read_rig_table``."""
+    return parse_card(RigTables, read_rig_table(name_or_path), str(card_path("rigs", name_or_path)))
+
+
+def tables_of(rig: StereoRig) -> dict[str, Any]:
+    """``left``, ``right`` and ``right_from_left`` of a rig, as rig.toml and manifests have them."""
+    R, t = rig.right_from_left
+    return {
+        **{side: camera_record(rig.sensor(side)) for side in SIDES},
+        "right_from_left": {"rotation": R.tolist(), "translation": t.tolist()},
+    }
+
+
+def camera_record(camera: PinholeCamera) -> dict[str, Any]:
+    """A camera for JSON: size and intrinsics, px, and its lens where it has one."""
+    own = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return own | ({} if camera.lens is None else {"lens": asdict(camera.lens)})
