@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import Side, View
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.se3 import Pose
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 
 PoseAt = Callable[[FloatArray], Pose]
@@ -31,7 +32,7 @@ class Recording:
     """Of the cameras whose readout is known; a global one has the ratio 0."""
     frame_period_s: float | None = None
     right_from_left: Pose | None = None
-    """Between the cameras; a rectified pair has no rotation and minus the baseline along x."""
+    """``X_right = R X_left + t`` between the cameras as they are, each in its own axes."""
     poses: Mapping[Side, PoseAt] = field(default_factory=dict)
     depths: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
     """(H, W) z, metres, 0 where there is none; read on demand."""
@@ -45,6 +46,29 @@ class Recording:
     """Images with the weight of each pixel in the layout's own scores of a corrected frame; 0 is none."""
     notes: tuple[str, ...] = ()
     """What the layout leaves open, and how it was taken."""
+
+    @property
+    def rig(self) -> StereoRig | None:
+        """Both cameras as they are; None of one camera, or where their places are not known.
+
+        Raises:
+            RsbenchError: the cameras cannot be a rig, such as two at one place.
+        """
+        if self.right_from_left is None or set(self.cameras) != set(SIDES):
+            return None
+        left, right = (self.cameras[side] for side in SIDES)
+        try:
+            return StereoRig.of_cameras(left, right, *self.right_from_left)
+        except ValueError as error:
+            raise RsbenchError(f"{self.name}: {error}") from error
+
+    @property
+    def shutter(self) -> RollingShutter | None:
+        """Of both cameras of the rig, each with its own ratio; None where a camera's readout is not known."""
+        if self.rig is None or set(self.shutters) != set(SIDES):
+            return None
+        left, right = (self.shutters[side].readout_ratio for side in SIDES)
+        return self.rig.shutter_of(Scanning(right_readout_ratio=None if left == right else right), left)
 
     @property
     def frames(self) -> int:

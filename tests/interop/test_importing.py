@@ -26,11 +26,13 @@ from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose
 from rsbench.interop.readers.check import agreements, epipolar_distance, file_faults, sights
 from rsbench.interop.readers.layouts import (
+    FORMATS,
     read_carla,
     read_colmap,
     read_euroc,
     read_fastec,
     read_kitti,
+    read_kitti_raw,
     read_middlebury,
     read_others,
 )
@@ -164,6 +166,63 @@ def test_kitti(tmp_path: Path) -> None:
     assert float(row["coverage"]) > 0.9
 
 
+# Of 2011_09_26, published with the data: cameras 0 and 1.
+KITTI_RAW = """calib_time: 09-Jan-2012 13:57:47
+S_00: 1.392000e+03 5.120000e+02
+K_00: 9.842439e+02 0.000000e+00 6.900000e+02 0.000000e+00 9.808141e+02 2.331966e+02 0.000000e+00 0.000000e+00 1.000000e+00
+D_00: -3.728755e-01 2.037299e-01 2.219027e-03 1.383707e-03 -7.233722e-02
+R_00: 1.000000e+00 0.000000e+00 0.000000e+00 0.000000e+00 1.000000e+00 0.000000e+00 0.000000e+00 0.000000e+00 1.000000e+00
+T_00: 2.573699e-16 -1.059758e-16 1.614870e-16
+S_rect_00: 1.242000e+03 3.750000e+02
+R_rect_00: 9.999239e-01 9.837760e-03 -7.445048e-03 -9.869795e-03 9.999421e-01 -4.278459e-03 7.402527e-03 4.351614e-03 9.999631e-01
+P_rect_00: 7.215377e+02 0.000000e+00 6.095593e+02 0.000000e+00 0.000000e+00 7.215377e+02 1.728540e+02 0.000000e+00 0.000000e+00 0.000000e+00 1.000000e+00 0.000000e+00
+S_01: 1.392000e+03 5.120000e+02
+K_01: 9.895267e+02 0.000000e+00 7.020000e+02 0.000000e+00 9.878386e+02 2.455590e+02 0.000000e+00 0.000000e+00 1.000000e+00
+D_01: -3.644661e-01 1.790019e-01 1.148107e-03 -6.298563e-04 -5.314062e-02
+R_01: 9.993513e-01 1.860866e-02 -3.083487e-02 -1.887662e-02 9.997863e-01 -8.421873e-03 3.067156e-02 8.998467e-03 9.994890e-01
+T_01: -5.370000e-01 4.822061e-03 -1.252488e-02
+S_rect_01: 1.242000e+03 3.750000e+02
+R_rect_01: 9.996878e-01 -8.976826e-03 2.331651e-02 8.876121e-03 9.999508e-01 4.418952e-03 -2.335503e-02 -4.210612e-03 9.997184e-01
+P_rect_01: 7.215377e+02 0.000000e+00 6.095593e+02 -3.875744e+02 0.000000e+00 7.215377e+02 1.728540e+02 0.000000e+00 0.000000e+00 0.000000e+00 1.000000e+00 0.000000e+00
+"""  # noqa: E501
+
+
+def write_kitti_raw(root: Path, size: tuple[int, int]) -> Path:
+    write(root / "calib_cam_to_cam.txt", KITTI_RAW)
+    for name in ("image_00", "image_01"):
+        for k in range(3):
+            path = root / "drive_0001" / name / "data" / f"{k:010d}.png"
+            write_image(path, np.full(size[::-1], 90, dtype=np.uint8))
+        times = "2011-09-26 23:59:59.900000000\n2011-09-27 00:00:00.003000000\n"
+        write(root / "drive_0001" / name / "timestamps.txt", times)
+    return root
+
+
+def test_kitti_raw_keeps_what_its_rectification_was_made_from(tmp_path: Path) -> None:
+    fields = {key: values for key, _, values in (line.partition(": ") for line in KITTI_RAW.splitlines())}
+    matrix = {key: np.array([float(each) for each in fields[key].split()]) for key in fields if key[0] != "c"}
+    (recording,) = read_kitti_raw(write_kitti_raw(tmp_path / "extract", (1392, 512)))
+    rig, shutter = recording.rig, recording.shutter
+    assert rig is not None and shutter is not None and shutter.still
+    assert recording.frame_period_s == pytest.approx(0.103)  # over midnight
+    assert rig.baseline == pytest.approx(387.5744 / 721.5377, abs=5e-5)  # of the rectified pair
+    for side, number in (("left", 0), ("right", 1)):
+        # Rows of R_rect are the axes of the rectified pair in the camera: x is along the baseline of both.
+        along = matrix[f"R_rect_0{number}"].reshape(3, 3)[0]
+        np.testing.assert_allclose(rig.own(side).R[:, 0], along, atol=1e-6)
+    X = np.random.default_rng(0).uniform([-3.0, -1.0, 6.0], [3.0, 1.0, 20.0], (40, 3))
+    K, rotation = matrix["K_01"].reshape(3, 3), cv2.Rodrigues(matrix["R_01"].reshape(3, 3))[0]
+    theirs, _ = cv2.projectPoints(X, rotation, matrix["T_01"], K, matrix["D_01"])
+    ours = rig.sensor("right").project(X @ rig.right_from_left.R.T + rig.right_from_left.t)
+    np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-3)  # a matrix of seven digits at 1000 px
+    (recording,) = read_kitti_raw(write_kitti_raw(tmp_path / "sync", (1242, 375)) / "drive_0001")
+    assert recording.rig is not None and recording.rig.rectified
+    assert recording.rig.baseline == pytest.approx(387.5744 / 721.5377)
+    assert run_here("verify", tmp_path / "sync", "--from", "kitti-raw").returncode == 0
+    with pytest.raises(RsbenchError, match=r"800 x 600 pixels: neither S_00 nor S_rect_00"):
+        read_kitti_raw(write_kitti_raw(tmp_path / "other", (800, 600)))
+
+
 # EuRoC and TUM RS-VI
 
 BODY_FROM = {
@@ -235,6 +294,15 @@ def test_tum_rsvi_has_its_line_delay(tmp_path: Path) -> None:
     (recording,) = read_others(write_euroc(tmp_path), "tum-rsvi")
     assert recording.shutters["left"].readout_ratio == 0.0
     assert recording.shutters["right"].readout_ratio == pytest.approx(29.4737e-6 * 48 * 20)  # rows times rate
+    rig, shutter = recording.rig, recording.shutter
+    assert rig is not None and shutter is not None  # a global camera and one that rolls are a rig
+    seconds = shutter.pixel_time(np.array([[3.0, 7.0]]), 1, "right") * 0.05
+    np.testing.assert_allclose(seconds, 0.05 + 7 * 29.4737e-6, rtol=1e-12)
+    assert shutter.pixel_time(np.array([3.0, 7.0]), 1, "left") == 1.0
+    right_from_left = np.linalg.inv(BODY_FROM[1]) @ BODY_FROM[0]
+    np.testing.assert_allclose(rig.right_from_left.R, right_from_left[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(rig.right_from_left.t, right_from_left[:3, 3], atol=1e-12)
+    assert rig.sensor("right") == recording.cameras["right"]
 
 
 # COLMAP
@@ -271,10 +339,61 @@ def test_colmap(tmp_path: Path) -> None:
     assert not first.shutters
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_rig_that_colmap_wrote_is_one_recording(tmp_path: Path, turned: bool) -> None:
+    """Of two sizes and lenses; the camera that is at the right is the right one, whichever COLMAP lists first."""
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction()
+    cameras = [
+        pycolmap.Camera(
+            camera_id=4, model="OPENCV", width=64, height=48, params=[60, 61, 32, 24, -0.1, 0.01, 0, 0]
+        ),
+        pycolmap.Camera(camera_id=7, model="PINHOLE", width=128, height=96, params=[120, 121, 64, 48]),
+    ]
+    turn, t = scipy.spatial.transform.Rotation.from_rotvec([0.01, 0.02, 0.03]), np.array([-0.2, 0.01, 0.02])
+    second_from_first = pycolmap.Rigid3d(pycolmap.Rotation3d(turn.as_quat()), t)
+    if turned:
+        cameras, second_from_first = cameras[::-1], second_from_first.inverse()
+    for camera in cameras:
+        model.add_camera(camera)
+    rig = pycolmap.Rig(rig_id=1)
+    rig.add_ref_sensor(cameras[0].sensor_id)
+    rig.add_sensor(cameras[1].sensor_id, second_from_first)
+    model.add_rig(rig)
+    for k in (1, 2):
+        frame = pycolmap.Frame(frame_id=k, rig_id=1)
+        frame.rig_from_world = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(np.array([0.1 * k, 0, 0])), [0.1 * k, 0.0, 0.0]
+        )
+        for camera in cameras:
+            frame.add_data_id(pycolmap.data_t(camera.sensor_id, 10 * k + camera.camera_id))
+        model.add_frame(frame)
+        for camera in cameras:
+            number, name = 10 * k + camera.camera_id, f"{camera.camera_id}/{3 - k}.png"
+            image = pycolmap.Image(image_id=number, name=name, camera_id=camera.camera_id)
+            image.frame_id = k
+            model.add_image(image)
+        model.register_frame(k)
+    model.write_text(str(tmp_path))
+    (recording,) = read_colmap(tmp_path)
+    assert recording.name == "rig 1" and recording.rig is not None
+    assert [recording.cameras[side].width for side in SIDES] == [64, 128]
+    assert recording.images["right", 0].name == "1.png" and recording.images["right", 0].parent.name == "7"
+    np.testing.assert_allclose(recording.rig.right_from_left.R, turn.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(recording.rig.right_from_left.t, t, atol=1e-9)
+    X = np.array([0.3, -0.2, 2.0])
+    for k in (1, 2):  # frame 0 is the one with the first name, COLMAP's frame 2
+        for side, number in (("left", 4), ("right", 7)):
+            pose = recording.poses[side](np.array([2.0 - k]))
+            ours = recording.cameras[side].project(X @ pose.R[0].T + pose.t[0])
+            theirs = model.image(10 * k + number).project_point(X)
+            np.testing.assert_allclose(ours, theirs - 0.5, atol=1e-9)
+
+
 # What is wrong
 
 
-@pytest.mark.parametrize("layout", ["carla-rs", "colmap", "euroc", "fastec-rs", "kitti", "middlebury", "tum-rsvi"])
+@pytest.mark.parametrize("layout", FORMATS)
 def test_an_empty_folder_has_no_layout(tmp_path: Path, layout: str) -> None:
     with pytest.raises(RsbenchError, match=r"holds no"):
         read_others(tmp_path, layout)

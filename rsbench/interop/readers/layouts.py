@@ -1,9 +1,10 @@
 """Data in the layouts of other projects, read in place: what a layout contains, and nothing that it does not.
 
-**COLMAP**'s text model: cameras.txt, images.txt and, where it exists, points3D.txt. Its pixels are counted from
-the corner of the image, ours from the centre of the first pixel: half a pixel less. A quaternion is (w, x, y, z),
-and a pose ``cam_from_world``, as ours. The layout has no times: images are ordered by name, one pose each, without
-a shutter.
+**COLMAP**'s text model: cameras.txt, images.txt and, where they exist, points3D.txt, rigs.txt and frames.txt (of
+COLMAP 3.12: ``sensor_from_rig`` of each camera, and the images of one time). Its pixels are counted from the
+corner of the image, ours from the centre of the first pixel: half a pixel less. A quaternion is (w, x, y, z), and
+a pose ``cam_from_world``, as ours. The layout has no times: images are ordered by name, one pose each, without a
+shutter. A rig of two cameras is one recording; any other camera is one of its own.
 
 **EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the
 sensor's coordinates to the body's, ``data.csv`` times in nanoseconds and file names; poses are those of the body,
@@ -36,6 +37,12 @@ with its lowest row, and unknown disparities are infinite.
 ``disp_occ``) and ``calib_cam_to_cam`` (or ``calib``). Disparities have 16 bits, 256 to the pixel, 0 unknown; the
 baseline is the difference of the fourth numbers of the projection matrices, each -fx times the camera's position.
 Neither Middlebury nor KITTI has times of rows, and no shutter is assumed.
+
+**KITTI raw** (Geiger et al., Vision meets Robotics, IJRR 2013): a drive holds ``image_02/data`` and
+``image_03/data`` (or 00 and 01, grey) with ``timestamps.txt``, and the day's folder ``calib_cam_to_cam.txt``. The
+images of an ``extract`` drive are as the cameras saw them, of the size ``S_0k``: ``K_0k``, ``D_0k`` (OpenCV's k1,
+k2, p1, p2, k3), and ``R_0k``, ``T_0k`` from camera 0 to camera k. Those of a ``sync`` drive are rectified, of the
+size ``S_rect_0k``: ``P_rect_0k = K [I | t]``, t from the rectified camera 0. The cameras have global shutters.
 """
 
 from __future__ import annotations
@@ -43,7 +50,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache, partial
-from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,15 +150,16 @@ _CORNER = 0.5
 
 
 class Shot(NamedTuple):
-    """An image: its name, its pose, and a function that returns observed pixels and points."""
+    """An image: its camera, its name, its pose, and a function that returns observed pixels and points."""
 
+    camera: str
     name: str
     pose: Pose
     seen: Callable[[], tuple[FloatArray, FloatArray]] | None
 
 
 def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
-    """One recording of each camera, its images in the order of their names.
+    """One recording of each rig of two cameras and of each other camera, images in the order of their names.
 
     Args:
         folder: holds cameras.txt and images.txt. images: folder to which image names are relative; None:
@@ -165,7 +172,7 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     root = images or next(
         (each / "images" for each in (folder, *folder.parents[:2]) if (each / "images").is_dir()), folder
     )
-    shots: dict[str, list[Shot]] = {}
+    shots: dict[str, Shot] = {}
     points = folder / "points3D.txt"
     path = only_file(folder, "images.txt")
     rows = [line for line in read_text(path).splitlines() if not line.lstrip().startswith("#")]
@@ -173,15 +180,75 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
         rows.pop()
     for number, line in enumerate(rows[::2]):  # every second line lists points, and may be empty
         where = f"{path}, image {number + 1}"
-        name, camera, pose = _colmap_image(where, line)
+        identifier, name, camera, pose = _colmap_image(where, line)
         if camera not in cameras:
             raise RsbenchError(f"{path}: {name} is of camera {camera}, which cameras.txt lacks")
         seen = partial(_colmap_points_seen, points, "".join(rows[2 * number + 1 : 2 * number + 2]), where)
-        shots.setdefault(camera, []).append(Shot(name, pose, seen if points.is_file() else None))
-    return [
-        _colmap_recording(camera, cameras[camera], sorted(each, key=attrgetter("name")), root)
-        for camera, each in shots.items()
-    ]
+        shots[identifier] = Shot(camera, name, pose, seen if points.is_file() else None)
+    found = list[Recording]()
+    rigs = _colmap_rigs(folder, cameras)
+    for rig in rigs:
+        times = [[shots[each] for each in together if each in shots] for together in rig.times]
+        times = [{shot.camera: shot for shot in together} for together in times if together]
+        found.append(_colmap_recording(f"rig {rig.number}", cameras, rig.sides, times, root, rig.right_from_left))
+    paired = {camera for rig in rigs for camera in rig.sides.values()}
+    for camera in dict.fromkeys(shot.camera for shot in shots.values() if shot.camera not in paired):
+        times = [{camera: shot} for shot in shots.values() if shot.camera == camera]
+        found.append(_colmap_recording(f"camera {camera}", cameras, {"left": camera}, times, root, None))
+    return found
+
+
+class _ColmapRig(NamedTuple):
+    """A rig of two cameras: its number, the cameras' numbers, how they stand, and the images of each time."""
+
+    number: str
+    sides: dict[Side, str]
+    right_from_left: Pose
+    times: list[list[str]]
+
+
+def _colmap_rigs(folder: Path, cameras: Mapping[str, PinholeCamera]) -> list[_ColmapRig]:
+    """The rigs of rigs.txt that have two cameras, of which each has a pose; none without the file."""
+    path, found = folder / "rigs.txt", list[_ColmapRig]()
+    for where, line in lines(path) if path.is_file() else ():
+        number, count, *words = line.split()
+        poses = {words[1]: Pose(np.eye(3), np.zeros(3))} if words[:1] == ["CAMERA"] else {}
+        words = words[2:]
+        while len(words) >= 3:
+            kind, sensor, known = words[:3]
+            values = words[3:10] if known == "1" else []
+            words = words[3 + len(values) :]
+            if kind == "CAMERA" and values:
+                q, t = np.split(numbers(" ".join(values), where, 7), [4])
+                poses[sensor] = Pose(rotation(q, where), t)
+        if words or len(poses) > int(numbers(count, where, 1)[0]) or not poses.keys() <= cameras.keys():
+            raise RsbenchError(f"{where}: must be a number, a count of sensors, and those with their poses")
+        if len(poses) == len(SIDES):
+            (one, at_one), (two, at_two) = poses.items()
+            sides, apart = _left_first((one, two), compose(at_two, inverse(at_one)))
+            found.append(_ColmapRig(number, sides, apart, _colmap_times(folder, number)))
+    return found
+
+
+def _left_first(cameras: tuple[str, str], second_from_first: Pose) -> tuple[dict[Side, str], Pose]:
+    """Which of two cameras is the left one, by where the second one stands in the first, and right_from_left."""
+    x, y, _ = inverse(second_from_first).t
+    if (x if abs(x) >= abs(y) else y) < 0.0:  # one above the other: the upper one counts as the left one
+        return dict(zip(SIDES, cameras[::-1], strict=True)), inverse(second_from_first)
+    return dict(zip(SIDES, cameras, strict=True)), second_from_first
+
+
+def _colmap_times(folder: Path, rig: str) -> list[list[str]]:
+    """Numbers of the images of each frame of a rig, by frames.txt."""
+    found, path = list[list[str]](), only_file(folder, "frames.txt")
+    for where, line in lines(path):
+        words = line.split()
+        data = words[10:]
+        if len(words) < 10 or len(data) % 3 or words[9] != str(len(data) // 3):
+            raise RsbenchError(f"{where}: must be a frame, a rig, its pose, and a count of images with these")
+        if words[1] == rig:
+            found.append([data[k + 2] for k in range(0, len(data), 3) if data[k] == "CAMERA"])
+    return found
 
 
 def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
@@ -197,12 +264,13 @@ def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
     return words[0], _pinhole(size, (fx, fy, cx, cy), where, model, values)
 
 
-def _colmap_image(where: str, line: str) -> tuple[str, str, Pose]:
+def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
+    """Number, name, camera and pose."""
     words = line.split(maxsplit=9)
     if len(words) != 10:
         raise RsbenchError(f"{where}: must be a number, a quaternion, a translation, a camera and a name")
     values = numbers(" ".join(words[1:8]), where, 7)
-    return words[9].strip(), words[8], Pose(rotation(values[:4], where), values[4:])
+    return words[0], words[9].strip(), words[8], Pose(rotation(values[:4], where), values[4:])
 
 
 def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
@@ -225,25 +293,41 @@ def _colmap_points(path: Path) -> dict[int, FloatArray]:
     return found
 
 
-def _colmap_recording(number: str, camera: PinholeCamera, shots: list[Shot], root: Path) -> Recording:
-    files: dict[View, Path] = {("left", k): inside(root, shot.name) for k, shot in enumerate(shots)}
-    R, t = np.array([shot.pose.R for shot in shots]), np.array([shot.pose.t for shot in shots])
+def _colmap_recording(
+    name: str,
+    cameras: Mapping[str, PinholeCamera],
+    sides: Mapping[Side, str],
+    times: list[dict[str, Shot]],
+    root: Path,
+    right_from_left: Pose | None,
+) -> Recording:
+    """A recording of one camera or two, from the images of each time by camera, in any order."""
+    times = sorted(times, key=lambda together: next(together[c].name for c in sides.values() if c in together))
+    shots = {
+        (side, k): together[camera]
+        for side, camera in sides.items()
+        for k, together in enumerate(times)
+        if camera in together
+    }
+    poses = {side: {k: shot.pose for (each, k), shot in shots.items() if each == side} for side in sides}
     return Recording(
-        name=f"camera {number}",
-        cameras={"left": camera},
-        images=files,
-        poses={"left": partial(_pose_of_image, R, t)},
-        sightings={("left", k): shot.seen for k, shot in enumerate(shots) if shot.seen is not None},
+        name=name,
+        cameras={side: cameras[camera] for side, camera in sides.items()},
+        images={view: inside(root, shot.name) for view, shot in shots.items()},
+        right_from_left=right_from_left,
+        poses={side: partial(_pose_of_image, of_side) for side, of_side in poses.items() if of_side},
+        sightings={view: shot.seen for view, shot in shots.items() if shot.seen is not None},
         notes=("the layout does not say when images were taken, or how rows were read",),
     )
 
 
-def _pose_of_image(R: FloatArray, t: FloatArray, tau: FloatArray) -> Pose:
+def _pose_of_image(known: Mapping[int, Pose], tau: FloatArray) -> Pose:
     """The pose of an image at its whole number; NaN between."""
     tau = np.asarray(tau, dtype=np.float64)
-    index = np.clip(np.rint(tau), 0, len(R) - 1).astype(np.int64)
-    known = index == tau
-    return Pose(np.where(known[..., None, None], R[index], np.nan), np.where(known[..., None], t[index], np.nan))
+    R, t = np.full((*tau.shape, 3, 3), np.nan), np.full((*tau.shape, 3), np.nan)
+    for number, pose in known.items():
+        R[tau == number], t[tau == number] = pose
+    return Pose(R, t)
 
 
 _LENSES = {
@@ -610,6 +694,84 @@ def _kitti_disparities(path: Path, size: tuple[int, int], offset: float) -> Floa
     return np.where(values > 0, values / 256.0 + offset, np.nan)
 
 
+def read_kitti_raw(folder: Path) -> list[Recording]:
+    """Each drive below a folder, or the drive itself; RsbenchError if there is none or a file is malformed."""
+    found = sorted(path.parent for pair in _KITTI_PAIRS for path in folder.glob(f"**/{pair[0]}") if path.is_dir())
+    if not found:
+        raise RsbenchError(f"{folder}: holds no drive of KITTI: no folders image_02 and image_03, or 00 and 01")
+    return [_kitti_drive(drive) for drive in dict.fromkeys(found)]
+
+
+_KITTI_PAIRS = (("image_02", "image_03"), ("image_00", "image_01"))
+
+
+def _kitti_drive(drive: Path) -> Recording:
+    names = next((pair for pair in _KITTI_PAIRS if all((drive / name).is_dir() for name in pair)), None)
+    if names is None:
+        raise RsbenchError(f"{drive}: holds one camera alone; image_02 and image_03, or image_00 and image_01")
+    path = only_file(drive if (drive / "calib_cam_to_cam.txt").is_file() else drive.parent, "calib_cam_to_cam.txt")
+    fields = {key.strip(): value for _, line in lines(path) for key, _, value in [line.partition(":")]}
+    images: dict[View, Path] = {
+        (side, int(file.stem)): file
+        for side, name in zip(SIDES, names, strict=True)
+        for file in sorted((drive / name / "data").glob("[0-9]*.png"))
+    }
+    if not images:
+        raise RsbenchError(f"{drive / names[0] / 'data'}: holds no 0000000000.png")
+    height, width = read_frame(next(iter(images.values()))).shape[:2]
+    both = [_kitti_camera(fields, name[-2:], (width, height), path) for name in names]
+    cameras = dict(zip(SIDES, (camera for camera, _ in both), strict=True))
+    return Recording(
+        name=drive.name,
+        cameras=cameras,
+        images=images,
+        shutters={
+            side: RollingShutter(height=camera.height, readout_ratio=0.0) for side, camera in cameras.items()
+        },
+        frame_period_s=_kitti_period(drive / names[0] / "timestamps.txt"),
+        right_from_left=compose(both[1][1], inverse(both[0][1])),
+    )
+
+
+def _kitti_camera(
+    fields: Mapping[str, str], number: str, size: tuple[int, int], path: Path
+) -> tuple[PinholeCamera, Pose]:
+    """Camera ``number`` of calib_cam_to_cam.txt for images of this size, and its pose from camera 0."""
+
+    def read(key: str, count: int) -> FloatArray:
+        if f"{key}_{number}" not in fields:
+            raise RsbenchError(f"{path}: {key}_{number} is required")
+        return numbers(fields[f"{key}_{number}"], f"{path}: {key}_{number}", count)
+
+    raw, rectified = (tuple(map(int, read(key, 2))) for key in ("S", "S_rect"))
+    if size == raw:
+        K, lens = read("K", 9).reshape(3, 3), dict(zip(_OPENCV, read("D", 5).tolist(), strict=True))
+        pose = Pose(read("R", 9).reshape(3, 3), read("T", 3))
+        return _pinhole(size, K[[0, 1, 0, 1], [0, 1, 2, 2]], path, "brown-conrady", lens), pose
+    if size == rectified:
+        P = read("P_rect", 12).reshape(3, 4)
+        camera = _pinhole(size, P[[0, 1, 0, 1], [0, 1, 2, 2]], path)
+        return camera, Pose(np.eye(3), np.asarray(np.linalg.inv(P[:, :3]) @ P[:, 3], dtype=np.float64))
+    raise RsbenchError(
+        f"{path}: its images are {size[0]} x {size[1]} pixels: neither S_{number} nor S_rect_{number}"
+    )
+
+
+_OPENCV = ("k1", "k2", "p1", "p2", "k3")
+
+
+def _kitti_period(path: Path) -> float:
+    """Median time between frames, s, of a file with a date and a time in each line."""
+    days = [line.split() for _, line in lines(path)]
+    try:
+        seconds = [60 * (60 * int(h) + int(m)) + float(s) for _, time in days for h, m, s in [time.split(":")]]
+    except ValueError:
+        raise RsbenchError(f"{path}: must hold lines of a date and a time") from None
+    if len(seconds) < 2:
+        raise RsbenchError(f"{path}: has {len(seconds)} times; two are needed")
+    return float(np.median(np.diff(seconds) % 86400.0))
+
+
 _TUM_RSVI: Mapping[Side, float] = {"left": 0.0, "right": 29.4737e-6}
 """Line delays, s: D. Schubert et al., Rolling-Shutter Modelling for Direct Visual-Inertial Odometry, IROS 2019."""
 
@@ -620,6 +782,7 @@ FORMATS: Mapping[str, Callable[[Path], list[Recording]]] = {
     "euroc": read_euroc,
     "fastec-rs": read_fastec,
     "kitti": read_kitti,
+    "kitti-raw": read_kitti_raw,
     "middlebury": read_middlebury,
     "tum-rsvi": partial(read_euroc, line_delays_s=_TUM_RSVI),
 }
