@@ -105,7 +105,7 @@ def _look(sources: Sources, rig: StereoRig, card: RigCard, options: CorrectionOp
         return rig.shutter_of(scanning or Scanning(), ratio), calibration, None
     with progress_bar("looking at the shutter", min(max(sources[0].count - 1, 1), WINDOWS)) as advance:
         capture, shutter = estimate_sequence_capture(*sources, rig, options, ratio, scanning, calibration, advance)
-    nothing = capture is None or not shutter.rows_together
+    nothing = capture is None or not rig.rows_together(shutter.scanning)
     return shutter, NO_ERRORS if nothing else capture.calibration, capture
 
 

@@ -82,7 +82,7 @@ def _matches(value: ArrayLike, name: str, columns: int) -> FloatArray:
     return rows
 
 
-_ENDS: dict[str, tuple[Side, ...]] = {
+SET_SIDES: dict[str, tuple[Side, ...]] = {
     "left": ("left", "left"),
     "right": ("right", "right"),
     "stereo_0": ("left", "right"),
@@ -102,7 +102,7 @@ def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspond
     if rig.rectified:
         return correspondences
     sets = {}
-    for name, sides in _ENDS.items():
+    for name, sides in SET_SIDES.items():
         rows: FloatArray = getattr(correspondences, name)
         ends = rows.reshape(-1, len(sides), 2).copy()
         for side in SIDES:

@@ -177,6 +177,14 @@ def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
         )
 
 
+def check_cameras_of(cameras: str, rig: StereoRig, shutter: RollingShutter, what: str) -> None:
+    """Raises RsbenchError for cameras that a part which declares ``cameras`` (ideal, any, rig) does not take."""
+    if cameras == "ideal":
+        check_plain(rig, shutter, what)
+    elif cameras == "any" and not rig.aligned:
+        raise RsbenchError(f"{UNALIGNED}: {what} takes two equal cameras in perfect alignment")
+
+
 def check_view(side: str, frame: int) -> None:
     """Raises ValueError unless the side exists and the frame may exist."""
     arguments.check_one_of("side", side, SIDES)

@@ -37,6 +37,8 @@ FRAMES = (0, 1)
 """The frames of a pair; every estimate is of one pair."""
 _ALIGNED_RAD = 1e-9
 """Rotations below this move no pixel by more than rounding: the camera counts as aligned."""
+_TOGETHER = 0.02
+"""Readout times between the ends of a match below which it is looked for, and its depth found, on one row."""
 _LEAST_FORWARD = 0.05
 """Least share of the mean viewing direction that is orthogonal to the baseline."""
 
@@ -266,6 +268,27 @@ class StereoRig:
         if self.left is None:
             return np.ones(np.shape(pixels)[:-1])
         return np.asarray(self.eye(side).unproject(pixels) @ self.own(side).R[2])
+
+    def rows_together(self, scanning: Scanning) -> bool:
+        """Whether both ends of a match are read at one time, or nearly: an ideal row of both within a fiftieth.
+
+        Of an ideal rig what ``scanning`` says, for its lens bends rows of both cameras alike.
+        """
+        if self.left is None or not scanning.rows_together:
+            return scanning.rows_together
+        shutter, camera = self.shutter_of(scanning, 1.0), self.camera
+        x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
+        ends = np.stack([x, y], axis=-1)
+        times = [shutter.pixel_time(self.eye(side).lens_pixels(ends), 0, side) for side in SIDES]
+        lag = np.abs(times[1] - times[0])
+        return bool(np.any(np.isfinite(lag)) and np.nanmax(lag) < _TOGETHER)
+
+    def right_by_left(self) -> FloatArray:
+        """Affine map (2, 2) from pixels around the left image's centre to those of the right one, far away."""
+        left, right = (self.eye(side) for side in SIDES)
+        centre = np.array([(left.width - 1) / 2, (left.height - 1) / 2])
+        there = right.lens_pixels(left.ideal_pixels(centre))
+        return np.asarray(inverse_2x2(right.ideal_by_pixel(there)) @ left.ideal_by_pixel(centre))
 
     def shutter_of(self, scanning: Scanning, readout_ratio: float) -> RollingShutter:
         """The shutter of these cameras, whose sizes may differ."""

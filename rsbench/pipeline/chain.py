@@ -160,17 +160,19 @@ def check_cameras(
         RsbenchError: depth is to be found where a pair is of two times, and no motion; or an offset is given, of
             cameras with a lens or another scan, or with a matcher that needs the motion.
     """
-    lens, needs = rig.camera.lens, options.corrector.component.spec.needs
+    needs = options.corrector.component.spec.needs
     if not depth_is_known and "depth" in needs:
         _check_matcher(options, disparity_offset)
-    if not (depth_is_known or scanning.rows_together) and "depth" in needs and "motion" not in needs:
+    if not (depth_is_known or rig.rows_together(scanning)) and "depth" in needs and "motion" not in needs:
         raise RsbenchError(
             f"scan = {scanning.scan!r}, right_scan = {scanning.right_scan!r}, "
             f"right_delay = {scanning.right_delay}: depth is found with the motion between the times of both "
             f"cameras, for which corrector {options.corrector.name!r} does not ask"
         )
+    lens = rig.camera.lens
     what = f"camera.lens = {lens.model!r}" if lens is not None else f"scan = {scanning.scan!r}"
-    if disparity_offset and not (lens is None and scanning.plain):
+    what = what if rig.aligned else "cameras that differ or look in different directions"
+    if disparity_offset and not (rig.rectified and scanning.plain):
         raise RsbenchError(
             f"disparity_offset = {disparity_offset}: must be 0 with {what}; calibrate the rig again"
         )
@@ -232,7 +234,7 @@ def find_depth(
         if motion is None:
             raise ValueError(f"the motion must be known where matcher {options.matcher.name!r} finds depth")
         pairs = motion_pairs(images, rig, shutter, motion, options)
-    elif pairs is None and not shutter.rows_together:
+    elif pairs is None and not rig.rows_together(shutter.scanning):
         if motion is None:
             raise ValueError("the motion must be known where depth is found of cameras that read rows apart")
         pairs = moving_pairs(images, rig, shutter, motion, options)
@@ -295,7 +297,7 @@ def correct_known_rows(
 ) -> list[dict[View, Fused]]:
     """``correct_known`` at the times of several target rows, in place of that of the options; its errors."""
     pairs, needs = known.pairs, options.corrector.component.spec.needs
-    if shutter.readout_ratio == 0.0:
+    if shutter.still:
         return [uncorrected(images, views, pairs) for _ in rows]
     if "gyro" in needs and known.gyro is None:
         raise RsbenchError(

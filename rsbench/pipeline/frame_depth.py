@@ -25,7 +25,14 @@ from rsbench.vision.feature_matcher import FeatureEntry, load_features
 from rsbench.vision.features import SiftMatcher
 from rsbench.vision.images import eight_bit
 from rsbench.vision.stereo_depth import SgmMatcher, fill_holes, moving_disparities, sky_mask, timed_depth
-from rsbench.vision.stereo_matcher import MatcherEntry, find_depths, load_matcher, sensor_disparities
+from rsbench.vision.stereo_matcher import (
+    MatcherEntry,
+    body_depth,
+    find_depths,
+    load_matcher,
+    own_depths,
+    sensor_disparities,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,12 +152,12 @@ def depth_of_pair(
     disparities = dict(zip(SIDES, both, strict=True))
     depth, guess = dict[Side, NDArray[np.float32]](), dict[Side, NDArray[np.float32]]()
     for side in SIDES:
-        sky = sky_mask(levels[side], disparities[side]) if find_sky else np.zeros(left.shape[:2], np.bool_)
+        sky = sky_mask(levels[side], disparities[side]) if find_sky else np.zeros(levels[side].shape[:2], np.bool_)
         disparity = np.where(sky, np.float32(0.0), disparities[side])
-        depth[side] = metres(disparity, rig)
+        depth[side] = metres(disparity, rig, side)
         filled = fill_holes(disparity)
-        guess[side] = np.where(np.isnan(disparity), metres(filled, rig), np.float32(0.0))
-    return FramePair(images=images, depth=depth, guess=guess, timed=rig.camera.lens is None)
+        guess[side] = np.where(np.isnan(disparity), metres(filled, rig, side), np.float32(0.0))
+    return FramePair(images=images, depth=depth, guess=guess, timed=rig.rectified)
 
 
 def moving_pairs(
@@ -198,7 +205,9 @@ def motion_disparities(
     """
     levels = dict(zip(images, eight_bit(list(images.values())), strict=True))
     found = find_depths(entry, levels, rig, shutter, motion, views)
-    return {view: rig.disparity(depth).astype(np.float32) for view, depth in found.items()}
+    return {
+        view: rig.disparity(body_depth(depth, rig, view[0])).astype(np.float32) for view, depth in found.items()
+    }
 
 
 def pair_with_motion(
@@ -275,7 +284,9 @@ def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> Frame
     return replace(pair, depth=depth, guess=guess, with_motion=True)
 
 
-def metres(disparity: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
-    """Metres (H, W): inf where there is no disparity, 0 where it is unknown."""
+def metres(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -> NDArray[np.float32]:
+    """Metres (H, W) along the camera's axis: inf where there is no disparity, 0 where it is unknown."""
     depth = np.where(np.isnan(disparity), 0.0, rig.depth(disparity))
+    if not rig.aligned:
+        depth = depth * own_depths(rig, side)
     return np.nan_to_num(depth, nan=np.inf, posinf=np.inf).astype(np.float32)

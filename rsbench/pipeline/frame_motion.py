@@ -25,8 +25,7 @@ from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, exami
 from rsbench.capture.two_frame_spline import log_odds_of_opposite, two_frame_spline
 from rsbench.components.motion_models import load_kernel, make_motion
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -48,18 +47,18 @@ def find_matches(
     images: Images,
     options: CorrectionOptions,
     sides: tuple[Side, Side] = SIDES,
-    camera: PinholeCamera | None = None,
+    rig: StereoRig | None = None,
 ) -> Correspondences:
     """Correspondences of the four frames, whatever they are; ``sides`` says which images are taken for the left's.
 
-    Those of frames that have the lens of ``camera`` are in their pixels.
+    Those of frames that the cameras of ``rig`` took are in their pixels.
 
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
     """
     levels = eight_bit([images[side, frame] for frame in (0, 1) for side in sides])
     names = [(side, frame) for frame in (0, 1) for side in SIDES]
-    return find_correspondences(options.features, dict(zip(names, levels, strict=True)), camera)
+    return find_correspondences(options.features, dict(zip(names, levels, strict=True)), rig)
 
 
 def find_matches_of_rig(
@@ -74,12 +73,12 @@ def find_matches_of_rig(
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
     """
-    component = options.features.component
-    if not scanning.rows_together and isinstance(component, SiftMatcher):
+    component, together = options.features.component, rig.rows_together(scanning)
+    if not together and isinstance(component, SiftMatcher):
         apart = replace(options.features, component=replace(component, row_tolerance=None))
         options = replace(options, features=apart)
-    matches = find_matches(images, options, camera=rig.camera)
-    if scanning.rows_together or isinstance(component, SiftMatcher):
+    matches = find_matches(images, options, rig=rig)
+    if together or isinstance(component, SiftMatcher):
         return matches
     return Correspondences(left=matches.left, right=matches.right)
 
@@ -102,7 +101,7 @@ def match_frames(
         RefusedFramesError: no texture, sides exchanged, not rectified, or not of one time.
     """
     scanning = scanning or Scanning()
-    if judge_rig and scanning.rows_together:
+    if judge_rig and rig.rows_together(scanning):
         check_rig(images["left", 0], images["right", 0], rig)
     return _enough(find_matches_of_rig(images, rig, scanning, options))
 
@@ -136,7 +135,7 @@ def match_unknown(
 
 def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
     """Without tracks whose left-right ends are not on one row, of cameras that read rows together."""
-    tracks = rig.camera.ideal_pixels(matches.tracks.reshape(-1, 2)).reshape(-1, 8)
+    tracks = without_lens(Correspondences(tracks=matches.tracks), rig).tracks
     off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
     return replace(matches, tracks=matches.tracks[off <= ROW_TOLERANCE_PX])
 
@@ -449,8 +448,9 @@ def solve_frames(
         if scanning is not None and runs_backwards(capture, scans_of(rig.shutter_of(scanning, 1.0))):
             raise RefusedFramesError(BACKWARDS)
         shutter = shutter_found(capture, rig)
-        used, errors = capture, capture.calibration if shutter.rows_together else NO_ERRORS
-        if shutter.rows_together:
+        together = rig.rows_together(shutter.scanning)
+        used, errors = capture, capture.calibration if together else NO_ERRORS
+        if together:
             if doubt is not None:
                 raise doubt
             matches = on_their_rows(matches, rig)
@@ -476,7 +476,7 @@ def _calibrated(
     options: CorrectionOptions,
 ) -> tuple[Capture | None, tuple[float, ...]]:
     """What the matches say of a calibration that may be wrong, with a known shutter; None where it is right."""
-    if given.calibration is not None or not (given.scanning or Scanning()).rows_together:
+    if given.calibration is not None or not rig.rows_together(given.scanning or Scanning()):
         return None, given.calibration or NO_ERRORS
     if not any(known_of(matches, rig, given).calibration_sigma):
         return None, NO_ERRORS

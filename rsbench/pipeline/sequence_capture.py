@@ -134,7 +134,7 @@ def estimate_sequence_capture(
         return (None if look.is_right else look.concluded()), shutter
     capture = look.concluded()
     shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
-    if doubt is not None and shutter.rows_together:
+    if doubt is not None and rig.rows_together(shutter.scanning):
         raise doubt
     return capture, shutter
 

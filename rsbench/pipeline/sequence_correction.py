@@ -212,7 +212,7 @@ def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]
 
 def _has_trajectory(left: FrameSource, shutter: RollingShutter, options: CorrectionOptions) -> bool:
     """Whether one trajectory is fitted to all windows."""
-    return takes_gyro(left, options) and shutter.readout_ratio > 0.0
+    return takes_gyro(left, options) and not shutter.still
 
 
 def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
@@ -261,7 +261,7 @@ def _with_depth(
     first: int,
 ) -> Iterator[Window]:
     """The windows with depth from the other camera, that of each frame from ``first`` on found once."""
-    apart = not shutter.rows_together or needs_motion(options.matcher)
+    apart = not rig.rows_together(shutter.scanning) or needs_motion(options.matcher)
     if apart or "depth" not in options.corrector.component.spec.needs:
         yield from windows
         return

@@ -239,12 +239,13 @@ def _cell(
     ``along`` are the steps of inverse depth to the next column and row.
     """
     height, width = buffer.shape
+    own_height, own_width = rho.shape
     columns = maps.columns
     ax, ay, az = move(maps, columns, x, y, rho[y, x])
     # The next line has another pose, also at the last one, whose next neighbour does not exist. A row's goes on.
-    right = -1 if x + 1 == width and (columns or maps.lens is not None) else 1
+    right = -1 if x + 1 == own_width and (columns or maps.ideal is not None) else 1
     bx, by, bz = move(maps, columns, x + right, y, rho[y, x] + right * along[0])
-    step = 1 if y + 1 < height else -1
+    step = 1 if y + 1 < own_height else -1
     cx, cy, cz = move(maps, columns, x, y + step, rho[y, x] + step * along[1])
     ux, uy, uz = right * (bx - ax), right * (by - ay), right * (bz - az)
     vx, vy, vz = step * (cx - ax), step * (cy - ay), step * (cz - az)
@@ -340,7 +341,7 @@ class LineView:
     poses: Pose
     """``cam_from_world`` of every line, (lines, 3, 3) and (lines, 3)."""
     camera: PinholeCamera | None = None
-    """Where it is not the target's: a rig whose disparities are off has two principal points. None with a lens."""
+    """Where it is not the target's: of a rig of two cameras, or one whose disparities are off."""
     columns: bool = False
     """Whether lines are columns."""
 
@@ -369,12 +370,13 @@ def line_maps(
     """Where the pixels of a frame, one pose per line, lie in ``camera`` at the target pose.
 
     Poses are ``cam_from_world``, of every line and of the target; either may be the one that has lines.
-    ``source_camera`` is the frame's when it is another one, of the same lens.
+    ``source_camera`` is the frame's when it is another one.
     """
     R, t = compose(target_pose, inverse(source_poses))
     K = camera.ideal.K
-    M = K @ R @ np.linalg.inv((source_camera or camera).ideal.K)
-    return LineMaps(M, t @ K.T, *optics_of(camera, columns))
+    source = source_camera or camera
+    M = K @ R @ np.linalg.inv(source.ideal.K)
+    return LineMaps(M, t @ K.T, optics_of(source, columns).ideal, optics_of(camera).lens, columns)
 
 
 def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose, columns: bool = False) -> FloatArray:
@@ -401,18 +403,19 @@ def warp(
     sky_mask: NDArray[np.bool_] | None = None,
     options: WarpOptions | None = None,
 ) -> Corrected:
-    """Warp a frame with one pose per line to any pose (3, 3), (3,) of the same camera model; z-buffered.
+    """Warp a frame with one pose per line to any pose (3, 3), (3,) of a camera; z-buffered.
 
     Pixels under ``sky_mask`` (H, W) are infinitely far. Raises ValueError on other shapes or types.
     """
     options = options or WarpOptions()
-    _check(view.image, view.depth, camera, view.poses, sky_mask, view.columns)
+    _check(view.image, view.depth, view.camera or camera, view.poses, sky_mask, view.columns)
     maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     rho = inverse_depth(view.depth, sky_mask)
     gain = np.broadcast_to(warp_gain(camera, view.poses, target_pose, view.columns), rho.shape)
     joined = connect(rho, options.tear_px / np.maximum(gain, np.finfo(np.float64).tiny))
-    source_map = np.full((*rho.shape, 2), np.nan, dtype=np.float32)
-    buffer = np.full(rho.shape, -1.0, dtype=np.float32)
+    size = camera.height, camera.width
+    source_map = np.full((*size, 2), np.nan, dtype=np.float32)
+    buffer = np.full(size, -1.0, dtype=np.float32)
     draw_mesh(rho, joined, maps, source_map, buffer)
     draw_cells(rho, joined, maps, source_map, buffer)
     mask = buffer >= 0.0
@@ -441,7 +444,7 @@ def correct_frame(
     """
     poses, target, columns = _poses(moving, view, target_tau)
     frame = LineView(image=image, depth=depth, poses=poses, columns=columns)
-    return warp(frame, moving.rig.camera, target, sky_mask=sky_mask, options=options)
+    return warp(frame, moving.rig.sensor(view[0]), target, sky_mask=sky_mask, options=options)
 
 
 def correction_flow(
@@ -457,7 +460,7 @@ def correction_flow(
     ``x_target - x_source`` on the grid of the source; NaN where the depth is unknown or the point is behind the
     target camera. Arguments as in ``correct_frame``.
     """
-    camera = moving.rig.camera
+    camera = moving.rig.sensor(view[0])
     poses, target, columns = _poses(moving, view, target_tau)
     _check(None, depth, camera, poses, sky_mask, columns)
     moved = np.zeros((3, *depth.shape))

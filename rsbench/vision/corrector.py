@@ -17,7 +17,7 @@ from rsbench.core import projection
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import check_plain
+from rsbench.core.geometry import check_cameras_of
 from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.se3 import Pose
@@ -27,7 +27,7 @@ from rsbench.vision.fusion import Fused, Origin
 
 Knowledge = Literal["motion", "depth", "matches", "gyro"]
 OtherFrames = Literal["stereo", "time"]
-Cameras = Literal["ideal", "any"]
+Cameras = Literal["ideal", "any", "rig"]
 Depths = Mapping[View, NDArray[np.float32]]
 
 
@@ -43,7 +43,8 @@ class CorrectorSpec:
     assumes: str
     """What must hold for it to work, in words."""
     cameras: Cameras = "ideal"
-    """``ideal``: no lens, and both cameras read rows from the top at one time; others are refused. ``any``."""
+    """Others are refused. ``ideal``: no lens, and both cameras read rows from the top at one time. ``any``: two
+    equal, aligned cameras with a lens and any scan. ``rig``: any two cameras."""
     sees: Set[OtherFrames] = frozenset(get_args(OtherFrames))
     """Which other frames it uses, itself or through what it needs: the other camera's (``stereo``), those of the
     other ``time``. The chain's matches are checked in both."""
@@ -70,11 +71,12 @@ class CorrectionProblem:
     """Four frames and what is known of them."""
 
     images: Mapping[View, NDArray[Any]]
-    """(H, W) grey or (H, W, 3) RGB of one size and type, uint8 or uint16."""
+    """(H, W) grey or (H, W, 3) RGB of one type, uint8 or uint16, each of its camera's size."""
     rig: StereoRig
     shutter: RollingShutter
     target_row: float
-    """A corrected frame shows the time at which its camera had read this many lines: a row, from the top."""
+    """A corrected frame shows the time at which its camera had read this many lines: a row, from the top. In rigs
+    of two sizes or readout ratios these are the left camera's lines."""
     motion: Motion | None
     """Motion of the rig's body, metres; None when the corrector does not need it."""
     depth: Depths | None
@@ -91,10 +93,11 @@ class CorrectionProblem:
 
     def camera(self, side: Side, reference: Side) -> PinholeCamera:
         """Camera of one side, in pixels in which the images of ``reference`` have the rig's principal point."""
+        camera = self.rig.sensor(side)
         if side == reference or self.disparity_offset == 0.0:
-            return self.rig.camera
+            return camera
         shift = self.disparity_offset if side == "left" else -self.disparity_offset
-        return replace(self.rig.camera, cx=self.rig.camera.cx + shift)
+        return replace(camera, cx=camera.cx + shift)
 
     def row_poses(self, view: View) -> Pose:
         """``cam_from_world`` (lines, 3, 3), (lines, 3) of every line of a frame, a row or a column.
@@ -105,9 +108,14 @@ class CorrectionProblem:
 
     def target_pose(self, view: View) -> Pose:
         """``cam_from_world`` of the corrected frame. Raises ValueError without a motion."""
+        return self.rig.cam_from_world(self._motion(), self.target_time(view), view[0])
+
+    def target_time(self, view: View) -> FloatArray:
+        """Time of the corrected frame: where rows differ, as long after its start as in the left camera."""
         side, frame = view
-        tau = self.shutter.time_after(self.target_row, frame, side)
-        return self.rig.cam_from_world(self._motion(), tau, side)
+        if side == "left" or (self.shutter.right_readout_ratio, self.shutter.right_size) == (None, None):
+            return self.shutter.time_after(self.target_row, frame, side)
+        return self.shutter.start(frame, side) + self.shutter.time_after(self.target_row, 0, "left")
 
     def _motion(self) -> Motion:
         if self.motion is None:
@@ -182,8 +190,7 @@ def find_corrected_rows(
         RsbenchError: another package's corrector raised, or answered something else: one line with its name.
     """
     where = f"{CORRECTORS.singular} {entry.name!r}"
-    if entry.component.spec.cameras == "ideal":
-        check_plain(problem.rig, problem.shutter, where)
+    check_cameras_of(entry.component.spec.cameras, problem.rig, problem.shutter, where)
     with plugins.blame(CORRECTORS, entry):
         answers = entry.component.correct_rows(problem, views, rows)
     if not isinstance(answers, list) or len(answers) != len(rows):

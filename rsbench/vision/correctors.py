@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import VIEWS, Side, StereoRig, View
+from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.correction import WarpOptions, draw_within, inverse_depth, warp_gain
@@ -88,12 +88,12 @@ def find_moving(
 
     Of most scenes a look at a frame of half the size says that.
     """
-    camera, baseline = rig.camera, rig.baseline
-    size, grid = camera.width * camera.height, camera.pixel_grid().astype(np.float32)
-    off = _DISPARITY_PX / (camera.fx * baseline)
+    size = max(rig.sensor(side).width * rig.sensor(side).height for side in SIDES)
+    grids = {side: rig.sensor(side).pixel_grid().astype(np.float32) for side in SIDES}
 
     def stays(view: View) -> _Still:
-        axis, other = shutter.axis(view[0]), _other(view)
+        axis, other, camera, grid = shutter.axis(view[0]), _other(view), rig.sensor(view[0]), grids[view[0]]
+        off = _DISPARITY_PX / (camera.fx * rig.baseline)
         maps = reprojection_of(camera, poses[view], poses[other], (axis, axis))
         lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], inverse_depth(depth[view])
         both = np.maximum(rho - np.float32(off), np.float32(0.0)), rho + np.float32(off)
@@ -105,7 +105,7 @@ def find_moving(
         return _Still(far, near, np.asarray(followed(there, between, cv2.BORDER_CONSTANT) > before))
 
     first = VIEWS[0]
-    half = camera.width // 2, camera.height // 2
+    half = rig.sensor("left").width // 2, rig.sensor("left").height // 2
     if min(half) < _SMALLEST:
         return {}
     small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
@@ -238,11 +238,11 @@ class FusionCorrector(Corrector):
         needs={"motion", "depth"},
         reference="Wang, Fan, Dai, eq. 11, with the holes filled (rsbench)",
         assumes="a scene that stands still, or moves evenly in the image; edges of depth are as good as the depth",
-        cameras="any",
+        cameras="rig",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        poses, camera = {view: problem.row_poses(view) for view in VIEWS}, problem.rig.camera
+        poses = {view: problem.row_poses(view) for view in VIEWS}
         depth, moving = problem.depth or {}, dict[View, Moving]()
         if self.moving and depth:
             moving = find_moving(problem.images, depth, poses, problem.rig, problem.shutter)
@@ -251,14 +251,15 @@ class FusionCorrector(Corrector):
         def corrected(view: View) -> Fused:
             sources = self._sources(problem, view, poses)
             sources[0] = self._placed(problem, view, sources[0])
-            fused = fuse(sources, camera, problem.target_pose(view), self.warp)
+            fused = fuse(sources, problem.rig.sensor(view[0]), problem.target_pose(view), self.warp)
             if not moving:
                 return fused
-            tau = float(problem.shutter.time_after(problem.target_row, view[1], view[0]))
+            tau = float(problem.target_time(view))
             known = problem.images[view], moving[view], depth[view], view, problem.shutter, tau
             return draw_moving(fused, *known, self.warp.interpolation)
 
-        found = map_frames(corrected, views, camera.width * camera.height, _FUSION_BYTES)
+        pixels = max(image.shape[0] * image.shape[1] for image in problem.images.values())
+        found = map_frames(corrected, views, pixels, _FUSION_BYTES)
         return dict(zip(views, found, strict=True))
 
     def _sources(self, problem: CorrectionProblem, view: View, poses: Mapping[View, Pose]) -> list[SourceView]:
@@ -288,7 +289,7 @@ class FusionCorrector(Corrector):
         if problem.guess is None or known.size == 0:
             return source
         nearest = _NEARER * float(np.quantile(known, 1.0 - _NEAREST_SHARE))
-        gain = warp_gain(problem.rig.camera, source.poses, problem.target_pose(view), source.columns)
+        gain = warp_gain(problem.rig.sensor(view[0]), source.poses, problem.target_pose(view), source.columns)
         certain = (source.depth == 0.0) & (gain <= self.warp.tear_px * nearest)
         guess = np.where(problem.guess[view] > 0.0, problem.guess[view], np.float32(np.inf))
         return replace(source, depth=np.where(certain, guess, source.depth))
@@ -329,7 +330,7 @@ class RotationCorrector(Corrector):
         needs={"motion"},
         reference="Forssen, Ringaby, Rectifying rolling shutter video from hand-held devices, CVPR 2010",
         assumes="a scene so far away that translation moves no pixel",
-        cameras="any",
+        cameras="rig",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
@@ -348,13 +349,14 @@ class PlaneCorrector(Corrector):
         needs={"motion", "depth"},
         reference="Wang, Fan, Dai, eq. 11, at the depth of one plane (rsbench)",
         assumes="a scene that is one plane",
-        cameras="any",
+        cameras="rig",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         depth = _depths(problem)
         return {
-            view: _alone(problem, view, plane_depth(depth[view], problem.rig.camera), self.warp) for view in views
+            view: _alone(problem, view, plane_depth(depth[view], problem.rig.sensor(view[0])), self.warp)
+            for view in views
         }
 
 
@@ -386,10 +388,11 @@ def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32
 
 def turned(problem: CorrectionProblem, view: View, options: WarpOptions) -> Fused:
     """A frame as the rotation of the problem's motion alone moves it: everything is at infinity."""
-    far = np.full((problem.rig.camera.height, problem.rig.camera.width), np.inf, dtype=np.float32)
+    camera = problem.rig.sensor(view[0])
+    far = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     return _alone(problem, view, far, options)
 
 
 def _alone(problem: CorrectionProblem, view: View, depth: F32, options: WarpOptions) -> Fused:
     source = _source(problem, view, problem.row_poses(view), depth, Origin.HERE)
-    return fuse([source], problem.rig.camera, problem.target_pose(view), options)
+    return fuse([source], problem.rig.sensor(view[0]), problem.target_pose(view), options)

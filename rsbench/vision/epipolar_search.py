@@ -81,8 +81,8 @@ def depth_from_motion(
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
     axes = (shutter.axis(side), shutter.axis(side))
-    maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
-    gain = parallax_gain(rig.camera, *maps)
+    maps = [reprojection_of(rig.sensor(side), poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
+    gain = parallax_gain(rig.sensor(side), *maps)
     count = int(_REACH * max(depths[0].shape))
     unknown = [depth == 0.0 for depth in depths]
     if gain == 0.0 or not any(np.any(mask) for mask in unknown):
@@ -367,7 +367,7 @@ def sweep_frames(
         options: see there.
     """
     height, width = search_size(greys[0].shape, options)
-    camera = _resized(rig.camera, width, height)
+    camera = _resized(rig.sensor(side), width, height)
     small = [np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)) for grey in greys]
     poses = [_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
     maps = [reprojection_of(camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
@@ -399,8 +399,8 @@ def largest_seen(
     depth would not be searched. 0 where there is none.
     """
     poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
-    maps = [reprojection_of(rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
-    gain = max(parallax_gain(rig.camera, *maps), 1e-9)
+    maps = [reprojection_of(rig.sensor(side), poses[frame], poses[1 - frame]) for frame in FRAMES]
+    gain = max(parallax_gain(rig.sensor(side), *maps), 1e-9)
     coarse = replace(options, shrink=_COARSE * options.shrink // 2)
     swept = sweep_frames(greys, rig, shutter, motion, side, _COARSE_REACH * max(greys[0].shape) / gain, coarse)
     height, width = swept[0].rho.shape
@@ -433,7 +433,7 @@ def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 def _poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, height: int) -> Pose:
     """``cam_from_world`` of the rows of a frame of ``height`` rows, each at the mean time of its own."""
-    scale = shutter.height / height
+    scale = shutter.lines(side) / height
     rows = (np.arange(height) + 0.5) * scale - 0.5
     tau = shutter.pixel_time(np.stack([np.zeros_like(rows), rows], axis=-1), frame, side)
     return rig.cam_from_world(motion, tau, side)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import SET_COLUMNS, Correspondences, lens_affine
+from rsbench.core.correspondences import SET_SIDES, Correspondences, lens_affine
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import View
+from rsbench.core.rig import SIDES, AlignedCamera, StereoRig, View
 from rsbench.core.so3 import FloatArray
 
 _FAR = -1e6
@@ -38,10 +38,10 @@ class FeatureMatcher(ABC):
         Sets may come out empty; the solver says what it needs. ``tracks`` are points seen in all four images.
         """
 
-    def match_with_lens(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera) -> Correspondences:
-        """``match`` of images that have the lens of ``camera``, in their pixels: of the images without it."""
-        straight = {view: undistorted(image, camera) for view, image in images.items()}
-        return with_lens(self.match(straight), camera)
+    def match_of_rig(self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig) -> Correspondences:
+        """``match`` of images of any cameras, in their pixels: of their images without lens and rotation."""
+        straight = {view: undistorted(image, rig.eye(view[0])) for view, image in images.items()}
+        return of_sensors(self.match(straight), rig)
 
 
 FeatureEntry = Entry[FeatureMatcher, RunOptions]
@@ -60,60 +60,65 @@ def load_features(name_or_path: str | Path) -> FeatureEntry:
 
 
 def find_correspondences(
-    entry: FeatureEntry, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None = None
+    entry: FeatureEntry, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig | None = None
 ) -> Correspondences:
     """What a feature matcher finds in four images, checked: finite positions inside the images.
 
     Args:
-        camera: whose lens the images have; None: they have none.
+        rig: whose cameras took the images; None: these are a rectified pair.
 
     Raises:
         RsbenchError: another package's matcher raised, or answered something else: one line with its name.
     """
     where = f"{FEATURE_MATCHERS.singular} {entry.name!r}"
     with plugins.blame(FEATURE_MATCHERS, entry):
-        if camera is None or camera.lens is None:
+        if rig is None or rig.rectified:
             found = entry.component.match(images)
         else:
-            found = entry.component.match_with_lens(images, camera)
+            found = entry.component.match_of_rig(images, rig)
     if not isinstance(found, Correspondences):
         raise RsbenchError(f"{where}: must return Correspondences, got {type(found).__name__}")
-    height, width = images["left", 0].shape[:2]
-    most = np.array([width, height]) - 1.0 + _OUTSIDE_PX
-    for name in SET_COLUMNS:
-        points = getattr(found, name).reshape(-1, 2)
-        outside = np.any((points < -_OUTSIDE_PX) | (points > most), axis=1)
-        if np.any(outside):
-            raise RsbenchError(
-                f"{where}: {name}: {np.count_nonzero(outside)} positions lie outside the {width} x {height} "
-                f"image, such as {points[outside][0].tolist()}"
-            )
+    for name, sides in SET_SIDES.items():
+        rows = getattr(found, name)
+        for side in SIDES:
+            own = [k for k, each in enumerate(sides) if each == side]
+            points = rows.reshape(len(rows), len(sides), 2)[:, own].reshape(-1, 2)
+            height, width = images[side, 0].shape[:2]
+            most = np.array([width, height]) - 1.0 + _OUTSIDE_PX
+            outside = np.any((points < -_OUTSIDE_PX) | (points > most), axis=1)
+            if np.any(outside):
+                raise RsbenchError(
+                    f"{where}: {name}: {np.count_nonzero(outside)} positions lie outside the {width} x {height} "
+                    f"image, such as {points[outside][0].tolist()}"
+                )
     return found
 
 
-def undistorted(image: NDArray[Any], camera: PinholeCamera) -> NDArray[Any]:
-    """The image (H, W[, 3]) without distortion, of the same size and intrinsics; cubic interpolation.
+def undistorted(image: NDArray[Any], camera: PinholeCamera | AlignedCamera) -> NDArray[Any]:
+    """The image (H, W[, 3]) in ideal pixels, of the size of the ideal camera; cubic interpolation.
 
-    What lies beyond the distorted image is a mirror of its border: ``with_lens`` drops matches there. Rows of the
-    result are not read at one time: times belong to the pixels of the image as it was.
+    What lies beyond the image is a mirror of its border: ``of_sensors`` drops matches there. Rows of the result
+    are not read at one time: times belong to the pixels of the image as it was.
     """
-    if camera.lens is None:
+    if camera.is_ideal:
         return image
-    source = np.nan_to_num(camera.lens_pixels(camera.pixel_grid()), nan=_FAR).astype(np.float32)
+    source = np.nan_to_num(camera.lens_pixels(camera.ideal.pixel_grid()), nan=_FAR).astype(np.float32)
     return np.asarray(
         cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
     )
 
 
-def with_lens(matches: Correspondences, camera: PinholeCamera) -> Correspondences:
-    """Matches of undistorted images in pixels of the distorted ones; those with an end outside are dropped."""
-    if camera.lens is None:
+def of_sensors(matches: Correspondences, rig: StereoRig) -> Correspondences:
+    """Matches in ideal pixels as pixels of the images; those with an end outside are dropped."""
+    if rig.rectified:
         return matches
     sets, kept = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
-    for name in SET_COLUMNS:
+    for name, sides in SET_SIDES.items():
         rows = getattr(matches, name)
-        ends = camera.lens_pixels(rows.reshape(len(rows), rows.shape[1] // 2, 2))
-        kept[name] = np.all(camera.contains(ends), axis=1)
+        ideal = rows.reshape(len(rows), len(sides), 2)
+        ends = np.stack([rig.eye(side).lens_pixels(ideal[:, k]) for k, side in enumerate(sides)], axis=1)
+        inside = [rig.sensor(side).contains(ends[:, k]) for k, side in enumerate(sides)]
+        kept[name] = np.all(inside, axis=0)
         sets[name] = ends[kept[name]].reshape(-1, rows.shape[1])
     affine = matches.affine[kept["left"][: len(matches.affine)]]
-    return replace(matches, **sets, affine=lens_affine(affine, sets["left"], camera))
+    return replace(matches, **sets, affine=lens_affine(affine, sets["left"], rig.eye("left")))

@@ -34,7 +34,7 @@ from rsbench.components.compiled import compiled
 from rsbench.core.arguments import check_ranges
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs, unlinked_pairs
-from rsbench.core.rig import Side, View
+from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher
 from rsbench.vision.images import at_full_size, grey_u8, halved, keys_weights, map_frames
@@ -143,7 +143,9 @@ _LEFT: Side = "left"
 _RIGHT: Side = "right"
 
 
-def refine_matches(images: Mapping[View, NDArray[Any]], matches: Correspondences) -> Correspondences:
+def refine_matches(
+    images: Mapping[View, NDArray[Any]], matches: Correspondences, rig: StereoRig | None = None
+) -> Correspondences:
     """The matches with their later ends aligned to their first one; where that fails they stay as they are.
 
     The first end is the left one of frame 0 where there is such, then the right one, then the left one of frame 1.
@@ -152,7 +154,9 @@ def refine_matches(images: Mapping[View, NDArray[Any]], matches: Correspondences
 
     Args:
         images: (H, W) or (H, W, 3), uint8 or uint16, of both sides and frames, in whose pixels the matches are.
+        rig: whose cameras may differ in scale and orientation; None: they are alike.
     """
+    across = np.eye(2) if rig is None else rig.right_by_left()
     with ThreadPoolExecutor() as pool:
         views: list[View] = [("left", 0), ("right", 0), ("left", 1), ("right", 1)]
         smooth = dict(zip(views, pool.map(lambda view: smoothed(images[view]), views), strict=True))
@@ -167,7 +171,14 @@ def refine_matches(images: Mapping[View, NDArray[Any]], matches: Correspondences
             (views[0], views[1], stereo_0[:, :2], stereo_0[:, 2:]),
             (views[2], views[3], stereo_1[:, :2], stereo_1[:, 2:]),
         ]
-        found = list(pool.map(lambda t: aligned(smooth[t[0]], smooth[t[1]], t[2], t[3])[0], tasks))
+        found = list(
+            pool.map(
+                lambda t: aligned(
+                    smooth[t[0]], smooth[t[1]], t[2], t[3], across if t[0][0] != t[1][0] else np.eye(2)
+                )[0],
+                tasks,
+            )
+        )
     tracks = np.concatenate([tracks[:, :2], *found[:3]], axis=1)
     return replace(
         matches,
@@ -191,16 +202,20 @@ def smoothed(image: NDArray[Any]) -> F32:
     return np.asarray(cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _BLUR_PX))
 
 
-def aligned(a: F32, b: F32, points_a: FloatArray, points_b: FloatArray) -> tuple[FloatArray, BoolArray]:
+def aligned(
+    a: F32, b: F32, points_a: FloatArray, points_b: FloatArray, start: FloatArray | None = None
+) -> tuple[FloatArray, BoolArray]:
     """The places (n, 2) in b of what is at points a, from places near them, and which of them were aligned.
 
     Args:
         a, b: (H, W) of ``smoothed``.
         points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
+        start: (2, 2) affine map from the pixels around a point of a to those of b, about; None: the identity.
     """
     out = np.array(points_b, dtype=np.float64)
     done = np.zeros(len(out), dtype=np.bool_)
-    _align_all(a, b, np.ascontiguousarray(points_a, dtype=np.float64), out, done)
+    start = np.eye(2) if start is None else np.ascontiguousarray(start)
+    _align_all(a, b, np.ascontiguousarray(points_a, dtype=np.float64), start, out, done)
     return out, done
 
 
@@ -234,7 +249,7 @@ def _template(image: F32, x: float, y: float, grid: F32, J: F32) -> None:
 
 
 @compiled(error_model="numpy")
-def _align_all(a: F32, b: F32, points: FloatArray, places: FloatArray, done: BoolArray) -> None:
+def _align_all(a: F32, b: F32, points: FloatArray, start: FloatArray, places: FloatArray, done: BoolArray) -> None:
     size = 2 * _HALF + 1
     grid, J = (
         np.zeros((size + 2, size + 2), dtype=np.float32),
@@ -249,11 +264,11 @@ def _align_all(a: F32, b: F32, points: FloatArray, places: FloatArray, done: Boo
         if not (margin <= x < a.shape[1] - margin and margin <= y < a.shape[0] - margin):
             continue
         _template(a, x, y, grid, J)
-        done[n] = _align(b, J, weights, places[n])
+        done[n] = _align(b, J, weights, start, places[n])
 
 
 @compiled(error_model="numpy")
-def _align(b: F32, J: F32, weights: FloatArray, place: FloatArray) -> bool:
+def _align(b: F32, J: F32, weights: FloatArray, start: FloatArray, place: FloatArray) -> bool:
     """Move one place (2,) to where the patch fits; False, and no move, where it cannot be."""
     count = len(J)
     H = np.zeros((_PARAMETERS, _PARAMETERS))
@@ -269,8 +284,7 @@ def _align(b: F32, J: F32, weights: FloatArray, place: FloatArray) -> bool:
             return False
     inverse = np.linalg.inv(H)
     x, y, gain, bias = place[0], place[1], 1.0, 0.0
-    A = np.zeros((2, 2))
-    A[0, 0] = A[1, 1] = 1.0
+    A = start.copy()
     residuals = np.zeros(count)
     for _ in range(_ROUNDS):
         if not _residuals(b, J, A, x, y, gain, bias, residuals):
@@ -284,7 +298,7 @@ def _align(b: F32, J: F32, weights: FloatArray, place: FloatArray) -> bool:
             return False
         if dx * dx + dy * dy < _CONVERGED_PX**2:
             break
-    shear = max(abs(A[0, 0] - 1.0), abs(A[0, 1]), abs(A[1, 0]), abs(A[1, 1] - 1.0))
+    shear = np.max(np.abs(A - start))
     variance = np.sum(weights * residuals**2) / np.sum(weights) * max(inverse[0, 0], inverse[1, 1])
     if not (shear < _MOST_SHEAR and abs(gain - 1.0) < _MOST_GAIN and variance < _MOST_SIGMA_PX**2):
         return False
@@ -420,18 +434,18 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
     def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
         return self._matched(images, None)
 
-    def match_with_lens(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera) -> Correspondences:
+    def match_of_rig(self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig) -> Correspondences:
         """Features are found in the images as they are: interpolating them would add a tenth to the noise."""
-        return self._matched(images, camera)
+        return self._matched(images, rig)
 
-    def _matched(self, images: Mapping[View, NDArray[np.uint8]], camera: PinholeCamera | None) -> Correspondences:
+    def _matched(self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig | None) -> Correspondences:
         four = (images["left", 0], images["right", 0], images["left", 1], images["right", 1])
-        matches = match_stereo_frames(*four, self, camera)
+        matches = match_stereo_frames(*four, self, rig)
         alone = 0 < self.enough_tracks <= len(matches.tracks)
         if alone:
             matches = Correspondences(tracks=matches.tracks)
         if self.refine and not _still(matches):
-            matches = refine_matches(images, matches)
+            matches = refine_matches(images, matches, None if rig is None or rig.aligned else rig)
         return Correspondences(tracks=matches.tracks) if alone else matches
 
 
@@ -442,7 +456,7 @@ class Features:
     points: FloatArray
     """(n, 2) px."""
     places: FloatArray
-    """(n, 2) px where a camera without the lens sees them."""
+    """(n, 2) ideal px."""
     descriptors: NDArray[np.float32]
     """(n, 128), whole numbers from 0 to 255."""
     frames: FloatArray
@@ -471,12 +485,12 @@ def forget_features() -> None:
 
 
 def detect(
-    image: NDArray[Any], options: MatchOptions | None = None, camera: PinholeCamera | None = None
+    image: NDArray[Any], options: MatchOptions | None = None, camera: PinholeCamera | AlignedCamera | None = None
 ) -> Features:
     """SIFT features of an image (H, W) or (H, W, 3), uint8 or uint16; none in an image without texture.
 
     Args:
-        camera: whose lens the image has; None: it has none. Features of which the lens shows no ray are dropped.
+        camera: whose image it is; None: its pixels are ideal. Features of which it shows no ray are dropped.
     """
     options, grey = options or MatchOptions(), grey_u8(image)
     if not 0 < options.max_features <= _REMEMBERED:
@@ -492,7 +506,9 @@ def detect(
     return _DETECTED.get(key, lambda: _detected(grey, options, camera))
 
 
-def _detected(grey: NDArray[np.uint8], options: MatchOptions, camera: PinholeCamera | None) -> Features:
+def _detected(
+    grey: NDArray[np.uint8], options: MatchOptions, camera: PinholeCamera | AlignedCamera | None
+) -> Features:
     sift = cv2.SIFT.create(
         nfeatures=options.max_features or _MOST_FEATURES,
         contrastThreshold=options.contrast_threshold,
@@ -544,19 +560,22 @@ def match_stereo_frames(
     left_1: NDArray[Any],
     right_1: NDArray[Any],
     options: MatchOptions | None = None,
-    camera: PinholeCamera | None = None,
+    rig: StereoRig | None = None,
 ) -> Correspondences:
     """Correspondences of the four images (H, W[, 3]), uint8 or uint16, of a rig over two frames.
 
-    Of images that have the lens of ``camera``, in their own pixels; the bounds of the options are without it.
+    Of images of the cameras of ``rig``, in their own pixels; the bounds of the options are in ideal pixels.
     Tracks are points whose four matches close the loop L0-R0-R1-L1-L0. Sets may come out empty. Raises ValueError
     when the images differ in size or are of another type.
     """
     options = options or MatchOptions()
     images = {"left_0": left_0, "right_0": right_0, "left_1": left_1, "right_1": right_1}
     for name, image in images.items():
-        if image.shape[:2] != left_0.shape[:2]:
-            raise ValueError(f"{name} must have the size of left_0, {left_0.shape[:2]}, got {image.shape[:2]}")
+        same, first = (
+            ("left_0", left_0) if rig is None or rig.aligned else (f"{name[:-1]}0", images[f"{name[:-1]}0"])
+        )
+        if image.shape[:2] != first.shape[:2]:
+            raise ValueError(f"{name} must have the size of {same}, {first.shape[:2]}, got {image.shape[:2]}")
     reach = float(max(left_0.shape)) if options.search_radius is None else options.search_radius
     anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     disparity = float(left_0.shape[1]) if options.max_disparity is None else options.max_disparity
@@ -566,8 +585,12 @@ def match_stereo_frames(
         beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
     # OpenCV, the BLAS and the compiled loop let go of the GIL.
     pixels = left_0.shape[0] * left_0.shape[1]
+    eyes = [None if rig is None else rig.eye(side) for side in (*SIDES, *SIDES)]
     l0, r0, l1, r1 = map_frames(
-        lambda image: detect(image, options, camera), images.values(), pixels, _DETECTION_BYTES
+        lambda each: detect(each[0], options, each[1]),
+        list(zip(images.values(), eyes, strict=True)),
+        pixels,
+        _DETECTION_BYTES,
     )
     tasks = ((l0, l1, anywhere), (r0, r1, anywhere), (l0, r0, beside), (l1, r1, beside))
     with ThreadPoolExecutor() as pool:

@@ -61,13 +61,13 @@ def flow_depth(
     here = rig.cam_from_world(motion, shutter.pixel_time(pixels, frame, side), side)
     there = rig.cam_from_world(motion, shutter.pixel_time(targets, 1 - frame, side), side)
     R, T = compose(there, inverse(here))
-    x, y = rig.camera.unproject(pixels), rig.camera.unproject(targets)
+    x, y = rig.sensor(side).unproject(pixels), rig.sensor(side).unproject(targets)
     z = ray_depths(compose(there, inverse(here)), x, y)
     front = np.all(np.where(np.isfinite(z), z, -1.0) > 0.0, axis=-1)
     depth = np.where(front, z[..., 0], np.inf)
     moved = (R @ x[..., None])[..., 0] + T / depth[..., None]
     ahead = moved[..., 2] > 0.0
-    seen = rig.camera.project(np.where(ahead[..., None], moved, 1.0))
+    seen = rig.sensor(side).project(np.where(ahead[..., None], moved, 1.0))
     return depth, np.where(ahead, np.linalg.norm(seen - targets, axis=-1), np.inf)
 
 
@@ -82,7 +82,7 @@ def monocular_depth(
 
     inf where the rays do not meet in front of the camera. Median-filtered in inverse depth.
     """
-    grid = rig.camera.pixel_grid()
+    grid = rig.sensor(side).pixel_grid()
     rho = np.zeros(flow.shape[:2], dtype=np.float32)
     for start in range(0, len(rho), _CHUNK_ROWS):
         rows = slice(start, start + _CHUNK_ROWS)

@@ -212,14 +212,15 @@ def _look_up(
         The places (H, W, 2), px, NaN outside the view; the inverse depth (H, W) of the points there; what the view
         knows there, NaN where it knows none.
     """
-    maps = line_maps(view.camera or camera, target_pose, view.poses, view.columns, camera)
+    own = view.camera or camera
+    maps = line_maps(own, target_pose, view.poses, view.columns, camera)
     places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
     expected = np.zeros(wanted.shape, dtype=np.float32)
-    _find_in_lines(rho, wanted, maps, places, expected)
+    _find_in_lines(rho, wanted, maps, own.width, own.height, places, expected)
     inside, known = np.isfinite(places[..., 0]), np.full(wanted.shape, np.nan, dtype=np.float32)
     # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
     nearest = np.rint(places[inside]).astype(np.intp)
-    x, y = np.clip(nearest, 0, (camera.width - 1, camera.height - 1)).T
+    x, y = np.clip(nearest, 0, (own.width - 1, own.height - 1)).T
     known[inside] = inverse_depth(view.depth[y, x])
     return places, expected, known
 
@@ -240,13 +241,16 @@ def _find_in_lines(
     rho: NDArray[np.float32],
     wanted: Mask,
     maps: LineMaps,
+    view_width: int,
+    view_height: int,
     places: NDArray[np.float32],
     seen_rho: NDArray[np.float32],
 ) -> None:
     """Where a rolling-shutter frame sees points given by pixel and inverse depth ``rho`` (H, W) of the target.
 
     Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, of the ``wanted`` pixels
-    whose points lie inside the frame. ``maps`` take them to each line's camera.
+    whose points lie inside the frame of ``view_width`` x ``view_height`` pixels. ``maps`` take them to each
+    line's camera.
     """
     M, b, columns = maps.M, maps.b, maps.columns
     height, width = rho.shape
@@ -256,7 +260,7 @@ def _find_in_lines(
             if not wanted[y, x]:
                 continue
             gx, gy = look(maps.ideal, x, y)
-            line, u, v, s = line_of(columns, x, y), np.nan, np.nan, np.nan
+            line, u, v, s = min(line_of(columns, x, y), lines - 1), np.nan, np.nan, np.nan
             for _ in range(_ROW_STEPS):
                 z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho[y, x] * b[line, 2]
                 s = 1.0 / z if z > 0.0 else np.nan
@@ -267,7 +271,7 @@ def _find_in_lines(
                 if not -lines < along < 2 * lines:  # NaN included
                     break
                 line = min(max(int(along + 0.5), 0), lines - 1)
-            if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+            if -0.5 < u < view_width - 0.5 and -0.5 < v < view_height - 0.5:
                 places[y, x, 0], places[y, x, 1], seen_rho[y, x] = u, v, rho[y, x] * s
 
 
@@ -291,14 +295,14 @@ def _keep_landing(
     wanted: NDArray[np.uint8],
     kept: NDArray[np.float32],
 ) -> int:
-    """Copy to ``kept`` the depth (H, W) of pixels that land on wanted target pixels (H, W); how many these are.
+    """Copy to ``kept`` the depth (H, W) of pixels that land on wanted target pixels (h, w); how many these are.
 
     ``rho`` is inverse depth, NaN where unknown.
     """
-    height, width = depth.shape
+    height, width = wanted.shape
     count = 0
-    for y in range(height):
-        for x in range(width):
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
             u, v, _ = move(maps, maps.columns, x, y, rho[y, x])
             u, v = u + 0.5, v + 0.5
             if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:  # NaN is outside

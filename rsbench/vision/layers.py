@@ -95,7 +95,7 @@ class MovingCamera(NamedTuple):
     @property
     def parallax_px(self) -> float:
         """px that a point of inverse depth 1, in the unit of the motion, moves in a frame period, about."""
-        return self.rig.camera.fx * float(np.linalg.norm(self.motion.d))
+        return self.rig.sensor(self.side).fx * float(np.linalg.norm(self.motion.d))
 
     def row_poses(self, frame: int) -> Pose:
         """``cam_from_world`` (lines, 3, 3), (lines, 3)."""
@@ -104,7 +104,7 @@ class MovingCamera(NamedTuple):
     def inverse_depths(self, planes: FloatArray, frame: int) -> F32:
         """Inverse depths (n, H, W) of planes (n, 3) at a frame's pixels, in the row's camera; NaN behind it."""
         seen = planes_seen(planes, self.row_poses(frame))  # (H, n, 3)
-        rays = self.rig.camera.unproject(self.rig.camera.pixel_grid())
+        rays = self.rig.sensor(self.side).unproject(self.rig.sensor(self.side).pixel_grid())
         rho = np.einsum("hnk,hwk->nhw", seen, rays)
         return np.where(rho >= 0.0, rho, np.nan).astype(np.float32)
 
@@ -175,7 +175,9 @@ class _Pair:
         self._rhos = [camera.inverse_depths(planes, frame) for frame in FRAMES]
         axes = (camera.shutter.axis(camera.side),) * 2
         poses = [camera.row_poses(frame) for frame in FRAMES]
-        self._maps = [reprojection_of(camera.rig.camera, poses[f], poses[1 - f], axes) for f in FRAMES]
+        self._maps = [
+            reprojection_of(camera.rig.sensor(camera.side), poses[f], poses[1 - f], axes) for f in FRAMES
+        ]
         self.costs = [np.zeros_like(rho) for rho in self._rhos]
         self._pixels = [np.zeros(rho.shape, dtype=np.int32) for rho in self._rhos]
         """(n, H, W) the other frame's pixel, counted along its rows, at which a layer lands; any if at none."""
@@ -278,7 +280,7 @@ def _inverse_depths(matches: FloatArray, camera: MovingCamera) -> FloatArray:
     depth, _ = flow_depth(pixels, matches[:, 2:] - pixels, rig, shutter, motion, side, 0)
     near = np.isfinite(depth)
     pose = rig.cam_from_world(motion, shutter.pixel_time(pixels, 0, side), side)
-    points = transform(inverse(pose), np.where(near, depth, 1.0)[:, None] * rig.camera.unproject(pixels))
+    points = transform(inverse(pose), np.where(near, depth, 1.0)[:, None] * rig.sensor(side).unproject(pixels))
     ahead = near & (points[:, 2] > 0.0)
     return np.where(ahead, 1.0 / np.where(ahead, points[:, 2], 1.0), 0.0)
 
@@ -429,14 +431,14 @@ def _ends(matches: FloatArray, camera: MovingCamera, planes: FloatArray) -> _End
     rig, shutter, side, motion = camera
     halves = matches[:, :2], matches[:, 2:]
     first, second = (rig.cam_from_world(motion, shutter.pixel_time(halves[f], f, side), side) for f in FRAMES)
-    rays = rig.camera.unproject(halves[0])
+    rays = rig.sensor(side).unproject(halves[0])
     rho = np.sum(planes_seen(planes[:, None], first)[:, 0] * rays, axis=-1)
     R, T = compose(second, inverse(first))
     point = (R @ rays[..., None])[..., 0] + rho[:, None] * T
     point[:, 2] = np.maximum(point[:, 2], _LEAST_DEPTH)
-    focal = np.array([rig.camera.fx, rig.camera.fy])
+    focal = np.array([rig.sensor(side).fx, rig.sensor(side).fy])
     slope = focal * (T[:, :2] - point[:, :2] / point[:, 2:] * T[:, 2:]) / point[:, 2:]
-    return _Ends(rig.camera.project(point) - halves[1], slope)
+    return _Ends(rig.sensor(side).project(point) - halves[1], slope)
 
 
 def _split(ends: _Ends) -> tuple[FloatArray, FloatArray, FloatArray]:

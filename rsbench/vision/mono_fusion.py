@@ -217,13 +217,13 @@ class MonoFusion:
         if own.far:
             return [_Layer(np.zeros(shape, np.float32), np.zeros(shape, np.float32)) for _ in FRAMES]
         poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
-        maps = [reprojection_of(own.rig.camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
+        maps = [reprojection_of(own.rig.sensor(own.side), poses[frame], poses[1 - frame]) for frame in FRAMES]
         pick = _picked(shape, search_size(shape, self.options.sweep))
         met = [_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES]
         offs = [off[np.ix_(*pick)] for off in self.flows.returns]
         greys = [grey_u8(image) for image in self.images]
         known, options = (greys, own.rig, own.shutter, own.motion, own.side), self.options.sweep
-        gain = parallax_gain(own.rig.camera, *maps)
+        gain = parallax_gain(own.rig.sensor(own.side), *maps)
         most = max(_range(offs, met, gain), largest_seen(*known, options))
         swept, same = sweep_frames(*known, most, options), _SAME_PX / max(gain, 1e-9)
         return [_layer(swept[frame], offs[frame], *met[frame], shape, same) for frame in FRAMES]
@@ -256,7 +256,7 @@ class MonoFusion:
         if own.motion is not None:
             target = own.rig.cam_from_world(own.motion, target_tau, own.side)
             poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
-            move_pixels(layer.rho, line_maps(own.rig.camera, poses, target), moved)
+            move_pixels(layer.rho, line_maps(own.rig.sensor(own.side), poses, target), moved)
             weight = layer.flow_share
         places = np.zeros((height, width, 3))
         _weigh(flow, layer.rho, weight, moved, target_tau - here, float(1 - 2 * frame), rate, places)

@@ -43,7 +43,7 @@ class Optics(NamedTuple):
 class LineMaps(NamedTuple):
     """Maps of each line of a frame, from its ideal pixels to another camera's, with the optics of both.
 
-    Homogeneous target pixel = M_y (x, y, 1) + b_y / depth, and the target has the lens of the source.
+    Homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
     """
 
     M: FloatArray
@@ -51,12 +51,13 @@ class LineMaps(NamedTuple):
     b: FloatArray
     """(lines, 3) px m."""
     ideal: Table
-    """Field of ``Optics``, as the next two."""
+    """Field of ``Optics`` of the frame's camera, as ``columns``."""
     lens: Table
+    """That of the target camera."""
     columns: bool
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
     """The camera for compiled loops."""
     lens = camera.lens
@@ -68,7 +69,7 @@ def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
     return Optics(_ideal_pixels(camera), np.array(numbers), columns)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _ideal_pixels(camera: PinholeCamera) -> FloatArray:
     return np.ascontiguousarray(camera.ideal_pixels(camera.pixel_grid()))
 

@@ -43,7 +43,7 @@ class GyroCorrector(Corrector):
         sees=set(),
         reference="Karpenko, Jacobs, Baek, Levoy: Rolling shutter correction using gyroscopes, CSTR 2011-03",
         assumes="a gyroscope aligned with the cameras; a scene so far away that translation moves no pixel",
-        cameras="any",
+        cameras="rig",
     )
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:

@@ -34,8 +34,7 @@ from rsbench.components.compiled import compiled
 from rsbench.core.arguments import check_ranges
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
-from rsbench.core.projection import row_poses
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -45,7 +44,9 @@ from rsbench.vision.stereo_matcher import (
     MatcherEntry,
     StereoMatcher,
     between_pixels,
+    body_depth,
     find_disparities,
+    own_depths,
     widened,
 )
 
@@ -449,13 +450,15 @@ def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig
     inside the picture. A rolling shutter changes nothing where both cameras read a row at the same time; with a
     lens the two times are so near that the difference is lost in that pixel.
     """
-    camera, sign = rig.camera, 1.0 if side == "left" else -1.0
-    disparity, other = (np.nan_to_num(rig.disparity(z)) for z in (depth, other_depth))
+    sign, there_side = (1.0, "right") if side == "left" else (-1.0, "left")
+    camera, other_camera = rig.eye(side), rig.eye(there_side)
+    disparity = np.nan_to_num(rig.disparity(body_depth(depth, rig, side)))
+    other = np.nan_to_num(rig.disparity(body_depth(other_depth, rig, there_side)))
     row, column = np.indices(depth.shape)
     ideal = camera.ideal_pixels(np.stack([column, row], axis=-1))
-    partner = camera.lens_pixels(np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1))
+    partner = other_camera.lens_pixels(np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1))
     x, y = np.moveaxis(np.rint(np.nan_to_num(partner, nan=-1.0)).astype(np.int64), -1, 0)
-    height, width = depth.shape
+    height, width = other_depth.shape
     inside = (disparity > 0.0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
     return inside & (np.abs(there - disparity) <= 1.0)
@@ -560,28 +563,30 @@ def timed_depth(
     at another time. The depth is that at which the other camera, where it was then, sees the point in that column.
     What is unknown (0) and infinitely far (inf) stays so; a point behind either camera becomes infinitely far.
     """
-    camera, sign = rig.camera, 1.0 if side == "left" else -1.0
+    sign = 1.0 if side == "left" else -1.0
     other: Side = "right" if side == "left" else "left"
-    out = depth.copy()
+    camera, ideal, partner = rig.eye(side), rig.camera.ideal, rig.eye(other)
+    out, depth = depth.copy(), body_depth(depth, rig, side)
     y, x = np.nonzero((depth > 0.0) & np.isfinite(depth))
-    poses, axis = row_poses(rig, shutter, motion, side, frame), shutter.axis(side)
+    poses, axis = rig.eye_from_world(motion, shutter.line_times(frame, side), side), shutter.axis(side)
     for start in range(0, len(y), _CHUNK):
         part = slice(start, start + _CHUNK)
         pixels = np.stack([x[part], y[part]], axis=-1)
         lines = pixels[:, axis]
         rays = camera.unproject(pixels)
-        ends = camera.ideal.project(rays)
+        ends = ideal.project(rays)
         ends[:, 0] -= sign * rig.disparity(depth[y[part], x[part]])
-        tau = shutter.pixel_time(camera.lens_pixels(ends), frame, other)
+        tau = shutter.pixel_time(partner.lens_pixels(ends), frame, other)
         # Beyond what the lens shows there is no time: as if it were read with the pixel itself.
         tau = np.where(np.isnan(tau), shutter.pixel_time(pixels, frame, side), tau)
-        R, t = compose(rig.cam_from_world(motion, tau, other), inverse(Pose(poses.R[lines], poses.t[lines])))
-        column = camera.ideal.unproject(ends)[:, 0]
+        R, t = compose(rig.eye_from_world(motion, tau, other), inverse(Pose(poses.R[lines], poses.t[lines])))
+        column = ideal.unproject(ends)[:, 0]
         turned = (R @ rays[..., None])[..., 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             z = (column * t[:, 2] - t[:, 0]) / (turned[:, 0] - column * turned[:, 2])
         ahead = np.isfinite(z) & (z > 0.0) & (turned[:, 2] * z + t[:, 2] > 0.0)
-        out[y[part], x[part]] = np.where(ahead, z, np.inf)
+        own = 1.0 if rig.aligned else own_depths(rig, side)[y[part], x[part]]
+        out[y[part], x[part]] = np.where(ahead, z * own, np.inf)
     return out
 
 
@@ -595,9 +600,9 @@ _SMOOTH = 5
 
 
 class _Eye(NamedTuple):
-    """One camera of the rig, and the poses of its lines."""
+    """One camera of the rig, and the poses of its lines, in the body's axes."""
 
-    camera: PinholeCamera
+    camera: PinholeCamera | AlignedCamera
     poses: Pose
     axis: int
 
@@ -637,13 +642,18 @@ def moving_disparities(
     """Disparities (H, W) on the pixels of both cameras, ideal px, NaN where unknown; by any matcher and scan.
 
     A disparity is that which the other camera would have shown at the time of the pixel: ``rig.depth`` makes it
-    the depth in the camera of the pixel's own line. ``images`` (H, W[, 3]) by side.
+    the depth, along the body's z, from the camera of the pixel's own line. ``images`` (H, W[, 3]) by side.
 
     Raises:
         RsbenchError: see ``find_disparities``.
     """
     eyes = {
-        side: _Eye(rig.camera, row_poses(rig, shutter, motion, side, frame), shutter.axis(side)) for side in SIDES
+        side: _Eye(
+            rig.eye(side),
+            rig.eye_from_world(motion, shutter.line_times(frame, side), side),
+            shutter.axis(side),
+        )
+        for side in SIDES
     }
     first, second = (_of_side(entry, images, rig, eyes, side) for side in SIDES)
     return first, second
@@ -656,19 +666,20 @@ def _of_side(
     eyes: Mapping[Side, _Eye],
     side: Side,
 ) -> F32:
-    camera, wide = rig.camera, widened(rig.camera)
+    wide = widened(rig)
     other: Side = "right" if side == "left" else "left"
-    sign, grid, level = (1.0 if side == "left" else -1.0), wide.pixel_grid(), replace(rig, camera=wide)
-    own = images[side] if camera.lens is None else resample(images[side], _shown(camera, wide, grid))
+    camera, there_camera = eyes[side].camera, eyes[other].camera
+    sign, grid, level = (1.0 if side == "left" else -1.0), wide.pixel_grid(), replace(rig.ideal, camera=wide)
+    own = images[side] if camera.is_ideal else resample(images[side], _shown(camera, wide, grid))
     rho = np.zeros(grid.shape[:2])
     for _ in range(_ROUNDS):
         ends = _ends(level, eyes[side], eyes[other], sign, rho)
-        seen = resample(images[other], _inside(camera, ends).astype(np.float32))
+        seen = resample(images[other], _inside(there_camera, ends).astype(np.float32))
         left, right = (own, seen) if side == "left" else (seen, own)
         both = find_disparities(entry, left, right, level)
         here, there = both if side == "left" else both[::-1]
         partner = grid + _across(sign * there)
-        before, gain = rho, camera.fx * rig.baseline
+        before, gain = rho, rig.camera.fx * rig.baseline
         rho = _without_holes(_inverse_depth(eyes[side], eyes[other], _looked(camera, wide, partner), ends))
         if np.mean(gain * np.abs(rho - before) > _STILL_PX) < _SETTLED:
             break
@@ -676,7 +687,7 @@ def _of_side(
     places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
     moved = (ends - grid).astype(np.float32)
     ends = places + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
-    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), _inside(camera, ends))
+    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), _inside(there_camera, ends))
     disparity = np.where(known, gain * rho, np.nan)
     return _on_sensor(camera, wide, disparity.astype(np.float32))
 
@@ -691,7 +702,7 @@ def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) 
     partner = _looked(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
     R, t = eye.pose_at(partner.pixels)
     X = _turned(np.swapaxes(R, -1, -2), partner.rays - rho[..., None] * t)
-    ends = _pixels(eye.camera, rig.camera, grid)
+    ends = _pixels(other.camera, rig.camera, grid)
     for _ in range(_STEPS):
         R, t = other.pose_at(ends)
         ends = other.camera.project(_turned(R, X) + rho[..., None] * t)
@@ -729,28 +740,28 @@ def _across(steps: NDArray[Any]) -> FloatArray:
     return np.stack([steps, np.zeros_like(steps)], axis=-1).astype(np.float64)
 
 
-def _pixels(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> FloatArray:
+def _pixels(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, places: FloatArray) -> FloatArray:
     """Pixels (H, W, 2) of the camera with its lens at places of the wide one without."""
     return places if wide is camera else camera.project(wide.unproject(places))
 
 
-def _looked(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> _Looked:
+def _looked(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, places: FloatArray) -> _Looked:
     rays, pixels = wide.unproject(places), _pixels(camera, wide, places)
     return _Looked(pixels, np.where(np.isfinite(pixels[..., :1]), rays, np.nan))
 
 
-def _shown(camera: PinholeCamera, wide: PinholeCamera, places: FloatArray) -> F32:
+def _shown(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, places: FloatArray) -> F32:
     return _inside(camera, _pixels(camera, wide, places)).astype(np.float32)
 
 
-def _inside(camera: PinholeCamera, pixels: FloatArray) -> FloatArray:
+def _inside(camera: PinholeCamera | AlignedCamera, pixels: FloatArray) -> FloatArray:
     """Pixels (H, W, 2), NaN beside the image."""
     return np.where(camera.contains(pixels)[..., None], pixels, np.nan)
 
 
-def _on_sensor(camera: PinholeCamera, wide: PinholeCamera, disparity: F32) -> F32:
+def _on_sensor(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, disparity: F32) -> F32:
     """Disparity of the wide camera on the pixels of the camera with its lens."""
     if wide is camera:
         return disparity
-    shift = np.array([wide.cx - camera.cx, wide.cy - camera.cy])
+    shift = np.array([wide.cx - camera.ideal.cx, wide.cy - camera.ideal.cy])
     return between_pixels(disparity, camera.ideal_pixels(camera.pixel_grid()) + shift)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -18,9 +19,9 @@ from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import check_ideal, check_plain
+from rsbench.core.geometry import check_cameras_of, check_ideal
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, StereoRig, View
+from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import resample
@@ -31,7 +32,7 @@ _ONE_SURFACE_PX = 1.0
 """Disparities of neighbours that differ by more are not interpolated."""
 
 F32 = NDArray[np.float32]
-Cameras = Literal["ideal", "any"]
+Cameras = Literal["ideal", "any", "rig"]
 
 
 class StereoMatcher(ABC):
@@ -159,8 +160,7 @@ def find_depths(
     """
     where, matcher = f"{STEREO_MATCHERS.singular} {entry.name!r}", entry.component
     assert isinstance(matcher, MotionMatcher)
-    if matcher.cameras == "ideal":
-        check_plain(rig, shutter, where)
+    check_cameras_of(matcher.cameras, rig, shutter, where)
     with plugins.blame(STEREO_MATCHERS, entry):
         if views is None:
             answer = matcher.depths(images, rig, shutter, motion)
@@ -210,25 +210,52 @@ def sensor_disparities(
     Raises:
         RsbenchError: see ``find_disparities``.
     """
-    camera = rig.camera
-    if camera.lens is None:
+    if rig.rectified:
         return find_disparities(entry, left, right, rig)
-    ideal, wide = camera.ideal_pixels(camera.pixel_grid()), widened(camera)
-    places = camera.project(wide.unproject(wide.pixel_grid()))
-    inside: F32 = np.where(camera.contains(places)[..., None], places, np.nan).astype(np.float32)
-    levels = [resample(image, inside) for image in (left, right)]
-    both = find_disparities(entry, levels[0], levels[1], replace(rig, camera=wide))
-    shift = np.array([wide.cx - camera.cx, wide.cy - camera.cy])
-    first, second = (
-        _with_partner(between_pixels(found, ideal + shift), ideal, camera, 1.0 if side == "left" else -1.0)
-        for side, found in zip(SIDES, both, strict=True)
-    )
-    return first, second
+    eyes, wide, levels = {side: rig.eye(side) for side in SIDES}, widened(rig), list[NDArray[np.uint8]]()
+    for side, image in zip(SIDES, (left, right), strict=True):
+        places = eyes[side].project(wide.unproject(wide.pixel_grid()))
+        inside: F32 = np.where(eyes[side].contains(places)[..., None], places, np.nan).astype(np.float32)
+        levels.append(resample(image, inside))
+    both = find_disparities(entry, levels[0], levels[1], replace(rig.ideal, camera=wide))
+    shift = np.array([wide.cx - rig.camera.cx, wide.cy - rig.camera.cy])
+    on_sensors = []
+    for side, found in zip(SIDES, both, strict=True):
+        ideal, other = (
+            eyes[side].ideal_pixels(eyes[side].pixel_grid()),
+            eyes["right" if side == "left" else "left"],
+        )
+        sign = 1.0 if side == "left" else -1.0
+        on_sensors.append(_with_partner(between_pixels(found, ideal + shift), ideal, other, sign))
+    return on_sensors[0], on_sensors[1]
 
 
-def widened(camera: PinholeCamera) -> PinholeCamera:
-    """The camera without its lens, with an image that holds all that this one shows; the camera without a lens."""
-    return camera if camera.lens is None else _around(camera.ideal, camera.ideal_pixels(camera.pixel_grid()))
+def widened(rig: StereoRig) -> PinholeCamera:
+    """The rig's ideal camera with an image that holds all that both cameras show."""
+    return rig.camera if rig.rectified else _widened(rig)
+
+
+@lru_cache(maxsize=4)
+def _widened(rig: StereoRig) -> PinholeCamera:
+    if rig.aligned:
+        return _around(rig.camera.ideal, rig.camera.ideal_pixels(rig.camera.pixel_grid()))
+    rims = []
+    for side in SIDES:
+        grid = rig.eye(side).pixel_grid()
+        some = grid[0], grid[-1], grid[:, 0], grid[:, -1], grid[::8, ::8].reshape(-1, 2)
+        rims.append(rig.eye(side).ideal_pixels(np.concatenate(some)))
+    return _around(rig.camera, np.concatenate(rims)[None])
+
+
+@lru_cache(maxsize=4)
+def own_depths(rig: StereoRig, side: Side) -> F32:
+    """(H, W) ``StereoRig.own_depth`` of all pixels of a camera."""
+    return rig.own_depth(side, rig.sensor(side).pixel_grid()).astype(np.float32)
+
+
+def body_depth(depth: F32, rig: StereoRig, side: Side) -> F32:
+    """Depth (H, W) along the body's z of depth along the camera's own axis."""
+    return depth if rig.aligned else depth / own_depths(rig, side)
 
 
 def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
@@ -254,7 +281,7 @@ def between_pixels(disparity: F32, places: FloatArray) -> F32:
     return np.where(inside, np.where(one, upper + t * (lower - upper), nearest), np.nan).astype(np.float32)
 
 
-def _with_partner(disparity: F32, ideal: FloatArray, camera: PinholeCamera, sign: float) -> F32:
+def _with_partner(disparity: F32, ideal: FloatArray, other: PinholeCamera | AlignedCamera, sign: float) -> F32:
     """The disparities whose other end the other camera shows."""
-    other = np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1)
-    return np.where(camera.contains(camera.lens_pixels(other)), disparity, np.float32(np.nan))
+    ends = np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1)
+    return np.where(other.contains(other.lens_pixels(ends)), disparity, np.float32(np.nan))

@@ -77,7 +77,9 @@ def test_equal_aligned_cameras_are_the_ideal_rig() -> None:
         (np.eye(3), (0, 0, -1), "along the line between"),
     ],
 )
-def test_impossible_extrinsics_are_refused(rotation: np.ndarray, translation: tuple, message: str) -> None:
+def test_impossible_extrinsics_are_refused(
+    rotation: np.ndarray, translation: tuple[float, ...], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         StereoRig.of_cameras(LEFT, RIGHT, rotation, translation)
 

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import Scanning
 from rsbench.vision.correction import correct_frame, correction_flow
 from rsbench.vision.epipolar_search import depth_from_motion
-from rsbench.vision.feature_matcher import with_lens
+from rsbench.vision.feature_matcher import of_sensors
 from rsbench.vision.fusion import Origin, SourceView, fuse
 from rsbench.vision.quality import psnr
 from rsbench.vision.reprojection import distort, optics_of
@@ -198,5 +199,5 @@ def test_disparities_lie_on_the_pixels_of_the_sensor(scene: Any, u8: Build, lens
 
 def test_no_match_is_none_behind_a_lens_too() -> None:
     camera = replace(PinholeCamera.centred(64, 48, 60.0), lens=Lens(model="brown-conrady", k1=-0.1))
-    found = with_lens(Correspondences(left=np.full((1, 4), 30.0)), camera)
+    found = of_sensors(Correspondences(left=np.full((1, 4), 30.0)), StereoRig(camera=camera, baseline=1.0))
     assert found.left.shape == (1, 4) and found.right.shape == (0, 4) and found.tracks.shape == (0, 8)

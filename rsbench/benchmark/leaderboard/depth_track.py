@@ -133,7 +133,7 @@ class DepthTrack(PictureTrack):
                 motion = _motion(work, chain)
                 shared, start = sum(work.spent.values()), time.perf_counter()
                 found = motion_disparities(chain.matcher, work.images, rig, work.problem.shutter, motion, (VIEW,))
-                depth = metres(found[VIEW], rig)
+                depth = metres(found[VIEW], rig, VIEW[0])
             else:
                 start = time.perf_counter()
                 pair = [work.images[each, frame] for each in SIDES]

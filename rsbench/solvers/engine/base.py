@@ -108,7 +108,7 @@ class SolverSpec:
     """Where it was published: paper and equation."""
     assumes: str
     """Its assumptions, in words."""
-    cameras: Literal["ideal", "lens", "any"] = "ideal"
+    cameras: Literal["ideal", "lens", "any", "rig"] = "ideal"
     """What it takes beside cameras without a lens that read rows from the top at the same times: a lens; or other
     scans and a late right camera too. It then has rays from ``camera.unproject`` and times from
     ``shutter.pixel_time`` alone. Of a global shutter it does not matter: matches come without the lens."""
