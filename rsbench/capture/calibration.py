@@ -93,6 +93,8 @@ def _stretching_shifts(rays: FloatArray, lens: Lens | None) -> FloatArray:
     if lens.model == "kannala-brandt":  # whose k1 is of the angle from the axis, not of its tangent
         radius = np.sqrt(square)
         radial = np.arctan(radius) ** 3 / np.where(radius > 0.0, radius, 1.0)
+    elif lens.model == "rational":
+        radial = square / lens.denominator(square)
     shifts = np.stack([radial * rays, distorted.xy], axis=-1)
     return np.asarray((inverse_2x2(distorted.jacobian) @ shifts).swapaxes(-1, -2))
 

@@ -22,6 +22,7 @@ from rsbench.capture.shutter_decision import as_global, examine_alone, known_of
 from rsbench.capture.two_frame_estimate import CERTAIN, Window, conclude, examine
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
@@ -91,8 +92,13 @@ def find_camera(
     Args:
         sigma: of the card; values with 0 are not estimated.
         given: as ``known_of`` takes it; with a readout ratio alone, rows are read from the top.
+
+    Raises:
+        RsbenchError: a deviation of k1 for a lens that has none.
     """
-    given = given or KnownInputs()
+    given, lens = given or KnownInputs(), rig.camera.lens
+    if sigma.k1 and lens is not None and lens.model == "double-sphere":
+        raise RsbenchError(f"k1_sigma = {sigma.k1}: a double-sphere lens has no k1; leave it out")
     if given.readout_ratio is not None and given.scanning is None:
         given = replace(given, scanning=Scanning())
     known = known_of(windows[0], rig, given)

@@ -5,8 +5,8 @@ Pixel coordinates are (x, y) and the centre of the top-left pixel is (0, 0), so 
 the sensor has it, distorted by the lens; "ideal" pixels are those of the same camera without it.
 
 A lens maps ideal coordinates, x / z and y / z of a point in the camera frame, to distorted ones; these times
-the focal length, plus the principal point, are pixels. Both lens models are OpenCV's, coefficient for
-coefficient.
+the focal length, plus the principal point, are pixels. The lens models are OpenCV's, coefficient for
+coefficient, but for the double sphere, which is that of its paper.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,13 +23,23 @@ from rsbench.core import arguments
 from rsbench.core.arguments import LARGEST_PX
 from rsbench.core.so3 import FloatArray
 
-LensModel = Literal["brown-conrady", "kannala-brandt"]
+LensModel = Literal["brown-conrady", "kannala-brandt", "rational", "double-sphere"]
+COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
+    "brown-conrady": ("k1", "k2", "p1", "p2", "k3"),
+    "kannala-brandt": ("k1", "k2", "k3", "k4"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "double-sphere": ("xi", "alpha"),
+}
+"""The coefficients of each model in the order of OpenCV's vectors, or of the paper."""
+_ALWAYS_IN_FILES = ("k1", "k2", "p1", "p2", "k3", "k4")
+"""Files list all of these for the first two models, whichever they have."""
 WIDEST = 1.5
 """Angle from the optical axis, rad, beyond which a fisheye shows nothing here: rays have z = 1."""
 _CONVERGED = 1e-14
 """Newton steps end when they are as short as this, relative to 1 + the radius: rounding."""
 _MOST_STEPS = 40
-_UNUSED = {"brown-conrady": ("k4",), "kannala-brandt": ("p1", "p2")}
+_ENTRIES = 4097
+"""Radii of the table in which Newton's method for a rational lens starts."""
 
 
 class Distorted(NamedTuple):
@@ -47,41 +57,78 @@ class Lens:
 
     ``brown-conrady``: D. Brown, Close-range camera calibration, 1971; OpenCV's k1, k2, p1, p2, k3.
     ``kannala-brandt``: J. Kannala, S. Brandt, PAMI 2006, eq. 6; OpenCV's fisheye k1 to k4.
+    ``rational``: OpenCV's k1, k2, p1, p2, k3, k4, k5, k6; the radial factor of ``brown-conrady`` over
+    1 + k4 r^2 + k5 r^4 + k6 r^6.
+    ``double-sphere``: V. Usenko, N. Demmel, D. Cremers, The double sphere camera model, 3DV 2018, eq. 40; its
+    focal length in the middle of the image is fx / (1 + xi).
 
     Raises:
-        ValueError: a coefficient that is not finite or that the model does not have.
+        ValueError: a coefficient that is not finite or that the model does not have, alpha outside 0 to 1, xi
+            of -1 or less.
     """
 
     model: LensModel
-    """``brown-conrady``: radial and tangential distortion of ordinary lenses; ``kannala-brandt``: fisheye
-    lenses."""
+    """``brown-conrady``: radial and tangential distortion of ordinary lenses; ``rational``: the same of wider
+    ones; ``kannala-brandt`` and ``double-sphere``: fisheye lenses."""
     k1: float = 0.0
     """First radial coefficient, as OpenCV has it."""
     k2: float = 0.0
     """Second radial coefficient."""
     p1: float = 0.0
-    """First tangential coefficient; of ``brown-conrady`` alone."""
+    """First tangential coefficient; of ``brown-conrady`` and ``rational``."""
     p2: float = 0.0
-    """Second tangential coefficient; of ``brown-conrady`` alone."""
+    """Second tangential coefficient; of ``brown-conrady`` and ``rational``."""
     k3: float = 0.0
     """Third radial coefficient."""
     k4: float = 0.0
-    """Fourth radial coefficient; of ``kannala-brandt`` alone."""
+    """Fourth radial coefficient of ``kannala-brandt``; of ``rational`` the first of the denominator."""
+    k5: float = 0.0
+    """Second coefficient of the denominator; of ``rational`` alone."""
+    k6: float = 0.0
+    """Third coefficient of the denominator; of ``rational`` alone."""
+    xi: float = 0.0
+    """Distance between the two spheres over their radius; of ``double-sphere`` alone."""
+    alpha: float = 0.0
+    """Place of the pinhole behind the second sphere, 0 to 1; of ``double-sphere`` alone."""
 
     def __post_init__(self) -> None:
         arguments.check_one_of("lens model", self.model, get_args(LensModel))
         for field in fields(self)[1:]:
             arguments.check_number(f"lens {field.name}", getattr(self, field.name))
         arguments.keep_plain(self)
-        for name in _UNUSED[self.model]:
-            if getattr(self, name) != 0.0:
-                raise ValueError(f"lens {name} = {getattr(self, name)}: {self.model} has no such coefficient")
+        for field in fields(self)[1:]:
+            if field.name not in COEFFICIENTS[self.model] and (value := getattr(self, field.name)) != 0.0:
+                raise ValueError(f"lens {field.name} = {value}: {self.model} has no such coefficient")
+        if not 0.0 <= self.alpha <= 1.0:
+            raise ValueError(f"lens alpha = {self.alpha}: must lie in [0, 1]")
+        if not self.xi > -1.0:
+            raise ValueError(f"lens xi = {self.xi}: must be above -1")
+
+    @property
+    def number(self) -> int:
+        """Number of the model in tables of compiled code: its place in ``COEFFICIENTS``."""
+        return list(COEFFICIENTS).index(self.model)
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """The coefficients that the model has, in the order of ``COEFFICIENTS``."""
+        return tuple(getattr(self, name) for name in COEFFICIENTS[self.model])
+
+    def record(self) -> dict[str, Any]:
+        """The lens as tables of cards and files have it: its model and its coefficients."""
+        first = self.model in ("brown-conrady", "kannala-brandt")
+        names = _ALWAYS_IN_FILES if first else COEFFICIENTS[self.model]
+        return {"model": self.model, **{name: getattr(self, name) for name in names}}
 
     @cached_property
     def reach(self) -> float:
-        """Ideal radius up to which the distorted radius grows; beyond it the polynomial folds back."""
+        """Ideal radius up to which the distorted radius grows; beyond it the image folds back."""
         if self.model == "brown-conrady":
             return math.sqrt(_first_root([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3]))
+        if self.model == "rational":
+            return self._rational_reach()
+        if self.model == "double-sphere":
+            return self._sphere_reach()
         slope = [1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3, 9.0 * self.k4]
         return math.tan(min(math.sqrt(_first_root(slope)), WIDEST))
 
@@ -90,14 +137,23 @@ class Lens:
         ideal = np.asarray(xy, dtype=np.float64)
         radius = np.hypot(ideal[..., 0], ideal[..., 1])
         known = np.where((radius < self.reach)[..., None], ideal, np.nan)
-        return self._brown(known) if self.model == "brown-conrady" else self._kannala(known)
+        models = {
+            "brown-conrady": self._brown,
+            "kannala-brandt": self._kannala,
+            "rational": self._rational,
+            "double-sphere": self._sphere,
+        }
+        return models[self.model](known)
 
     def undistort(self, xy: ArrayLike) -> FloatArray:
-        """Ideal coordinates (..., 2) of distorted ones (..., 2), by Newton's method; NaN where it finds none.
+        """Ideal coordinates (..., 2) of distorted ones (..., 2); NaN where there are none.
 
-        What comes back is within ``reach``, does not fold, and distorts to ``xy`` but for rounding.
+        What comes back is within ``reach``, does not fold, and distorts to ``xy`` but for rounding. The double
+        sphere has a closed form; the others are solved by Newton's method.
         """
         wanted = np.asarray(xy, dtype=np.float64)
+        if self.model == "double-sphere":
+            return self._from_spheres(wanted)
         flat = wanted.reshape(-1, 2)
         ideal = self._start(flat)
         done = np.zeros(len(flat), dtype=np.bool_)
@@ -115,8 +171,11 @@ class Lens:
         return np.where(good[:, None], ideal, np.nan).reshape(wanted.shape)
 
     def _start(self, distorted: FloatArray) -> FloatArray:
-        """Where Newton's method starts: at the same radius, within half of the reach."""
+        """Where Newton's method starts: at the same radius, within half of the reach; by table if rational."""
         radius = np.hypot(distorted[:, 0], distorted[:, 1])
+        if self.model == "rational":  # whose radii may bend either way
+            ideal, bent = self._radii
+            return distorted * (np.interp(radius, bent, ideal) / np.where(radius > 0.0, radius, 1.0))[:, None]
         most = 0.5 * self.reach
         return distorted * np.where(radius > most, most / np.where(radius > 0.0, radius, 1.0), 1.0)[:, None]
 
@@ -125,6 +184,31 @@ class Lens:
         s = x * x + y * y
         gain = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
         bend = 2.0 * (self.k1 + s * (2.0 * self.k2 + s * 3.0 * self.k3))
+        return self._tangential(x, y, s, gain, bend)
+
+    def _rational(self, ideal: FloatArray) -> Distorted:
+        x, y = ideal[..., 0], ideal[..., 1]
+        s = x * x + y * y
+        gain, bend, _ = self._quotient(s)
+        return self._tangential(x, y, s, gain, bend)
+
+    def denominator(self, s: FloatArray) -> FloatArray:
+        """Denominator (...) of the radial factor at squared ideal radii (...); of ``rational``."""
+        return 1.0 + s * (self.k4 + s * (self.k5 + s * self.k6))
+
+    def _quotient(self, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Radial factor of a rational lens by squared radii, twice its derivative, and the denominator."""
+        above, below = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3)), self.denominator(s)
+        above_slope = self.k1 + s * (2.0 * self.k2 + s * 3.0 * self.k3)
+        below_slope = self.k4 + s * (2.0 * self.k5 + s * 3.0 * self.k6)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain = above / below
+            return gain, 2.0 * (above_slope - gain * below_slope) / below, below
+
+    def _tangential(
+        self, x: FloatArray, y: FloatArray, s: FloatArray, gain: FloatArray, bend: FloatArray
+    ) -> Distorted:
+        """With a radial factor and twice its derivative by s = x^2 + y^2."""
         p1, p2 = self.p1, self.p2
         xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
         yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
@@ -147,6 +231,60 @@ class Lens:
         bend = np.where(central, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + s) - gain) / np.where(central, 1.0, s))
         J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
         return Distorted(ideal * gain[..., None], J)
+
+    def _rational_reach(self) -> float:
+        """Where the distorted radius ceases to grow, or is infinite: in a table that narrows to one entry."""
+        low, high = 0.0, math.tan(WIDEST)
+        for _ in range(5):
+            radius = np.linspace(low, high, _ENTRIES)
+            gain, bend, below = self._quotient(radius * radius)
+            with np.errstate(invalid="ignore"):
+                grows = (gain + bend * radius * radius > 0.0) & (below > 0.0)
+            if np.all(grows):
+                break
+            first = int(np.argmin(grows))
+            low, high = float(radius[first - 1]), float(radius[first])
+        return high
+
+    @cached_property
+    def _radii(self) -> tuple[FloatArray, FloatArray]:
+        """Ideal radii of a rational lens, and the distorted ones without tangential terms; both grow."""
+        ideal = np.linspace(0.0, self.reach, _ENTRIES)[:-1]
+        return ideal, ideal * self._quotient(ideal * ideal)[0]
+
+    def _sphere(self, ideal: FloatArray) -> Distorted:
+        x, y = ideal[..., 0], ideal[..., 1]
+        s, xi, alpha = x * x + y * y, self.xi, self.alpha
+        d1 = np.sqrt(s + 1.0)
+        w = xi * d1 + 1.0
+        d2 = np.sqrt(s + w * w)
+        gain = 1.0 / (alpha * d2 + (1.0 - alpha) * w)
+        bend = -gain * gain * (alpha * (1.0 + xi * w / d1) / d2 + (1.0 - alpha) * xi / d1)
+        J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
+        return Distorted(ideal * gain[..., None], J)
+
+    def _sphere_reach(self) -> float:
+        """Tangent of the angle at which the second projection folds (alpha > 1/2) or goes to infinity.
+
+        Both are at a cosine of -w from the centre of the second sphere, which stands at -xi on the axis.
+        """
+        low = self.alpha <= 0.5
+        w = self.alpha / (1.0 - self.alpha) if low else (1.0 - self.alpha) / self.alpha
+        square = 1.0 - self.xi**2 * (1.0 - w * w)
+        cosine = -self.xi * (1.0 - w * w) - w * math.sqrt(square) if square > 0.0 else -1.0
+        return math.tan(min(math.acos(max(cosine, -1.0)), WIDEST))
+
+    def _from_spheres(self, distorted: FloatArray) -> FloatArray:
+        """Usenko et al., eq. 46: closed form of ``undistort``."""
+        xi, alpha = self.xi, self.alpha
+        s = np.sum(distorted * distorted, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            z = (1.0 - alpha * alpha * s) / (alpha * np.sqrt(1.0 - (2.0 * alpha - 1.0) * s) + 1.0 - alpha)
+            scale = (z * xi + np.sqrt(z * z + (1.0 - xi * xi) * s)) / (z * z + s)
+            forward = scale * z - xi
+            ideal = distorted * (scale / np.where(forward > 0.0, forward, np.nan))[..., None]
+            seen = np.sum(ideal * ideal, axis=-1) < self.reach**2
+        return np.where(seen[..., None], ideal, np.nan)
 
 
 def _matrix(by_x: FloatArray, across: FloatArray, by_y: FloatArray) -> FloatArray:
@@ -219,8 +357,9 @@ class PinholeCamera:
         lost = np.isnan(self.unproject(pixels)[:, 0])
         if np.any(lost):
             x, y = pixels[lost][0]
+            form = "projection" if lens.model == "double-sphere" else "polynomial"
             raise ValueError(
-                f"camera lens: the {lens.model} polynomial folds inside the image, or leaves it: pixel "
+                f"camera lens: the {lens.model} {form} folds inside the image, or leaves it: pixel "
                 f"({x:g}, {y:g}) shows no ray in front of the camera; check the coefficients"
             )
 
@@ -297,6 +436,12 @@ class PinholeCamera:
             return np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2))
         by_distorted = inverse_2x2(self.lens.distort(self.unproject(p)[..., :2]).jacobian)
         return self._focal[:, None] * by_distorted / self._focal
+
+    @property
+    def central_focal(self) -> tuple[float, float]:
+        """Focal lengths in the middle of the image, px: fx and fy times the derivative of the lens there."""
+        gain = 1.0 if self.lens is None else float(self.lens.distort([0.0, 0.0]).jacobian[0, 0])
+        return gain * self.fx, gain * self.fy
 
     @property
     def _focal(self) -> FloatArray:

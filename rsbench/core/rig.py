@@ -320,7 +320,7 @@ def _ideal_camera(left: RigCamera, right: RigCamera) -> PinholeCamera:
     are exchanged.
     """
     pair = (left, right)
-    focal = float(np.mean([f for each in pair for f in (each.camera.fx, each.camera.fy)]))
+    focal = float(np.mean([f for each in pair for f in each.camera.central_focal]))
     turned = abs(left.R[1, 0]) > abs(left.R[0, 0])  # the body's x in the left camera: nearer to its y axis
     width, height = left.camera.width, left.camera.height
     width, height = (height, width) if turned else (width, height)

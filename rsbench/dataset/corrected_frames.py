@@ -236,7 +236,7 @@ def rig_record(
     return {
         "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
-        "lens": None if camera.lens is None else asdict(camera.lens),
+        "lens": None if camera.lens is None else camera.lens.record(),
         "scan": asdict(shutter_.scanning),
         "baseline": rig.baseline,
         "readout_ratio": shutter_.readout_ratio,

@@ -210,4 +210,6 @@ def says(data: bytes, content: dict[str, Any]) -> bool:
 def _record(card: DatasetCard) -> dict[str, Any]:
     """The complete card; without ``frames`` where there are two, as in the first version of the format."""
     own = asdict(card)
+    if card.camera.lens is not None:
+        own["camera"]["lens"] = card.camera.lens.record()
     return own if card.frames > len(FRAMES) else {key: value for key, value in own.items() if key != "frames"}

@@ -317,7 +317,7 @@ def sequence_manifest(
     camera = rig.camera
     fields = ("width", "height", "fx", "fy", "cx", "cy")
     readout_s = shutter.readout_ratio * frame_period_s
-    lens: dict[str, Any] = {} if camera.lens is None else {"lens": asdict(camera.lens)}
+    lens: dict[str, Any] = {} if camera.lens is None else {"lens": camera.lens.record()}
     count = {"frames": frames} if frames > len(FRAMES) else {}
     return {
         "format": FORMAT,

@@ -285,12 +285,13 @@ def _pose_table(geometry: Geometry, view: ImageView) -> _Table:
 
 
 def _intrinsics(camera: PinholeCamera) -> FloatArray:
-    """(14,): width, height, fx, fy, cx, cy; which lens, its coefficients and its reach."""
+    """(18,): width, height, fx, fy, cx, cy; which lens, its reach and its coefficients."""
     lens = camera.lens
-    own = [0.0] * 8
+    own = [0.0] * 12
     if lens is not None:
-        kind = 1.0 if lens.model == "brown-conrady" else 2.0
-        own = [kind, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.reach]
+        kind = 1.0 + lens.number
+        own = [kind, lens.reach, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4]
+        own += [lens.k5, lens.k6, lens.xi, lens.alpha]
     return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *own])
 
 
@@ -419,13 +420,20 @@ def _pixel(pose: FloatArray, camera: FloatArray, X: tuple[float, float, float]) 
 @compiled
 def _bent(camera: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Distorted coordinates. NumPy: ``Lens.distort``."""
-    k1, k2, p1, p2, k3, k4 = camera[7], camera[8], camera[9], camera[10], camera[11], camera[12]
+    k1, k2, p1, p2, k3, k4 = camera[8], camera[9], camera[10], camera[11], camera[12], camera[13]
     s = x * x + y * y
     r = math.sqrt(s)
-    if not r < camera[13]:
+    if not r < camera[7]:
         return math.nan, math.nan
-    if camera[6] == 1.0:
+    if camera[6] == 4.0:
+        xi, alpha = camera[16], camera[17]
+        w = xi * math.sqrt(s + 1.0) + 1.0
+        gain = 1.0 / (alpha * math.sqrt(s + w * w) + (1.0 - alpha) * w)
+        return x * gain, y * gain
+    if camera[6] != 2.0:
         gain = 1.0 + s * (k1 + s * (k2 + s * k3))
+        if camera[6] == 3.0:
+            gain /= 1.0 + s * (k4 + s * (camera[14] + s * camera[15]))
         return (
             x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
             y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,

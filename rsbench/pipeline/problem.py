@@ -125,7 +125,7 @@ def read_problem(path: str | Path) -> Problem:
 def problem_record(problem: Problem) -> dict[str, Any]:
     """A problem as JSON holds it: ``parse_problem`` reads it. Sets without a match are left out, but not all."""
     camera = problem.rig.camera
-    lens: dict[str, Any] = {} if camera.lens is None else {"lens": asdict(camera.lens)}
+    lens: dict[str, Any] = {} if camera.lens is None else {"lens": camera.lens.record()}
     sets = {key: getattr(problem.correspondences, key).tolist() for key in COLUMNS}
     return {
         "name": problem.name,

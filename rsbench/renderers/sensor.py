@@ -13,6 +13,7 @@ sample: no ray is interpolated. It takes the steps that the lens needs, which th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from functools import cache, lru_cache
 from typing import Any
 
@@ -28,7 +29,6 @@ _EXACT_PX = 1e-8
 _MOST_STEPS = 12
 _TRIED = 65
 """Pixels along each side of the image that the host tries, the outermost among them."""
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 
 
 class LensRays:
@@ -41,7 +41,7 @@ class LensRays:
         self.lens, self.width, self.steps = lens, dr.opaque(mi.UInt32, camera.width), chord_steps(camera, lens)
         self._centre = [dr.opaque(mi.Float64, value) for value in (camera.cx, camera.cy)]
         self._per_pixel = [dr.opaque(mi.Float64, 1.0 / value) for value in (camera.fx, camera.fy)]
-        self._k = {name: dr.opaque(mi.Float64, getattr(lens, name)) for name in _COEFFICIENTS}
+        self._k = {each.name: dr.opaque(mi.Float64, getattr(lens, each.name)) for each in fields(lens)[1:]}
         self._most = dr.opaque(mi.Float, camera.width - 1.0), dr.opaque(mi.Float, camera.height - 1.0)
         centres = camera.unproject(camera.pixel_grid())[..., :2].reshape(-1, 2)
         if lens.model == "kannala-brandt":
@@ -55,6 +55,8 @@ class LensRays:
         import drjit as dr
         import mitsuba as mi
 
+        if self.lens.model == "double-sphere":
+            return ()
         column, row = (
             mi.UInt32(dr.clip(dr.floor(v + 0.5), 0.0, most)) for v, most in zip((x, y), self._most, strict=True)
         )
@@ -70,8 +72,8 @@ class LensRays:
         """Ideal coordinates, in single precision, of pixel coordinates (x, y) inside a pixel."""
         import mitsuba as mi
 
-        distorted = self._distorted(x, y)
-        found = (self._brown if self.lens.model == "brown-conrady" else self._kannala)(*distorted, *pixel)
+        solve = {"kannala-brandt": self._kannala, "double-sphere": self._spheres}.get(self.lens.model, self._brown)
+        found = solve(*self._distorted(x, y), *pixel)
         return mi.Float(found[0]), mi.Float(found[1])
 
     def _distorted(self, x: Any, y: Any) -> list[Any]:
@@ -81,39 +83,56 @@ class LensRays:
         return [(mi.Float64(value) - centre) * rate for value, centre, rate in rates]
 
     def _derivative(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Symmetric derivative of Brown's distortion: of x by x, of x by y, of y by y."""
-        k1, k2, p1, p2, k3, _ = self._k.values()
+        """Symmetric derivative of the distortion: of x by x, of x by y, of y by y."""
+        k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self._k.values()
         s = x * x + y * y
         gain = 1 + s * (k1 + s * (k2 + s * k3))
         bend = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
+        if self.lens.model == "rational":
+            below = 1 + s * (k4 + s * (k5 + s * k6))
+            gain = gain / below
+            bend = (bend - 2 * gain * (k4 + s * (2 * k5 + s * 3 * k6))) / below
         across = bend * x * y + 2 * (p1 * x + p2 * y)
         return gain + bend * x * x + 2 * p1 * y + 6 * p2 * x, across, gain + bend * y * y + 6 * p1 * y + 2 * p2 * x
 
     def _brown(
         self, xd: Any, yd: Any, x0: Any, y0: Any, xd0: Any, yd0: Any, xx: Any, xy: Any, yy: Any
     ) -> tuple[Any, Any]:
-        k1, k2, p1, p2, k3, _ = self._k.values()
+        k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self._k.values()
         off_x, off_y = xd - xd0, yd - yd0
         x, y = x0 + xx * off_x + xy * off_y, y0 + xy * off_x + yy * off_y
         for _ in range(self.steps):
             square_x, square_y, twice = x * x, y * y, 2 * x * y
             s = square_x + square_y
             gain = 1 + s * (k1 + s * (k2 + s * k3))
+            if self.lens.model == "rational":
+                gain = gain / (1 + s * (k4 + s * (k5 + s * k6)))
             off_x = xd - (x * gain + p1 * twice + p2 * (s + 2 * square_x))
             off_y = yd - (y * gain + p1 * (s + 2 * square_y) + p2 * twice)
             x, y = x + xx * off_x + xy * off_y, y + xy * off_x + yy * off_y
         return x, y
 
+    def _spheres(self, xd: Any, yd: Any) -> tuple[Any, Any]:
+        """Closed form of the double sphere. NumPy: ``Lens.undistort``."""
+        import drjit as dr
+
+        *_, xi, alpha = self._k.values()
+        s = xd * xd + yd * yd
+        z = (1 - alpha * alpha * s) / (alpha * dr.sqrt(1 - (2 * alpha - 1) * s) + 1 - alpha)
+        scale = (z * xi + dr.sqrt(z * z + (1 - xi * xi) * s)) / (z * z + s)
+        gain = scale / (scale * z - xi)
+        return xd * gain, yd * gain
+
     def _slope(self, angle: Any) -> Any:
         """Derivative of Kannala's radius by the angle."""
-        k1, k2, _, _, k3, k4 = self._k.values()
+        k1, k2, _, _, k3, k4, *_ = self._k.values()
         a = angle * angle
         return 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
 
     def _kannala(self, xd: Any, yd: Any, angle0: Any, rate: Any, radius0: Any, tangent0: Any) -> tuple[Any, Any]:
         import drjit as dr
 
-        k1, k2, _, _, k3, k4 = self._k.values()
+        k1, k2, _, _, k3, k4, *_ = self._k.values()
         radius = dr.sqrt(xd * xd + yd * yd)
         angle = angle0 + rate * (radius - radius0)
         for _ in range(self.steps):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
 from rsbench.components.motion_kernels import Vector, apply
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 
@@ -35,7 +35,8 @@ class Optics(NamedTuple):
     ideal: Table
     """(H, W, 2) px at which the camera without its lens sees what a pixel sees; None where there is no lens."""
     lens: Table
-    """(12,) fx, fy, cx, cy, reach, whether a fisheye, k1, k2, p1, p2, k3, k4; None where there is no lens."""
+    """(14,) fx, fy, cx, cy, reach, number of the model, k1, k2, p1, p2, k3, k4, k5, k6, or xi and alpha first of
+    these; None where there is no lens."""
     columns: bool
     """Whether lines, each read at one time, are columns."""
 
@@ -63,10 +64,16 @@ def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
     lens = camera.lens
     if lens is None:
         return Optics(None, None, columns)
-    fisheye = float(lens.model == "kannala-brandt")
-    coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4)
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, lens.reach, fisheye, *coefficients)
-    return Optics(_ideal_pixels(camera), np.array(numbers), columns)
+    return Optics(_ideal_pixels(camera), lens_table(camera, lens), columns)
+
+
+def lens_table(camera: PinholeCamera, lens: Lens) -> FloatArray:
+    """(14,) the numbers of ``Optics.lens``."""
+    coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
+    if lens.model == "double-sphere":
+        coefficients = (lens.xi, lens.alpha, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, lens.reach, float(lens.number))
+    return np.array([*numbers, *coefficients])
 
 
 @lru_cache(maxsize=4)
@@ -111,7 +118,12 @@ def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     if not s < lens[4] * lens[4]:  # NaN included
         return np.nan, np.nan
     k1, k2, p1, p2, k3, k4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
-    if lens[5] > 0.0:
+    if lens[5] == 3.0:
+        xi, alpha = k1, k2
+        w = xi * np.sqrt(s + 1.0) + 1.0
+        gain = 1.0 / (alpha * np.sqrt(s + w * w) + (1.0 - alpha) * w)
+        xd, yd = x * gain, y * gain
+    elif lens[5] == 1.0:
         r = np.sqrt(s)
         angle = np.arctan(r)
         a = angle * angle
@@ -121,6 +133,8 @@ def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
         xd, yd = x * gain, y * gain
     else:
         gain = 1.0 + s * (k1 + s * (k2 + s * k3))
+        if lens[5] == 2.0:
+            gain /= 1.0 + s * (k4 + s * (lens[12] + s * lens[13]))
         xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
         yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
     return xd * lens[0] + lens[2], yd * lens[1] + lens[3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from rsbench.capture.calibration import (
     LENS,
     NO_ERRORS,
     OFFSET,
+    RADIAL,
     ROWS,
     TERMS,
     RefusedFramesError,
@@ -63,6 +66,22 @@ def test_lens_terms_are_those_of_cameras() -> None:
     seen = RIG.camera.unproject(camera.project(np.column_stack([v, np.ones(40)])))[:, :2]
     expected = np.einsum("ncx,c->nx", ray_shifts(v, "right", 700.0)[:, LENS], [k1, p2, p1])
     np.testing.assert_allclose(seen - v, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(model="brown-conrady", k1=-0.2, k2=0.03, p1=0.001),
+        Lens(model="kannala-brandt", k1=-0.03, k2=0.01),
+        Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, k3=0.001, k4=1.25, k5=0.22, k6=0.006),
+    ],
+)
+def test_the_radial_term_behind_a_lens_is_its_own_first_coefficient(lens: Lens) -> None:
+    v, step = 0.7 * rays(), 1e-6
+    ends = [replace(lens, k1=lens.k1 + change).undistort(lens.distort(v).xy) for change in (-step, step)]
+    found = ray_shifts(v, "left", 700.0, lens)[:, RADIAL]
+    # A larger k1 at the same pixel is a smaller ray; the shift is that by which measured rays are too large.
+    np.testing.assert_allclose(found, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-8)
 
 
 def wrong(matches: Correspondences) -> tuple[Correspondences, tuple[float, ...]]:

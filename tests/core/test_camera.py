@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.camera import WIDEST, Lens, PinholeCamera
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=510.0, cx=310.0, cy=250.0)
 
@@ -71,28 +71,86 @@ PLAIN = PinholeCamera(width=640, height=480, fx=420.0, fy=430.0, cx=310.0, cy=25
 PHONE = Lens(model="brown-conrady", k1=0.12, k2=-0.35, p1=0.0011, p2=-0.0007, k3=0.28)
 ACTION = Lens(model="brown-conrady", k1=-0.26, k2=0.05, p1=0.0004, p2=0.0002, k3=-0.003)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.02, k2=0.006, k3=-0.004, k4=0.0006)
-LENSES = [PHONE, ACTION, FISHEYE]
-IDS = ["phone", "action", "fisheye"]
+# Figures of a depth camera, and of a 100 degree lens, whose radii bend both ways.
+DEPTH = Lens(model="rational", k1=0.6, k2=-2.6, p1=0.0007, p2=-0.0003, k3=1.5, k4=0.48, k5=-2.4, k6=1.43)
+WIDE = Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006)
+SPHERES = Lens(model="double-sphere", xi=-0.18, alpha=0.59)
+BALL = Lens(model="double-sphere", xi=0.4, alpha=0.3)
+LENSES = [PHONE, ACTION, FISHEYE, DEPTH, WIDE, SPHERES, BALL]
+IDS = ["phone", "action", "fisheye", "depth", "wide", "spheres", "ball"]
 
 
 def _opencv(lens: Lens, X: np.ndarray) -> np.ndarray:
     """OpenCV's pixels of points (n, 3)."""
     still = np.zeros(3)
-    if lens.model == "brown-conrady":
-        k = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
-        return cv2.projectPoints(X[:, None], still, still, PLAIN.K, k)[0][:, 0]
-    k = np.array([lens.k1, lens.k2, lens.k3, lens.k4])
-    return cv2.fisheye.projectPoints(X[:, None], still, still, PLAIN.K, k)[0][:, 0]
+    if lens.model == "double-sphere":
+        return _two_spheres(lens, X)
+    k = np.array(lens.coefficients)
+    if lens.model == "kannala-brandt":
+        return cv2.fisheye.projectPoints(X[:, None], still, still, PLAIN.K, k)[0][:, 0]
+    return cv2.projectPoints(X[:, None], still, still, PLAIN.K, k)[0][:, 0]
+
+
+def _two_spheres(lens: Lens, X: np.ndarray) -> np.ndarray:
+    """The construction, angle by angle: onto a unit sphere, onto a second one whose centre is at -xi, and through
+    a pinhole alpha / (1 - alpha) behind that on a plane scaled by 1 / (1 - alpha)."""
+    angle = np.arctan2(np.hypot(X[:, 0], X[:, 1]), X[:, 2])
+    second = np.arctan2(np.sin(angle), np.cos(angle) + lens.xi)
+    radius = np.sin(second) / (lens.alpha + (1.0 - lens.alpha) * np.cos(second))
+    around = np.arctan2(X[:, 1], X[:, 0])
+    xy = radius[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
+    return xy * (PLAIN.fx, PLAIN.fy) + (PLAIN.cx, PLAIN.cy)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=IDS)
-def test_pixels_are_opencvs(lens: Lens) -> None:
+def test_pixels_are_opencvs_or_the_papers(lens: Lens) -> None:
     camera = replace(PLAIN, lens=lens)
     pixels = np.random.default_rng(0).uniform([-0.5, -0.5], [639.5, 479.5], size=(500, 2))
     X = camera.unproject(pixels) * np.random.default_rng(1).uniform(0.1, 50, size=(500, 1))
     # Two implementations of polynomials of order 9 in numbers near 1, times 420 px.
     np.testing.assert_allclose(_opencv(lens, X), pixels, rtol=0, atol=1e-10)
     np.testing.assert_allclose(camera.project(X), pixels, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("brown", [PHONE, ACTION])
+def test_a_rational_lens_without_a_denominator_is_brown_and_conradys(brown: Lens) -> None:
+    xy = np.random.default_rng(3).uniform(-0.7, 0.7, (200, 2))
+    rational = Lens(model="rational", **{name: getattr(brown, name) for name in ("k1", "k2", "p1", "p2", "k3")})
+    assert rational.reach == pytest.approx(min(brown.reach, np.tan(WIDEST)), rel=1e-12)
+    for found, expected in zip(rational.distort(xy), brown.distort(xy), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+
+
+@settings(max_examples=40)
+@given(st.floats(-0.9, 1.5), st.floats(0.0, 1.0), st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=2))
+def test_two_spheres_are_inverted_up_to_where_they_fold(xi: float, alpha: float, direction: list[float]) -> None:
+    lens = Lens(model="double-sphere", xi=xi, alpha=alpha)
+    # The distorted radius grows with the angle up to the reach, and no further if that is nearer than WIDEST.
+    at = np.linspace(0.0, np.arctan(lens.reach) - 1e-6, 2001)
+    X = np.stack([np.sin(at), 0.0 * at, np.cos(at)], axis=-1)
+    assert np.all(np.diff(_two_spheres(lens, X)[:, 0]) > 0.0)
+    assert np.all(np.isfinite(lens.distort(X[:, :2] / X[:, 2:]).xy))
+    if lens.reach < 0.999 * np.tan(WIDEST):
+        after = np.arctan(lens.reach) + np.array([1e-4, 1.1e-4])
+        ends = _two_spheres(lens, np.stack([np.sin(after), 0.0 * after, np.cos(after)], axis=-1))[:, 0]
+        assert ends[1] < ends[0] or ends[0] < PLAIN.cx or abs(ends[0]) > 1e5
+    ideal = np.array(direction) * min(1.0, 0.3 * lens.reach)
+    np.testing.assert_allclose(lens.undistort(lens.distort(ideal).xy), ideal, rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=40)
+@given(
+    st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6), st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=2)
+)
+def test_a_rational_lens_is_inverted_up_to_where_it_folds(k: list[float], direction: list[float]) -> None:
+    lens = Lens(model="rational", **dict(zip(("k1", "k2", "k3", "k4", "k5", "k6"), k, strict=True)))
+    at = np.linspace(0.0, min(lens.reach, 20.0), 4001)[:-1]
+    seen = lens.distort(np.stack([at, 0.0 * at], axis=-1)).xy[:, 0]
+    assert np.all(np.diff(seen) > -1e-12 * np.max(np.abs(seen)))
+    ideal = 1.3 * np.array(direction) * min(lens.reach, 5.0)
+    found, J = lens.distort(ideal)
+    if np.linalg.det(J) > 1e-3:
+        np.testing.assert_allclose(lens.undistort(found), ideal, rtol=1e-9, atol=1e-11)
 
 
 @settings(max_examples=40)
@@ -143,8 +201,10 @@ def test_the_middle_of_a_lens_is_ideal() -> None:
     near = np.array([[0.0, 0.0], [1e-9, 0.0], [3e-7, -2e-7], [1e-5, 1e-5]])
     for lens in LENSES:
         found, J = lens.distort(near)
-        np.testing.assert_allclose(found, near, rtol=1e-5, atol=1e-11)
-        np.testing.assert_allclose(J, np.broadcast_to(np.eye(2), J.shape), atol=3e-4)
+        focal = 1.0 / (1.0 + lens.xi)
+        assert replace(PLAIN, lens=lens).central_focal == (focal * PLAIN.fx, focal * PLAIN.fy)
+        np.testing.assert_allclose(found, focal * near, rtol=1e-5, atol=1e-11)
+        np.testing.assert_allclose(J, np.broadcast_to(focal * np.eye(2), J.shape), atol=3e-4)
         np.testing.assert_allclose(lens.undistort(found), near, rtol=1e-12, atol=1e-20)
 
 
@@ -179,6 +239,10 @@ def test_behind_a_fisheye_there_is_no_pixel() -> None:
         ({"model": "pinhole"}, "lens model = 'pinhole'"),
         ({"model": "brown-conrady", "k4": 0.1}, "k4 = 0.1: brown-conrady has no"),
         ({"model": "kannala-brandt", "p1": 0.1}, "p1 = 0.1: kannala-brandt has no"),
+        ({"model": "brown-conrady", "k5": 0.1}, "k5 = 0.1: brown-conrady has no"),
+        ({"model": "double-sphere", "k1": 0.1}, "k1 = 0.1: double-sphere has no"),
+        ({"model": "double-sphere", "xi": -1.0, "alpha": 0.5}, "xi = -1.0: must be above -1"),
+        ({"model": "double-sphere", "alpha": 1.5}, "alpha = 1.5: must lie in"),
         ({"model": "brown-conrady", "k1": float("nan")}, "k1 = nan: must be a number that is finite"),
     ],
 )

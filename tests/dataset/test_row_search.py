@@ -24,6 +24,8 @@ LENSES = (
     None,
     Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.001, p2=-0.002),
     Lens(model="kannala-brandt", k1=-0.03, k2=0.01),
+    Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006),
+    Lens(model="double-sphere", xi=-0.18, alpha=0.59),
 )
 MODELS = (LinearMotion, TwistMotion, AcceleratedMotion, lambda w, d: SplineMotion(w, d, preset="drone", seed=3))
 NEAR_PX = 5e-6

@@ -127,11 +127,15 @@ def test_pose_table_holds_the_inverse_pose(row_poses: Any) -> None:
 
 BARREL = Lens(model="brown-conrady", k1=-0.28, k2=0.07, p1=0.002, p2=-0.001, k3=0.004)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.04, k2=0.012, k3=-0.003, k4=0.0005)
+RATIONAL = Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006)
+SPHERES = Lens(model="double-sphere", xi=-0.18, alpha=0.59)
 LENS_CAMERA = PinholeCamera.centred(30, 24, 20.0)
 
 
 @pytest.mark.parametrize("shrunk", [1, 16])
-@pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["barrel", "fisheye"])
+@pytest.mark.parametrize(
+    "lens", [BARREL, FISHEYE, RATIONAL, SPHERES], ids=["barrel", "fisheye", "rational", "spheres"]
+)
 def test_rays_at_every_sample_are_the_host_s(lens: Lens, shrunk: int) -> None:
     """In a small camera a sample is far from its pixel's centre: many steps are needed."""
     start_backend()

@@ -26,6 +26,8 @@ LENSES = (
     None,
     Lens(model="brown-conrady", k1=-0.25, k2=0.06, p1=0.004, p2=-0.003),
     Lens(model="kannala-brandt", k1=-0.06, k2=0.01),
+    Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006),
+    Lens(model="double-sphere", xi=-0.18, alpha=0.59),
 )
 PLANE = np.array([0.03, 0.12, 0.2])
 """n / c of n . X = c: the inverse depth of a ray (x, y, 1) is their product."""

@@ -30,10 +30,14 @@ GEOMETRY_PX = 0.01
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.002, p2=-0.001)
 CUSHION = Lens(model="brown-conrady", k1=0.15, k3=0.1)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.03, k2=0.01, k4=0.002)
+RATIONAL = Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006)
+SPHERES = Lens(model="double-sphere", xi=-0.18, alpha=0.59)
 Build = Callable[..., Any]
 CASES: dict[str, tuple[Lens | None, Scanning]] = {
     "barrel": (BARREL, Scanning()),
     "fisheye": (FISHEYE, Scanning()),
+    "rational": (RATIONAL, Scanning()),
+    "spheres": (SPHERES, Scanning()),
     "bottom": (None, Scanning(scan="bottom")),
     "barrel, bottom": (BARREL, Scanning(scan="bottom")),
     "columns": (None, Scanning(scan="left")),
@@ -66,14 +70,14 @@ def _smooth(depth: np.ndarray) -> np.ndarray:
 
 
 @settings(max_examples=60)
-@given(st.sampled_from([BARREL, CUSHION, FISHEYE]), st.floats(-200, 400), st.floats(-200, 400))
+@given(st.sampled_from([BARREL, CUSHION, FISHEYE, RATIONAL, SPHERES]), st.floats(-200, 400), st.floats(-200, 400))
 def test_the_compiled_lens_is_the_one_of_the_camera(lens: Lens, x: float, y: float) -> None:
     camera = PinholeCamera(width=200, height=160, fx=260.0, fy=250.0, cx=97.0, cy=81.0, lens=lens)
     numbers, expected = optics_of(camera).lens, camera.lens_pixels(np.array([x, y]))
     assert numbers is not None
     np.testing.assert_allclose(np.array(distort(numbers, x, y)), expected, atol=1e-9)
     centre = np.array(distort(numbers, 97.0 + 1e-7, 81.0))
-    np.testing.assert_allclose(centre, [97.0 + 1e-7, 81.0], atol=1e-12)
+    np.testing.assert_allclose(centre, [97.0 + 1e-7 / (1.0 + lens.xi), 81.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
