@@ -372,6 +372,6 @@ def test_a_lens_that_folds_is_one_line_with_the_field() -> None:
     ) as error:
         parse_problem(json.dumps(data), "p.json")
     assert "\n" not in str(error.value)
-    data["camera"]["lens"] = {"model": "brown-conrady", "k5": 0.1}
-    with pytest.raises(RsbenchError, match=r"unknown key 'camera.lens.k5'"):
+    data["camera"]["lens"] = {"model": "brown-conrady", "k7": 0.1}
+    with pytest.raises(RsbenchError, match=r"unknown key 'camera.lens.k7'"):
         parse_problem(json.dumps(data), "p.json")
