@@ -18,6 +18,7 @@ from foreign_rig import NAMES, SIDES, Camera, Rig
 from foreign_world import Image, read_photographs
 from numpy.typing import NDArray
 
+import rsbench
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.rig import StereoRig
@@ -61,11 +62,20 @@ def ours(rig: Rig) -> tuple[StereoRig, RollingShutter]:
 @cache
 def case(row: str, seed: int = 0) -> Seen:
     """A row and seed, as ``foreign_frames.py`` writes them."""
-    drawn, rng = frames.draw_case(row, seed)
+    return seen(*frames.draw_case(row, seed))
+
+
+def seen(drawn: frames.Case, rng: np.random.Generator) -> Seen:
+    """What both cameras see of a world that the generator makes."""
     traced = frames.trace_case(drawn, rng, _photographs())
     views = [(side, frame) for frame in (0, 1) for side in SIDES]
     rolling, still = ([frames.grey(images[view]) for view in views] for images in (traced.rolling, traced.still))
     return Seen(rolling, still, *ours(drawn.rig), LinearMotion(*motion.between(drawn.law, 0.0, 1.0)))
+
+
+def corrected(images: list[NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter) -> Any:
+    """What ``rsbench.correct`` makes of them where the shutter and the law are given."""
+    return rsbench.correct(images, rig, shutter.readout_ratio, motion_model="linear")
 
 
 @cache

@@ -265,19 +265,21 @@ RIGS = {
 """Rigs as calibrations give them. A seed has the same world, motion and noise for all of them."""
 
 
-def _seen_by(rig: Rig) -> Callable[[np.random.Generator], Case]:
-    """The linear law of 2 deg and 0.25 m."""
+def usual_law(rng: np.random.Generator, speed: float = 1.0) -> motion.Linear:
+    """The linear law of 2 deg and 0.25 m, in axes in which the ground lies below, so many times as fast."""
+    w, d = _vectors(rng, 2.0, (0.25, 0.25))
+    return motion.Linear(speed * w, speed * d)
+
+
+def usual_case(law: motion.Linear, rig: Rig) -> Case:
+    """What a rig sees of it."""
     upright = np.rint(rig.body_from_left())  # of a vertical rig a quarter turn
     focal = 1010.0 if rig.right.width > 640 else 520.0
-
-    def case(rng: np.random.Generator) -> Case:
-        law = motion.Linear(*(upright @ vector for vector in _vectors(rng, 2.0, (0.25, 0.25))))
-        return Case(law=law, rig=rig, model="linear", noise=1.5, focal=focal, upright=upright)
-
-    return case
+    law = motion.Linear(upright @ law.w, upright @ law.d)
+    return Case(law=law, rig=rig, model="linear", noise=1.5, focal=focal, upright=upright)
 
 
-ROWS |= {name: _seen_by(rig) for name, rig in RIGS.items()}
+ROWS |= {name: lambda rng, rig=rig: usual_case(usual_law(rng), rig) for name, rig in RIGS.items()}
 
 
 def draw_case(row: str, seed: int) -> tuple[Case, np.random.Generator]:

@@ -92,15 +92,15 @@ def rays(camera: Camera, samples: int) -> Rays:
     if not any(camera.coefficients):
         return Rays(x.astype(np.float32), y.astype(np.float32))
     undistort = _undistort_brown if camera.lens == BROWN else _undistort_kannala
-    x, y = undistort(*np.broadcast_arrays(x, y), _padded(camera))
+    x, y = undistort(*np.broadcast_arrays(x, y), padded(camera))
     (x_by_row, x_by_column), (y_by_row, y_by_column) = np.gradient(x), np.gradient(y)
     area = np.abs(x_by_column * y_by_row - x_by_row * y_by_column) * camera.fx * camera.fy * samples**2
     blur = 0.5 * np.log2(np.maximum(area, 1e-12))
     return Rays(x.astype(np.float32), y.astype(np.float32), blur.astype(np.float32))
 
 
-def _padded(camera: Camera) -> Array:
-    """All coefficients of the lens."""
+def padded(camera: Camera) -> Array:
+    """All coefficients of the lens, in the order of ``NAMES``."""
     return np.array([*camera.coefficients, *[0.0] * (len(NAMES[camera.lens]) - len(camera.coefficients))])
 
 
@@ -226,7 +226,7 @@ def _reading(camera: Camera) -> str:
 
 
 def _intrinsics(c: Camera) -> str:
-    named = ", ".join(f"{name} = {value}" for name, value in zip(NAMES[c.lens], _padded(c), strict=True) if value)
+    named = ", ".join(f"{name} = {value}" for name, value in zip(NAMES[c.lens], padded(c), strict=True) if value)
     lens = f'lens = {{ model = "{c.lens}", {named} }}\n' if named else ""
     return f"fx = {c.fx}\nfy = {c.fy}\ncx = {c.centre[0]}\ncy = {c.centre[1]}\n{lens}"
 
@@ -240,8 +240,8 @@ def camchain(rig: Rig) -> str:
     text = ""
     for number, side in enumerate(SIDES):
         c = rig.camera(side)
-        model, k = ("radtan", _padded(c)[:4]) if c.lens == BROWN else ("equidistant", _padded(c))
-        assert c.lens == KANNALA or not _padded(c)[4], "Kalibr has no k3"
+        model, k = ("radtan", padded(c)[:4]) if c.lens == BROWN else ("equidistant", padded(c))
+        assert c.lens == KANNALA or not padded(c)[4], "Kalibr has no k3"
         text += f"cam{number}:\n"
         if side == "right":
             matrix = np.vstack([np.column_stack([rig.R, rig.t]), [0.0, 0.0, 0.0, 1.0]])

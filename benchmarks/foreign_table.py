@@ -1,10 +1,12 @@
 """What ``rsbench correct`` makes of frames that other code traced: ``foreign_frames.py``.
 
 Each case is corrected twice: told everything (readout ratio, scans, and the law of motion where rsbench knows it),
-and told nothing but the cameras. Frames are compared with the traced global-shutter ones, on the pixels that the
+and told nothing but the cameras. Those of ``RIGS`` are corrected with rig.toml, with Kalibr's file, and rectified
+as ``rectify_study.py`` does. Frames are compared with the traced global-shutter ones, on the pixels that the
 correction claims (mask above 0); the gain is over the uncorrected frames on the same pixels.
 
     python benchmarks/foreign_table.py --data data/foreign --seeds 5 --rows twist lens
+    python benchmarks/foreign_table.py --data data/foreign --seeds 5 --rows ideal printed --ways told rectified
 
 Nothing is rendered or corrected twice; with --again, corrections are, as after a change of rsbench.
 """
@@ -24,16 +26,22 @@ from typing import Any
 
 import cv2
 import numpy as np
-from foreign_frames import ROWS, SIDES, picture, write_case
-from foreign_motion import Array, matrices
+from foreign_frames import RIGS, ROWS, grey, picture, write_case
+from foreign_motion import Array
+from foreign_rig import SIDES, short_card
 from foreign_world import read_photographs
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
+from rectify_study import errors, psnr, rectified
 
 _NAN = float("nan")
 _LIMIT = 3.0
 """Deviations that a found readout ratio may err by."""
 _LONGEST = 3600.0
 """Seconds of a command."""
+WAYS = {"told": "all", "untold": "nothing", "kalibr": "Kalibr's file", "rectified": "all, rectified"}
+"""What the command gets."""
+LIMITS = {"e_R": 0.01, "e_T": 0.05, "worst e_T": 0.2, "dB": -0.5}
+"""Of the rows of rigs: degrees, medians but for one, and PSNR over that of the ideal rig with the same seed."""
 HEAD = ("case", "told", "ratio", "sigma", "error / sigma", "e_R (deg)", "e_T (deg)", "PSNR", "gain", "s", "note")
 
 
@@ -43,7 +51,7 @@ class Outcome:
 
     row: str
     seed: int
-    told: bool
+    way: str
     frames: int
     message: str = ""
     """Why it failed, or its notes."""
@@ -68,34 +76,48 @@ class Outcome:
         return abs(self.ratio - self.true_ratio) / self.sigma if self.sigma > 0.0 else _NAN
 
 
-def run_case(folder: Path, told: bool, again: bool, model: str | None = None) -> tuple[int, str, float]:
+def run_case(folder: Path, way: str, again: bool, model: str | None = None) -> tuple[int, str, float]:
     """Correct a case; returns the exit code, what was said and the seconds.
 
     Args:
         folder: of the case.
-        told: whether the command is told what the shutter does, and the law where rsbench knows it.
+        way: of ``WAYS``; ``told`` and those of rigs give the law too where rsbench knows it.
         again: even where it has been done.
         model: motion model where the law is not told.
     """
-    name = "told" if told else "untold"
-    record = folder / f"{name}.json"
+    record = folder / f"{way}.json"
     if record.is_file() and not again:
         code, message, seconds = json.loads(record.read_text("utf-8"))
         return int(code), str(message), float(seconds)
     truth = json.loads((folder / "truth.json").read_text("utf-8"))
+    source = _resample(folder, truth["row"]) if way == "rectified" else folder
     if truth["frames"] == 2:
-        frames = [str(picture(folder, 2, side, frame)) for frame in (0, 1) for side in SIDES]
+        frames = [str(picture(source, 2, side, frame)) for frame in (0, 1) for side in SIDES]
     else:
         frames = ["--left", str(folder / "left"), "--right", str(folder / "right")]
-    shutil.rmtree(folder / f"corrected-{name}", ignore_errors=True)
-    arguments = [*frames, "--rig", str(folder / f"{name}.toml"), "--out", str(folder / f"corrected-{name}")]
-    law = truth["motion_model"] if told else None
+    shutil.rmtree(folder / f"corrected-{way}", ignore_errors=True)
+    card = {"kalibr": "camchain.yaml", "untold": "untold.toml"}.get(way, "told.toml")
+    arguments = [*frames, "--rig", str(source / card), "--out", str(folder / f"corrected-{way}")]
+    law = None if way == "untold" else truth["motion_model"]
     code, message, seconds = _correct(arguments, law or model)
     if law and code == 2 and "--motion-model" in message:
         code, message, seconds = _correct(arguments, "auto")
         message = f"{law} cannot be asked for: auto. {message}".strip()
     record.write_text(json.dumps([code, message, seconds]), "utf-8")
     return code, message, seconds
+
+
+def _resample(folder: Path, row: str) -> Path:
+    """The folder of a rig's rectified frames, with their rig and truth."""
+    new, out = rectified(RIGS[row]), folder / "rectified"
+    for kind in (Path(), Path("gs")):
+        (out / kind).mkdir(parents=True, exist_ok=True)
+        for side in SIDES:
+            for frame in (0, 1):
+                image = new.resample(side, grey(_read(picture(folder / kind, 2, side, frame))))
+                cv2.imwrite(str(picture(out / kind, 2, side, frame)), image)
+    (out / "told.toml").write_text(short_card(new.rig, True), "utf-8")
+    return out
 
 
 def _correct(arguments: Sequence[str], model: str | None) -> tuple[int, str, float]:
@@ -124,17 +146,19 @@ def _said(text: str, code: int) -> str:
     return " ".join(said).replace("|", "/").removeprefix("rsbench: ")
 
 
-def outcome(row: str, seed: int, folder: Path, told: bool, again: bool, model: str | None = None) -> Outcome:
+def outcome(row: str, seed: int, folder: Path, way: str, again: bool, model: str | None = None) -> Outcome:
     """One run, compared with the truth."""
-    code, message, seconds = run_case(folder, told, again, model)
+    code, message, seconds = run_case(folder, way, again, model)
     truth = json.loads((folder / "truth.json").read_text("utf-8"))
-    known = {"row": row, "seed": seed, "told": told, "frames": truth["frames"], "true_ratio": truth["ratio"]}
-    corrected = folder / f"corrected-{'told' if told else 'untold'}"
+    known = {"row": row, "seed": seed, "way": way, "frames": truth["frames"], "true_ratio": truth["ratio"]}
+    corrected = folder / f"corrected-{way}"
     if code != 0 and not (truth["frames"] > 2 and code == 1 and corrected.is_dir()):
         return Outcome(**known, failed=True, message=f"exit {code}: {message}", seconds=seconds)
     found = json.loads((corrected / "motion.json").read_text("utf-8"))
-    e_R, e_T = _motion_errors(found, truth)
-    psnr, gains = _gains(folder, corrected, truth["frames"])
+    new = rectified(RIGS[row]) if way == "rectified" else None
+    e_R, e_T = _motion_errors(found, truth, None if new is None else new.body)
+    shown = None if new is None else {side: new.shown(side) for side in SIDES}
+    after, gains = _gains(folder if new is None else folder / "rectified", corrected, truth["frames"], shown)
     estimated = found["readout_ratio_estimated"]
     return Outcome(
         **known,
@@ -143,7 +167,7 @@ def outcome(row: str, seed: int, folder: Path, told: bool, again: bool, model: s
         sigma=float(found["readout_ratio_sigma"] or _NAN) if estimated else _NAN,
         turn_error=e_R,
         way_error=e_T,
-        psnr=psnr,
+        psnr=after,
         gain=float(np.mean(gains)),
         worst_gain=float(np.min(gains)),
         seconds=seconds,
@@ -162,32 +186,32 @@ def _remark(found: dict[str, Any], message: str, code: int) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def _motion_errors(found: dict[str, Any], truth: dict[str, Any]) -> tuple[float, float]:
-    """e_R and e_T in degrees, medians over the periods."""
+def _motion_errors(found: dict[str, Any], truth: dict[str, Any], turn: Array | None = None) -> tuple[float, float]:
+    """e_R and e_T in degrees, medians over the periods; ``turn`` (3, 3) from the found axes to the body's."""
+    axes = np.eye(3) if turn is None else turn
     if truth["frames"] == 2:
         motions = {0: found["motion"]}
     else:
         motions = {int(frame["number"]): frame.get("motion") for frame in found["frames"][:-1]}
     pairs = [(truth["motions"][number], motion) for number, motion in motions.items() if motion]
-    errors = [(_turn(true["w"], motion["w"]), _angle(true["d"], motion["d"])) for true, motion in pairs]
-    if not errors:
+    each = [
+        list(errors(_vectors(true), tuple(axes @ vector for vector in _vectors(motion))).values())
+        for true, motion in pairs
+    ]
+    if not each:
         return _NAN, _NAN
-    e_R, e_T = np.median(np.array(errors), axis=0)
+    e_R, e_T = np.median(np.array(each), axis=0)
     return float(e_R), float(e_T)
 
 
-def _turn(true: Sequence[float], found: Sequence[float]) -> float:
-    R = matrices(np.array([true, found]))
-    return float(np.degrees(np.linalg.norm(Rotation.from_matrix(R[1] @ R[0].T).as_rotvec())))
+def _vectors(motion: dict[str, Any]) -> tuple[Array, Array]:
+    return np.array(motion["w"]), np.array(motion["d"])
 
 
-def _angle(true: Sequence[float], found: Sequence[float]) -> float:
-    a, b = np.array(true), np.array(found)
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-
-
-def _gains(folder: Path, corrected: Path, frames: int) -> tuple[float, Array]:
-    """Mean PSNR, and the gains (n,) of the frames, in dB."""
+def _gains(
+    folder: Path, corrected: Path, frames: int, shown: dict[str, NDArray[np.bool_]] | None = None
+) -> tuple[float, Array]:
+    """Mean PSNR, and the gains (n,) of the frames, in dB, on pixels that are shown, if not all."""
     found = []
     for frame in range(frames):
         for side in SIDES if frames == 2 else SIDES[:1]:
@@ -196,9 +220,10 @@ def _gains(folder: Path, corrected: Path, frames: int) -> tuple[float, Array]:
                 found.append((_NAN, 0.0))  # given back as it was
                 continue
             mask = _read(corrected / "mask" / f"{name}.png") > 0
+            mask = mask if shown is None else mask & shown[side]
             truth = _read(picture(folder / "gs", frames, side, frame))
             images = [_read(corrected / "corrected" / f"{name}.png"), _read(picture(folder, frames, side, frame))]
-            after, before = (_psnr(image[mask], truth[mask]) for image in images)
+            after, before = (psnr(image[mask], truth[mask]) for image in images)
             found.append((after, after - before))
     values = np.array(found)
     return float(np.nanmean(values[:, 0])) if np.any(np.isfinite(values[:, 0])) else _NAN, values[:, 1]
@@ -210,15 +235,48 @@ def _read(path: Path) -> Array:
     return np.asarray(image, dtype=np.float64)
 
 
-def _psnr(image: Array, truth: Array) -> float:
-    return float(10.0 * np.log10(255.0**2 / max(float(np.mean((image - truth) ** 2)), 1e-12)))
-
-
 def table(outcomes: Sequence[Outcome]) -> str:
     """All cases, and below them a line for each row."""
     lines = [f"| {' | '.join(HEAD)} |", "|---|---|" + "---:|" * (len(HEAD) - 3) + "---|"]
     lines += [f"| {' | '.join(_cells(one))} |" for one in outcomes]
-    return "\n".join([*lines, "", *_summary(outcomes)])
+    plain, rigs = ([one for one in outcomes if (one.row in RIGS) == kind] for kind in (False, True))
+    parts = (["", *_summary(plain)] if plain else []) + (["", *_of_rigs(rigs)] if rigs else [])
+    return "\n".join([*lines, *parts])
+
+
+def _of_rigs(outcomes: Sequence[Outcome]) -> list[str]:
+    """Per row and way: how many failed, errors, and PSNR over that of the ideal rig; what is beyond ``LIMITS``."""
+    ideal = {one.seed: one.psnr for one in outcomes if (one.row, one.way) == ("ideal", "told")}
+    head = (
+        "row",
+        "given",
+        "runs",
+        "failed",
+        "e_R median",
+        "worst",
+        "e_T median",
+        "worst",
+        "PSNR",
+        "over ideal",
+        "",
+    )
+    lines = [f"| {' | '.join(head)} |", "|---|---|" + "---:|" * (len(head) - 3) + "---|"]
+    for row, way in dict.fromkeys((one.row, one.way) for one in outcomes):
+        runs = [one for one in outcomes if (one.row, one.way) == (row, way)]
+        done = [one for one in runs if not one.failed]
+        e_R, e_T = np.array([one.turn_error for one in done]), np.array([one.way_error for one in done])
+        more = [one.psnr - ideal[one.seed] for one in done if one.seed in ideal]
+        cells = [row, WAYS[way], str(len(runs)), str(len(runs) - len(done))]
+        if done:
+            cells += [f"{np.median(e_R):.4f}", f"{np.max(e_R):.4f}", f"{np.median(e_T):.3f}", f"{np.max(e_T):.3f}"]
+            cells += [_median([one.psnr for one in done], 2), _median(more, 2)]
+            found = {"e_R": np.median(e_R), "e_T": np.median(e_T), "worst e_T": np.max(e_T)}
+            beyond = [name for name, value in found.items() if value > LIMITS[name]]
+            beyond += ["dB"] if more and np.median(more) < LIMITS["dB"] else []
+        else:
+            cells, beyond = [*cells, *"------"], []
+        lines.append(f"| {' | '.join([*cells, ', '.join(beyond)])} |")
+    return lines
 
 
 def _number(value: float, digits: int) -> str:
@@ -239,7 +297,7 @@ def _cells(one: Outcome) -> list[str]:
         (one.psnr, 2),
     ]
     cells = [_number(value, digits) for value, digits in numbers]
-    return [f"{one.row}-{one.seed}", "all" if one.told else "nothing", *cells, gain, seconds, one.message]
+    return [f"{one.row}-{one.seed}", WAYS[one.way], *cells, gain, seconds, one.message]
 
 
 def _summary(outcomes: Sequence[Outcome]) -> list[str]:
@@ -248,7 +306,9 @@ def _summary(outcomes: Sequence[Outcome]) -> list[str]:
     head = (*head, "median gain told", "untold", "worst gain untold", "PSNR told - untold", "median s")
     lines = [f"| {' | '.join(head)} |", "|---|" + "---:|" * (len(head) - 1)]
     for row in dict.fromkeys(one.row for one in outcomes):
-        told, untold = ([one for one in outcomes if one.row == row and one.told == kind] for kind in (True, False))
+        told, untold = (
+            [one for one in outcomes if one.row == row and one.way == way] for way in ("told", "untold")
+        )
         lines.append(f"| {' | '.join([row, *_row_cells(told, untold)])} |")
     return lines
 
@@ -286,7 +346,7 @@ def main() -> None:
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--photographs", type=Path, help="folder (default: those of scikit-image, if installed)")
     parser.add_argument("--again", action="store_true", help="correct again what has been corrected")
-    parser.add_argument("--only", choices=("told", "untold"), help="run one of the two")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), help="run these alone")
     parser.add_argument("--model", help="motion model where the law is not told, such as auto (default: none)")
     arguments = parser.parse_args()
     photographs = read_photographs(arguments.photographs)
@@ -296,9 +356,9 @@ def main() -> None:
             folder = arguments.data / f"{row}-{seed}"
             if not (folder / "truth.json").is_file():
                 write_case(row, seed, folder, photographs)
-            for told in (True, False):
-                if arguments.only in (None, "told" if told else "untold"):
-                    outcomes.append(outcome(row, seed, folder, told, arguments.again, arguments.model))
+            for way in ("told", "kalibr", "rectified") if row in RIGS else ("told", "untold"):
+                if way in arguments.ways:
+                    outcomes.append(outcome(row, seed, folder, way, arguments.again, arguments.model))
                     sys.stderr.write(f"| {' | '.join(_cells(outcomes[-1]))} |\n")
     sys.stdout.write(table(outcomes) + "\n")
 

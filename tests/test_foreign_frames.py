@@ -266,8 +266,8 @@ def test_the_table_finds_no_error_in_the_truth_and_counts_failures(programs_: Pr
     turned = [-value for value in D]
     assert table._motion_errors({"motion": {"w": [0.0] * 3, "d": turned}}, truth)[1] == pytest.approx(180.0)
     known = {"row": "twist", "seed": 0, "frames": 2, "true_ratio": 0.8}
-    found = table.Outcome(**known, told=False, ratio=0.75, sigma=0.02, psnr=28.0, gain=2.0, worst_gain=1.0)
-    failed = table.Outcome(**known, told=True, failed=True, message="exit 1: no motion")
+    found = table.Outcome(**known, way="untold", ratio=0.75, sigma=0.02, psnr=28.0, gain=2.0, worst_gain=1.0)
+    failed = table.Outcome(**known, way="told", failed=True, message="exit 1: no motion")
     assert found.deviations == pytest.approx(2.5)
     *cases, head, rule, line = table.table([failed, found]).split("\n")
     assert "exit 1: no motion" in cases[2] and {row.count("|") for row in cases[:4]} == {12}
