@@ -1,0 +1,89 @@
+"""Fisheye models of other tools that have no counterpart here, as Kannala-Brandt lenses fitted to them.
+
+Radially symmetric models are a function from the angle between a ray and the axis to the distorted radius in focal
+lengths. Kannala-Brandt is such a function too, an odd polynomial, so the fit is linear.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rsbench.core.camera import WIDEST, Lens, PinholeCamera
+from rsbench.core.so3 import FloatArray
+
+Profile = Callable[[FloatArray], FloatArray]
+"""Distorted radii, in focal lengths, of angles from the axis, rad."""
+_NODES, _CHECKED = 400, 4001
+
+
+class LensFit(NamedTuple):
+    """A Kannala-Brandt lens in place of another, with the focal lengths that go with it."""
+
+    lens: Lens
+    fx: float
+    fy: float
+    error_px: float
+    """Largest distance between the two models' pixels of a ray, over the angles that the image shows."""
+
+
+def kannala_brandt_of(camera: PinholeCamera, profile: Profile) -> LensFit:
+    """The nearest Kannala-Brandt lens of a radially symmetric model.
+
+    Args:
+        camera: size, focal lengths and principal point as the model has them; without a lens.
+        profile: the model: ``unified_profile``, ``fov_profile`` or another function.
+
+    Raises:
+        ValueError: the image shows angles at which the model folds, or beyond ``camera.WIDEST``.
+    """
+    corners = [(x, y) for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)]
+    most = float(np.max(np.linalg.norm(camera.ideal.unproject(corners)[:, :2], axis=-1)))
+    angles = np.linspace(0.0, WIDEST, _CHECKED)
+    radii = profile(angles)
+    grows = np.append(True, np.diff(radii) > 0.0) & np.isfinite(radii)
+    shown = int(np.argmax(~grows | (radii >= most)))
+    if not (grows[shown] and radii[shown] >= most):
+        raise ValueError(
+            f"camera lens: the corners of the image lie {most:.3g} focal lengths from the principal point, where "
+            f"the model folds or shows rays more than {math.degrees(WIDEST):.0f} degrees from the axis"
+        )
+    # Chebyshev's nodes of an odd function: least squares on them are near the least largest error.
+    nodes = angles[shown] * np.sin(np.linspace(0.0, np.pi / 2, _NODES))
+    powers = np.array([1, 3, 5, 7, 9])
+    scale = angles[shown]
+    scaled = np.linalg.lstsq((nodes[:, None] / scale) ** powers, profile(nodes), rcond=None)[0]
+    polynomial = scaled / scale**powers
+    gain, k = float(polynomial[0]), polynomial[1:] / polynomial[0]
+    seen = angles[: shown + 1]
+    off = np.abs(seen[:, None] ** powers @ polynomial - radii[: shown + 1])
+    lens = Lens(model="kannala-brandt", **dict(zip(("k1", "k2", "k3", "k4"), map(float, k), strict=True)))
+    error_px = float(np.max(off)) * max(camera.fx, camera.fy)
+    return LensFit(lens, gain * camera.fx, gain * camera.fy, error_px)
+
+
+def unified_profile(alpha: float, beta: float = 1.0) -> Profile:
+    """The enhanced unified camera model of B. Khomutenko, G. Garcia, P. Martinet, RA-L 2016; beta = 1: unified."""
+    return lambda angle: (
+        np.sin(angle)
+        / (alpha * np.sqrt(beta * np.sin(angle) ** 2 + np.cos(angle) ** 2) + (1.0 - alpha) * np.cos(angle))
+    )
+
+
+def mirror_profile(xi: float, k1: float = 0.0, k2: float = 0.0) -> Profile:
+    """The unified model of C. Mei, P. Rives, ICRA 2007, with radial distortion: omni of Kalibr."""
+
+    def profile(angle: FloatArray) -> FloatArray:
+        radius = np.sin(angle) / (np.cos(angle) + xi)
+        s = radius * radius
+        return np.asarray(radius * (1.0 + s * (k1 + s * k2)))
+
+    return profile
+
+
+def fov_profile(omega: float) -> Profile:
+    """The field-of-view model of F. Devernay, O. Faugeras, 2001; omega in rad, above 0."""
+    return lambda angle: np.arctan2(2.0 * math.tan(omega / 2.0) * np.sin(angle), np.cos(angle)) / omega
