@@ -34,7 +34,7 @@ import scipy
 
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.epipolar import in_front, row_pair_pose, rs_constraint
+from rsbench.core.epipolar import in_front, match_pose, rs_constraint
 from rsbench.core.imu import GyroMotion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
@@ -76,7 +76,7 @@ class GyroSolver(Solver):
             metric=self._stereo,
             motion_model="linear",
             shutter="rolling",
-            cameras="lens",
+            cameras="rig",
             reference_point="body" if self._stereo else "left",
             reference="after Lee et al.: Gyroscope-Aided Relative Pose for Rolling Shutter Cameras, 2019",
             assumes="a gyroscope without bias and delay, aligned with the cameras; constant linear velocity",
@@ -222,8 +222,8 @@ def _signed(
     for each in (d, -d):
         count = 0
         for side, m in matches.items():
-            pose = row_pair_pose(rig, shutter, motion.along(each), side, m[:, 1], m[:, 3])
-            x, y = rig.camera.unproject(m[:, :2]), rig.camera.unproject(m[:, 2:])
+            pose, eye = match_pose(rig, shutter, motion.along(each), side, m), rig.eye(side)
+            x, y = eye.unproject(m[:, :2]), eye.unproject(m[:, 2:])
             count += int(np.count_nonzero(in_front(pose, x, y)))
         votes.append(count)
     behind = votes[1] > (_CONTRADICTED * votes[0] if metric else votes[0])

@@ -26,7 +26,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import Packed, pack, pack_tracks
+from rsbench.solvers.engine.packed import Packed, pack
 
 ROUNDING = 1e-10
 """Below this, relative to the largest, a column norm or singular value is rounding. Exact data of the slowest and
@@ -272,11 +272,14 @@ def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatA
 
 
 def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: FloatArray) -> float | None:
-    """Signed length, metres, of a translation along u (3,) for a known rotation, from tracks (n, 8); or None.
+    """Signed length, metres, of a translation along u (3,) for a known rotation, from tracks; or None.
 
     A left-right match holds its point's inverse depth rho, so that ``y x (R x + rho s T(u)) = 0`` is linear in the
-    length s; one least-squares quotient over all tracks.
+    length s; one least-squares quotient over all tracks. Of tracks (n, 4, 9), whose ends have a time each, the
+    equations of the four rays are linear in s and the point, which is eliminated.
     """
+    if tracks.ndim == 3:
+        return _length_from_rays(tracks, packed.baseline, w, u)
     ones = np.ones(len(tracks))
     x = np.column_stack([tracks[:, :2], ones])
     y = np.column_stack([tracks[:, 3:5] / packed.focal, ones])
@@ -287,6 +290,21 @@ def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: Flo
     moved = rho[:, None] * so3.cross(y, tau1[:, None] * u - tau0[:, None] * (R @ u))
     squares = float(np.sum(moved * moved))
     return -float(np.sum(moved * turned)) / squares if squares > 0.0 else None
+
+
+def _length_from_rays(tracks: FloatArray, baseline: float, w: FloatArray, u: FloatArray) -> float | None:
+    """The same of tracks (n, 4, 9), over the depth as frame 0 shows it, for errors to be those of rays."""
+    rho = np.maximum(tracks[:, 0, 0] - tracks[:, 1, 0], 0.0)[:, None, None] / baseline
+    x, tau = tracks[:, :, :2, None], tracks[:, :, 2, None]
+    R, o = so3.exp(tau * w), baseline * np.array([[0.5], [-0.5], [0.5], [-0.5]]) * np.array([1.0, 0.0, 0.0])
+    by_point, by_length, rest = (
+        (rho * (each[:, :, :2] - x * each[:, :, 2:]).reshape(len(tracks), 8, -1))
+        for each in (R, (tau * u)[..., None], np.broadcast_to(o[..., None], (len(tracks), 4, 3, 1)))
+    )
+    found = np.concatenate([by_length, rest], axis=2)
+    found = found - by_point @ (np.linalg.pinv(by_point) @ found)
+    squares = float(np.sum(found[:, :, 0] ** 2))
+    return -float(np.sum(found[:, :, 0] * found[:, :, 1])) / squares if squares > 0.0 else None
 
 
 @final
@@ -319,7 +337,7 @@ class IteratedSolver(Solver):
             metric=True,
             motion_model="linear",
             shutter="rolling",
-            cameras="rig" if self.scale == "pairs" else "ideal",
+            cameras="rig",
             reference_point="body",
             reference="rsbench; after Wang, Fan, Dai, eq. 7-10, with the antisymmetric part of E folded into d",
             assumes="small rotation, constant velocity, a scene that is not planar, translation",
@@ -343,7 +361,8 @@ class IteratedSolver(Solver):
             return MotionEstimate.failed(solution)
         w, d = solution
         if self.scale == "tracks":
-            length = length_from_tracks(pack_tracks(correspondences.tracks, rig, shutter), packed, w, d)
+            linked = pack(Correspondences(tracks=correspondences.tracks), rig, shutter)
+            length = length_from_tracks(linked.tracks, packed, w, d)
             if length is None or not 0.0 < abs(length) <= self.max_translation_m:
                 return MotionEstimate.failed("the left-right matches do not determine the length of d")
             return MotionEstimate(w=w, d=length * d, success=True, metric=True)

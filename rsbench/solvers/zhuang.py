@@ -335,17 +335,29 @@ _LEAST_DURATION = 0.05
 """Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""
 
 
-def scale_flow(correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Correspondences:
-    """Matches, without a lens, whose frame-1 ends are moved to where they are after exactly one frame period."""
+def scale_flow(
+    correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, linked: bool = True
+) -> Correspondences:
+    """Ideal matches whose frame-1 ends are moved to where they are after exactly one frame period.
+
+    Args:
+        linked: whether the ends of a left-right match that have two times are brought to the left camera's.
+    """
     ideal = without_lens(correspondences, rig)
     halves = [
         _scaled(track_pairs(correspondences.tracks, side), track_pairs(ideal.tracks, side), side, shutter)
         for side in SIDES
     ]
+    if linked and not (rig.aligned and shutter.rows_together):
+        left, right = (
+            shutter.pixel_time(track_pairs(correspondences.tracks, side)[:, :2], 0, side) for side in SIDES
+        )
+        moved = (left - right)[:, None] * (halves[1][:, 2:] - halves[1][:, :2])
+        halves[1] = halves[1] + np.tile(moved, 2)
     return Correspondences(
         left=_scaled(correspondences.left, ideal.left, "left", shutter),
         right=_scaled(correspondences.right, ideal.right, "right", shutter),
-        tracks=np.concatenate([ideal.tracks[:, :4], halves[0][:, 2:], halves[1][:, 2:]], axis=1),
+        tracks=np.concatenate([each[:, ends] for ends in (slice(2), slice(2, 4)) for each in halves], axis=1),
     )
 
 
@@ -396,7 +408,7 @@ class FlowScaledSolver(Solver):
             inner,
             motion_model="twist",
             shutter="rolling",
-            cameras="rig" if inner.needs == {"left"} else "lens",
+            cameras="rig",
             reference=f"Zhuang, Cheong, Lee, ICCV 2017, eq. 8-9; {inner.reference}",
             assumes=f"constant twist, small motion; {inner.assumes}",
         )
@@ -404,18 +416,23 @@ class FlowScaledSolver(Solver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        return self.inner.estimate(scale_flow(correspondences, rig, shutter), rig.ideal, shutter)
+        return self.inner.estimate(self._scaled(correspondences, rig, shutter), rig.ideal, shutter)
+
+    def _scaled(self, matches: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Correspondences:
+        return scale_flow(matches, rig, shutter, linked="tracks" in self.inner.spec.needs)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return self.inner.sample_sizes(correspondences)
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        return self.inner.propose(scale_flow(sample, rig, shutter), rig.ideal, shutter)
+        return self.inner.propose(self._scaled(sample, rig, shutter), rig.ideal, shutter)
 
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        return self.inner.propose_all([scale_flow(sample, rig, shutter) for sample in samples], rig.ideal, shutter)
+        return self.inner.propose_all(
+            [self._scaled(sample, rig, shutter) for sample in samples], rig.ideal, shutter
+        )
 
     def improve(
         self,
@@ -425,4 +442,4 @@ class FlowScaledSolver(Solver):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
-        return self.inner.improve(motion, scale_flow(correspondences, rig, shutter), rig.ideal, shutter, quick)
+        return self.inner.improve(motion, self._scaled(correspondences, rig, shutter), rig.ideal, shutter, quick)

@@ -36,6 +36,7 @@ MatchSet = Literal["left", "right", "stereo", "tracks", "affine", "gyro", "gravi
 part of RANSAC's samples."""
 SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
 """Samples of other sensors."""
+Cameras = Literal["ideal", "lens", "any", "rig"]
 BESIDE: Mapping[MatchSet, str] = {"affine": "affine frames of left matches", **SENSORS}
 """Sets that are not matches."""
 
@@ -108,10 +109,11 @@ class SolverSpec:
     """Where it was published: paper and equation."""
     assumes: str
     """Its assumptions, in words."""
-    cameras: Literal["ideal", "lens", "any", "rig"] = "ideal"
-    """What it takes beside cameras without a lens that read rows from the top at the same times: a lens; or other
-    scans and a late right camera too. It then has rays from ``camera.unproject`` and times from
-    ``shutter.pixel_time`` alone. Of a global shutter it does not matter: matches come without the lens."""
+    cameras: Cameras = "ideal"
+    """What it takes beside equal aligned cameras without a lens that read rows from the top at the same times: a
+    lens; other scans and a late right camera too; or any rig. It then has times from ``shutter.pixel_time`` alone
+    and rays from ``camera.unproject``, of any rig from ``rig.eye(side).unproject``. Of a global shutter it does
+    not matter: its matches and its rig are those of an ideal rig that sees the same."""
     motion_parameters: Mapping[str, Any] = field(default_factory=dict)
     """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 
@@ -143,7 +145,7 @@ class SolverSpec:
         for name, allowed in (
             ("shutter", ("rolling", "global")),
             ("reference_point", ("body", "left")),
-            ("cameras", ("ideal", "lens", "any", "rig")),
+            ("cameras", get_args(Cameras)),
         ):
             if not isinstance(getattr(self, name), str) or getattr(self, name) not in allowed:
                 raise ValueError(f"{name} = {shown(getattr(self, name))}: must be one of {', '.join(allowed)}")

@@ -98,14 +98,14 @@ def test_equals_a_numeric_fit_on_any_rig(rig: StereoRig, scanning: Scanning) -> 
         views = views if rays == 4 else [(side, frame) for side, frame in views if side == name]
         found = []
         for row in getattr(c, name):
-            A, b = [], []
+            A, b = list[FloatArray](), list[float]()
             for (side, frame), pixel in zip(views, row.reshape(-1, 2), strict=True):
                 R, t = rig.cam_from_world(motion, shutter.pixel_time(pixel, frame, side), side)
                 x, y, _ = rig.sensor(side).unproject(pixel)
                 A += [R[0] - x * R[2], R[1] - y * R[2]]
                 b += [x * t[2] - t[0], y * t[2] - t[1]]
             found.append(np.linalg.lstsq(np.array(A), np.array(b), rcond=None)[0])
-        X[name] = numeric_information(rig, shutter, motion, np.array(found), views)
+        X[name] = numeric_information(rig, shutter, motion, np.array(found, dtype=np.float64), views)
     expected = sum(X.values())
     measured = motion_bound(c, rig, shutter, motion, 1.0).information
     scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
