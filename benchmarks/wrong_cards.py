@@ -34,7 +34,7 @@ def true_and_found(folder: Path) -> tuple[StereoRig, FoundCamera]:
     """The rig of a case, and what was found of it by a card that errs."""
     images = {(side, frame): read_frame(picture(folder, 2, side, frame)) for frame in (0, 1) for side in SIDES}
     height, width = images["left", 0].shape[:2]
-    rig = read_rig_card(folder / "untold.toml").rig(width, height)
+    rig = read_rig_card(folder / "untold.toml").rig((width, height))
     camera, lens = rig.camera, rig.camera.lens or Lens(model="brown-conrady")
     wrong = replace(lens, k1=lens.k1 + _LARGER)
     camera = replace(camera, fx=_LONGER * camera.fx, fy=_LONGER * camera.fy, lens=wrong)

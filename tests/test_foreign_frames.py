@@ -248,7 +248,7 @@ def test_a_case_is_written_with_rigs_that_the_command_reads_and_poses_that_are_t
     told, untold = (read_rig_card(tmp_path / f"{name}.toml") for name in ("told", "untold"))
     assert (told.readout_ratio, told.scan, told.right_scan) == (0.6, "top", "right")
     assert untold.readout_ratio is None and untold.scanning is None
-    assert told.rig(48, 36) == untold.rig(48, 36) == programs_.case.ours(small)[0]
+    assert told.rig((48, 36)) == untold.rig((48, 36)) == programs_.case.ours(small)[0]
     truth = json.loads((tmp_path / "truth.json").read_text("utf-8"))
     times = programs_.case.ours(small)[1].line_times(2, "right")
     R, t = LinearMotion(W, D).body_from_world(times)

@@ -180,11 +180,11 @@ def _correct_four(
     order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
     refuse_video(out)
     images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
-    rig = sized(card, images["left", 0])
+    rig = sized(card, images["left", 0], images["right", 0])
     options = replace(options, target_row=target_row(target, rig.camera.height))
     with fresh_folder(out) as folder:
         rig, focal = with_found_camera(
-            rig, card.camera.sigma, [images], options, card.readout_ratio, card.scanning, progress_bar
+            rig, card.sigma, [images], options, card.readout_ratio, card.scanning, progress_bar
         )
         with progress_bar("correcting", 4) as advance:
             result = correct_four(

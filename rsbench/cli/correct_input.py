@@ -200,12 +200,13 @@ def target_row(target: str, height: int) -> float:
     return row
 
 
-def sized(card: RigCard, image: Any) -> StereoRig:
-    """The rig with images like this one; RsbenchError where its lens cannot be one of such images."""
+def sized(card: RigCard, left: Any, right: Any) -> StereoRig:
+    """The rig with images like these two; RsbenchError where its cameras cannot be of such images."""
     from rsbench.core.errors import RsbenchError
 
-    height, width = image.shape[:2]
+    sizes = [(image.shape[1], image.shape[0]) for image in (left, right)]
     try:
-        return card.rig(width, height)
+        return card.rig(*sizes)
     except ValueError as error:
-        raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
+        words = " and ".join(dict.fromkeys(f"{width} x {height}" for width, height in sizes))
+        raise RsbenchError(f"--rig: of images of {words} pixels: {error}") from error

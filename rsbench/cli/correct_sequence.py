@@ -41,14 +41,14 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
 
     sources, card, out = given.footage(), given.card, given.out
     gyro = _gyro(given, sources[0], options)
-    rig = sized(card, next(iter(sources[0])))
+    rig = sized(card, *(next(iter(source)) for source in sources))
     options = replace(options, target_row=target_row(target, rig.camera.height))
     check_cameras(rig, card.scanning or Scanning(), options, card.disparity_offset)
     run = _run_key(given, sources, options, close, gyro)
     with video_place(out, run) if is_video(out) else fresh_folder(out, run=run) as folder:
         rig, focal = with_found_camera(
             rig,
-            card.camera.sigma,
+            card.sigma,
             spread_windows(*sources),
             options,
             card.readout_ratio,

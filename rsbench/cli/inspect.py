@@ -149,18 +149,17 @@ def _of_footage(left: Path | None, right: Path | None, card: Path, options: _Opt
 
 def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, options: _Options) -> _Case:
     """Frames of a user, whose card says the rig."""
+    from rsbench.cli.correct_input import sized
     from rsbench.pipeline.footage import read_rig_card
 
     given = read_rig_card(card)
-    height, width = next(iter(left)).shape[:2]
+    rig = sized(given, next(iter(left)), next(iter(right)))
+    ratio, scanning = given.readout_ratio, given.scanning
     try:
-        rig = given.rig(width, height)
-        ratio = given.readout_ratio
-        scanning = given.scanning
-        shutter = None if ratio is None or scanning is None else scanning.shutter_of(width, height, ratio)
+        shutter = None if ratio is None or scanning is None else rig.shutter_of(scanning, ratio)
     except ValueError as error:
-        raise RsbenchError(f"--rig: of images of {width} x {height} pixels: {error}") from error
-    if given.camera.sigma:
+        raise RsbenchError(f"{card}: {error}") from error
+    if given.sigma:
         rig = _with_found_camera(left, right, rig, given, options)
     return _Case(name, _frame_windows(left, right, rig, options), shutter)
 
@@ -177,7 +176,7 @@ def _with_found_camera(
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
     rig, words = with_found_camera(
         rig,
-        given.camera.sigma,
+        given.sigma,
         spread_windows(left, right),
         chain,
         given.readout_ratio,

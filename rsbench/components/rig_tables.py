@@ -5,6 +5,7 @@ A card in ``cards/rigs/`` is such a rig under a name, with its source.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
@@ -21,9 +22,13 @@ from rsbench.core.so3 import FloatArray
 
 Size = tuple[int, int]
 Vector = tuple[float, float, float]
+_DIGITS = 1e-2
+"""Share by which printed line delays may exceed a frame period."""
 _READOUT_KEYS = {
     **SHUTTER_KEY,
     "readout_ratio": "Readout time over frame period of this camera, 0 to 1.",
+    "line_delay_s": "Seconds from a line to the next, in place of ``readout_ratio``; needs the size and "
+    "``frame_period_s``.",
     "scan": "Side of the image at which the readout of this camera begins.",
     "delay_s": "Seconds by which this camera reads later than the other one.",
 }
@@ -51,6 +56,11 @@ class CameraTable:
     lens: Lens | None = None
     """Distortion of the lens. Absent: images without distortion."""
 
+    @property
+    def size(self) -> Size | None:
+        """(width, height); None where the frames decide."""
+        return None if self.width is None or self.height is None else (self.width, self.height)
+
     def camera(self, size: Size | None = None) -> PinholeCamera:
         """The camera, of images of this size (width, height).
 
@@ -63,7 +73,7 @@ class CameraTable:
         if (self.width or width, self.height or height) != (width, height):
             raise ValueError(
                 f"width, height = {self.width}, {self.height}: the frames are {width} x {height}; give the "
-                "calibration of that size"
+                "calibration of that size, or rsbench rig --resize where frames were scaled, not cropped"
             )
         return PinholeCamera(
             width=width, height=height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, lens=self.lens
@@ -92,6 +102,14 @@ class RightFromLeft:
             raise ValueError(f"{named[0]} and {named[1]} exclude each other")
         if self.quaternion_wxyz is not None and abs(np.linalg.norm(self.quaternion_wxyz) - 1.0) > 1e-3:
             raise ValueError(f"quaternion_wxyz = {list(self.quaternion_wxyz)}: must have the length 1")
+
+        R, t = self.R, np.array(self.translation)
+        place = -(R.T @ t)
+        if place[0] - t[0] < -np.linalg.norm(t):  # of at most twice that: each sees the other on its wrong side
+            raise ValueError(
+                f"the right camera would stand {abs(place[0]):.4g} m to the left of the left one: exchange the "
+                "cameras and their frames, or invert the transform, which is X_right = R X_left + t"
+            )
 
     @property
     def R(self) -> FloatArray:
@@ -125,7 +143,7 @@ def rig_of_tables(
         except ValueError as error:
             raise ValueError(f"{side}: {error}") from error
     try:
-        return StereoRig.of_cameras(*cameras, right_from_left.R, right_from_left.translation)
+        return StereoRig.of_cameras(cameras[0], cameras[1], right_from_left.R, right_from_left.translation)
     except ValueError as error:
         raise ValueError(f"right_from_left: {error}") from error
 
@@ -148,6 +166,8 @@ def with_readouts(table: Mapping[str, Any], where: str) -> dict[str, Any]:
             period = {key: made[key] for key in ("frame_period_s",) if key in made}
             cameras[side] = with_shutter(camera | period, f"{where}: {side}")
             made["frame_period_s"] = cameras[side].pop("frame_period_s")
+        if "line_delay_s" in cameras[side]:
+            cameras[side]["readout_ratio"] = _ratio_of_lines(cameras[side], made, f"{where}: {side}")
     for key in ("readout_ratio", "scan"):
         both = made.pop(key, None)
         left = cameras["left"].pop(key, both)
@@ -163,6 +183,24 @@ def with_readouts(table: Mapping[str, Any], where: str) -> dict[str, Any]:
             raise RsbenchError(f"{where}: delay_s = {delays}: must be seconds")
         made["right_delay"] = (delays[1] - delays[0]) / period
     return made | cameras
+
+
+def _ratio_of_lines(camera: dict[str, Any], rig: Mapping[str, Any], where: str) -> float:
+    """Readout ratio of a camera's ``line_delay_s``, which goes; RsbenchError where that cannot be."""
+    delay, period = camera.pop("line_delay_s"), rig.get("frame_period_s")
+    count = camera.get("height" if camera.get("scan", rig.get("scan")) in (None, "top", "bottom") else "width")
+    numbers = [each for each in (delay, period, count) if isinstance(each, int | float)]
+    if "readout_ratio" in camera or len(numbers) < 3:
+        raise RsbenchError(
+            f"{where}: line_delay_s: needs width, height and frame_period_s; readout_ratio and shutter exclude it"
+        )
+    delay, period, count = numbers
+    ratio = delay * count / period if period > 0.0 else math.inf
+    if not 0.0 <= ratio <= 1.0 + _DIGITS:
+        raise RsbenchError(
+            f"{where}: line_delay_s = {delay}: {count} lines would take {ratio:.4g} frame periods, and 1 is most"
+        )
+    return min(ratio, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)

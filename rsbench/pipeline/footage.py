@@ -6,6 +6,7 @@ into columns, and rows are what a rolling shutter reads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
@@ -17,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration import CardSigma, of_offset
-from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
-from rsbench.core.arguments import check_number
+from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml
+from rsbench.components.rig_tables import CameraTable, RightFromLeft, Size, rig_of_tables, tables_of, with_readouts
+from rsbench.core.arguments import LARGEST_M, LARGEST_SIZE, check_number, check_positive
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig, View
@@ -29,6 +31,8 @@ _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
 _LARGEST_OFFSET_PX = 10.0
 _MOST_FRAMES = 1e9
+_LONGEST_S = 1e4
+"""Of a frame period."""
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -44,7 +48,7 @@ def no_progress(label: str, total: int) -> AbstractContextManager[Callable[[str]
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCard:
-    """Intrinsics of both cameras, pixels; the centre of the top-left pixel is (0, 0)."""
+    """Intrinsics of a camera, or of both cameras of a rig, pixels; the centre of the top-left pixel is (0, 0)."""
 
     fx: float
     """Focal length across, pixels."""
@@ -72,22 +76,50 @@ class CameraCard:
         """How sure the card is of them."""
         return CardSigma(focal=self.focal_sigma, k1=self.k1_sigma)
 
+    def camera(self, size: Size) -> PinholeCamera:
+        """The camera of images of this (width, height); ValueError where its lens cannot be one of such images."""
+        (width, height), lens = size, self.lens
+        return PinholeCamera(width=width, height=height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, lens=lens)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RigCard(StatedShutter):
-    """What must be known of a rig to correct its frames; the size comes from the images."""
+    """What must be known of a rig to correct its frames: of two equal aligned cameras, or of any two.
+
+    Sizes come from the images where the card has none.
+    """
 
     SHORTHANDS: ClassVar = SHUTTER_KEY
 
-    camera: CameraCard
-    """Intrinsics of both cameras, which are the same."""
-    baseline: float
-    """Full distance between the cameras, metres."""
+    camera: CameraCard | None = None
+    """Intrinsics of both cameras, where they are the same and aligned."""
+    baseline: float | None = None
+    """Full distance between the cameras, metres; with ``left`` and ``right`` of cameras that look the same way."""
+    left: CameraTable | None = None
+    """The left camera, with ``right`` in place of ``camera``."""
+    right: CameraTable | None = None
+    """The right camera."""
+    right_from_left: RightFromLeft | None = None
+    """Where the right camera is, in place of ``baseline``."""
+    frame_period_s: float | None = None
+    """Seconds from one frame to the next, for what is given in seconds: ``shutter``, ``line_delay_s``,
+    ``delay_s``."""
     disparity_offset: float | None = None
     """Pixels by which matched disparities are too large; absent: found, where the matches show errors."""
 
     def __post_init__(self) -> None:
-        self.rig(1, 1)
+        two = self.left is not None and self.right is not None
+        if (self.left is None) != (self.right is None) or (self.camera is not None) == two:
+            raise ValueError("camera: give [camera] for two equal aligned cameras, or both [left] and [right]")
+        if (self.baseline is None) == (self.right_from_left is None):
+            raise ValueError("baseline: give it or [right_from_left], which says where the right camera is")
+        if self.right_from_left is not None and not two:
+            raise ValueError("right_from_left: needs [left] and [right] in place of [camera]")
+        if self.baseline is not None:
+            check_positive("baseline", self.baseline, LARGEST_M, "metres")
+        if self.frame_period_s is not None:
+            check_positive("frame_period_s", self.frame_period_s, _LONGEST_S, "seconds")
+        self.rig(*self._sizes)
         (self.scanning or Scanning()).shutter_of(1, 1, 0.0)
         if self.disparity_offset is not None and not abs(self.disparity_offset) <= _LARGEST_OFFSET_PX:
             raise ValueError(
@@ -102,32 +134,67 @@ class RigCard(StatedShutter):
         """What the calibration is wrong by; None where it is looked for."""
         return None if self.disparity_offset is None else of_offset(self.disparity_offset)
 
-    def rig(self, width: int, height: int) -> StereoRig:
-        """The rig with images of this size; ValueError where its lens cannot be one of such images."""
-        c = self.camera
-        camera = PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)
-        return StereoRig(camera=camera, baseline=self.baseline)
+    @property
+    def sigma(self) -> CardSigma:
+        """How sure the card is of the intrinsics."""
+        return CardSigma(focal=0.0, k1=0.0) if self.camera is None else self.camera.sigma
+
+    @property
+    def _sizes(self) -> tuple[Size, Size]:
+        """(width, height) of the left and the right images; of a part of them where the card does not say."""
+        if self.left is None or self.right is None:
+            return (1, 1), (1, 1)
+        left, right = (each.size or (_within(each.cx), _within(each.cy)) for each in (self.left, self.right))
+        return left, right
+
+    def rig(self, left: Size, right: Size | None = None) -> StereoRig:
+        """The rig with images of these (width, height); those of the right camera are as the left ones if absent.
+
+        Raises:
+            ValueError: other sizes than the card's, a lens that cannot be one of such images, or impossible
+                extrinsics.
+        """
+        right = right or left
+        if self.camera is not None and self.baseline is not None:
+            if left != right:
+                raise ValueError(
+                    f"right images are {right[0]} x {right[1]} pixels, left ones {left[0]} x {left[1]}: the card "
+                    "needs [left] and [right] in place of [camera]"
+                )
+            return StereoRig(camera=self.camera.camera(left), baseline=self.baseline)
+        assert self.left is not None and self.right is not None
+        apart = self.right_from_left or RightFromLeft(translation=(-(self.baseline or 0.0), 0.0, 0.0))
+        return rig_of_tables(self.left, self.right, apart, {"left": left, "right": right})
+
+
+def _within(centre: float) -> int:
+    """Columns or rows that an image surely has whose principal point lies at this one."""
+    return min(max(math.ceil(centre) + 1, 1), LARGEST_SIZE)
 
 
 def read_rig_card(path: Path) -> RigCard:
-    """Rig card: ``baseline``, ``readout_ratio`` or ``shutter``, ``scan``; ``[camera]``: fx, fy, cx, cy, ``lens``.
+    """The card of a rig: ``baseline`` and ``[camera]``, or ``[left]``, ``[right]`` and ``[right_from_left]``.
+
+    ``readout_ratio`` or ``shutter``, ``scan`` are above the tables, or in those of the cameras.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
-    table = read_toml(path)
-    if "shutter" in table:
-        table = {key: value for key, value in with_shutter(table, str(path)).items() if key != "frame_period_s"}
-    return parse_card(RigCard, table, str(path))
+    return parse_card(RigCard, with_readouts(read_toml(path), str(path)), str(path))
 
 
 def rig_card_of(rig: StereoRig, shutter: RollingShutter) -> RigCard:
     """The card of cameras that are known."""
+    readout = {"readout_ratio": shutter.readout_ratio, **asdict(shutter.scanning)}
+    if not rig.aligned:
+        return parse_card(
+            RigCard,
+            {**tables_of(rig), **{name: value for name, value in readout.items() if value is not None}},
+            "rig",
+        )
     c = rig.camera
     camera = CameraCard(fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)
-    return RigCard(
-        camera=camera, baseline=rig.baseline, readout_ratio=shutter.readout_ratio, **asdict(shutter.scanning)
-    )
+    return RigCard(camera=camera, baseline=rig.baseline, **readout)
 
 
 def read_frame(path: Path) -> NDArray[Any]:
