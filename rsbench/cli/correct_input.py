@@ -33,7 +33,7 @@ RIG.toml, for images of cameras side by side (pixels, metres; without readout_ra
   fy = 812.3
   cx = 479.5
   cy = 269.5
-  lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt; without it: no distortion[/dim]
+  lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt, rational, double-sphere[/dim]
   k1_sigma = 0.02            [dim]# k1 = -0.2 +- 0.02, likewise[/dim]
 
 Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.

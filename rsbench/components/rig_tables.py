@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -259,4 +259,4 @@ def tables_of(rig: StereoRig) -> dict[str, Any]:
 def camera_record(camera: PinholeCamera) -> dict[str, Any]:
     """A camera for JSON: size and intrinsics, px, and its lens where it has one."""
     own = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return own | ({} if camera.lens is None else {"lens": asdict(camera.lens)})
+    return own | ({} if camera.lens is None else {"lens": camera.lens.record()})
