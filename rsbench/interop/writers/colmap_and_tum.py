@@ -36,6 +36,7 @@ from rsbench.interop.writers.sequence_views import (
     Images,
     Note,
     Surfaces,
+    View,
     about_moving_objects,
     copy_image,
     first_pose,
@@ -50,7 +51,8 @@ from rsbench.storage.files import read_depth, write_bytes
 from rsbench.storage.untrusted_files import check_amount, inside, read_bytes, read_json, read_text
 
 _COLMAP_ABOUT = (
-    "SEQUENCE/sparse holds cameras.txt, images.txt and points3D.txt, SEQUENCE/images the images. The world "
+    "SEQUENCE/sparse holds cameras.txt, images.txt, points3D.txt and, since COLMAP 3.12, rigs.txt and frames.txt; "
+    "SEQUENCE/images the images. The world "
     "is the rig's body at time 0 (x right, y down, z forward, metres). Points are those of the true depth, "
     "observations their exact projections; points on objects that move are left out."
 )
@@ -58,6 +60,7 @@ _ONE_POSE = (
     "the images are rolling-shutter frames: images.txt has the pose of the line that is read first, and the "
     "observations are where the rolling shutter sees the points, so they do not reproject"
 )
+_TWO_TIMES = "the right camera is late, so its images are of other times: there is no rigs.txt"
 
 
 def _write_colmap(sequence: Sequence, root: Path, images: Images) -> Note:
@@ -65,13 +68,36 @@ def _write_colmap(sequence: Sequence, root: Path, images: Images) -> Note:
     found = surfaces(sequence, images)
     sparse = folder / "sparse"
     sparse.mkdir(parents=True)
-    write_lines(sparse / "cameras.txt", [camera_line(k + 1, sequence.rig.camera) for k in range(len(SIDES))])
+    write_lines(sparse / "cameras.txt", _camera_lines(sequence.rig))
     write_lines(sparse / "images.txt", _image_lines(sequence, found))
     write_lines(sparse / "points3D.txt", _point_lines(sequence, found))
     for view in views_in_time(sequence):
         copy_image(sequence, view, images, folder / "images" / view.name)
     sentences = [_ONE_POSE] if images == "rs" else []
+    if sequence.shutter.right_delay:
+        sentences.append(_TWO_TIMES)
+    else:
+        lefts = [first_pose(sequence, View("left", frame)) for frame in range(sequence.frames)]
+        _write_rig(sparse, sequence.rig, lefts)
     return sentences + about_moving_objects(sequence), {"points": len(found.world)}
+
+
+def _camera_lines(rig: StereoRig) -> list[str]:
+    return [camera_line(k, rig.sensor(side)) for k, side in enumerate(SIDES, start=1)]
+
+
+def _write_rig(sparse: Path, rig: StereoRig, lefts: list[Pose]) -> None:
+    """rigs.txt and frames.txt from the left camera's poses; the images of a frame are 2 k + 1 and 2 k + 2."""
+    right = rig.right_from_left
+    write_lines(sparse / "rigs.txt", [f"1 2 CAMERA 1 CAMERA 2 1 {_pose_words(right)}"])
+    frames = [
+        f"{k} 1 {_pose_words(left)} 2 CAMERA 1 {2 * k - 1} CAMERA 2 {2 * k}" for k, left in enumerate(lefts, 1)
+    ]
+    write_lines(sparse / "frames.txt", frames)
+
+
+def _pose_words(pose: Pose) -> str:
+    return f"{numbers(so3.quaternion(pose.R))} {numbers(pose.t)}"
 
 
 def camera_line(identifier: int, camera: PinholeCamera) -> str:
@@ -97,7 +123,7 @@ def _image_lines(sequence: Sequence, found: Surfaces) -> list[str]:
     for k, view in enumerate(views_in_time(sequence)):
         pose = first_pose(sequence, view)
         camera = SIDES.index(view.side) + 1
-        lines.append(f"{k + 1} {numbers(so3.quaternion(pose.R))} {numbers(pose.t)} {camera} {view.name}")
+        lines.append(f"{k + 1} {_pose_words(pose)} {camera} {view.name}")
         seen = found.seen[view]
         pixels = seen.pixels + CORNER_PX
         lines.append(
@@ -144,7 +170,8 @@ def _write_tum(sequence: Sequence, root: Path, images: Images) -> Note:
         )
         times = line_times(sequence, side)
         if times is None:
-            sentences = ["all lines are read at once: there is no trajectory of lines"]
+            which = "" if sequence.shutter.still else f" of the {side} camera"
+            sentences = [f"all lines{which} are read at once: there is no trajectory of lines"]
         else:
             poses = rig.cam_from_world(motion, times, side)
             write_poses(folder / f"{side}_rows.txt", sequence.frame_period_s * times, poses)
@@ -153,7 +180,7 @@ def _write_tum(sequence: Sequence, root: Path, images: Images) -> Note:
 
 def line_times(sequence: Sequence, side: Side) -> FloatArray | None:
     """Times (n) of all lines of all frames in the order of time, frame periods; None of a global shutter."""
-    if sequence.shutter.readout_ratio == 0.0:
+    if sequence.shutter.ratio_of(side) == 0.0:
         return None
     frames = range(sequence.frames)
     return np.sort(np.concatenate([sequence.shutter.line_times(frame, side) for frame in frames]))
@@ -281,7 +308,8 @@ def check_corrected(corrected: Corrected, name: str) -> None:
 
 def _camera_pose(corrected: Corrected, side: Side, body: Pose) -> Pose:
     """cam_from_world of a camera of the rig, from the body's pose."""
-    return Pose(body.R, body.t + corrected.rig.offset(side))
+    offset, turn = corrected.rig.offset(side), corrected.rig.own(side).R
+    return Pose(turn @ body.R, (body.t + offset) @ turn.T)
 
 
 def _write_corrected_tum(corrected: Corrected, folder: Path) -> Note:
@@ -305,18 +333,18 @@ def _write_corrected_colmap(corrected: Corrected, folder: Path) -> Note:
     sparse = folder / "sparse"
     sparse.mkdir()
     lines, points = list[str](), list[str]()
-    camera = corrected.rig.camera
+    camera = corrected.rig.sensor("left")
     step = max(1, round(np.sqrt(camera.width * camera.height * len(frames) / _CORRECTED_POINTS)))
     for k, (frame, body) in enumerate(frames):
         for number_, side in enumerate(SIDES, start=1):
             pose, stem = _camera_pose(corrected, side, body), f"{side}_{frame:06d}"
             identifier = len(SIDES) * k + number_
-            lines += [f"{identifier} {numbers(so3.quaternion(pose.R))} {numbers(pose.t)} {number_} {stem}.png", ""]
+            lines += [f"{identifier} {_pose_words(pose)} {number_} {stem}.png", ""]
             _copy(corrected.folder, f"corrected/{stem}.png", folder / "images" / f"{stem}.png")
             _copy(corrected.folder, f"mask/{stem}.png", folder / "masks" / f"{stem}.png.png")
         points += _corrected_points(corrected, frame, _camera_pose(corrected, "left", body), step, len(points))
-    cameras = [camera_line(k, camera) for k in range(1, len(SIDES) + 1)]
-    for name, content in (("cameras", cameras), ("images", lines), ("points3D", points)):
+    _write_rig(sparse, corrected.rig, [_camera_pose(corrected, "left", body) for _, body in frames])
+    for name, content in (("cameras", _camera_lines(corrected.rig)), ("images", lines), ("points3D", points)):
         write_lines(sparse / f"{name}.txt", content)
     left_out = len(corrected.times) - len(frames)
     words = "frames of the trajectory were not corrected, or have no pose at their row, and are left out"
@@ -359,7 +387,7 @@ def _corrected_points(corrected: Corrected, frame: int, left: Pose, step: int, b
     path = corrected.folder / "depth" / f"{stem}.exr"
     if not path.is_file():
         return []
-    camera = corrected.rig.camera
+    camera = corrected.rig.sensor("left")
     depth = read_depth(path, (camera.width, camera.height))[cut, cut]
     image = read_corrected(corrected.folder, stem)
     if image.shape[:2] != (camera.height, camera.width):

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
@@ -35,6 +36,7 @@ from rsbench.interop.writers.sequence_views import (
     camera_velocity,
     compare_rows,
     first_pose,
+    line_delay,
     number,
     numbers,
     one_by_one,
@@ -58,8 +60,12 @@ _LOADED = 10
 
 
 def _carla_fault(sequence: Sequence, images: Images) -> str:
-    if sequence.rig.camera.lens is not None:
+    left, right = (sequence.rig.sensor(side) for side in SIDES)
+    if left.lens is not None or right.lens is not None:
         return "its cameras have no lens; choose other sequences"
+    ratios = {sequence.shutter.ratio_of(side) for side in SIDES}
+    if (left.width, left.height) != (right.width, right.height) or len(ratios) > 1:
+        return "its cameras have one size and one readout; choose other sequences"
     return "" if reads_from_top(sequence) else "its rows are read from the top; choose other sequences"
 
 
@@ -91,7 +97,7 @@ def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArr
 
 
 def _write_carla_frame(sequence: Sequence, view: View, place: Path) -> None:
-    middle = sequence.shutter.lines(view.side) // 2
+    middle, camera = sequence.shutter.lines(view.side) // 2, sequence.rig.sensor(view.side)
     names = {"rs": picture_file("rs", view.side, view.frame), "gs_f": picture_file("gs", view.side, view.frame)}
     if middle in sequence.twins:
         names["gs_m"] = picture_file("gs", view.side, view.frame, middle)
@@ -101,12 +107,11 @@ def _write_carla_frame(sequence: Sequence, view: View, place: Path) -> None:
         ("rs", sequence.depth("rs", view.side, view.frame)),
         ("gs_f", sequence.depth("gs", view.side, view.frame)),
     ):
-        write_bytes(place / f"{view.frame:04d}_{name}.depth", _depth_text(radial(sequence, depth)))
+        write_bytes(place / f"{view.frame:04d}_{name}.depth", _depth_text(radial(camera, depth)))
 
 
-def radial(sequence: Sequence, depth: NDArray[np.float32]) -> FloatArray:
+def radial(camera: PinholeCamera, depth: NDArray[np.float32]) -> FloatArray:
     """Distances (H, W) along the rays of depths z (H, W)."""
-    camera = sequence.rig.camera
     return depth * np.linalg.norm(camera.unproject(camera.pixel_grid()), axis=-1)
 
 
@@ -118,14 +123,14 @@ def _depth_text(values: FloatArray) -> bytes:
 
 
 def _write_carla_calibration(sequence: Sequence, folder: Path) -> None:
-    camera, shutter = sequence.rig.camera, sequence.shutter
-    delay_ms = 1e3 * shutter.readout_ratio * sequence.frame_period_s / shutter.lines("left")
+    camera, delay_ms = sequence.rig.sensor("left"), 1e3 * line_delay(sequence, "left")
     rows = ["#Rolling shutter camera intrinsic parameters", f"FPS: {number(1.0 / sequence.frame_period_s)}"]
     rows += [f"ROW_READOUT_TIME(ms): {number(delay_ms)}", f"RESOLUTION_H: {camera.height}"]
     write_lines(folder / "rs_calib.txt", [*rows, f"RESOLUTION_W: {camera.width}"])
-    values = numbers([camera.fx, camera.fy, camera.cx + CORNER_PX, camera.cy + CORNER_PX])
     lines = ["# Camera intrinsic parameters", "", "numCameras 2", ""]
-    for k in range(2):
+    for k, side in enumerate(SIDES):
+        camera = sequence.rig.sensor(side)
+        values = numbers([camera.fx, camera.fy, camera.cx + CORNER_PX, camera.cy + CORNER_PX])
         lines += [f"devName cam{k}", "# resolution: nCols, nRows", f"resolution {camera.width} {camera.height}"]
         lines += ["# K: fx fy cx cy with pinhole camera model", f"K {values}", ""]
     write_lines(folder / "intrinsics.txt", lines)
@@ -139,7 +144,7 @@ def _carla_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
     seconds = (sequence.frame_period_s * tau)[:, None]
     moved = inverse(Pose(so3.exp(seconds * w), seconds * v))
     start = first_pose(sequence, View(view.side, 0))
-    return seen_by(sequence, compose(moved, start), points.world)
+    return seen_by(sequence, view.side, compose(moved, start), points.world)
 
 
 _FASTEC_ABOUT = (
@@ -162,12 +167,12 @@ def _fastec_fault(sequence: Sequence, images: Images) -> str:
 
 
 def _write_fastec(sequence: Sequence, root: Path, images: Images) -> Note:
-    shutter = sequence.shutter
-    middle = shutter.height // 2
+    shutter, sentences = sequence.shutter, list[str]()
     for side in SIDES:
+        middle, ratio = shutter.lines(side) // 2, shutter.ratio_of(side)
         place = root / f"{sequence.name}_{side}"
         place.mkdir(parents=True)
-        write_lines(place / _META, [f"# {sequence.name}, {side} camera: readout ratio {shutter.readout_ratio:g}"])
+        write_lines(place / _META, [f"# {sequence.name}, {side} camera: readout ratio {ratio:g}"])
         for frame in range(sequence.frames):
             names = {"rolling": picture_file("rs", side, frame), "global_first": picture_file("gs", side, frame)}
             if middle in sequence.twins:
@@ -175,14 +180,13 @@ def _write_fastec(sequence: Sequence, root: Path, images: Images) -> Note:
             for name, file in names.items():
                 path = place / f"{frame:03d}_{name}.png"
                 write_bytes(path, read_bytes(inside(sequence.folder, file)))
-    sentences = []
-    if middle not in sequence.twins:
-        sentences.append(f"there is no twin of row {middle}, so no NNN_global_middle.png, which training reads")
-    if shutter.readout_ratio != 1.0:
-        sentences.append(
-            f"the readout ratio is {shutter.readout_ratio:g}, where those who use the layout assume 1"
-        )
-    return sentences, {}
+        if middle not in sequence.twins:
+            sentences.append(
+                f"there is no twin of row {middle}, so no NNN_global_middle.png, which training reads"
+            )
+        if ratio != 1.0:
+            sentences.append(f"the readout ratio is {ratio:g}, where those who use the layout assume 1")
+    return list(dict.fromkeys(sentences)), {}
 
 
 CARLA_RS = Format(_CARLA_ABOUT, (), one_by_one(_write_carla), fault=_carla_fault)

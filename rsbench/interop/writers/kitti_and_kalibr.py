@@ -31,6 +31,7 @@ from rsbench.interop.writers.sequence_views import (
     copy_image,
     first_pose,
     first_second,
+    line_delay,
     matrix,
     number,
     numbers,
@@ -51,8 +52,11 @@ _ONE_POSE = "the images are rolling-shutter frames: poses are those of the line 
 
 
 def _kitti_fault(sequence: Sequence, images: Images) -> str:
-    if sequence.rig.camera.lens is not None:
-        return "its images are rectified, these are seen through a lens; choose other sequences"
+    if not sequence.rig.rectified:
+        return (
+            "its pairs are rectified, and these cameras have lenses, differ, or look in two directions; "
+            "rsbench correct --rectify writes rectified pairs"
+        )
     if images == "gs" and sequence.shutter.right_delay:
         return "the right camera is late, so a pair is of two times; choose other sequences"
     if images == "rs" and not sequence.shutter.rows_together:
@@ -108,10 +112,10 @@ _KALIBR_ABOUT = (
 
 
 def _kalibr_fault(sequence: Sequence, images: Images) -> str:
-    lens = sequence.rig.camera.lens
     if not reads_from_top(sequence):
         return "its line delay is of rows that are read from the top; choose other sequences"
-    if lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0:
+    lenses = [sequence.rig.sensor(side).lens for side in SIDES]
+    if any(lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0 for lens in lenses):
         return "its lens radtan has k1, k2, p1, p2 but no k3; choose other sequences"
     return ""
 
@@ -139,7 +143,7 @@ def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
-    camera, lens, shutter = sequence.rig.camera, sequence.rig.camera.lens, sequence.shutter
+    rig, camera, lens = sequence.rig, sequence.rig.sensor(side), sequence.rig.sensor(side).lens
     if lens is None:
         model, values = "none", list[float]()
     elif lens.model == "kannala-brandt":
@@ -153,18 +157,18 @@ def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
         f"distortion_coeffs: {_yaml_list(values)}",
         f"resolution: [{camera.width}, {camera.height}]",
         f"rostopic: /{side}/image_raw",
-        f"line_delay: {number(shutter.readout_ratio * sequence.frame_period_s / shutter.lines(side))}",
+        f"line_delay: {number(line_delay(sequence, side))}",
     ]
     if side == "right":
-        lines += _yaml_transform("T_cn_cnm1", sequence.rig.offset("right") - sequence.rig.offset("left"))
+        lines += _yaml_transform("T_cn_cnm1", rig.right_from_left)
     if sequence.imu is not None:
-        lines += _yaml_transform("T_cam_imu", sequence.rig.offset(side))
+        lines += _yaml_transform("T_cam_imu", Pose(rig.own(side).R, rig.own(side).R @ rig.offset(side)))
         lines.append(f"timeshift_cam_imu: {number(sequence.imu.time_offset_s)}")
     return lines
 
 
-def _yaml_transform(name: str, translation: FloatArray) -> list[str]:
-    return [f"{name}:", *(f"- {_yaml_list(row)}" for row in matrix(Pose(np.eye(3), translation)).tolist())]
+def _yaml_transform(name: str, pose: Pose) -> list[str]:
+    return [f"{name}:", *(f"- {_yaml_list(row)}" for row in matrix(pose).tolist())]
 
 
 def _yaml_list(values: list[float]) -> str:

@@ -14,7 +14,6 @@ the rig is shown at its pose at that time. Pixels of Rerun are counted from the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from rsbench.interop.writers.sequence_views import (
     corner_matrix,
     first_second,
     line_poses,
+    step_of,
     views_in_time,
     world_points,
 )
@@ -89,7 +89,7 @@ def _tabs(side: Side) -> list[rrb.Spatial2DView]:
 
 def _log_camera(recording: rr.RecordingStream, sequence: Sequence, side: Side) -> None:
     """A camera, and its pose at the time of every line of every frame."""
-    camera = sequence.rig.camera
+    camera = sequence.rig.sensor(side)
     recording.log(
         f"world/{side}",
         rr.Pinhole(
@@ -133,9 +133,7 @@ def _log_lines(recording: rr.RecordingStream, sequence: Sequence, view: View) ->
 
 
 def _log_points(recording: rr.RecordingStream, sequence: Sequence, view: View, most: int) -> None:
-    camera = sequence.rig.camera
-    step = max(math.ceil(math.sqrt(camera.width * camera.height / most)), 1)
-    found = world_points(sequence, view, "rs", step)
+    found = world_points(sequence, view, "rs", step_of(sequence.rig.sensor(view.side), most))
     name = f"world/points/{view.side}_{view.frame}"
     recording.log(name, rr.Points3D(found.world, colors=found.colours, radii=rr.Radius.ui_points(_POINT_RADIUS)))
 

@@ -93,7 +93,7 @@ def camera_velocity(sequence: Sequence, side: Side, tau: float) -> tuple[FloatAr
     A point of the world is at x = R X + t in the camera and R' = [w]x R, so it moves by w x (x - t) + t', which is
     -(v + a x x) of a camera that moves by v and turns by a: a = -w, v = w x t - t'.
     """
-    w, rate = sequence.motion.velocity(tau)
+    w, rate = (sequence.rig.own(side).R @ each for each in sequence.motion.velocity(tau))
     t = sequence.rig.cam_from_world(sequence.motion, tau, side).t
     return (so3.cross(w, t) - rate) / sequence.frame_period_s, -w / sequence.frame_period_s
 
@@ -108,6 +108,11 @@ def matrix(pose: Pose) -> FloatArray:
 def world_from_camera(pose: Pose) -> FloatArray:
     """Homogeneous (..., 4, 4) of the inverse of ``cam_from_world``."""
     return matrix(inverse(pose))
+
+
+def step_of(camera: PinholeCamera, wanted: float) -> int:
+    """Distance between pixels, px, at which some ``wanted`` of an image are taken."""
+    return max(math.ceil(math.sqrt(camera.width * camera.height / wanted)), 1)
 
 
 def corner_matrix(camera: PinholeCamera) -> FloatArray:
@@ -202,7 +207,7 @@ def world_points(sequence: Sequence, view: View, images: Images, step: int) -> P
     y, x = np.nonzero(still & grid)
     pixels = np.stack([x, y], axis=-1)
     colours = sequence.image(images, view.side, view.frame)[y, x]
-    x_in_cam = depth[y, x, None].astype(np.float64) * sequence.rig.camera.unproject(pixels)
+    x_in_cam = depth[y, x, None].astype(np.float64) * sequence.rig.sensor(view.side).unproject(pixels)
     return Points(transform(inverse(pixel_poses(sequence, view, images, pixels)), x_in_cam), pixels, colours)
 
 
@@ -222,7 +227,7 @@ def observe(sequence: Sequence, view: View, images: Images, world: FloatArray) -
         start = shutter.start(view.frame, view.side)
         found = project_at(rig, motion, view.side, start, world)
         pixels, z = found[:, :2], found[:, 2]
-        once = rig.camera.contains(np.nan_to_num(pixels, nan=-np.inf))
+        once = rig.sensor(view.side).contains(np.nan_to_num(pixels, nan=-np.inf))
     else:
         rolling = rs_project(rig, shutter, motion, view.side, view.frame, world)
         pixels, z, once = rolling.pixels, rolling.depth, rolling.status == ProjectionStatus.SEEN
@@ -251,12 +256,10 @@ def _on_surface(depth: NDArray[np.float32], pixels: FloatArray, z: FloatArray) -
 def surfaces(sequence: Sequence, images: Images) -> Surfaces:
     """Points of the depth of every image, and every image near in time that sees them."""
     views = views_in_time(sequence)
-    camera = sequence.rig.camera
     wanted = min(_MOST_OF_AN_IMAGE, max(_POINTS // len(views), 1))
-    step = max(math.ceil(math.sqrt(camera.width * camera.height / wanted)), 1)
     worlds, colours, origins = list[FloatArray](), list[NDArray[np.uint8]](), list[NDArray[np.int64]]()
     for number, view in enumerate(views):
-        points = world_points(sequence, view, images, step)
+        points = world_points(sequence, view, images, step_of(sequence.rig.sensor(view.side), wanted))
         worlds.append(points.world)
         colours.append(points.colours)
         origins.append(np.full(len(points.world), number, dtype=np.int64))
@@ -295,11 +298,9 @@ def largest_row_error(sequence: Sequence, views: list[View], law: Law) -> float:
 
     Each point is projected with the model's pose of the line that saw it. 0 where no image has depth.
     """
-    camera = sequence.rig.camera
-    step = max(math.ceil(math.sqrt(camera.width * camera.height / _TRIED)), 1)
     worst = 0.0
     for view in views:
-        points = world_points(sequence, view, "rs", step)
+        points = world_points(sequence, view, "rs", step_of(sequence.rig.sensor(view.side), _TRIED))
         away = np.linalg.norm(law(view, points) - points.pixels, axis=-1)
         if len(away):  # NaN: behind the camera, a large error
             worst = max(worst, float(np.max(np.nan_to_num(away, nan=math.inf))))
@@ -316,9 +317,15 @@ def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> 
     return [] if error < 1e-6 else [sentence], {"largest_row_error_px": error}
 
 
-def seen_by(sequence: Sequence, poses: Pose, world: FloatArray) -> FloatArray:
-    """Pixels (n, 2) of world points (n, 3) from poses ``cam_from_world`` (n, 3, 3), (n, 3)."""
-    return sequence.rig.camera.project(transform(poses, world))
+def seen_by(sequence: Sequence, side: Side, poses: Pose, world: FloatArray) -> FloatArray:
+    """Pixels (n, 2) of world points (n, 3) in a camera with poses ``cam_from_world`` (n, 3, 3), (n, 3)."""
+    return sequence.rig.sensor(side).project(transform(poses, world))
+
+
+def line_delay(sequence: Sequence, side: Side) -> float:
+    """Seconds from each line of a camera to the next."""
+    shutter = sequence.shutter
+    return shutter.ratio_of(side) * sequence.frame_period_s / shutter.lines(side)
 
 
 def lines_of(sequence: Sequence, view: View, pixels: NDArray[np.int64]) -> NDArray[np.int64]:

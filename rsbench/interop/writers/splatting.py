@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.camera import Lens
-from rsbench.core.rig import SIDES, Side, views_of
+from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.rig import SIDES, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
@@ -45,6 +45,7 @@ from rsbench.interop.writers.sequence_views import (
     corner_matrix,
     first_pose,
     first_second,
+    line_delay,
     line_poses,
     lines_of,
     matrix,
@@ -68,13 +69,20 @@ AXES = np.array([1.0, -1.0, -1.0])
 
 
 def _nerfstudio_fault(sequence: Sequence, images: Images) -> str:
+    cameras = [sequence.rig.sensor(side) for side in SIDES]
+    if len({_camera_model(camera) for camera in cameras}) > 1:
+        return (
+            "its camera_model is one for all images, and one of these cameras is a fisheye; choose other sequences"
+        )
     if images == "gs":
         return ""
     if not reads_from_top(sequence):
         return "3dgs-deblur knows rows that are read from the top alone; take --images gs"
-    if sequence.rig.camera.lens is not None:
+    if any(camera.lens is not None for camera in cameras):
         what = "nerfstudio undistorts images before it trains, and a row of time is one of the distorted image"
         return f"{what}; take --images gs"
+    if len({sequence.shutter.ratio_of(side) for side in SIDES}) > 1:
+        return "the readouts of the cameras differ, and rolling_shutter_time is one for all; take --images gs"
     one = len(_exposures(sequence)) == 1
     return "" if one else "exposures differ, and exposure_time is one for all; take --images gs"
 
@@ -97,18 +105,25 @@ def _write_nerfstudio(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def camera_fields(sequence: Sequence) -> dict[str, Any]:
-    """The fields of transforms.json above its frames."""
-    camera, lens = sequence.rig.camera, sequence.rig.camera.lens
-    fisheye = lens is not None and lens.model == "kannala-brandt"
+    """The fields of transforms.json above its frames: those of equal cameras; each frame has those of others."""
+    model = {"camera_model": _camera_model(sequence.rig.sensor("left"))}
+    return model | (_intrinsics(sequence.rig.camera) if sequence.rig.aligned else {})
+
+
+def _camera_model(camera: PinholeCamera) -> str:
+    fisheye = camera.lens is not None and camera.lens.model == "kannala-brandt"
+    return "OPENCV_FISHEYE" if fisheye else "OPENCV"
+
+
+def _intrinsics(camera: PinholeCamera) -> dict[str, float]:
     return {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
         "fl_x": camera.fx,
         "fl_y": camera.fy,
         "cx": camera.cx + CORNER_PX,
         "cy": camera.cy + CORNER_PX,
         "w": camera.width,
         "h": camera.height,
-        **_opencv_coefficients(lens),
+        **_opencv_coefficients(camera.lens),
     }
 
 
@@ -130,6 +145,7 @@ def _frame(sequence: Sequence, view: View, images: Images) -> dict[str, Any]:
     place = world_from_camera(pose)
     place[:3, :3] *= AXES
     frame: dict[str, Any] = {"file_path": f"images/{view.name}", "transform_matrix": place.tolist()}
+    frame |= {} if sequence.rig.aligned else _intrinsics(sequence.rig.sensor(view.side))
     if images == "rs":
         linear, angular = camera_velocity(sequence, view.side, middle_time(sequence, view))
         frame["camera_linear_velocity"] = (AXES * linear).tolist()
@@ -150,7 +166,7 @@ def middle_pose(sequence: Sequence, view: View) -> Pose:
 
 def _deblur_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
     """Pixels (n, 2) where 3dgs-deblur's motion model sees the points."""
-    pose, camera = middle_pose(sequence, view), sequence.rig.camera
+    pose, camera = middle_pose(sequence, view), sequence.rig.sensor(view.side)
     x = points.world @ pose.R.T + pose.t
     linear, angular = camera_velocity(sequence, view.side, middle_time(sequence, view))
     rates = camera.velocity(x, -(linear + so3.cross(angular, x)))
@@ -204,7 +220,7 @@ def ends(sequence: Sequence, view: View) -> tuple[Pose, Pose]:
 
 
 def _arrays(sequence: Sequence, views: list[View], images: Images) -> dict[str, FloatArray]:
-    camera, count = sequence.rig.camera, len(views)
+    camera, count = sequence.rig.sensor(views[0].side), len(views)
     both = [[matrix(pose) for pose in ends(sequence, view)] for view in views]
     arrays = {
         "viewmats": np.stack([first for first, _ in both]),
@@ -227,24 +243,20 @@ def _gsplat_coefficients(lens: Lens | None) -> dict[str, list[float]]:
 
 
 def _arguments(sequence: Sequence, views: list[View], images: Images) -> dict[str, Any]:
-    camera, side = sequence.rig.camera, views[0].side
+    side = views[0].side
+    camera = sequence.rig.sensor(side)
     name, value = _SHUTTERS[sequence.shutter.scan_of(side)] if images == "rs" else _GLOBAL
-    fisheye = camera.lens is not None and camera.lens.model == "kannala-brandt"
     return {
         "width": camera.width,
         "height": camera.height,
-        "camera_model": "fisheye" if fisheye else "pinhole",
+        "camera_model": "fisheye" if _camera_model(camera) == "OPENCV_FISHEYE" else "pinhole",
         "rolling_shutter": name,
         "rolling_shutter_value": value,
         "row_to_time": _GSPLAT_LAW if images == "rs" else "all rows have the pose of viewmats",
         "images": [f"images/{view.name}" for view in views],
         "first_line_s": [first_second(sequence, view) for view in views],
-        "line_delay_s": _line_delay(sequence, side) if images == "rs" else 0.0,
+        "line_delay_s": line_delay(sequence, side) if images == "rs" else 0.0,
     }
-
-
-def _line_delay(sequence: Sequence, side: Side) -> float:
-    return sequence.shutter.readout_ratio * sequence.frame_period_s / sequence.shutter.lines(side)
 
 
 def _gsplat_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
@@ -254,7 +266,7 @@ def _gsplat_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray
     share = (lines / max(sequence.shutter.lines(view.side) - 1, 1))[:, None]
     turn = so3.log(last.R @ first.R.T)
     poses = Pose(so3.exp(share * turn) @ first.R, first.t + share * (last.t - first.t))
-    return seen_by(sequence, poses, points.world)
+    return seen_by(sequence, view.side, poses, points.world)
 
 
 NERFSTUDIO = Format(_NERFSTUDIO_ABOUT, ("rs", "gs"), one_by_one(_write_nerfstudio), fault=_nerfstudio_fault)
