@@ -58,7 +58,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rsbench.components.cards import choices
 from rsbench.core import so3
-from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, View
 from rsbench.core.se3 import Pose, compose, inverse
@@ -141,6 +141,7 @@ _COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
     "SIMPLE_RADIAL": ("f cx cy k1", "brown-conrady"),
     "RADIAL": ("f cx cy k1 k2", "brown-conrady"),
     "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "brown-conrady"),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational"),
     "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "kannala-brandt"),
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "kannala-brandt"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "kannala-brandt"),
@@ -261,6 +262,9 @@ def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
     size = numbers(" ".join(words[2:4]), where, 2)
     fx, fy = values.pop("fx", values.get("f", 0.0)), values.pop("fy", values.pop("f", 0.0))
     cx, cy = values.pop("cx") - _CORNER, values.pop("cy") - _CORNER
+    if model == "rational" and values["k4"] == values["k5"] == values["k6"] == 0.0:
+        model = "brown-conrady"
+        values = {key: values[key] for key in COEFFICIENTS["brown-conrady"]}
     return words[0], _pinhole(size, (fx, fy, cx, cy), where, model, values)
 
 
@@ -745,7 +749,10 @@ def _kitti_camera(
 
     raw, rectified = (tuple(map(int, read(key, 2))) for key in ("S", "S_rect"))
     if size == raw:
-        K, lens = read("K", 9).reshape(3, 3), dict(zip(_OPENCV, read("D", 5).tolist(), strict=True))
+        K, lens = (
+            read("K", 9).reshape(3, 3),
+            dict(zip(COEFFICIENTS["brown-conrady"], read("D", 5).tolist(), strict=True)),
+        )
         pose = Pose(read("R", 9).reshape(3, 3), read("T", 3))
         return _pinhole(size, K[[0, 1, 0, 1], [0, 1, 2, 2]], path, "brown-conrady", lens), pose
     if size == rectified:
@@ -755,9 +762,6 @@ def _kitti_camera(
     raise RsbenchError(
         f"{path}: its images are {size[0]} x {size[1]} pixels: neither S_{number} nor S_rect_{number}"
     )
-
-
-_OPENCV = ("k1", "k2", "p1", "p2", "k3")
 
 
 def _kitti_period(path: Path) -> float:

@@ -14,6 +14,7 @@ corrected.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from rsbench.components.cards import parse_card
 from rsbench.core import so3
-from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.camera import Lens, LensModel, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
@@ -40,6 +41,7 @@ from rsbench.interop.writers.sequence_views import (
     about_moving_objects,
     copy_image,
     first_pose,
+    lens_fault,
     number,
     numbers,
     one_by_one,
@@ -103,19 +105,21 @@ def _pose_words(pose: Pose) -> str:
 def camera_line(identifier: int, camera: PinholeCamera) -> str:
     """A line of cameras.txt."""
     lens = camera.lens
-    values = [camera.fx, camera.fy, camera.cx + CORNER_PX, camera.cy + CORNER_PX]
-    if lens is None:
-        model = "PINHOLE"
-    elif lens.model == "kannala-brandt":
-        model = "OPENCV_FISHEYE"
-        values += [lens.k1, lens.k2, lens.k3, lens.k4]
-    elif lens.k3 == 0.0:
-        model = "OPENCV"
-        values += [lens.k1, lens.k2, lens.p1, lens.p2]
-    else:
+    model = "PINHOLE" if lens is None else _MODELS[lens.model]
+    if lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0:
         model = "FULL_OPENCV"
-        values += [lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, 0.0, 0.0, 0.0]
+    known = (() if lens is None else lens.coefficients)[: _COEFFICIENTS[model]]
+    values = [camera.fx, camera.fy, camera.cx + CORNER_PX, camera.cy + CORNER_PX, *known]
+    values += [0.0] * (_COEFFICIENTS[model] - len(known))
     return f"{identifier} {model} {camera.width} {camera.height} {numbers(values)}"
+
+
+_MODELS: Mapping[LensModel, str] = {
+    "brown-conrady": "OPENCV",
+    "kannala-brandt": "OPENCV_FISHEYE",
+    "rational": "FULL_OPENCV",
+}
+_COEFFICIENTS = {"PINHOLE": 0, "OPENCV": 4, "OPENCV_FISHEYE": 4, "FULL_OPENCV": 8}
 
 
 def _image_lines(sequence: Sequence, found: Surfaces) -> list[str]:
@@ -192,7 +196,11 @@ def write_poses(path: Path, seconds: FloatArray, cam_from_world: Pose) -> None:
     write_lines(path, [f"# {FORMAT}", *map(numbers, table)])
 
 
-COLMAP = Format(_COLMAP_ABOUT, ("gs", "rs"), one_by_one(_write_colmap))
+def _colmap_fault(sequence: Sequence, images: Images) -> str:
+    return lens_fault(sequence.rig, *_MODELS)
+
+
+COLMAP = Format(_COLMAP_ABOUT, ("gs", "rs"), one_by_one(_write_colmap), fault=_colmap_fault)
 TUM = Format(_TUM_ABOUT, (), one_by_one(_write_tum))
 
 
@@ -299,6 +307,8 @@ def check_corrected(corrected: Corrected, name: str) -> None:
             f"--to {name}: {corrected.folder} holds corrected frames, which are exported to "
             f"{' or '.join(CORRECTED_ABOUT)}"
         )
+    if name == "colmap" and (fault := lens_fault(corrected.rig, *_MODELS)):
+        raise RsbenchError(f"--to {name}: {corrected.folder}: {fault}")
     if name == "colmap" and not corrected.shutter.rows_together:
         raise RsbenchError(
             f"--to {name}: {corrected.folder}: its cameras do not read each row at one time, so that a "

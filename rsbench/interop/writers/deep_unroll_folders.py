@@ -36,6 +36,7 @@ from rsbench.interop.writers.sequence_views import (
     camera_velocity,
     compare_rows,
     first_pose,
+    lens_fault,
     line_delay,
     number,
     numbers,
@@ -60,9 +61,9 @@ _LOADED = 10
 
 
 def _carla_fault(sequence: Sequence, images: Images) -> str:
+    if fault := lens_fault(sequence.rig):
+        return fault
     left, right = (sequence.rig.sensor(side) for side in SIDES)
-    if left.lens is not None or right.lens is not None:
-        return "its cameras have no lens; choose other sequences"
     ratios = {sequence.shutter.ratio_of(side) for side in SIDES}
     if (left.width, left.height) != (right.width, right.height) or len(ratios) > 1:
         return "its cameras have one size and one readout; choose other sequences"

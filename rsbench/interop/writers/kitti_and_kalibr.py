@@ -12,11 +12,13 @@ Pixels are ours in both: (0, 0) is the centre of the first one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.core.camera import LensModel
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
@@ -31,6 +33,7 @@ from rsbench.interop.writers.sequence_views import (
     copy_image,
     first_pose,
     first_second,
+    lens_fault,
     line_delay,
     matrix,
     number,
@@ -117,7 +120,15 @@ def _kalibr_fault(sequence: Sequence, images: Images) -> str:
     lenses = [sequence.rig.sensor(side).lens for side in SIDES]
     if any(lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0 for lens in lenses):
         return "its lens radtan has k1, k2, p1, p2 but no k3; choose other sequences"
-    return ""
+    return lens_fault(sequence.rig, *_KALIBR_LENSES)
+
+
+_KALIBR_LENSES: Mapping[LensModel, tuple[str, str]] = {
+    "brown-conrady": ("pinhole", "radtan"),
+    "kannala-brandt": ("pinhole", "equidistant"),
+    "double-sphere": ("ds", "none"),
+}
+"""Kalibr's camera model and distortion model; the two numbers of a double sphere precede the intrinsics."""
 
 
 def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
@@ -144,17 +155,14 @@ def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
 
 def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
     rig, camera, lens = sequence.rig, sequence.rig.sensor(side), sequence.rig.sensor(side).lens
-    if lens is None:
-        model, values = "none", list[float]()
-    elif lens.model == "kannala-brandt":
-        model, values = "equidistant", [lens.k1, lens.k2, lens.k3, lens.k4]
-    else:
-        model, values = "radtan", [lens.k1, lens.k2, lens.p1, lens.p2]
+    model, distortion = ("pinhole", "none") if lens is None else _KALIBR_LENSES[lens.model]
+    coefficients = () if lens is None else lens.coefficients[:4]
+    before, after = (coefficients, ()) if model == "ds" else ((), coefficients)
     lines = [
-        "camera_model: pinhole",
-        f"intrinsics: {_yaml_list([camera.fx, camera.fy, camera.cx, camera.cy])}",
-        f"distortion_model: {model}",
-        f"distortion_coeffs: {_yaml_list(values)}",
+        f"camera_model: {model}",
+        f"intrinsics: {_yaml_list([*before, camera.fx, camera.fy, camera.cx, camera.cy])}",
+        f"distortion_model: {distortion}",
+        f"distortion_coeffs: {_yaml_list([*after])}",
         f"resolution: [{camera.width}, {camera.height}]",
         f"rostopic: /{side}/image_raw",
         f"line_delay: {number(line_delay(sequence, side))}",

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import LensModel, PinholeCamera
 from rsbench.core.projection import ProjectionStatus, project_at, row_poses, rs_project
-from rsbench.core.rig import SIDES, Side
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import picture_file
@@ -148,6 +148,16 @@ def write_lines(path: Path, lines: list[str]) -> None:
 def reads_from_top(sequence: Sequence) -> bool:
     """Whether both cameras read their rows from the top."""
     return {sequence.shutter.scan_of(side) for side in SIDES} == {"top"}
+
+
+def lens_fault(rig: StereoRig, *known: LensModel) -> str:
+    """Why a format that knows these lenses alone cannot hold a rig; empty where it can."""
+    for side in SIDES:
+        lens = rig.sensor(side).lens
+        if lens is not None and lens.model not in known:
+            lenses = f"knows {' and '.join(known)} lenses alone" if known else "has no lenses"
+            return f"it {lenses}, and the {side} camera's is {lens.model}; choose other sequences"
+    return ""
 
 
 def about_moving_objects(sequence: Sequence) -> list[str]:

@@ -45,6 +45,7 @@ from rsbench.interop.writers.sequence_views import (
     corner_matrix,
     first_pose,
     first_second,
+    lens_fault,
     line_delay,
     line_poses,
     lines_of,
@@ -74,8 +75,8 @@ def _nerfstudio_fault(sequence: Sequence, images: Images) -> str:
         return (
             "its camera_model is one for all images, and one of these cameras is a fisheye; choose other sequences"
         )
-    if images == "gs":
-        return ""
+    if (fault := lens_fault(sequence.rig, "brown-conrady", "kannala-brandt")) or images == "gs":
+        return fault
     if not reads_from_top(sequence):
         return "3dgs-deblur knows rows that are read from the top alone; take --images gs"
     if any(camera.lens is not None for camera in cameras):
@@ -239,7 +240,8 @@ def _gsplat_coefficients(lens: Lens | None) -> dict[str, list[float]]:
         return {}
     if lens.model == "kannala-brandt":
         return {"radial_coeffs": [lens.k1, lens.k2, lens.k3, lens.k4]}
-    return {"radial_coeffs": [lens.k1, lens.k2, lens.k3, 0.0, 0.0, 0.0], "tangential_coeffs": [lens.p1, lens.p2]}
+    radial = [lens.k1, lens.k2, lens.k3, lens.k4, lens.k5, lens.k6]
+    return {"radial_coeffs": radial, "tangential_coeffs": [lens.p1, lens.p2]}
 
 
 def _arguments(sequence: Sequence, views: list[View], images: Images) -> dict[str, Any]:
@@ -270,4 +272,10 @@ def _gsplat_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray
 
 
 NERFSTUDIO = Format(_NERFSTUDIO_ABOUT, ("rs", "gs"), one_by_one(_write_nerfstudio), fault=_nerfstudio_fault)
-GSPLAT = Format(_GSPLAT_ABOUT, ("rs", "gs"), one_by_one(_write_gsplat))
+
+
+def _gsplat_fault(sequence: Sequence, images: Images) -> str:
+    return lens_fault(sequence.rig, "brown-conrady", "rational", "kannala-brandt")
+
+
+GSPLAT = Format(_GSPLAT_ABOUT, ("rs", "gs"), one_by_one(_write_gsplat), fault=_gsplat_fault)
