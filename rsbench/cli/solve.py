@@ -29,7 +29,8 @@ EPILOG = """[bold]Examples[/bold]
 
   cat problems.jsonl | rsbench solve - --json --with covariance,inliers
 
-A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy), [bold]baseline[/bold] (m),
+A problem holds [bold]camera[/bold] (width, height, fx, fy, cx, cy) and [bold]baseline[/bold] (m), or
+[bold]cameras[/bold] (left, right) and [bold]right_from_left[/bold] (rotation, translation),
 [bold]readout_ratio[/bold] (absent: it is found) and matches in pixels: [bold]left[/bold], [bold]right[/bold]
 (x0, y0, x1, y1), [bold]stereo_0[/bold], [bold]stereo_1[/bold] (xl, yl, xr, yr), [bold]tracks[/bold] (xl0, yl0,
 xr0, yr0, xl1, yl1, xr1, yr1); absent sets are empty. The centre of the top-left pixel is (0, 0).
@@ -159,6 +160,9 @@ def _show_one(answer: dict[str, Any]) -> None:
     unit = "m per frame" if answer["metric"] else "(direction only)"
     echo(f"w  {_vector(answer['w'])} rad per frame ({_degrees(answer['w']):.4f} deg)")
     echo(f"d  {_vector(answer['d'])} {unit}, of {whose}")
+    for side, own in answer.get("cameras", {}).items():
+        d = "" if own["d"] is None else f", d {_vector(own['d'])}"
+        echo(f"{side} camera, in its own axes: w {_vector(own['w'])}{d}")
     echo(f"inliers: {answer['inliers']} of {answer['matches']} matches")
     echo(f"assumes: {answer['motion_model']} motion, {answer['shutter']} shutter; {answer['assumes']}")
     if "readout" in answer:

@@ -14,7 +14,8 @@ from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of,
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.core.correspondences import Correspondences, join_stereo
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig
+from rsbench.core.pose_errors import translation_of_offset
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.frame_motion import (
     SHAKES,
@@ -27,7 +28,7 @@ from rsbench.pipeline.frame_motion import (
 )
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
-from rsbench.solvers.engine.base import MotionEstimate, SolverEntry
+from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
 
 Answer = dict[str, Any]
@@ -75,6 +76,7 @@ def solve_problem(
         "direction_known": estimate.direction_known,
         "reference_point": spec.reference_point,
         "d_body": None if isinstance(body, str) else body.d.tolist(),
+        **({} if problem.rig.aligned else {"cameras": _of_cameras(estimate, spec, body, problem.rig)}),
         "motion_model": spec.motion_model if choice is None else choice.used,
         **({} if motion_model is None else {"model_choice": None if choice is None else choice.record()}),
         "shutter": spec.shutter,
@@ -153,6 +155,23 @@ def _under_model(
         if capture is not None and motion is not law:
             return other, _unsolved(SHAKES, options), None
     return other, result, choice
+
+
+def _of_cameras(
+    estimate: MotionEstimate, spec: SolverSpec, body: Motion | str, rig: StereoRig
+) -> dict[str, Any] | None:
+    """The motion of each camera in its own axes; without metres d of the left one alone, where that is known."""
+    if not estimate.success:
+        return None
+    out = dict[str, Any]()
+    for side in SIDES:
+        R, d = rig.own(side).R, None
+        if not isinstance(body, str):
+            d = translation_of_offset(estimate.w, body.d, rig.offset(side))
+        elif (spec.reference_point, side) == ("left", "left"):
+            d = estimate.d
+        out[side] = {"w": (R @ estimate.w).tolist(), "d": None if d is None else (R @ d).tolist()}
+    return out
 
 
 def _extras(problem: Problem, result: RobustEstimate, extras: Collection[Extra]) -> Answer:

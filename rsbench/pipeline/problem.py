@@ -12,10 +12,11 @@ from typing import Any, TextIO
 import numpy as np
 
 from rsbench.components.cards import choices, parse_card, shipped_folder
+from rsbench.components.rig_tables import RightFromLeft, camera_record, tables_of
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
 from rsbench.storage.untrusted_files import (
     FILE_BYTES,
@@ -70,9 +71,18 @@ class Problem:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Cameras:
+    left: PinholeCamera
+    right: PinholeCamera
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Content(StatedShutter):
-    camera: PinholeCamera
-    baseline: float
+    camera: PinholeCamera | None = None
+    baseline: float | None = None
+    cameras: _Cameras | None = None
+    """With ``right_from_left`` in place of those two: format 2, of any rig."""
+    right_from_left: RightFromLeft | None = None
     name: str = ""
     left: _Rows = ()
     right: _Rows = ()
@@ -124,16 +134,20 @@ def read_problem(path: str | Path) -> Problem:
 
 def problem_record(problem: Problem) -> dict[str, Any]:
     """A problem as JSON holds it: ``parse_problem`` reads it. Sets without a match are left out, but not all."""
-    camera = problem.rig.camera
-    lens: dict[str, Any] = {} if camera.lens is None else {"lens": camera.lens.record()}
     sets = {key: getattr(problem.correspondences, key).tolist() for key in COLUMNS}
     return {
         "name": problem.name,
-        "camera": {key: getattr(camera, key) for key in _CAMERA} | lens,
-        "baseline": problem.rig.baseline,
+        **_rig_record(problem.rig),
         **_shutter_record(problem),
         **({key: rows for key, rows in sets.items() if rows} or {"left": []}),
     }
+
+
+def _rig_record(rig: StereoRig) -> dict[str, Any]:
+    if rig.aligned:
+        return {"camera": camera_record(rig.camera), "baseline": rig.baseline}
+    tables = tables_of(rig)
+    return {"cameras": {side: tables.pop(side) for side in SIDES}, **tables}
 
 
 def _shutter_record(problem: Problem) -> dict[str, Any]:
@@ -219,14 +233,30 @@ def parse_problem(text: str, where: str, name: str = "") -> Problem:
     for key, columns in given.items():
         _check_widths(getattr(content, key), key, columns, where)
     sets = {key: getattr(content, key) for key in given}
-    return _problem(
-        content.camera,
-        content.baseline,
-        content,
-        sets,
-        content.name or name or where,
-        where,
-    )
+    return _problem(_rig_of(content, where), content, sets, content.name or name or where, where)
+
+
+_IDEAL, _ANY = ("camera", "baseline"), ("cameras", "right_from_left")
+
+
+def _rig_of(content: _Content, where: str) -> StereoRig:
+    given = [key for key in (*_IDEAL, *_ANY) if getattr(content, key) is not None]
+    form = _ANY if given and given[-1] in _ANY else _IDEAL
+    for key in given:
+        if key not in form:
+            raise RsbenchError(f"{where}: {key} and {form[0]} exclude each other: {form[0]} goes with {form[1]}")
+    for key in form:
+        if key not in given:
+            other = "" if given else f"; or {_ANY[0]} and {_ANY[1]} of a rig whose cameras differ"
+            raise RsbenchError(f"{where}: {key!r} is required{other}")
+    try:
+        if content.cameras is not None and content.right_from_left is not None:
+            pose = content.right_from_left
+            return StereoRig.of_cameras(content.cameras.left, content.cameras.right, pose.R, pose.translation)
+        assert content.camera is not None and content.baseline is not None
+        return StereoRig(camera=content.camera, baseline=content.baseline)
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {'right_from_left: ' if form is _ANY else ''}{error}") from error
 
 
 def _check_sets(data: Mapping[str, Any], where: str) -> None:
@@ -243,17 +273,17 @@ def _check_widths(rows: _Rows, name: str, columns: str, where: str) -> None:
 
 
 def _problem(
-    camera: PinholeCamera,
-    baseline: float,
+    rig: StereoRig,
     stated: StatedShutter,
     sets: Mapping[str, Any],
     name: str,
     where: str,
 ) -> Problem:
+    scanning, ratio, right = stated.scanning, stated.readout_ratio, stated.right_readout_ratio
+    if ratio is None and right is not None:
+        raise RsbenchError(f"{where}: right_readout_ratio = {right}: needs readout_ratio, that of the left camera")
     try:
-        rig = StereoRig(camera=camera, baseline=baseline)
-        scanning, ratio = stated.scanning, stated.readout_ratio
-        known = (scanning or Scanning()).shutter_of(camera.width, camera.height, ratio or 0.0)
+        known = rig.shutter_of(scanning or Scanning(), ratio or 0.0)
         matches = Correspondences(**{key: np.array(rows, dtype=np.float64) for key, rows in sets.items()})
     except ValueError as error:
         raise RsbenchError(f"{where}: {error}") from error
@@ -283,9 +313,12 @@ def _from_npz(path: Path) -> Problem:
             raise RsbenchError(f"{path}: {key} has shape {arrays[key].shape}: must be one number")
     width, height, *rest = size.tolist()
     values = {"width": int(width), "height": int(height), **dict(zip(_CAMERA[2:], rest, strict=True))}
-    camera = parse_card(PinholeCamera, values, f"{path}: camera")
+    try:
+        camera = parse_card(PinholeCamera, values, f"{path}: camera")
+        rig = StereoRig(camera=camera, baseline=float(arrays["baseline"].item()))
+    except ValueError as error:
+        raise RsbenchError(f"{path}: {error}") from error
     sets = {key: arrays[key] for key in COLUMNS if key in arrays}
-    baseline = float(arrays["baseline"].item())
     ratio = float(arrays["readout_ratio"].item()) if "readout_ratio" in arrays else None
     name = str(arrays["name"]) if "name" in arrays else path.stem
-    return _problem(camera, baseline, StatedShutter(readout_ratio=ratio), sets, name, str(path))
+    return _problem(rig, StatedShutter(readout_ratio=ratio), sets, name, str(path))

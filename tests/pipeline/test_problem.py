@@ -14,16 +14,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from general_rigs import RIGS
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
+from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.answer import EXTRAS, Answer, solve_problem
 from rsbench.pipeline.isolated_components import SolverRunner
-from rsbench.pipeline.problem import EXAMPLE, Problem, parse_problem, read_problem, read_problems
+from rsbench.pipeline.problem import EXAMPLE, Problem, parse_problem, problem_record, read_problem, read_problems
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
@@ -375,3 +377,75 @@ def test_a_lens_that_folds_is_one_line_with_the_field() -> None:
     data["camera"]["lens"] = {"model": "brown-conrady", "k7": 0.1}
     with pytest.raises(RsbenchError, match=r"unknown key 'camera.lens.k7'"):
         parse_problem(json.dumps(data), "p.json")
+
+
+# Format 2: any two cameras.
+
+
+def of_any_rig(**changes: Any) -> dict[str, Any]:
+    rig = RIGS["turned"]
+    motion = LinearMotion(np.array([0.01, 0.03, -0.02]), np.array([0.05, -0.1, 0.12]))
+    shutter = rig.shutter_of(Scanning(right_readout_ratio=0.3), 0.8)
+    matches = simulate(
+        rig, shutter, motion, SimulationOptions(pairs=40, tracks=40, depth=(3.0, 8.0)), np.random.default_rng(0)
+    ).correspondences
+    found = problem_record(Problem(name="any", correspondences=matches, rig=rig, known_shutter=shutter))
+    return {key: value for key, value in (found | changes).items() if value is not None}
+
+
+def test_a_problem_of_any_rig_is_read_as_written_and_solved_exactly() -> None:
+    data = of_any_rig()
+    problem = parse_problem(json.dumps(data), "p.json")
+    assert problem.shutter == RIGS["turned"].shutter_of(Scanning(right_readout_ratio=0.3), 0.8)
+    assert problem.rig.right_from_left.R.tolist() == pytest.approx(RIGS["turned"].right_from_left.R, abs=1e-15)
+    w, d = np.array([0.01, 0.03, -0.02]), np.array([0.05, -0.1, 0.12])
+    answer = answer_of(problem, "rs-stereo-refined")
+    np.testing.assert_allclose([answer["w"], answer["d"]], [w, d], atol=1e-8)
+    for side in SIDES:  # in its own axes, against the poses at 0 and 1
+        (R0, t0), (R1, t1) = (problem.rig.cam_from_world(LinearMotion(w, d), k, side) for k in (0, 1))
+        turned = R1 @ R0.T
+        own = answer["cameras"][side]
+        np.testing.assert_allclose(so3.exp(np.array(own["w"])), turned, atol=1e-8)
+        np.testing.assert_allclose(own["d"], t1 - turned @ t0, atol=1e-8)
+    one = answer_of(problem, "rs-mono-refined")["cameras"]
+    assert one["right"]["d"] is None and np.linalg.norm(one["left"]["d"]) == pytest.approx(1.0)
+    assert "perfect alignment" in answer_of(problem, "rs-r6p")["reason"]
+    assert answer_of(problem, "rs-r6p")["cameras"] is None
+
+
+def test_equal_aligned_cameras_have_the_answers_of_format_1() -> None:
+    camera = content()["camera"]
+    pose = {"translation": [-RIG.baseline, 0.0, 0.0]}
+    both = content(camera=None, baseline=None, cameras={"left": camera, "right": camera}, right_from_left=pose)
+    answers = [
+        answer_of(parse_problem(json.dumps(each), "p.json", "p"), "rs-stereo-refined")
+        for each in (content(), both)
+    ]
+    for answer in answers:
+        del answer["seconds"]
+    assert answers[0] == answers[1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({"camera": content()["camera"]}, ["camera and cameras exclude", "right_from_left"]),
+        ({"baseline": 0.2}, ["baseline and cameras exclude"]),
+        ({"right_from_left": None}, ["'right_from_left' is required"]),
+        ({"cameras": None}, ["'cameras' is required"]),
+        ({"cameras": {"left": content()["camera"]}}, ["cameras.right"]),
+        ({"right_from_left": {"translation": [0.0, 0.0, 0.0]}}, ["right_from_left", "translation", "one place"]),
+        (
+            {"right_from_left": {"translation": [-1, 0, 0], "rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}},
+            ["rotation"],
+        ),
+        ({"readout_ratio": None}, ["right_readout_ratio = 0.3", "needs readout_ratio"]),
+    ],
+)
+def test_a_wrong_rig_is_refused_in_one_line(changes: dict[str, Any], parts: list[str]) -> None:
+    with pytest.raises(RsbenchError) as caught:
+        parse_problem(json.dumps(of_any_rig(**changes)), "p.json")
+    message = str(caught.value)
+    assert message.startswith("p.json: ") and "\n" not in message
+    for part in parts:
+        assert part in message
