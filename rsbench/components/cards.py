@@ -16,7 +16,7 @@ import math
 import os
 import tomllib
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -318,19 +318,25 @@ def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_shutters(card: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A dataset's card with every ``shutter`` replaced; values of wrong types stay for the parser to refuse.
+    """A dataset's card with every ``shutter`` replaced; RsbenchError as ``with_shutter``."""
+    return in_all_tables(card, lambda table: with_shutter(table, where))
 
-    Raises:
-        RsbenchError: as ``with_shutter``.
+
+def in_all_tables(
+    card: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]
+) -> dict[str, Any]:
+    """A dataset's card in which its own table, those of its sequences and of values of its grid are changed.
+
+    Values of wrong types stay for the parser to refuse.
     """
 
     def replaced(value: Any) -> Any:
-        return with_shutter(value, where) if isinstance(value, dict) else value
+        return change(value) if isinstance(value, dict) else value
 
     def values(axis: Any) -> Any:
         return {key: replaced(value) for key, value in axis.items()} if isinstance(axis, dict) else axis
 
-    made = with_shutter(card, where)
+    made = change(card)
     if isinstance(sequences := made.get("sequence"), list):
         made["sequence"] = [replaced(sequence) for sequence in sequences]
     if isinstance(grid := made.get("grid"), dict):

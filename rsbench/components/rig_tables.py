@@ -247,6 +247,35 @@ def load_rig(name_or_path: str) -> RigTables:
     return parse_card(RigTables, read_rig_table(name_or_path), str(card_path("rigs", name_or_path)))
 
 
+RIG_KEY = {
+    "left": "The left camera of a rig whose cameras differ, with ``right`` and ``right_from_left``, in place of "
+    "``rig``.",
+    "right": "The right camera.",
+    "right_from_left": "Where the right camera is, and how it is turned.",
+}
+"""Shorthands of tables in which ``with_rig`` replaces these keys."""
+
+
+def with_rig(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A table of a card whose rig, a name or tables of its own, becomes the table ``rig`` of ``RigTables``.
+
+    Raises:
+        RsbenchError: both are given, no such rig card, or as ``with_readouts``.
+    """
+    made = {key: value for key, value in table.items() if key not in RIG_KEY}
+    if own := {key: table[key] for key in RIG_KEY if key in table}:
+        if "rig" in made:
+            raise RsbenchError(f"{where}: rig and {next(iter(own))} exclude each other; leave one out")
+        made["rig"] = own
+    rig = made.get("rig")
+    if isinstance(rig, str):
+        made["rig"] = read_rig_table(rig)
+    elif isinstance(rig, dict):
+        period = {key: made[key] for key in ("frame_period_s",) if key in made}
+        made["rig"] = with_readouts(period | rig, where)
+    return made
+
+
 def tables_of(rig: StereoRig) -> dict[str, Any]:
     """``left``, ``right`` and ``right_from_left`` of a rig, as rig.toml and manifests have them."""
     R, t = rig.right_from_left
@@ -258,5 +287,5 @@ def tables_of(rig: StereoRig) -> dict[str, Any]:
 
 def camera_record(camera: PinholeCamera) -> dict[str, Any]:
     """A camera for JSON: size and intrinsics, px, and its lens where it has one."""
-    own = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return own | ({} if camera.lens is None else {"lens": camera.lens.record()})
+    own: dict[str, Any] = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return own if camera.lens is None else own | {"lens": camera.lens.record()}

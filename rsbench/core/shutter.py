@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,15 @@ class Scanning:
     """Frame periods by which the right camera reads later than the left one, from -1 to 1."""
     right_readout_ratio: float | None = None
     """Readout time over frame period of the right camera, 0 to 1. Absent: as the left camera's."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """For JSON; newer keys only where they say something."""
+        return {
+            name: value
+            for name, value in asdict(self).items()
+            if name != "right_readout_ratio" or value is not None
+        }
 
     @property
     def plain(self) -> bool:

@@ -10,8 +10,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml, with_shutters
+from rsbench.components.cards import SHUTTER_KEY, card_path, in_all_tables, parse_card, read_toml, with_shutters
 from rsbench.components.imports import search
+from rsbench.components.rig_tables import RIG_KEY, RigTables, with_rig
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry
@@ -31,10 +32,10 @@ from rsbench.dataset.motion_cards import (
     generator,
     parts_along,
 )
-from rsbench.dataset.sequence import sequence_manifest
+from rsbench.dataset.sequence import check_sizes, sequence_manifest
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.scenes.model import Start
-from rsbench.storage.untrusted_files import check_name, check_size
+from rsbench.storage.untrusted_files import check_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +56,7 @@ class CameraCard:
 class SequenceCard:
     """One scene seen from one viewpoint under one motion."""
 
-    SHORTHANDS: ClassVar = SHUTTER_KEY
+    SHORTHANDS: ClassVar = SHUTTER_KEY | RIG_KEY
 
     name: str
     """Name of the sequence and of its folder."""
@@ -65,6 +66,8 @@ class SequenceCard:
     """Name of a viewpoint of the scene card."""
     motion: MotionCard | None = None
     """Motion of this sequence, in place of the dataset's."""
+    rig: RigTables | None = None
+    """Rig of this sequence, in place of the dataset's."""
     baseline: float | None = None
     """Full distance between the cameras, metres, in place of the dataset's."""
     readout_ratio: float | None = None
@@ -92,12 +95,14 @@ class SequenceCard:
 class Variation:
     """What one value of an axis of a grid sets in every sequence; what is left out stays."""
 
-    SHORTHANDS: ClassVar = SHUTTER_KEY
+    SHORTHANDS: ClassVar = SHUTTER_KEY | RIG_KEY
 
     motion: MotionCard | None = None
     """Motion, in place of the sequence's."""
     viewpoint: str | None = None
     """Name of a viewpoint, in place of the sequence's."""
+    rig: RigTables | None = None
+    """Rig, in place of the sequence's."""
     baseline: float | None = None
     """Full distance between the cameras, metres, in place of the sequence's."""
     readout_ratio: float | None = None
@@ -120,7 +125,7 @@ Twin = Literal["first", "middle", "last"]
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCard(Scanning):
-    """A dataset: one camera, rig and shutter, and its sequences.
+    """A dataset: its rig and shutter, and its sequences.
 
     From a key to pixels: ``rig_of``, ``shutter_for``, ``motion_of`` and ``sensor_of`` of this class make the
     objects of a sequence from its keys, and ``render_camera`` in rsbench/dataset/generation.py renders its frames
@@ -128,7 +133,7 @@ class DatasetCard(Scanning):
     renderer the row seen from that pose, and the sensor turns it into digital numbers.
     """
 
-    SHORTHANDS: ClassVar = SHUTTER_KEY
+    SHORTHANDS: ClassVar = SHUTTER_KEY | RIG_KEY
 
     name: str
     """Name of the dataset."""
@@ -136,13 +141,17 @@ class DatasetCard(Scanning):
     """One line for ``rsbench list datasets``."""
     license: str = "CC-BY-4.0"
     """SPDX name of the licence of the data: another one where meshes or textures of yours ask for it."""
-    camera: CameraCard
-    """Image size, focal length and lens of both cameras."""
-    baseline: float
-    """Full distance between the cameras, metres."""
-    readout_ratio: float
+    camera: CameraCard = None  # pyrefly: ignore[bad-assignment]
+    """Image size, focal length and lens of both cameras. Required, unless there is a ``rig``."""
+    baseline: float = None  # pyrefly: ignore[bad-assignment]
+    """Full distance between the cameras, metres. Required with ``camera``."""
+    rig: RigTables | None = None
+    """Name of a rig card (``rsbench list rigs``) or a path to one, or its tables: a calibrated rig, in place of
+    ``camera`` and ``baseline``. What it states of the readout goes before ``readout_ratio`` and ``scan`` here, but
+    not before those of a sequence."""
+    readout_ratio: float = None  # pyrefly: ignore[bad-assignment]
     """Readout time over frame period, 0 (global shutter) to 1: row y of frame k is exposed at the time k +
-    readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given."""
+    readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given or the rig states it."""
     readout_range: tuple[float, float] | None = None
     """Two readout ratios: each sequence's is drawn evenly between them, by its seed and name; all other ratios
     of the card are ignored."""
@@ -183,11 +192,12 @@ class DatasetCard(Scanning):
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,63}", self.license):
             raise ValueError(f"license = {self.license!r}: must be an SPDX name, such as CC-BY-4.0")
-        check_size("camera", (self.camera.width, self.camera.height))
+        if self.camera is not None and self.rig is not None:
+            raise ValueError("rig and camera exclude each other; leave one out")
         if not len(FRAMES) <= self.frames <= MOST_FRAMES:
             raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")
         for sequence in self.sequence:
-            self.rig_of(sequence)
+            self._check_cameras(sequence)
             self._check_times(sequence)
             check_moving(sequence.moving, self.channels)
         low, high = self.readout_range or (0.0, 1.0)
@@ -195,7 +205,6 @@ class DatasetCard(Scanning):
             raise ValueError(f"readout_range = {[low, high]}: must be two ratios in [0, 1], the smaller first")
         if len(set(self.channels)) < len(self.channels):
             raise ValueError(f"channels = {list(self.channels)}: must differ from each other")
-        check_channels(self.channels, self.camera.lens is not None, self.plain)
         if any(sequence.seed is not None for sequence in self.sequence) and self.seeds:
             raise ValueError("seeds and the seed of a sequence exclude each other")
         if len(set(self.seeds)) < len(self.seeds):
@@ -209,6 +218,11 @@ class DatasetCard(Scanning):
         ).items():  # folders that many systems take for one
             if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
+
+    def _check_cameras(self, sequence: SequenceCard) -> None:
+        rig, shutter = self.rig_of(sequence), self.shutter_for(sequence)
+        check_sizes(rig)
+        check_channels(self.channels, not rig.rectified, shutter.plain)
 
     def _check_times(self, sequence: SequenceCard) -> None:
         self.shutter_for(sequence)
@@ -230,18 +244,34 @@ class DatasetCard(Scanning):
             raise ValueError("'motion' is required")
 
     def rig_of(self, sequence: SequenceCard) -> StereoRig:
-        camera = PinholeCamera.centred(self.camera.width, self.camera.height, self.camera.focal)
-        camera = replace(camera, lens=self.camera.lens)
+        """The rig of a sequence; ValueError for one that is not stated, or cannot be."""
+        tables = sequence.rig or self.rig
+        if tables is not None:
+            rig = tables.rig()
+            return rig if sequence.baseline is None else replace(rig, baseline=sequence.baseline)
         baseline = self.baseline if sequence.baseline is None else sequence.baseline
-        return StereoRig(camera=camera, baseline=baseline)
+        if self.camera is None or baseline is None:
+            raise ValueError(f"{'camera' if self.camera is None else 'baseline'!r} is required")
+        camera = PinholeCamera.centred(self.camera.width, self.camera.height, self.camera.focal)
+        return StereoRig(camera=replace(camera, lens=self.camera.lens), baseline=baseline)
 
     def shutter_for(self, sequence: SequenceCard) -> RollingShutter:
-        ratio = self.readout_ratio if sequence.readout_ratio is None else sequence.readout_ratio
-        return self.shutter_of(self.camera.width, self.camera.height, ratio)
+        """The shutter of a sequence; ValueError for one that is not stated, or cannot be."""
+        tables = sequence.rig or self.rig
+        stated = None if tables is None else tables.readout_ratio
+        ratio = next(
+            (each for each in (sequence.readout_ratio, stated, self.readout_ratio) if each is not None), None
+        )
+        if ratio is None:
+            raise ValueError("'readout_ratio' is required")
+        scanning = self if tables is None else tables.scanning or self
+        return self.rig_of(sequence).shutter_of(scanning, ratio)
 
     def period_of(self, sequence: SequenceCard) -> float:
         """Seconds of a frame period."""
-        return self.frame_period_s if sequence.frame_period_s is None else sequence.frame_period_s
+        tables = sequence.rig or self.rig
+        stated = self.frame_period_s if tables is None else tables.frame_period_s or self.frame_period_s
+        return stated if sequence.frame_period_s is None else sequence.frame_period_s
 
     def sensor_of(self, sequence: SequenceCard) -> Sensor | None:
         return self.sensor if sequence.sensor is None else sequence.sensor
@@ -251,7 +281,11 @@ class DatasetCard(Scanning):
         shutter = self.shutter_for(sequence)
         lines = min(shutter.lines(side) for side in SIDES)
         if self.twins and lines < max(shutter.lines(side) for side in SIDES):
-            raise ValueError("twins: cameras of which one reads rows and one columns have no rows in common")
+            raise ValueError(
+                "twins: cameras of which one reads rows and one columns have no rows in common"
+                if shutter.axis("left") != shutter.axis("right")
+                else "twins: cameras of which one has more rows than the other have no rows in common"
+            )
         named = {"first": 0, "middle": lines // 2, "last": lines - 1}
         rows = [named[row] if isinstance(row, str) else row for row in self.twins]
         if len(rows) > MOST_TWINS:
@@ -278,9 +312,11 @@ class DatasetCard(Scanning):
         """From when to when its rows are exposed, frame periods."""
         period, sensor, shutter = self.period_of(sequence), self.sensor_of(sequence), self.shutter_for(sequence)
         half = 0.0 if sensor is None else 0.5 * sensor.longest_s / period
-        late = shutter.right_delay
-        last = self.frames - 1 + shutter.readout_ratio
-        return min(0.0, late) - half, last + max(0.0, late) + half
+        starts = [float(shutter.start(0, side)) for side in SIDES]
+        ends = [
+            self.frames - 1 + shutter.ratio_of(side) + start for start, side in zip(starts, SIDES, strict=True)
+        ]
+        return min(starts) - half, max(ends) + half
 
     def seed_of(self, sequence: SequenceCard) -> int:
         return self.seed if sequence.seed is None else sequence.seed
@@ -447,4 +483,5 @@ def load_dataset_card(
 def read_dataset_card(path: Path) -> DatasetCard:
     """A dataset card as it stands in its file, nothing drawn; raises as ``load_dataset_card``."""
     search(path)
-    return parse_card(DatasetCard, with_shutters(read_toml(path), str(path)), str(path))
+    card = in_all_tables(with_shutters(read_toml(path), str(path)), lambda table: with_rig(table, str(path)))
+    return parse_card(DatasetCard, card, str(path))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -548,7 +548,7 @@ class ChannelReader:
         Raises:
             RsbenchError: the sequence does not have this channel, or the file cannot be read.
         """
-        return OBJECTS[channel].read_values(self._path(channel, file), self._size)
+        return OBJECTS[channel].read_values(self._path(channel, file), self._size(_side_of(file)))
 
     def offsets(
         self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
@@ -653,6 +653,12 @@ class ChannelReader:
             )
         return inside(self.folder, file)
 
-    @property
-    def _size(self) -> tuple[int, int]:
-        return self.rig.camera.width, self.rig.camera.height
+    def _size(self, side: Side) -> tuple[int, int]:
+        """Width and height of a camera's images."""
+        camera = self.rig.sensor(side)
+        return camera.width, camera.height
+
+
+def _side_of(file: str) -> Side:
+    """Of a file that belongs to one frame: FOLDER/SIDE_FRAME.END."""
+    return "left" if PurePosixPath(file).name.startswith("left") else "right"

@@ -365,7 +365,7 @@ def render_view(
         # No stitching: all rows have one pose, and one time.
         tau, options = np.full(tau.shape, tau[line]), replace(options, method="single-pass")
     lines = LinePoses(*poses, poses_of(geometry.objects, tau), columns)
-    return render(scene, geometry.rig.camera, lines, options, rows=rows, on_gs_frame=on_gs_frame)
+    return render(scene, geometry.rig.sensor(view.side), lines, options, rows=rows, on_gs_frame=on_gs_frame)
 
 
 def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDArray[np.float32]], None]:

@@ -75,9 +75,10 @@ def stack_file(side: Side, frame: int, row: int) -> str:
     return f"gs_stack/{side}_{frame}/{row:04d}.png"
 
 
-def whole_frames(manifest: Mapping[str, Any]) -> int:
-    """How many whole frames each camera has at each time, by a sequence.json: one for each row, or none."""
-    renderer, camera = manifest.get("renderer"), manifest.get("camera")
+def whole_frames(manifest: Mapping[str, Any], side: str = "left") -> int:
+    """How many whole frames a camera has at each time, by a sequence.json: one for each row, or none."""
+    renderer, camera, cameras = (manifest.get(key) for key in ("renderer", "camera", "cameras"))
+    camera = cameras.get(side) if isinstance(cameras, dict) else camera
     if not (isinstance(renderer, dict) and renderer.get("full_frames") is True and isinstance(camera, dict)):
         return 0
     height = camera.get("height")

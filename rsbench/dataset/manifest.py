@@ -13,7 +13,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
 from rsbench.core.version import RELEASED, __version__
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.sequence import FORMAT, UNITS
+from rsbench.dataset.sequence import UNITS, format_of
 from rsbench.storage.files import HashedFile, sha256, write_json
 from rsbench.storage.untrusted_files import read_bytes
 
@@ -186,7 +186,7 @@ def manifest_of(card: DatasetCard, made: Mapping[str, Files]) -> dict[str, Any]:
         for name, file in made[sequence.name].items()
     }
     return {
-        "format": FORMAT,
+        "format": max(format_of(card.rig_of(each), card.shutter_for(each)) for each in card.sequence),
         "name": card.name,
         "description": card.description,
         "license": card.license,
@@ -208,8 +208,17 @@ def says(data: bytes, content: dict[str, Any]) -> bool:
 
 
 def _record(card: DatasetCard) -> dict[str, Any]:
-    """The complete card; without ``frames`` where there are two, as in the first version of the format."""
-    own = asdict(card)
-    if card.camera.lens is not None:
+    """The complete card; without ``frames`` where there are two, and without newer keys where they say nothing."""
+    own = _without_new_keys(asdict(card))
+    if card.camera is not None and card.camera.lens is not None:
         own["camera"]["lens"] = card.camera.lens.record()
-    return own if card.frames > len(FRAMES) else {key: value for key, value in own.items() if key != "frames"}
+    absent = {key for key in ("camera", "baseline", "readout_ratio") if own[key] is None}
+    absent |= {"frames"} if card.frames == len(FRAMES) else set()
+    return {key: value for key, value in own.items() if key not in absent}
+
+
+def _without_new_keys(value: Any) -> Any:
+    if isinstance(value, dict):
+        new = {key for key in ("rig", "right_readout_ratio") if value.get(key, 0) is None}
+        return {key: _without_new_keys(each) for key, each in value.items() if key not in new}
+    return [_without_new_keys(each) for each in value] if isinstance(value, (list, tuple)) else value

@@ -284,7 +284,7 @@ def looks(geometry: Geometry, view: View, pixels: FloatArray) -> tuple[FloatArra
     side, frame = view
     tau = geometry.shutter.pixel_time(pixels, frame, side)
     world = inverse(geometry.rig.cam_from_world(geometry.motion, tau, side))
-    return world.t, transform(world, geometry.rig.camera.unproject(pixels))
+    return world.t, transform(world, geometry.rig.sensor(side).unproject(pixels))
 
 
 def seen_near(

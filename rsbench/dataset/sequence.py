@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import motion_record, read_motion
+from rsbench.components.rig_tables import CameraTable, RightFromLeft, Vector, camera_record, tables_of
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import MovingObject
 from rsbench.core.motion import LaterMotion, Motion
-from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig, views_of
+from rsbench.core.rig import FRAMES, SIDES, RigCamera, Side, StereoRig, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
@@ -49,7 +50,9 @@ from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
 from rsbench.storage.untrusted_files import check_name, check_size, inside
 
-FORMAT = 1
+FORMAT, OF_RIG = 1, 2
+FORMATS = (FORMAT, OF_RIG)
+"""Of files: that of the ideal rig, and that of cameras which differ or do not look the same way."""
 CONVENTIONS, WITH_LENS, OF_FRAMES, WITH_MOVING = 1, 2, 3, 4
 """Of pixels and times. Those of a lens, another scan or a late right camera are others, and so are those of more
 than two frames, and of objects that move, whatever the cameras: earlier versions of rsbench, that would take them
@@ -57,17 +60,27 @@ for ideal, for two or for still, refuse to read them."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
 """What dataset.json tells people who find the folder."""
 
-Vector = tuple[float, float, float]
 M = TypeVar("M")
 
 
-def conventions_of(camera: PinholeCamera, plain: bool, frames: int, moves: bool = False) -> int:
-    """The conventions of such cameras; ``plain``: both read rows from the top at once; ``moves``: objects do."""
+def check_sizes(rig: StereoRig) -> None:
+    """Raises ValueError for cameras of more pixels than files may have."""
+    for side in SIDES:
+        check_size("camera" if rig.aligned else side, (rig.sensor(side).width, rig.sensor(side).height))
+
+
+def format_of(rig: StereoRig, shutter: RollingShutter) -> int:
+    """The format of the files of such cameras."""
+    return FORMAT if rig.aligned and shutter.right_readout_ratio is None else OF_RIG
+
+
+def conventions_of(plain: bool, frames: int, moves: bool = False) -> int:
+    """``plain``: of a rectified pair that reads rows from the top at once; ``moves``: of objects that move."""
     if moves:
         return WITH_MOVING
     if frames > len(FRAMES):
         return OF_FRAMES
-    return CONVENTIONS if plain and camera.lens is None else WITH_LENS
+    return CONVENTIONS if plain else WITH_LENS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +94,38 @@ class MotionManifest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CameraManifest(CameraTable):
+    """A camera of format 2."""
+
+    rotation_from_body: Vector
+    """Rotation vector (rad) from the axes of the body, which are those of the rectified pair, to the camera's."""
+
+    @property
+    def own(self) -> RigCamera:
+        """The camera of the rig."""
+        return RigCamera(camera=self.camera(), rotation=self.rotation_from_body)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamerasManifest:
+    """Both cameras of format 2."""
+
+    left: CameraManifest
+    right: CameraManifest
+
+
+@dataclass(frozen=True, kw_only=True)
 class SequenceManifest(Scanning):
     """What sequence.json must hold; it holds more."""
 
     format: int
     conventions: int
     name: str
-    camera: PinholeCamera
+    camera: PinholeCamera | None = None
+    """Of format 1: both cameras."""
+    cameras: CamerasManifest | None = None
+    """Of format 2, with ``right_from_left``."""
+    right_from_left: RightFromLeft | None = None
     baseline: float
     readout_ratio: float
     frame_period_s: float
@@ -110,17 +148,19 @@ class SequenceManifest(Scanning):
         check_name(self.name)
         if not len(FRAMES) <= self.frames <= MOST_FRAMES:
             raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")
-        moves = bool(self.moving)
-        if self.conventions != (needed := conventions_of(self.camera, self.plain, self.frames, moves)):
+        moves, rig = bool(self.moving), self.rig
+        shutter = rig.shutter_of(self, self.readout_ratio)
+        plain = rig.rectified and shutter.plain
+        if self.conventions != (needed := conventions_of(plain, self.frames, moves)):
             raise ValueError(
                 f"conventions = {self.conventions}: {needed} is needed; this version reads {CONVENTIONS}, and "
                 f"{WITH_LENS} with a lens, another scan or a late camera, {OF_FRAMES} with more than two frames, "
                 f"{WITH_MOVING} with moving objects"
             )
-        check_size("camera", (self.camera.width, self.camera.height))
-        check_channels(self.channels, self.camera.lens is not None, self.plain)
+        check_sizes(rig)
+        check_channels(self.channels, not rig.rectified, shutter.plain)
         check_moving(self.moving, self.channels)
-        lines = self.camera.height if self.scan in ("top", "bottom") else self.camera.width
+        lines = min(shutter.lines(side) for side in SIDES)
         if (
             list(self.twins) != sorted({row for row in self.twins if 0 < row < lines})
             or len(self.twins) > MOST_TWINS
@@ -130,6 +170,30 @@ class SequenceManifest(Scanning):
             check_brightness(self.sensor, self.frames)
         if not self.frame_period_s > 0.0:
             raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
+
+    @property
+    def rig(self) -> StereoRig:
+        """The rig of the sequence.
+
+        Raises:
+            ValueError: a key that the format needs is missing, or two contradict each other.
+        """
+        if self.format == FORMAT:
+            if self.camera is None:
+                raise ValueError("'camera' is required")
+            return StereoRig(camera=self.camera, baseline=self.baseline)
+        if self.cameras is None or self.right_from_left is None:
+            raise ValueError(f"'{'right_from_left' if self.cameras else 'cameras'}' is required")
+        rig = StereoRig.of_body(self.cameras.left.own, self.cameras.right.own, self.baseline)
+        R, t = rig.right_from_left
+        stated = self.right_from_left.R, np.array(self.right_from_left.translation)
+        if not (np.allclose(stated[0], R, atol=_SAME) and np.allclose(stated[1], t, atol=_SAME * self.baseline)):
+            raise ValueError("right_from_left contradicts rotation_from_body of the cameras or the baseline")
+        return rig
+
+
+_SAME = 1e-9
+"""Largest difference of two statements of one rotation, or of directions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +229,7 @@ class DatasetManifest:
 
 @dataclass(frozen=True, kw_only=True)
 class Sequence(ChannelReader):
-    """A sequence folder of format 1, or two successive frames of one; sides left and right, frames from 0."""
+    """A sequence folder, or two successive frames of one; sides left and right, frames from 0."""
 
     folder: Path
     name: str
@@ -241,7 +305,9 @@ class Sequence(ChannelReader):
 
     def image(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of a row: 0, or one of ``twins``."""
-        return read_png(inside(self.folder, picture_file(shutter, side, frame + self.first, row)), self._size)
+        return read_png(
+            inside(self.folder, picture_file(shutter, side, frame + self.first, row)), self._size(side)
+        )
 
     def exposed_image(self, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB: what the sensor expects under a global shutter at the pose of a row, without noise.
@@ -256,13 +322,13 @@ class Sequence(ChannelReader):
                 f"{self.folder}: has no global-shutter images of its sensor; render it again with "
                 "exposed_twins = true in the dataset card"
             )
-        return read_png(inside(self.folder, exposed_file(side, frame + self.first, row)), self._size)
+        return read_png(inside(self.folder, exposed_file(side, frame + self.first, row)), self._size(side))
 
     def clean_image(self, side: Side, frame: int) -> NDArray[np.uint8]:
         """(H, W, 3) sRGB: the rolling-shutter frame of an ideal sensor, sharp and without noise."""
         if self.sensor is None:
             return self.image("rs", side, frame)
-        return read_png(inside(self.folder, clean_file(side, frame + self.first)), self._size)
+        return read_png(inside(self.folder, clean_file(side, frame + self.first)), self._size(side))
 
     def images(self, shutter: Shutter = "rs") -> list[NDArray[np.uint8]]:
         """Left 0, right 0, left 1, right 1, and so on: the order of ``rsbench.match`` and ``rsbench.correct``."""
@@ -271,15 +337,15 @@ class Sequence(ChannelReader):
     def depth(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.float32]:
         """(H, W) z in the camera of the row that saw the pixel, m, 0 = no surface; ``row`` as of ``image``."""
         file = picture_file(shutter, side, frame + self.first, row, depth=True)
-        return read_depth(inside(self.folder, file), self._size)
+        return read_depth(inside(self.folder, file), self._size(side))
 
     def labels(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
         """(H, W) what moves at each pixel of a picture: the number of an object, 0 = none, and 128 more where an
         object hides the sun from what is seen; all 0 where none moves. ``row`` as of ``image``."""
         if not self.moving:
-            return np.zeros(self._size[::-1], dtype=np.uint8)
+            return np.zeros(self._size(side)[::-1], dtype=np.uint8)
         path = inside(self.folder, moving_file(shutter, side, frame + self.first, row))
-        labels = read_grey_png(path, self._size)
+        labels = read_grey_png(path, self._size(side))
         if np.max(numbers_of(labels)) > len(self.moving):
             raise RsbenchError(f"{path}: holds object {np.max(numbers_of(labels))}: there are {len(self.moving)}")
         return labels
@@ -287,9 +353,9 @@ class Sequence(ChannelReader):
     def gloss(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.bool_]:
         """(H, W) whether a pixel's surface is glossy; ``row`` as of ``image``."""
         if not self.glossy:
-            return np.zeros(self._size[::-1], dtype=np.bool_)
+            return np.zeros(self._size(side)[::-1], dtype=np.bool_)
         path = inside(self.folder, gloss_file(shutter, side, frame + self.first, row))
-        return read_mask(path, self._size)
+        return read_mask(path, self._size(side))
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
         """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
@@ -314,16 +380,14 @@ def sequence_manifest(
     moves: bool = False,
 ) -> dict[str, Any]:
     """The geometric part of sequence.json, with units in the names where they are not metres and radians."""
-    camera = rig.camera
-    fields = ("width", "height", "fx", "fy", "cx", "cy")
     readout_s = shutter.readout_ratio * frame_period_s
-    lens: dict[str, Any] = {} if camera.lens is None else {"lens": camera.lens.record()}
+    kind = format_of(rig, shutter)
     count = {"frames": frames} if frames > len(FRAMES) else {}
     return {
-        "format": FORMAT,
-        "conventions": conventions_of(camera, shutter.plain, frames, moves),
+        "format": kind,
+        "conventions": conventions_of(rig.rectified and shutter.plain, frames, moves),
         "name": name,
-        "camera": {field: getattr(camera, field) for field in fields} | lens,
+        **({"camera": camera_record(rig.camera)} if kind == FORMAT else _cameras_record(rig)),
         "baseline": rig.baseline,
         "readout_ratio": shutter.readout_ratio,
         "frame_period_s": frame_period_s,
@@ -331,8 +395,15 @@ def sequence_manifest(
         "row_time_s": readout_s / shutter.lines("left"),
         "motion": motion_record(motion),
         **count,
-        **({} if shutter.plain else asdict(shutter.scanning)),
+        **({} if shutter.scanning.plain else shutter.scanning.record),
     }
+
+
+def _cameras_record(rig: StereoRig) -> dict[str, Any]:
+    """``cameras`` and ``right_from_left`` of format 2."""
+    tables = tables_of(rig)
+    turned = {side: tables.pop(side) | {"rotation_from_body": list(rig.own(side).rotation)} for side in SIDES}
+    return {"cameras": turned, **tables}
 
 
 def read_sequence(folder: Path) -> Sequence:
@@ -355,8 +426,8 @@ def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
         return Sequence(
             folder=folder,
             name=manifest.name,
-            rig=StereoRig(camera=manifest.camera, baseline=manifest.baseline),
-            shutter=manifest.shutter_of(manifest.camera.width, manifest.camera.height, manifest.readout_ratio),
+            rig=manifest.rig,
+            shutter=manifest.rig.shutter_of(manifest, manifest.readout_ratio),
             motion=read_motion(content["motion"]),
             frame_period_s=manifest.frame_period_s,
             sensor=manifest.sensor,
@@ -412,8 +483,10 @@ def read_dataset_manifest(folder: Path) -> DatasetManifest:
 
 
 def _parsed(cls: type[M], content: dict[str, Any], path: Path) -> M:
-    if content.get("format") != FORMAT:
-        raise RsbenchError(f"{path}: format = {content.get('format')!r}; this version reads {FORMAT}")
+    if content.get("format") not in FORMATS:
+        raise RsbenchError(
+            f"{path}: format = {content.get('format')!r}; this version reads {' and '.join(map(str, FORMATS))}"
+        )
     return parse_card(cls, content, str(path), extra="ignore")
 
 
@@ -422,7 +495,7 @@ def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     frames, rows = frames_of(manifest), twins_of(manifest)
     views = views_of(frames)
     clean = tuple(clean_file(*view) for view in views if manifest.get("sensor"))
-    stacks = tuple(stack_file(*view, row) for view in views for row in range(whole_frames(manifest)))
+    stacks = tuple(stack_file(*view, row) for view in views for row in range(whole_frames(manifest, view[0])))
     pictures = [("gs", *view, row, depth) for row in rows for depth in (False, True) for view in views]
     twins = tuple(picture_file(*each) for each in pictures)  # pyrefly: ignore[bad-argument-type]
     every = [("rs", *view, 0) for view in views] + [("gs", *view, row) for row in (0, *rows) for view in views]

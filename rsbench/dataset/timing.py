@@ -34,11 +34,11 @@ def timing_manifest(
     shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
 ) -> dict[str, Any]:
     """Content of timing.json: of each camera what makes its tables; times count from that of row 0 of frame 0."""
-    readout_ns = _NS * shutter.readout_ratio * frame_period_s
+    readout_ns = {side: _NS * shutter.ratio_of(side) * frame_period_s for side in SIDES}
     cameras = {
         side: {
-            "readout_ns": readout_ns,
-            "line_delay_ns": readout_ns / shutter.lines(side),
+            "readout_ns": readout_ns[side],
+            "line_delay_ns": readout_ns[side] / shutter.lines(side),
             "exposure_ns": _NS * (sensor.of(side, 0).exposure_s if sensor else 0.0),
             "scan": shutter.scan_of(side),
             "reference_row": shutter.first_line(side),

@@ -159,7 +159,7 @@ def points_of(geometry: Geometry, view: ImageView, pixels: FloatArray, depth: Fl
     """World points (..., 3) that a view sees at pixels (..., 2) with depth (...)."""
     rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
     if view.shutter == "gs":
-        x_in_cam = depth[..., None] * rig.camera.unproject(pixels)
+        x_in_cam = depth[..., None] * rig.sensor(view.side).unproject(pixels)
         return transform(inverse(_pose(geometry, view)), x_in_cam)
     return back_project(rig, shutter, motion, view.side, view.frame, pixels, depth)
 
@@ -171,8 +171,9 @@ def seen_by(geometry: Geometry, view: ImageView, X: FloatArray, rows: ArrayLike)
         found = rs_project_near(rig, shutter, motion, view.side, view.frame, X, rows)
         return Seen(found.pixels, found.depth, found.tau)
     x_in_cam = transform(_pose(geometry, view), X)
-    pixels = rig.camera.project(x_in_cam)
-    outside = ~rig.camera.contains(pixels)
+    camera = rig.sensor(view.side)
+    pixels = camera.project(x_in_cam)
+    outside = ~camera.contains(pixels)
     pixels[outside] = np.nan
     tau = np.broadcast_to(_time(geometry, view), outside.shape)
     return Seen(pixels, np.where(outside, np.nan, x_in_cam[..., 2]), np.where(outside, np.nan, tau))
@@ -237,7 +238,7 @@ def find(geometry: Geometry, target: ImageView, points: FloatArray, start: Float
     Raises:
         RsbenchError: a motion that no table of poses follows.
     """
-    camera, shutter = geometry.rig.camera, geometry.shutter
+    camera, shutter = geometry.rig.sensor(target.side), geometry.shutter
     table = _pose_table(geometry, target)
     pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
     status = np.zeros(start.shape, dtype=np.uint8)
@@ -269,6 +270,9 @@ def _pose_table(geometry: Geometry, view: ImageView) -> _Table:
         tau = shutter.line_time(at, view.frame, view.side)
         R, t = rig.cam_from_world(motion, tau, view.side)
         spin, speed = motion.velocity(tau)
+        if not rig.aligned:
+            turn = rig.own(view.side).R.T
+            spin, speed = spin @ turn, speed @ turn
         changes = np.concatenate([(hat(spin) @ R).reshape(-1, 9), speed], axis=1) * (rate / per_line)
         entries = np.concatenate([R.reshape(-1, 9), t, changes], axis=1)
         between = shutter.line_time(at[:-1] + 0.5 / per_line, view.frame, view.side)
@@ -488,7 +492,7 @@ class SeenSurfaces:
         rows: Sequence[int] | None = None,
         numbers: NDArray[np.uint8] | None = None,
     ) -> None:
-        camera, shutter = geometry.rig.camera, geometry.shutter
+        camera, shutter = geometry.rig.sensor(source.side), geometry.shutter
         self.geometry, self.source = geometry, source
         self.grid = camera.pixel_grid()[slice(None) if rows is None else np.asarray(rows)]
         self.sky = depth == 0
@@ -524,7 +528,7 @@ class Carried(NamedTuple):
 
 def carry(surfaces: SeenSurfaces, target: ImageView) -> Carried:
     """Where another picture sees what every pixel of a rolling-shutter frame sees, hidden or not."""
-    start = surfaces.grid[..., surfaces.geometry.shutter.axis(target.side)]
+    start = _first_lines(surfaces, target)
     landed = find(surfaces.geometry, target, surfaces.points, start)
     if surfaces.numbers is None or not surfaces.geometry.objects:
         return Carried(landed, surfaces.points)
@@ -535,6 +539,19 @@ def carry(surfaces: SeenSurfaces, target: ImageView) -> Carried:
         for whole, part in zip(landed, own, strict=True):
             whole[chosen] = part
     return Carried(landed, points)
+
+
+def _first_lines(surfaces: SeenSurfaces, target: ImageView) -> FloatArray:
+    """Lines (H, W) at which the search begins: a pixel's own; in a general rig those seen from the middle line."""
+    rig, shutter = surfaces.geometry.rig, surfaces.geometry.shutter
+    axis = shutter.axis(target.side)
+    if rig.aligned:
+        return surfaces.grid[..., axis]
+    middle = 0.5 * (shutter.lines(target.side) - 1)
+    tau = shutter.line_time(middle, target.frame, target.side)
+    pose = rig.cam_from_world(surfaces.geometry.motion, tau, target.side)
+    line = rig.sensor(target.side).project(transform(pose, surfaces.points))[..., axis]
+    return np.clip(np.where(np.isnan(line), middle, line), -0.5, 2.0 * middle + 0.5)
 
 
 def pair_truth(surfaces: SeenSurfaces, target: ImageView, carried: Carried, blocked: Blocked) -> PairTruth:

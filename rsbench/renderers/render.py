@@ -244,9 +244,10 @@ def sensed_rows(
     exposed = None
     if sensor.exposure_s:
         exposed = poses(instant_times(tau, sensor.exposure_s / frame_period_s, instant_count(options.samples)))
-    chosen = range(shutter.height) if rows is None else rows
+    camera = rig.sensor(side)
+    chosen = range(camera.height) if rows is None else rows
     options = replace(options, full_frames=False)
-    needed = rows_needed(sensor, chosen, shutter.height)
-    light = render(scene, rig.camera, poses(tau), options, exposed=exposed, rows=needed).image
-    read = expose(light * np.float32(options.exposure), sensor, options.seed, shutter.height, needed)
-    return processed(read, sensor, shutter.height, needed, chosen)
+    needed = rows_needed(sensor, chosen, camera.height)
+    light = render(scene, camera, poses(tau), options, exposed=exposed, rows=needed).image
+    read = expose(light * np.float32(options.exposure), sensor, options.seed, camera.height, needed)
+    return processed(read, sensor, camera.height, needed, chosen)

@@ -189,8 +189,8 @@ def obstacle(
     Followed in straight steps, from the middle of the rig at time 0 to each camera, and along its path until the
     last row of the last of so many frames is read. A rig that starts inside a solid and stays there meets nothing.
     """
-    tau = np.linspace(0.0, frames - 1 + shutter.readout_ratio, 1 + 2 * (frames - 1) * shutter.height)
     for side in SIDES:
+        tau = np.linspace(0.0, frames - 1 + shutter.ratio_of(side), 1 + 2 * (frames - 1) * rig.sensor(side).height)
         centres = inverse(rig.cam_from_world(motion, tau, side)).t
         step = first_crossing(scene.scene, np.concatenate([np.zeros((1, 3)), centres]))
         if step == 0:

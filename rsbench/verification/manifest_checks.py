@@ -17,7 +17,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.manifest import CROISSANT, DATASET, croissant_of, says
-from rsbench.dataset.sequence import FORMAT, UNITS, Sequence, files_of, sequence_manifest
+from rsbench.dataset.sequence import FORMATS, UNITS, Sequence, files_of, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import read_scene_card
 from rsbench.storage.files import read_json, sha256
@@ -71,8 +71,8 @@ def is_name(name: object) -> bool:
 def dataset_faults(listing: Listing) -> Iterator[Finding]:
     """What is wrong with dataset.json as a whole."""
     manifest, card = listing.manifest, listing.card
-    if manifest.get("format") != FORMAT or isinstance(manifest.get("format"), bool):
-        yield Finding(DATASET, f"format = {manifest.get('format')!r}: {FORMAT} is needed")
+    if manifest.get("format") not in FORMATS or isinstance(manifest.get("format"), bool):
+        yield Finding(DATASET, f"format = {manifest.get('format')!r}: {FORMATS[0]} or {FORMATS[1]} is needed")
     for key in _TEXTS:
         if not isinstance(manifest.get(key), str):
             yield Finding(DATASET, f"{key} = {manifest.get(key)!r}: a text is needed")

@@ -24,7 +24,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.card import DatasetCard
+from rsbench.dataset.card import CameraCard, DatasetCard
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs
@@ -41,21 +41,30 @@ _LOST = {"psnr": 0.0, "psnr_clean": 0.0, "coverage": 0.0}
 
 
 def ideal_card(card: DatasetCard) -> DatasetCard:
-    """The same sequences as an ideal camera sees them."""
-    return replace(card, name=f"{card.name}-ideal", sensor=None, camera=replace(card.camera, lens=None))
+    """The same sequences as an ideal camera sees them; RsbenchError for a card with a rig of its own."""
+    return replace(card, name=f"{card.name}-ideal", sensor=None, camera=replace(_camera(card), lens=None))
 
 
 def sized(card: DatasetCard, width: int) -> DatasetCard:
     """The same sequences in images of this width, of the same field of view.
 
     Raises:
-        RsbenchError: so narrow that there is nothing to match.
+        RsbenchError: so narrow that there is nothing to match, or a card with a rig of its own.
     """
-    scale = width / card.camera.width
+    camera = _camera(card)
+    scale = width / camera.width
     if width < 64:
         raise RsbenchError(f"--width {width}: must be at least 64 px")
-    height = max(round(card.camera.height * scale), 1)
-    return replace(card, camera=replace(card.camera, width=width, height=height, focal=card.camera.focal * scale))
+    height = max(round(camera.height * scale), 1)
+    return replace(card, camera=replace(camera, width=width, height=height, focal=camera.focal * scale))
+
+
+def _camera(card: DatasetCard) -> CameraCard:
+    if card.camera is None:
+        raise RsbenchError(
+            f"dataset {card.name}: has a rig; this study takes two equal cameras, the table 'camera'"
+        )
+    return card.camera
 
 
 def study(

@@ -1,0 +1,207 @@
+"""Datasets of rigs whose cameras differ and look in different directions, against OpenCV and float64 rays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from small_scenes import write_box_scene
+from traced_truth import first_hit
+
+from rsbench.components.cards import load_card
+from rsbench.core.projection import row_poses
+from rsbench.core.rig import SIDES, VIEWS, Side
+from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.generation import build_scene, generate_dataset, render_view, seen_scene
+from rsbench.dataset.sequence import read_dataset, read_dataset_manifest
+from rsbench.dataset.views import ImageView
+from rsbench.renderers.options import RendererOptions
+
+Array = NDArray[np.float64]
+LEFT: dict[str, Any] = {"width": 96, "height": 72, "fx": 80.0, "fy": 81.0, "cx": 46.0, "cy": 37.0}
+LEFT |= {"lens": {"model": "brown-conrady", "k1": -0.2, "k2": 0.03, "p1": 1e-3}}
+RIGHT: dict[str, Any] = {"width": 120, "height": 64, "fx": 85.0, "fy": 84.0, "cx": 61.0, "cy": 30.0}
+RIGHT |= {"lens": {"model": "kannala-brandt", "k1": 0.02}}
+W, D = np.array([0.012, 0.03, -0.02]), np.array([-0.12, 0.05, -0.1])
+RIGS: dict[str, dict[str, Any]] = {
+    "two-sizes": {"right": RIGHT, "w": (0.03, -0.06, 0.05), "t": (-0.3, 0.02, -0.03)},
+    "vertical": {"right": LEFT | {"fx": 83.0}, "w": (0.02, 0.01, 0.01), "t": (0.01, -0.25, 0.02)},
+    "global-right": {
+        "right": {key: RIGHT[key] for key in RIGHT if key != "lens"} | {"readout_ratio": 0.0},
+        "w": (0.0, 0.1, 0.0),
+        "t": (-0.3, 0.0, 0.0),
+    },
+    "late-columns": {
+        "right": LEFT | {"scan": "right", "delay_s": 0.01},
+        "w": (0.0, -0.03, 0.02),
+        "t": (-0.3, 0.0, 0.01),
+    },
+}
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + "}"
+    return (
+        repr(list(value)).replace("(", "[").replace(")", "]")
+        if isinstance(value, (tuple, list))
+        else (f'"{value}"' if isinstance(value, str) else repr(value))
+    )
+
+
+def write_card(folder: Path, name: str, more: str = "") -> Path:
+    """A dataset card of a rig of ``RIGS`` in a textured box."""
+    scene, rig = write_box_scene(folder, "box"), RIGS[name]
+    matrix = Rotation.from_rotvec(rig["w"]).as_matrix().tolist()
+    card = folder / f"{name}.toml"
+    card.write_text(
+        f"""
+name = "{name}"
+readout_ratio = 0.8
+renderer = "preview"
+left = {_toml(LEFT)}
+right = {_toml(rig["right"])}
+frame_period_s = 0.1
+{more}
+[right_from_left]
+rotation = {_toml(matrix)}
+translation = {_toml(rig["t"])}
+[motion]
+rotation_deg = {np.rad2deg(np.linalg.norm(W))}
+rotation_axis = {_toml(W.tolist())}
+translation = {np.linalg.norm(D)}
+translation_axis = {_toml(D.tolist())}
+[[sequence]]
+name = "box"
+scene = "{scene}"
+"""
+    )
+    return card
+
+
+@pytest.fixture(scope="module", params=RIGS)
+def made(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, DatasetCard, Path]:
+    folder = tmp_path_factory.mktemp("rigs")
+    card = load_dataset_card(write_card(folder, request.param))
+    generate_dataset(card, folder / "out")
+    return request.param, card, folder / "out"
+
+
+def _table(name: str, side: Side) -> dict[str, Any]:
+    return LEFT if side == "left" else RIGS[name]["right"]
+
+
+def rays(table: dict[str, Any]) -> Array:
+    """(H, W, 3) with z = 1, by OpenCV."""
+    K = np.array([[table["fx"], 0, table["cx"]], [0, table["fy"], table["cy"]], [0, 0, 1.0]])
+    grid = np.stack(np.meshgrid(np.arange(table["width"]), np.arange(table["height"])), axis=-1)
+    pixels = grid.reshape(-1, 1, 2).astype(np.float64)
+    lens = table.get("lens", {"model": ""})
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
+    if lens["model"] == "kannala-brandt":
+        xy = cv2.fisheye.undistortPoints(pixels, K, np.array([lens["k1"], 0.0, 0.0, 0.0]), criteria=stop)
+    else:
+        k = np.array([lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
+        xy = cv2.undistortPoints(pixels, K, k, criteria=stop)
+    return np.concatenate([xy.reshape(*grid.shape), np.ones((*grid.shape[:2], 1))], axis=-1)
+
+
+def camera_in_body(name: str, side: Side) -> tuple[Array, Array]:
+    """Rotation body to camera (3, 3) and centre (3,) in the body, from the calibration, as documented."""
+    R, t = Rotation.from_rotvec(RIGS[name]["w"]).as_matrix(), np.array(RIGS[name]["t"])
+    x = -R.T @ t / np.linalg.norm(t)
+    z = np.array([0, 0, 1.0]) + R[2]
+    z -= (z @ x) * x
+    z /= np.linalg.norm(z)
+    from_body = np.stack([x, np.cross(z, x), z]).T  # to the left camera
+    half = 0.5 * float(np.linalg.norm(t)) * np.array([1.0, 0.0, 0.0])
+    return (from_body, -half) if side == "left" else (np.asarray(R @ from_body), half)
+
+
+def times(name: str, side: Side, frame: int) -> Array:
+    """(H, W) when pixels are read."""
+    table = _table(name, side)
+    ratio = table.get("readout_ratio", 0.8)
+    y, x = np.mgrid[: table["height"], : table["width"]].astype(np.float64)
+    late = table.get("delay_s", 0.0) / 0.1
+    if table.get("scan") == "right":
+        return frame + late + ratio * (table["width"] - 1 - x) / table["width"]
+    return frame + late + ratio * y / table["height"]
+
+
+def traced(name: str, triangles: Array, side: Side, tau: Array) -> Array:
+    """(H, W) depth z in the camera's own axes."""
+    turn, centre = camera_in_body(name, side)
+    own = rays(_table(name, side)).reshape(-1, 3)
+    flat = tau.ravel()
+    R = Rotation.from_rotvec(flat[:, None] * W).as_matrix()  # body from world
+    eyes = np.einsum("nji,nj->ni", R, centre - flat[:, None] * D)
+    ways = np.einsum("nji,nj->ni", R, own @ turn)
+    return first_hit(triangles, eyes, ways).reshape(tau.shape)
+
+
+def triangles_of(card: DatasetCard) -> Array:
+    scene = seen_scene(build_scene(card.sequence[0].scene).scene, card.sequence[0])
+    return np.concatenate([mesh.vertices[mesh.faces] for mesh in scene.meshes]).astype(np.float64)
+
+
+def test_depth_is_what_float64_rays_of_the_calibration_meet(made: tuple[str, DatasetCard, Path]) -> None:
+    name, card, folder = made
+    (sequence,) = read_dataset(folder)
+    assert sequence.rig == card.rig_of(card.sequence[0]) and sequence.shutter == card.shutter_for(card.sequence[0])
+    triangles = triangles_of(card)
+    for side, frame in VIEWS:
+        tau = times(name, side, frame)
+        start = np.full_like(tau, frame + _table(name, side).get("delay_s", 0.0) / 0.1)
+        for kind, at in (("rs", tau), ("gs", start)):
+            depth = sequence.depth(kind, side, frame).astype(np.float64)
+            wanted = traced(name, triangles, side, at)
+            far = np.abs(depth / wanted - 1.0) > 2e-5
+            assert depth.shape == (_table(name, side)["height"], _table(name, side)["width"])
+            assert np.mean(far) < 2e-3, f"{kind} {side} {frame}: {np.mean(far):.3g}"  # at edges of two walls
+
+
+def test_manifest_says_what_the_calibration_says(made: tuple[str, DatasetCard, Path]) -> None:
+    name, _, folder = made
+    (sequence,) = read_dataset(folder)
+    manifest, rig = sequence.manifest, RIGS[name]
+    assert manifest["format"] == 2 and read_dataset_manifest(folder).format == 2
+    R = Rotation.from_rotvec(rig["w"]).as_matrix()
+    np.testing.assert_allclose(manifest["right_from_left"]["rotation"], R, atol=1e-12)
+    np.testing.assert_allclose(manifest["right_from_left"]["translation"], rig["t"], atol=1e-12)
+    for side in SIDES:
+        turn, _ = camera_in_body(name, side)
+        given = Rotation.from_rotvec(manifest["cameras"][side]["rotation_from_body"]).as_matrix()
+        np.testing.assert_allclose(given, turn, atol=1e-12)
+        assert {key: manifest["cameras"][side][key] for key in ("width", "height", "fx")} == {
+            key: _table(name, side)[key] for key in ("width", "height", "fx")
+        }
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_rows_have_the_bits_of_global_images_at_their_poses(
+    made: tuple[str, DatasetCard, Path], side: Side
+) -> None:
+    from rsbench.renderers.scene import MitsubaScene
+
+    _, card, folder = made
+    (sequence,) = read_dataset(folder)
+    scene = MitsubaScene(seen_scene(build_scene(card.sequence[0].scene).scene, card.sequence[0]))
+    options = load_card(RendererOptions, "renderers", card.renderer)
+    poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, 1)
+    rolling = render_view(scene, sequence, ImageView("rs", side, 1), poses, options)
+    axis, lines = sequence.shutter.axis(side), sequence.shutter.lines(side)
+    for read in (0, lines // 3, lines - 1):
+        still = render_view(scene, sequence, ImageView("gs", side, 1, read), poses, options)
+        line = abs(sequence.shutter.first_line(side) - read)
+        place = np.s_[line] if axis == 1 else np.s_[:, line]
+        for part in ("image", "depth"):
+            np.testing.assert_array_equal(getattr(still, part)[place], getattr(rolling, part)[place])
+    assert np.array_equal(rolling.depth, sequence.depth("rs", side, 1))
