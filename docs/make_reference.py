@@ -122,6 +122,7 @@ def pages() -> dict[str, str]:
     return {
         "reference/commands.md": "\n".join([_MADE, *_commands()]) + "\n",
         "reference/cards.md": "\n".join([_MADE, *_cards()]) + "\n",
+        "reference/rigs.md": "\n".join([_MADE, *_rigs()]) + "\n",
     }
 
 
@@ -264,6 +265,7 @@ def card_classes() -> dict[str, list[tuple[str, type]]]:
     from rsbench.cli.names import COMPONENTS, component_kind
     from rsbench.components.cards import ShutterCard
     from rsbench.components.plugins import CardContent
+    from rsbench.components.rig_tables import RigTables
     from rsbench.dataset.card import DatasetCard
     from rsbench.pipeline.footage import RigCard
     from rsbench.pipeline.mono_camera import OneCameraCard
@@ -276,6 +278,7 @@ def card_classes() -> dict[str, list[tuple[str, type]]]:
         "Renderer cards": [("", RendererOptions)],
         "Sweep cards": [("", SweepCard)],
         "Shutter cards": [("", ShutterCard)],
+        "Rig cards": [("", RigTables)],
         "rig.toml": [("", RigCard)],
         "camera.toml": [("", OneCameraCard)],
         "Leaderboard predictions": [("First line", Header), ("Every other line", Answer)],
@@ -292,6 +295,7 @@ _ABOUT = {
     "Renderer cards": "Files in `renderers/`.",
     "Sweep cards": "Files in `cards/sweeps/`, for `rsbench simulate`.",
     "Shutter cards": "Files in `cards/shutters/`: measured readout times of real cameras.",
+    "Rig cards": "Files in `cards/rigs/`: [published calibrations](rigs.md) of two cameras.",
     "camera.toml": "The camera of frames for `rsbench correct --camera`; with `--frames` it may be absent.",
     "rig.toml": "The cameras of your own frames, for `rsbench correct` and `rsbench inspect`.",
     "Leaderboard predictions": "JSON lines, for `rsbench leaderboard submit`.",
@@ -384,6 +388,50 @@ def _about(cls: type, names: Sequence[str]) -> str:
     return "\n\n".join(
         [_wrapped(part) for part in (text.partition("\n\n")[0], more) if part] + [f"{where}{used}."]
     )
+
+
+# Rigs
+
+
+def _rigs() -> Iterator[str]:
+    """The cards of real rigs, with what they measure and assume, and their sources."""
+    import textwrap
+
+    import numpy as np
+
+    from rsbench.components.cards import list_cards
+    from rsbench.components.rig_tables import load_rig
+    from rsbench.core import so3
+    from rsbench.core.rig import SIDES
+
+    text = """Published calibrations of two cameras, as cards in `cards/rigs/`: `rsbench list rigs` names them,
+    `rsbench show NAME` prints one, and `rig = "NAME"` in a dataset card takes one. Each was compared with its
+    source through OpenCV. Copy the card that is nearest to your rig and put your numbers in. A readout is that of
+    the whole image over the frame period, 0 for a global shutter."""
+    yield f"# Real rigs\n\n{_wrapped(_joined(text))}\n"
+    rows, notes = [], []
+    for name, path in list_cards("rigs").items():
+        card = load_rig(name)
+        rig = card.rig()
+        sizes, lenses, readouts = [], [], []
+        shutter = rig.shutter_of(card.scanning, card.readout_ratio)
+        for side in SIDES:
+            camera = rig.sensor(side)
+            sizes.append(f"{camera.width} x {camera.height}")
+            lenses.append("none" if camera.lens is None else camera.lens.model)
+            readouts.append(f"{shutter.ratio_of(side):.3g}")
+        angle = np.degrees(np.linalg.norm(so3.log(rig.right_from_left.R)))
+        both = [", ".join(dict.fromkeys(each)) for each in (sizes, lenses, readouts)]
+        rows.append([f"[{name}](#{name})", *both, f"{1e3 * rig.baseline:.1f}", f"{angle:.2f}"])
+        said = " ".join(line[1:] for line in path.read_text("utf-8").splitlines() if line.startswith("#"))
+        paragraphs = [
+            textwrap.fill(_joined(each), 100, break_long_words=False, break_on_hyphens=False)
+            for each in (said, f"Source: {card.source}")
+        ]
+        notes.append("\n\n".join([f"## {name}", *paragraphs]) + "\n")
+    columns = ("rig", "images, px", "lens", "readout", "baseline, mm", "between the cameras, deg")
+    yield _table(columns, rows)
+    yield from notes
 
 
 def main() -> None:

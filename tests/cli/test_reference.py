@@ -46,6 +46,7 @@ def test_every_key_of_a_card_says_what_it_is(cls: type) -> None:
         ("renderers", "Renderer cards"),
         ("sweeps", "Sweep cards"),
         ("shutters", "Shutter cards"),
+        ("rigs", "Rig cards"),
         ("solvers", "Component cards"),
     ],
 )
