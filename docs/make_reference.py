@@ -405,15 +405,16 @@ def _rigs() -> Iterator[str]:
     from rsbench.core.rig import SIDES
 
     text = """Published calibrations of two cameras, as cards in `cards/rigs/`: `rsbench list rigs` names them,
-    `rsbench show NAME` prints one, and `rig = "NAME"` in a dataset card takes one. Each was compared with its
-    source through OpenCV. Copy the card that is nearest to your rig and put your numbers in. A readout is that of
-    the whole image over the frame period, 0 for a global shutter."""
+    `rsbench show NAME` prints one, `--rig NAME` and `rig = "NAME"` in a dataset card take one. Each was compared
+    with its source through OpenCV. Copy the card that is nearest to your rig and put your numbers in. A readout is
+    that of the whole image over the frame period, 0 for a global shutter."""
     yield f"# Real rigs\n\n{_wrapped(_joined(text))}\n"
     rows, notes = [], []
     for name, path in list_cards("rigs").items():
         card = load_rig(name)
         rig = card.rig()
         sizes, lenses, readouts = [], [], []
+        assert card.scanning is not None and card.readout_ratio is not None
         shutter = rig.shutter_of(card.scanning, card.readout_ratio)
         for side in SIDES:
             camera = rig.sensor(side)

@@ -62,7 +62,9 @@ def inspect(
             help="Problems (files, folders, -); or LEFT_0 RIGHT_0 LEFT_1 RIGHT_1; or a dataset or a sequence.",
         ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(metavar="RIG.toml", help="Camera and baseline, for frames.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(metavar="RIG.toml|NAME", help="Cameras and baseline, for frames.")
+    ] = None,
     left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="Folder of images or video of the right camera.")] = None,
     windows: Annotated[int, typer.Option(min=1, help="Largest number of frame pairs of a sequence to use.")] = 5,

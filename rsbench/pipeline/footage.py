@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration import CardSigma, of_offset
-from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml
+from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml
 from rsbench.components.rig_tables import CameraTable, RightFromLeft, Size, rig_of_tables, tables_of, with_readouts
 from rsbench.core.arguments import LARGEST_M, LARGEST_SIZE, check_number, check_positive
 from rsbench.core.camera import Lens, PinholeCamera
@@ -91,6 +91,10 @@ class RigCard(StatedShutter):
 
     SHORTHANDS: ClassVar = SHUTTER_KEY
 
+    description: str = ""
+    """Cameras and mode, in words."""
+    source: str = ""
+    """Where the calibration comes from."""
     camera: CameraCard | None = None
     """Intrinsics of both cameras, where they are the same and aligned."""
     baseline: float | None = None
@@ -175,11 +179,14 @@ def _within(centre: float) -> int:
 def read_rig_card(path: Path) -> RigCard:
     """The card of a rig: ``baseline`` and ``[camera]``, or ``[left]``, ``[right]`` and ``[right_from_left]``.
 
-    ``readout_ratio`` or ``shutter``, ``scan`` are above the tables, or in those of the cameras.
+    ``readout_ratio`` or ``shutter``, ``scan`` are above the tables, or in those of the cameras. A word without an
+    ending is the name of a card in ``cards/rigs/``, unless there is such a file.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
+    if not path.suffix and path == Path(path.name) and not path.exists():
+        path = card_path("rigs", path.name)
     return parse_card(RigCard, with_readouts(read_toml(path), str(path)), str(path))
 
 
