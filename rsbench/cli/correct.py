@@ -52,9 +52,7 @@ def correct(
             metavar="LEFT_0 RIGHT_0 LEFT_1 RIGHT_1", help="Four images; or the folder of a rendered sequence."
         ),
     ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(metavar="RIG.toml|NAME", help="Cameras and their readout.")
-    ] = None,
+    rig: Annotated[Path | None, typer.Option(metavar="RIG.toml|NAME", help="Cameras and their readout.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
     left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="The same for the right camera.")] = None,
