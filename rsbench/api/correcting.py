@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core import arguments
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import Scanning
 
 if TYPE_CHECKING:
     from rsbench.pipeline.chain import CorrectedFrames
@@ -60,6 +61,7 @@ def correct(
     rig: StereoRig | None = None,
     readout_ratio: float | None = None,
     *,
+    scanning: Scanning | None = None,
     camera: PinholeCamera | float | Literal["unknown"] | None = None,
     solver: str | Path | Solver = "rs-stereo-refined",
     motion_model: str | None = None,
@@ -82,6 +84,8 @@ def correct(
         images: as the sensor read them.
         rig: both cameras, with their lens where they have one.
         readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
+        scanning: how the rig's cameras read their lines: from which side, the right one's delay and readout ratio.
+            None: from the top, both at once, or found with the readout ratio.
         camera: one camera: its intrinsics, or its horizontal field of view in degrees, or "unknown". Of the other
             arguments one camera takes readout_ratio, target_row, inpaint, seed, gyro and gyro_clock_error.
         solver: finds the motion, in metres; as in ``estimate_motion``.
@@ -116,7 +120,11 @@ def correct(
     sigmas = {"focal_sigma": focal_sigma, "k1_sigma": k1_sigma}
     for name, value in (*sigmas.items(), ("gyro_clock_error", gyro_clock_error)):
         arguments.check_number(name, value, 0.0)
+    if scanning is not None:
+        arguments.check_type("scanning", scanning, Scanning)
     if rig is None:
+        if scanning is not None:
+            raise ValueError("scanning: is that of a stereo rig; leave it out with camera")
         _check_own(solver, motion_model, matcher, features, corrector)
         for name in [name for name, value in sigmas.items() if value]:
             raise ValueError(f"{name}: is estimated for a stereo rig; leave it out with camera")
@@ -134,7 +142,9 @@ def correct(
     sigma = CardSigma(focal=float(focal_sigma), k1=float(k1_sigma))
     components = solver, motion_model, matcher, features, corrector
     options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
-    return array_correction.of_rig(images, rig, readout_ratio, options, gyro, sigma=sigma, close=inpaint is None)
+    return array_correction.of_rig(
+        images, rig, readout_ratio, options, gyro, scanning=scanning, sigma=sigma, close=inpaint is None
+    )
 
 
 def _check_own(*components: object) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rsbench.core.camera import Lens, inverse_2x2
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import undistorted
 from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match
@@ -249,20 +249,25 @@ def row_pattern(stereo: FloatArray, rig: StereoRig) -> RowPattern | None:
 
 
 def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRig) -> None:
-    """Whether two images (H, W[, 3]) can be the left and right one of a rectified rig at one time, lens or not.
+    """Whether two images (H, W[, 3]) can be the left and right one of the rig at one time.
 
     Too few matches say nothing.
 
     Raises:
         RefusedFramesError: the sides are exchanged, the lens is not undistorted, or the rows do not agree.
     """
-    options, camera, reach = MatchOptions(), rig.camera, float(max(left.shape[:2]))
-    a, b = (detect(undistorted(level, camera), options) for level in eight_bit([left, right]))
+    options, reach = MatchOptions(), float(max(left.shape[:2]))
+    eyes = [rig.eye(side) for side in SIDES]
+    a, b = (
+        detect(undistorted(level, eye), options) for level, eye in zip(eight_bit([left, right]), eyes, strict=True)
+    )
     anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     pairs = match(a, b, anywhere, options)
     ends = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
     # Beyond the borders of what the lens shows there is a mirror of it.
-    shown = np.logical_and.reduce([camera.contains(camera.lens_pixels(end)) for end in ends])
+    shown = np.logical_and.reduce(
+        [eye.contains(eye.lens_pixels(end)) for eye, end in zip(eyes, ends, strict=True)]
+    )
     if np.count_nonzero(shown) < _FEWEST:
         return
     judge_stereo(np.concatenate(ends, axis=1)[shown], rig, ROW_TOLERANCE_PX)
@@ -274,11 +279,16 @@ def judge_stereo(stereo: FloatArray, rig: StereoRig, row_tolerance: float) -> No
     Distortion is looked for where no lens is given: a given one is taken for calibrated.
     """
     share = float(np.mean(np.abs(stereo[:, 1] - stereo[:, 3]) <= row_tolerance))
-    pattern = row_pattern(stereo, rig) if rig.camera.lens is None else None
+    pattern = row_pattern(stereo, rig) if rig.rectified else None
     if pattern is not None and _is_distorted(pattern, share):
         raise RefusedFramesError(
             f"the row differences of left and right matches show a lens that was not undistorted (k1 about "
             f"{pattern.distortion:.2f}); give the lens, or undistort and rectify the images first"
+        )
+    if share < _SAME_ROW and not rig.aligned:
+        raise RefusedFramesError(
+            f"only {share:.0%} of the left-right matches lie on the rig's epipolar lines: left and right are "
+            "exchanged or of two times, or the calibration is not that of these frames"
         )
     if share < _SAME_ROW:
         raise RefusedFramesError(

@@ -39,6 +39,8 @@ _ALIGNED_RAD = 1e-9
 """Rotations below this move no pixel by more than rounding: the camera counts as aligned."""
 _TOGETHER = 0.02
 """Readout times between the ends of a match below which it is looked for, and its depth found, on one row."""
+_NEAR = 0.125
+"""Disparity of near things, in widths of the image."""
 _LEAST_FORWARD = 0.05
 """Least share of the mean viewing direction that is orthogonal to the baseline."""
 
@@ -279,8 +281,12 @@ class StereoRig:
         shutter, camera = self.shutter_of(scanning, 1.0), self.camera
         x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
         ends = np.stack([x, y], axis=-1)
-        times = [shutter.pixel_time(self.eye(side).lens_pixels(ends), 0, side) for side in SIDES]
-        lag = np.abs(times[1] - times[0])
+        first = shutter.pixel_time(self.eye("left").lens_pixels(ends), 0, "left")
+        near = ends - [_NEAR * camera.width, 0.0]
+        lag = [
+            np.abs(shutter.pixel_time(self.eye("right").lens_pixels(each), 0, "right") - first)
+            for each in (ends, near)
+        ]
         return bool(np.any(np.isfinite(lag)) and np.nanmax(lag) < _TOGETHER)
 
     def right_by_left(self) -> FloatArray:

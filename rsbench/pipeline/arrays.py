@@ -20,7 +20,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, gyro_samples
 from rsbench.core.geometry import check_image, check_times, four_images
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.frame_depth import CorrectionOptions
@@ -67,6 +67,7 @@ def of_rig(
     gyro: ArrayLike | None = None,
     *,
     sigma: CardSigma,
+    scanning: Scanning | None = None,
     close: bool = False,
 ) -> CorrectedFrames:
     """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``.
@@ -77,8 +78,8 @@ def of_rig(
     views, known = four_images(images, rig), Given(gyro=gyro_samples(gyro))
     with Isolation() as isolation:
         chain = isolation.chain(options)
-        rig, _ = with_found_camera(rig, sigma, [views], chain, readout_ratio)
-        found = correct_four(views, rig, readout_ratio, chain, given=known)
+        rig, _ = with_found_camera(rig, sigma, [views], chain, readout_ratio, scanning)
+        found = correct_four(views, rig, readout_ratio, chain, given=known, scanning=scanning)
     demand_corrected(found.frames, options.corrector.name)
     if not close:
         return found
