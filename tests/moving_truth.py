@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from traced_truth import Array, first_hit, look, rays
+from traced_truth import Array, axis_of, crossing, first_hit, grid_of, line_of, line_times, look, rays, within
 
+from rsbench.core.rig import Side
 from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.sequence import Sequence as Recorded
 from rsbench.dataset.views import PixelClass
@@ -68,16 +69,15 @@ def truth(
     sequence: Recorded,
     world: World,
     channel: PairChannel,
-    side: str,
+    side: Side,
     frame: int,
     row: int = 0,
     *,
     back: bool = False,
 ) -> tuple[Array, Array, NDArray[np.int64]]:
     """As ``traced_truth.truth``, of all pixels, ``back``: to the frame before; and the thing (n,) of each."""
-    width, height = sequence.rig.camera.width, sequence.rig.camera.height
-    y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
-    pixels, start = np.column_stack([x, y]), row_times(sequence, frame, y)
+    pixels = grid_of(sequence, side)
+    start = line_times(sequence, side, frame, pixels[:, axis_of(sequence, side)])
     origins, directions = rays(sequence, side, start, pixels)
     depth, owner = world.hit(origins, directions, start)
     sky = np.isinf(depth)
@@ -87,26 +87,15 @@ def truth(
         there, tau = ("right" if side == "left" else "left"), start
     elif channel == "flow":
         to = frame - 1 if back or frame == sequence.frames - 1 else frame + 1
-        low, high = np.full(len(X), -0.5), np.full(len(X), height - 0.5)
-
-        def below(at: Array) -> Array:
-            time = row_times(sequence, to, at)
-            return look(sequence, side, time, world.carried(X, owner, start, time))[:, 1] - at
-
-        crosses = (below(low) >= 0) & (below(high) <= 0)
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            right = below(middle) >= 0
-            low, high = np.where(right, middle, low), np.where(right, high, middle)
-        tau = np.where(crosses, row_times(sequence, to, low), np.nan)
+        lines = crossing(sequence, side, to, lambda time: world.carried(X, owner, start, time), len(X))
+        tau = line_times(sequence, side, to, lines)
     else:
-        tau = np.full(len(X), row_times(sequence, frame, np.array(float(row))))
+        tau = np.full(len(X), line_times(sequence, side, frame, np.array(float(line_of(sequence, side, row)))))
     lost = np.isnan(tau)
     tau = np.where(lost, 0.0, tau)
     arrived = world.carried(X, owner, start, tau)
     landed = look(sequence, there, tau, arrived)
-    with np.errstate(invalid="ignore"):
-        inside = ~lost & np.all((landed >= -0.5) & (landed <= [width - 0.5, height - 0.5]), axis=1)
+    inside = ~lost & within(sequence, there, landed)
     eyes, _ = rays(sequence, there, tau, pixels)
     hidden = world.hit(eyes, arrived - eyes, tau)[0] < 1 - 1e-6  # as in ``traced_truth``
     classes = np.where(

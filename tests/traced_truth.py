@@ -1,16 +1,20 @@
 """Where pixels of a rolling-shutter frame lie in another picture, by triangles traced in float64 and bisection.
 
-Shares nothing with rsbench but the numbers of a sequence: the truth that channels are compared with.
+Shares nothing with rsbench but the numbers of a sequence: the truth that channels are compared with. Lenses are
+OpenCV's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import Side
 from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import PixelClass
@@ -36,38 +40,75 @@ def first_hit(triangles: Array, origins: Array, ways: Array) -> Array:
     return nearest
 
 
-def pose_at(sequence: Sequence, side: str, tau: Array) -> tuple[Array, Array]:
+def pose_at(sequence: Sequence, side: Side, tau: Array) -> tuple[Array, Array]:
     """``cam_from_world`` (n, 3, 3), (n, 3) of the paper's motion at times (n,)."""
     half = 0.5 * sequence.rig.baseline * (1.0 if side == "left" else -1.0)
-    R = Rotation.from_rotvec(tau[:, None] * sequence.motion.w).as_matrix()
-    return R, tau[:, None] * sequence.motion.d + [half, 0.0, 0.0]
+    turn = Rotation.from_rotvec(sequence.rig.own(side).rotation)
+    R = turn * Rotation.from_rotvec(tau[:, None] * sequence.motion.w)
+    return R.as_matrix(), turn.apply(tau[:, None] * sequence.motion.d + [half, 0.0, 0.0])
 
 
-def rays(sequence: Sequence, side: str, tau: Array, pixels: Array) -> tuple[Array, Array]:
+def matrices(camera: PinholeCamera) -> tuple[Array, Array, bool]:
+    """OpenCV's camera matrix and coefficients, and whether they are those of its fisheye."""
+    lens = camera.lens
+    names = ("k1", "k2", "p1", "p2", "k3")
+    fisheye = lens is not None and lens.model == "kannala-brandt"
+    values = [getattr(lens, name, 0.0) for name in (("k1", "k2", "k3", "k4") if fisheye else names)]
+    return camera.ideal.K, np.array(values), fisheye
+
+
+def rays(sequence: Sequence, side: Side, tau: Array, pixels: Array) -> tuple[Array, Array]:
     """Origins and directions (n, 3), camera z = 1, world frame."""
-    camera = sequence.rig.camera
+    K, k, fisheye = matrices(sequence.rig.sensor(side))
     R, t = pose_at(sequence, side, tau)
-    local = np.column_stack([(pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(pixels))])
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
+    undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
+    xy = undistort(np.ascontiguousarray(pixels)[:, None], K, k, criteria=stop)[:, 0]
+    local = np.column_stack([xy, np.ones(len(pixels))])
     return -np.einsum("nji,nj->ni", R, t), np.einsum("nji,nj->ni", R, local)
 
 
-def look(sequence: Sequence, side: str, tau: Array, X: Array) -> Array:
+def look(sequence: Sequence, side: Side, tau: Array, X: Array) -> Array:
     """Pixels (n, 2) of points (n, 3) at times (n,); NaN behind the camera."""
-    camera = sequence.rig.camera
+    K, k, fisheye = matrices(sequence.rig.sensor(side))
     R, t = pose_at(sequence, side, tau)
     x = np.einsum("nij,nj->ni", R, X) + t
-    z = np.where(x[:, 2:] > 0, x[:, 2:], np.nan)
-    return np.asarray(x[:, :2] / z * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+    none, before = np.zeros(3), np.where(x[:, 2:] > 0, x, [0.0, 0.0, 1.0])
+    if fisheye:
+        pixels, _ = cv2.fisheye.projectPoints(before[:, None], none, none, K, k)
+    else:
+        pixels, _ = cv2.projectPoints(before[:, None], none, none, K, k)
+    return np.where(x[:, 2:] > 0, pixels[:, 0], np.nan)
 
 
-def row_seeing(sequence: Sequence, side: str, frame: int, X: Array) -> Array:
-    """Rows (n,) that see points, by bisection; NaN where there is none in the picture."""
-    height, h = sequence.shutter.height, sequence.shutter.readout_ratio / sequence.shutter.height
+def line_times(sequence: Sequence, side: Side, frame: int, lines: Array) -> Array:
+    """Times (n,) at which a camera reads lines, counted from the top or the left."""
+    s, camera = sequence.shutter, sequence.rig.sensor(side)
+    scan, late, ratio = s.scan, 0.0, s.readout_ratio
+    if side == "right":
+        scan, late = s.right_scan or scan, s.right_delay
+        ratio = ratio if s.right_readout_ratio is None else s.right_readout_ratio
+    count = camera.height if scan in ("top", "bottom") else camera.width
+    read = count - 1 - lines if scan in ("bottom", "right") else lines
+    return np.asarray(frame + late + ratio / count * read)
 
-    def below(y: Array) -> Array:
-        return look(sequence, side, frame + h * y, X)[:, 1] - y
 
-    low, high = np.full(len(X), -0.5), np.full(len(X), height - 0.5)
+def axis_of(sequence: Sequence, side: Side) -> int:
+    """1 where a camera reads rows, 0 where it reads columns."""
+    s = sequence.shutter
+    return int(((s.right_scan or s.scan) if side == "right" else s.scan) in ("top", "bottom"))
+
+
+def crossing(sequence: Sequence, side: Side, frame: int, at: Callable[[Array], Array], count: int) -> Array:
+    """Lines (n,) that see points, which are ``at`` (n, 3) at times (n,), by bisection; NaN where none does."""
+    axis, camera = axis_of(sequence, side), sequence.rig.sensor(side)
+    last = (camera.width, camera.height)[axis] - 0.5
+
+    def below(line: Array) -> Array:
+        tau = line_times(sequence, side, frame, line)
+        return look(sequence, side, tau, at(tau))[:, axis] - line
+
+    low, high = np.full(count, -0.5), np.full(count, last)
     crosses = (below(low) >= 0) & (below(high) <= 0)
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -76,11 +117,39 @@ def row_seeing(sequence: Sequence, side: str, frame: int, X: Array) -> Array:
     return np.where(crosses, low, np.nan)
 
 
+def row_seeing(sequence: Sequence, side: Side, frame: int, X: Array) -> Array:
+    """Rows (n,) that see points, by bisection; NaN where there is none in the picture."""
+    return crossing(sequence, side, frame, lambda tau: X, len(X))
+
+
+def grid_of(sequence: Sequence, side: Side) -> Array:
+    """Pixels (n, 2), row by row."""
+    camera = sequence.rig.sensor(side)
+    y, x = (each.ravel().astype(float) for each in np.mgrid[: camera.height, : camera.width])
+    return np.column_stack([x, y])
+
+
+def line_of(sequence: Sequence, side: Side, row: int) -> int:
+    """The line that is read after so many others."""
+    s, camera = sequence.shutter, sequence.rig.sensor(side)
+    scan = (s.right_scan or s.scan) if side == "right" else s.scan
+    last = (camera.height if scan in ("top", "bottom") else camera.width) - 1
+    return last - row if scan in ("bottom", "right") else row
+
+
+def within(sequence: Sequence, side: Side, pixels: Array) -> NDArray[np.bool_]:
+    """Whether pixels (n, 2) lie in a camera's image."""
+    camera = sequence.rig.sensor(side)
+    with np.errstate(invalid="ignore"):
+        last = [camera.width - 0.5, camera.height - 0.5]
+        return np.asarray(np.all((pixels >= -0.5) & (pixels <= last), axis=1))
+
+
 def truth(
     sequence: Sequence,
     hit: FirstHit,
     channel: PairChannel,
-    side: str,
+    side: Side,
     frame: int,
     row: int = 0,
     chosen: NDArray[np.int64] | None = None,
@@ -89,26 +158,23 @@ def truth(
 
     ``row``: of a global-shutter twin; ``chosen`` (n,): numbers of pixels, all by default.
     """
-    width, height = sequence.rig.camera.width, sequence.rig.camera.height
-    y, x = (each.ravel().astype(float) for each in np.mgrid[:height, :width])
-    y, x = (y, x) if chosen is None else (y[chosen], x[chosen])
-    pixels, h = np.column_stack([x, y]), sequence.shutter.readout_ratio / height
-    origins, ways = rays(sequence, side, frame + h * y, pixels)
+    pixels = grid_of(sequence, side) if chosen is None else grid_of(sequence, side)[chosen]
+    start = line_times(sequence, side, frame, pixels[:, axis_of(sequence, side)])
+    origins, ways = rays(sequence, side, start, pixels)
     depth = hit(origins, ways)
     sky = np.isinf(depth)
     X = origins + ways * np.where(sky, 1e8, depth)[:, None]
     if channel == "disparity":
-        side, tau = ("right" if side == "left" else "left"), frame + h * y
+        side, tau = ("right" if side == "left" else "left"), start
     elif channel == "flow":
         frame = 1 - frame
-        tau = frame + h * row_seeing(sequence, side, frame, X)
+        tau = line_times(sequence, side, frame, row_seeing(sequence, side, frame, X))
     else:
-        tau = np.full(len(X), frame + h * row)
+        tau = np.full(len(X), line_times(sequence, side, frame, np.array(float(line_of(sequence, side, row)))))
     lost = np.isnan(tau)
     tau = np.where(lost, 0.0, tau)
     landed = look(sequence, side, tau, X)
-    with np.errstate(invalid="ignore"):
-        inside = ~lost & np.all((landed >= -0.5) & (landed <= [width - 0.5, height - 0.5]), axis=1)
+    inside = ~lost & within(sequence, side, landed)
     eyes, _ = rays(sequence, side, tau, pixels)
     # The eye is off the surface that ends the segment by far more than rounding: 1e-6 of the way.
     hidden = hit(eyes, X - eyes) < 1 - 1e-6

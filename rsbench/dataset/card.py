@@ -350,6 +350,11 @@ class DatasetCard(Scanning):
                 raise RsbenchError(f"dataset {self.name}: no sequence {name!r}; there are: {', '.join(known)}")
         return replace(self, sequence=tuple(known[name] for name in names))
 
+    def with_rig(self, rig: RigTables) -> DatasetCard:
+        """The same card with this rig instead of its own cameras."""
+        none: dict[str, Any] = {"camera": None, "baseline": None}
+        return replace(self, rig=rig, **none)
+
     def with_channels(self, names: tuple[Channel, ...]) -> DatasetCard:
         """The same card with these channels instead of its own.
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsbench.components.motion_models import LinearMotion, TwistMotion
+from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.geometry import FixedGeometry, Geometry
 from rsbench.core.motion import Motion
@@ -24,6 +25,12 @@ Array = NDArray[np.float64]
 CAMERA = PinholeCamera.centred(640, 480, 500.0)
 BARREL = Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.001)
 FISHEYE = Lens(model="kannala-brandt", k1=0.02, k2=-0.01)
+RIG = StereoRig.of_cameras(
+    replace(CAMERA, lens=BARREL),
+    PinholeCamera(width=800, height=440, fx=520.0, fy=519.0, cx=410.0, cy=212.0, lens=FISHEYE),
+    so3.exp(np.array([0.03, -0.06, 0.05])),
+    (-0.3, 0.02, -0.03),
+)
 MOTION = LinearMotion([0.03, -0.05, 0.06], [0.2, -0.1, 0.3])
 
 
@@ -55,7 +62,7 @@ def unit(vectors: Array) -> Array:
 def ray(geometry: Geometry, view: View, pixels: Array) -> tuple[Array, Array]:
     tau = geometry.shutter.pixel_time(pixels, view[1], view[0])
     world = inverse(geometry.rig.cam_from_world(geometry.motion, tau, view[0]))
-    return world.t, transform(world, geometry.rig.camera.unproject(pixels)) - world.t
+    return world.t, transform(world, geometry.rig.sensor(view[0]).unproject(pixels)) - world.t
 
 
 def differences(geometry: Geometry, tracks: Tracks, normals: Array, view: View, k: int, step: float) -> Array:
@@ -81,8 +88,9 @@ def differences(geometry: Geometry, tracks: Tracks, normals: Array, view: View, 
         geometry_of(BARREL, motion=TwistMotion(MOTION.w, MOTION.d)),
         geometry_of(FISHEYE, scan="left", right_scan="bottom", right_delay=0.2),
         geometry_of(scan="bottom", right_scan="top"),
+        FixedGeometry(RIG, RIG.shutter_of(Scanning(right_scan="left", right_readout_ratio=0.3), 0.9), MOTION),
     ],
-    ids=["plain", "barrel", "fisheye, columns, late", "opposite"],
+    ids=["plain", "barrel", "fisheye, columns, late", "opposite", "rig"],
 )
 def test_derivatives_are_those_of_traced_rays(geometry: FixedGeometry) -> None:
     """A step of 0.01 px errs by its square times third derivatives, and by 1e-9 px of rows over 0.02 px."""
