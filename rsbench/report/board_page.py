@@ -293,9 +293,10 @@ def _inverse(depth: NDArray[np.float32]) -> FloatArray:
 
 
 def depth_error_image(depth: NDArray[np.float32], pictures: TruePictures) -> Image:
-    """Error of the disparity, px, in colours."""
+    """Error of the disparity of the left camera, px, in colours."""
     rig = pictures.sequence.rig
-    error = rig.camera.fx * rig.baseline * np.abs(_inverse(depth) - _inverse(pictures.depth()))
+    gain = rig.camera.fx * rig.baseline * rig.own_depth("left", rig.sensor("left").pixel_grid())
+    error = gain * np.abs(_inverse(depth) - _inverse(pictures.depth()))
     return colour_map(error, 0.0, DEPTH_PX)
 
 

@@ -19,7 +19,7 @@ from rsbench.benchmark.images.score import hash_of_prediction, scoring_version
 from rsbench.benchmark.images.store import identity_of, read_record
 from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import View
+from rsbench.core.rig import SIDES, View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.report import pictures
@@ -413,7 +413,8 @@ def correction_of(record: dict[str, Any]) -> dict[str, str]:
 
 def _section(sequence: Sequence, folder: Path, captions: dict[str, str]) -> dict[str, Any]:
     angle, length = np.rad2deg(np.linalg.norm(sequence.motion.w)), np.linalg.norm(sequence.motion.d)
-    camera = sequence.rig.camera
+    rig = sequence.rig
+    cameras = [rig.sensor(side) for side in (SIDES[:1] if rig.aligned else SIDES)]
     hover = {"rolling": "global", "corrected": "global"}
     shown = [
         {
@@ -425,9 +426,9 @@ def _section(sequence: Sequence, folder: Path, captions: dict[str, str]) -> dict
         if name != "global"
     ]
     text = (
-        f"{camera.width} x {camera.height} px, f = {camera.fx:g} px, baseline {sequence.rig.baseline:g} m, "
-        f"readout ratio {sequence.shutter.readout_ratio:g}; true motion per frame: {angle:.3g} deg, "
-        f"{length:.3g} m ({sequence.motion.name})."
+        f"{' and '.join(f'{each.width} x {each.height} px, f = {each.fx:g} px' for each in cameras)}, "
+        f"baseline {rig.baseline:g} m, readout ratio {sequence.shutter.readout_ratio:g}; true motion per frame: "
+        f"{angle:.3g} deg, {length:.3g} m ({sequence.motion.name})."
     )
     return {"title": sequence.name, "text": text, "pictures": shown}
 

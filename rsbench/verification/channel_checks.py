@@ -212,7 +212,7 @@ def _derived(
     depth = maps[view].depth
     filled = replace(maps[view], depth=np.where(depth > 0, depth, np.float32(FAR)))
     reprojection = reproject(sequence, filled, maps[layer.target(view, sequence.frames)], stride)
-    grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
+    grid = maps[view].camera.pixel_grid()[::stride, ::stride]
     values = pair_values(layer.channel, view, reprojection.pixels - grid)
     sky, relative = depth[::stride, ::stride] == 0, reprojection.relative
     free = np.where(sky, np.isneginf(relative), np.abs(relative) < _SURFACE)
@@ -363,7 +363,7 @@ def _resting(
 ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
     """Points, rays to them and normals, (H, W, 3) each, in the world; of what moves, in its own frame, where it
     rests: the normals of a frame are those of the times of its rows."""
-    view, grid, labels = depth_map.view, sequence.rig.camera.pixel_grid(), depth_map.labels
+    view, grid, labels = depth_map.view, depth_map.camera.pixel_grid(), depth_map.labels
 
     def of(number: int, chosen: Any) -> tuple[FloatArray, FloatArray]:
         pixels, depth = grid[chosen], z[chosen]

@@ -98,13 +98,14 @@ def read_view(content: Content, view: ImageView, missing: Collection[str]) -> No
     sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
-    size = sequence.rig.camera.width, sequence.rig.camera.height
+    camera = sequence.rig.sensor(view.side)
+    size = camera.width, camera.height
     try:
         beside = [view.labels] * bool(sequence.moving) + [view.gloss] * sequence.glossy
         if not {view.depth, *beside} & set(missing):
             labels = sequence.labels(*view) if sequence.moving else None
             gloss = sequence.gloss(*view) if sequence.glossy else None
-            content.maps[view] = DepthMap(view, sequence.depth(*view), sequence.rig.camera, labels, gloss)
+            content.maps[view] = DepthMap(view, sequence.depth(*view), camera, labels, gloss)
     except RsbenchError as error:
         content.faults.append(Finding.of(error))
     file = clean_picture(sequence, view)
@@ -193,13 +194,11 @@ class Comparison:
     """What could not be compared well, and is no fault."""
 
     def __post_init__(self) -> None:
-        camera = self.content.sequence.rig.camera
         self.evidence = {
             view: depth_checks.DepthEvidence(each, self.stride) for view, each in self.content.maps.items()
         }
-        self.votes = {
-            view: image_checks.ImageVotes.none((camera.height, camera.width)) for view in self.content.pictures
-        }
+        pictures = self.content.pictures.items()
+        self.votes = {view: image_checks.ImageVotes.none(each.colours.shape[:2]) for view, each in pictures}
 
     def pairs(self) -> Iterator[DepthAgreement | None]:
         """Compare one pair after the other; None where a file of it could not be read."""
@@ -224,7 +223,7 @@ class Comparison:
 
     def geometry(self) -> depth_checks.GeometryFault | None:
         """What the pairs show of sequence.json; where that is wrong they show nothing else."""
-        return depth_checks.geometry_fault(self.agreements)
+        return depth_checks.geometry_fault(self.agreements, self.content.sequence.rig)
 
     def faults(
         self,
@@ -241,7 +240,7 @@ class Comparison:
         for view, fault in wrong.items():
             cause = likely_cause(self.content.sequence, self.content.maps, view, fault.rows)
             yield Finding(view.depth, fault.what, rows_of(fault.rows), cause)
-        yield from depth_checks.pair_faults(self.agreements, wrong)
+        yield from depth_checks.pair_faults(self.agreements, wrong, self.content.sequence.rig)
         yield from self._without_rendered(list(self._image_faults(wrong.keys(), other_images)), image_is_rendered)
 
     def _without_rendered(
@@ -395,8 +394,8 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
         rows_scanned = sequence.shutter.axis(view.side) == 1
         if view.shutter != "rs" or not rows_scanned or not whole_frames(sequence.manifest):
             continue
-        rows = range(0, sequence.rig.camera.height, stride)
-        wrong = np.zeros(sequence.rig.camera.height, dtype=np.bool_)
+        height = sequence.rig.sensor(view.side).height
+        rows, wrong = range(0, height, stride), np.zeros(height, dtype=np.bool_)
         for row in rows:
             file = stack_file(view.side, view.frame, row)
             if file in missing:
@@ -425,7 +424,7 @@ def stack_rows(sequence: Sequence, view: ImageView, rows: Rows[int], of: Rows[in
     Raises:
         RsbenchError: an image cannot be read.
     """
-    camera = sequence.rig.camera
+    camera = sequence.rig.sensor(view.side)
     shown = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     for row, image in zip(rows, of, strict=True):
         shown[row] = _stack_image(sequence, view, image)[row]
@@ -433,6 +432,6 @@ def stack_rows(sequence: Sequence, view: ImageView, rows: Rows[int], of: Rows[in
 
 
 def _stack_image(sequence: Sequence, view: ImageView, row: int) -> NDArray[np.uint8]:
-    camera = sequence.rig.camera
+    camera = sequence.rig.sensor(view.side)
     file = inside(sequence.folder, stack_file(view.side, view.frame, row))
     return read_png(file, (camera.width, camera.height))

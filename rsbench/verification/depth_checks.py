@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import Geometry
+from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView, Times, nearby_views, numbers_of
@@ -49,8 +50,8 @@ _FEW = 6
 """Contradicted pixels in one row, or missing ones in a map, that thin things may leave."""
 _MANY = 4
 """Pairs, of 8 between the cameras and 16 others, that say that the geometry is wrong and not a map."""
-_ACROSS, _OVER_TIME = "baseline, camera, right_scan and right_delay", "motion, readout_ratio and scan"
-"""Keys of sequence.json on which pairs between the cameras depend, and those of one camera."""
+_OVER_TIME = "motion, readout_ratio and scan"
+"""Keys of sequence.json on which pairs of one camera depend; ``_across`` has those of pairs of both."""
 _TILE, _BAD_IN_TILE = 5, 12
 """A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
 _LEAST_WIDTH = 0.5
@@ -247,14 +248,23 @@ class GeometryFault(NamedTuple):
     """Whether it is only the two times that disagree."""
 
 
-def geometry_fault(pairs: list[tuple[ImageView, ImageView, DepthAgreement]]) -> GeometryFault | None:
+def _across(rig: StereoRig) -> str:
+    """Keys of sequence.json on which pairs between the cameras depend."""
+    if rig.aligned:
+        return "baseline, camera, right_scan and right_delay"
+    return "baseline, cameras, right_from_left, right_readout_ratio, right_scan and right_delay"
+
+
+def geometry_fault(
+    pairs: list[tuple[ImageView, ImageView, DepthAgreement]], rig: StereoRig
+) -> GeometryFault | None:
     """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
     wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
     if not across and len(wrong) >= 2 * _MANY:
         cause = f"the two cameras agree with each other: look at {_OVER_TIME} in sequence.json"
     elif across >= 2 * _MANY - 1:
-        cause = f"the two cameras never agree: look at {_ACROSS} in sequence.json, or all depth is scaled"
+        cause = f"the two cameras never agree: look at {_across(rig)} in sequence.json, or all depth is scaled"
     else:
         return None
     worst = min((each for _, _, each in pairs), key=lambda each: each.share)
@@ -273,7 +283,7 @@ def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
 
 
 def pair_faults(
-    pairs: list[tuple[ImageView, ImageView, DepthAgreement]], wrong: Collection[ImageView]
+    pairs: list[tuple[ImageView, ImageView, DepthAgreement]], wrong: Collection[ImageView], rig: StereoRig
 ) -> Iterator[Finding]:
     """Pairs that disagree though neither map is contradicted by all who see it."""
     for source, target, agreement in pairs:
@@ -283,7 +293,7 @@ def pair_faults(
             f"depth agrees with {target.depth} to {DEPTH_TOLERANCE:g} on only {100 * agreement.share:.2f} % of "
             f"{agreement.compared} visible pixels, and differs typically by {agreement.typical:.1e} of itself"
         )
-        keys = _ACROSS if source.side != target.side else _OVER_TIME
+        keys = _across(rig) if source.side != target.side else _OVER_TIME
         yield Finding(source.depth, what, cause=f"look at {keys} in sequence.json")
 
 
@@ -339,6 +349,10 @@ def _depth_candidates(
     rays = np.linalg.norm(stored.camera.unproject(stored.camera.pixel_grid()), axis=-1)
     along = (depth / rays).astype(np.float32)
     yield "looks like the distance along the ray instead of z", replace(stored, depth=along)
+    if not sequence.rig.aligned:
+        own = sequence.rig.own_depth(view.side, stored.camera.pixel_grid())
+        words = "looks like z along the axes of the rig instead of the camera's own"
+        yield words, replace(stored, depth=(depth * own).astype(np.float32))
 
 
 def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: BoolArray) -> NDArray[np.float32]:
@@ -509,7 +523,7 @@ class _MapsOverTime:
         if frame not in self._read:
             view = ImageView("rs", "left", frame)
             try:
-                self._read[frame] = DepthMap(view, self.sequence.depth(*view), self.sequence.rig.camera)
+                self._read[frame] = DepthMap(view, self.sequence.depth(*view), self.sequence.rig.sensor("left"))
             except RsbenchError:  # reported already
                 self._read[frame] = None
         return self._read[frame]

@@ -99,7 +99,8 @@ def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, 
     """Points are those of the depth map at the whole pixels from which they were drawn."""
     own = tracks.sources == k
     pixels, points = tracks.pixels[own, k], tracks.points[own]
-    outside = ~np.all((pixels == np.round(pixels)) & sequence.rig.camera.contains(pixels)[:, None], axis=1)
+    inside = depth.camera.contains(pixels)[:, None]
+    outside = ~np.all((pixels == np.round(pixels)) & inside, axis=1)
     if np.any(outside):
         yield Finding(TRACKS, f"{np.sum(outside)} points were drawn from no pixel of it", part=name)
         return
@@ -329,7 +330,8 @@ def match_faults(
     for k, (name, views) in enumerate(MATCHED.items()):
         source, target = (at(view, first) for view in views)
         part, found = matches.of_pair(k), partial(Finding, stored, part=name)
-        outside = ~sequence.rig.camera.contains(part.pixels).all(axis=1)
+        ends = zip((source, target), np.moveaxis(part.pixels, 1, 0), strict=True)
+        outside = ~np.all([sequence.rig.sensor(view[0]).contains(pixels) for view, pixels in ends], axis=0)
         if np.any(outside):
             yield found(f"{np.sum(outside)} matches have a keypoint beside the images")
             continue

@@ -85,7 +85,7 @@ class PoseTable(NamedTuple):
 
 
 class Optics(NamedTuple):
-    """The camera of both views."""
+    """The camera of a view."""
 
     numbers: FloatArray
     """(6,) fx, fy, cx, cy, width, height."""
@@ -155,6 +155,9 @@ def _table(geometry: MovingRig, view: ImageView, parts: int) -> PoseTable:
     tau = shutter.line_time(lines, view.frame, side)
     R, t = geometry.rig.cam_from_world(geometry.motion, tau, side)
     w_rate, speed = geometry.motion.velocity(tau)
+    if not geometry.rig.aligned:
+        turn = geometry.rig.own(side).R.T
+        w_rate, speed = w_rate @ turn, speed @ turn
     by_entry = shutter.rate(side)[shutter.axis(side)] / parts
     rates = so3.hat(w_rate) @ R * by_entry, np.asarray(speed) * by_entry
     R, t, R_rate, t_rate = (np.ascontiguousarray(each) for each in (R, t, *rates))
@@ -174,14 +177,15 @@ def _errors(geometry: MovingRig, view: ImageView, table: PoseTable) -> float:
     return worst if np.isfinite(worst) else np.inf
 
 
-def carry(carried: Carried, source: LinePoses, target: PoseTable, optics: Optics, surface: Surface) -> None:
-    """Fill in ``carried``."""
+def carry(
+    carried: Carried, source: LinePoses, target: PoseTable, optics: tuple[Optics, Optics], surface: Surface
+) -> None:
+    """Fill in ``carried``; ``optics`` are those of the source and of the target."""
     by_bands(partial(_carry_rows, carried, source, target, optics, surface), len(carried.depth))
 
 
-def optics_of_camera(geometry: MovingRig) -> Optics:
-    """Of the rig's camera."""
-    camera = geometry.rig.camera
+def optics_of_camera(camera: PinholeCamera) -> Optics:
+    """Of a camera in its own axes."""
     ideal, lens, _ = optics_of(camera)
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     return Optics(np.array(numbers, dtype=np.float64), ideal, lens)
@@ -192,13 +196,14 @@ def _carry_rows(
     carried: Carried,
     source: LinePoses,
     target: PoseTable,
-    optics: Optics,
+    optics: tuple[Optics, Optics],
     surface: Surface,
     first: int,
     last: int,
 ) -> None:
     """``carry`` for rows ``first`` to ``last`` of those that are carried."""
-    fx, fy, cx, cy = optics.numbers[0], optics.numbers[1], optics.numbers[2], optics.numbers[3]
+    own, there = optics
+    fx, fy, cx, cy = own.numbers[0], own.numbers[1], own.numbers[2], own.numbers[3]
     for row in range(first, last):
         for column in range(carried.depth.shape[1]):
             if not _is_chosen(carried.chosen, row, column):
@@ -207,7 +212,7 @@ def _carry_rows(
             z = carried.depth[row, column]
             sky = z == 0.0
             far = carried.far if sky else float(z)
-            u, v = look(optics.ideal, x, y)
+            u, v = look(own.ideal, x, y)
             a, b, c = far * ((u - cx) / fx), far * ((v - cy) / fy), far
             line = min(line_of(source.columns, x, y), len(source.t) - 1)
             R, t = source.R[line], source.t[line]
@@ -216,7 +221,7 @@ def _carry_rows(
             Y = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
             Z = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
             guess = across_lines(target.columns, float(x), float(y))
-            pu, pv, iu, iv, depth = _seen(X, Y, Z, guess, target, optics)
+            pu, pv, iu, iv, depth = _seen(X, Y, Z, guess, target, there)
             carried.pixels[row, column, 0] = pu
             carried.pixels[row, column, 1] = pv
             carried.relative[row, column] = _relative(pu, pv, iu, iv, depth, sky, surface)
@@ -451,7 +456,7 @@ class _Bending(NamedTuple):
     """Second differences of ``ideal``, as ``DepthMap._bends``."""
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _bending(camera: PinholeCamera) -> _Bending:
     ideal = camera.ideal_pixels(camera.pixel_grid())
     # Both sides of the equation are differences of the same pixels, so that it is exact on planes.
@@ -493,7 +498,8 @@ def reproject(sequence: Sequence, source: DepthMap, target: DepthMap, stride: in
             _reproject_exactly(sequence, source, target, found, stride)
             break
         carried = Carried(depth, stride, FAR, chosen, *found)
-        carry(carried, poses_of_source(own, source.view), table, optics_of_camera(own), target.surface)
+        optics = optics_of_camera(source.camera), optics_of_camera(target.camera)
+        carry(carried, poses_of_source(own, source.view), table, optics, target.surface)
     return found
 
 
@@ -501,7 +507,7 @@ def _reproject_exactly(
     sequence: Sequence, source: DepthMap, target: DepthMap, found: Reprojection, stride: int
 ) -> None:
     """The same with the pose at each pixel's own time."""
-    grid = sequence.rig.camera.pixel_grid()[::stride, ::stride]
+    grid = source.camera.pixel_grid()[::stride, ::stride]
     depth = source.depth[::stride, ::stride].astype(np.float64)
     step = max(1, _CHUNK_PIXELS // grid.shape[1])
     for first in range(0, len(grid), step):
@@ -544,7 +550,7 @@ def without_changing_light(
 ) -> Reprojection:
     """The same without what colours do not tell: gloss, and what turns, or is shaded by what moves, at another
     time."""
-    one_time = source.view.side != target.view.side and sequence.shutter.plain and source.camera.lens is None
+    one_time = source.view.side != target.view.side and sequence.shutter.plain and sequence.rig.rectified
     changing = [_changing(each, one_time) for each in (source, target)]
     if not np.any(changing):
         return reprojection

@@ -20,6 +20,7 @@ from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import poses_of
 from rsbench.core.projection import row_poses
+from rsbench.core.rig import SIDES, Side
 from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
 from rsbench.dataset.generation import render_view
@@ -180,7 +181,7 @@ class Rerenderer:
 
     def image_is_rendered(self, content: Content, view: ImageView) -> bool:
         """Whether a picture, without its sensor, is what its scene looks like: all of it, with all samples."""
-        manifest, camera = content.sequence.manifest, content.sequence.rig.camera
+        manifest, camera = content.sequence.manifest, content.sequence.rig.sensor(view.side)
         with contextlib.suppress(RsbenchError):  # reported by ``check``
             options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
             rows = list(range(camera.height))
@@ -196,11 +197,11 @@ class Rerenderer:
         from rsbench.renderers.visibility import SceneRays
 
         sequence, same = content.sequence, set[str]()
-        rows = list(range(sequence.rig.camera.height))
         with contextlib.suppress(RsbenchError):
             for view in [each for each in image_views(content.times) if each.shutter == "rs"]:
                 if any(f"/{view.side}_{view.frame}." in file for file in accused):
                     scene, frame = self.whole(content, view)
+                    rows = list(range(sequence.rig.sensor(view.side).height))
                     checks = channels_again(sequence, view, rows, frame, SceneRays(scene, sequence.objects), ())
                     same |= {file for file, _, alike in checks if alike}
             scene, _ = self.scene(sequence)
@@ -219,7 +220,8 @@ class Rerenderer:
         options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
         scene, _ = self.scene(content.sequence)
         quick = replace(options, samples=1, integrator="sunsky")
-        return scene, _render(content, scene, quick, view, list(range(content.sequence.rig.camera.height)))
+        rows = list(range(content.sequence.rig.sensor(view.side).height))
+        return scene, _render(content, scene, quick, view, rows)
 
     def scene(self, sequence: Sequence) -> tuple[MitsubaScene, str]:
         """The scene of a sequence in the renderer, and its hash."""
@@ -266,7 +268,7 @@ class RerenderedRows:
             self._refusal = f"no row rendered again: {error}"
             return
         self._rows = _rows_of(again.mode, sequence, self._options)
-        if not self._rows:
+        if not self._rows["left"]:
             self._refusal = "no row rendered again: its renderer takes too many samples; --rerender all does it"
         self._seconds = time.perf_counter() - self._begun
 
@@ -291,7 +293,9 @@ class RerenderedRows:
         again = chain(*of_points, of_matches)
         self._take(RowCheck(*check) for check in again)
         wrong = [check for check in checks if check.fault]
-        done = f"{len(self._rows)} rows of each image and depth map rendered again in {self._seconds:.1f} s"
+        done = (
+            f"{len(self._rows['left'])} rows of each image and depth map rendered again in {self._seconds:.1f} s"
+        )
         if _table(manifest, "scene").get("sha256") != self._digest:
             done += "; the scene built here has another sha256 than sequence.json says"
             if wrong and _table(manifest, "made_by").get("rsbench") != __version__:
@@ -311,17 +315,25 @@ def _rays(scene: MitsubaScene) -> SceneRays:
     return SceneRays(scene)
 
 
-def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> list[int]:
-    """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are."""
-    camera = sequence.rig.camera
+def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> dict[Side, list[int]]:
+    """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are.
+
+    Those of each camera; the same where these have the same height.
+    """
+    cameras = {side: sequence.rig.sensor(side) for side in SIDES}
+    heights = {side: camera.height for side, camera in cameras.items()}
     if mode == "all":
-        return list(range(camera.height))
+        return {side: list(range(height)) for side, height in heights.items()}
     views = len(IMAGE_VIEWS) * sequence.frames // 2
-    affordable = int(_MOST_RAYS / (views * _rays_of(camera.width, options)))
-    count = min(_ROWS, camera.height, affordable)
+    widest = max(camera.width for camera in cameras.values())
+    count = min(_ROWS, *heights.values(), int(_MOST_RAYS / (views * _rays_of(widest, options))))
+    return {side: _drawn_rows(sequence, height, count) for side, height in heights.items()}
+
+
+def _drawn_rows(sequence: Sequence, height: int, count: int) -> list[int]:
     digest = hashlib.sha256(repr(sequence.manifest.get("files")).encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
-    edges = np.linspace(0, camera.height, count + 1).astype(int)
+    edges = np.linspace(0, height, count + 1).astype(int)
     return [int(rng.integers(low, high)) for low, high in pairwise(edges)]
 
 
@@ -337,7 +349,11 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def _row_checks(
-    content: Content, scene: MitsubaScene, options: RendererOptions, rows: list[int], reported: set[str]
+    content: Content,
+    scene: MitsubaScene,
+    options: RendererOptions,
+    rows_of_sides: Mapping[Side, list[int]],
+    reported: set[str],
 ) -> Iterator[RowCheck]:
     from rsbench.renderers.visibility import SceneRays
 
@@ -346,6 +362,7 @@ def _row_checks(
     for view in (*own, *twins):
         if view not in content.maps and view not in content.pictures:
             continue
+        rows = rows_of_sides[view.side]
         frame = _render(content, scene, options, view, rows)
         if view in content.maps:
             yield depth_check(content.maps[view], frame.depth, rows)
@@ -392,7 +409,7 @@ def _frame_checks(
         if sequence.sensor is not None and view.image not in reported:
             seen = Picture.of(view, sequence.image(*view[:3]), noisy=False)
             sensor = sequence.sensor.of(view.side, view.frame)
-            some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < sequence.shutter.height else rows
+            some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < len(seen.colours) else rows
             period = sequence.frame_period_s
             sensed = sensed_rows(scene, sequence, (view.side, view.frame), sensor, period, chosen, some)
             yield image_check(view.image, seen, sensed, some, elsewhere, _by_gpu(content))
@@ -437,7 +454,7 @@ def _stack_check(
     tau = sequence.shutter.line_times(view.frame, view.side).copy()
     R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
     poses = LinePoses(R, t, poses_of(sequence.objects, tau))
-    frame = render(scene, sequence.rig.camera, poses, chosen, rows=rows)
+    frame = render(scene, sequence.rig.sensor(view.side), poses, chosen, rows=rows)
     rendered = to_srgb8(frame.image, chosen.exposure)
     noisy = chosen.integrator == "path" and not _made_here(content)
     return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy, _by_gpu(content))

@@ -206,13 +206,13 @@ def sensor_faults(
 ) -> Iterator[Finding]:
     """What the frames of a sequence show that their sensor cannot have made of the clean twins."""
     sensor = sequence.sensor
-    size = sequence.rig.camera.width, sequence.rig.camera.height
     for view in pictures:
+        camera = sequence.rig.sensor(view.side)
         rolling, file = view.shutter == "rs", _file(view)
         if sensor is None or file in missing or view not in maps or not (rolling or sequence.exposed_twins):
             continue
         try:
-            fault = png_fault(inside(sequence.folder, file), file, size)
+            fault = png_fault(inside(sequence.folder, file), file, (camera.width, camera.height))
             if fault is None:
                 seen = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
                 own, spacing = sensor.of(view.side, view.frame), _spacing(sequence)
@@ -267,7 +267,7 @@ def _window(
     Of the surfaces of an object, by its ``number``, or of what stands still.
     """
     view, labels = depth_map.view, depth_map.labels
-    grid = sequence.rig.camera.pixel_grid()[::4, ::4]
+    grid = depth_map.camera.pixel_grid()[::4, ::4]
     own = np.ones(grid.shape[:2], np.bool_) if labels is None else numbers_of(labels[::4, ::4]) == number
     if not (sensor.exposure_s and np.any(own)):
         return 0, 0
@@ -277,7 +277,7 @@ def _window(
     if view.shutter == "gs":
         line = shutter.line_times(view.frame, view.side)[abs(shutter.first_line(view.side) - view.row)]
         tau = np.full(tau.shape, line)
-    rays = rig.camera.unproject(grid) * np.where(depth > 0, depth, FAR)[:, None]
+    rays = depth_map.camera.unproject(grid) * np.where(depth > 0, depth, FAR)[:, None]
     X = transform(inverse(rig.cam_from_world(motion, tau, view.side)), rays)
     half = 0.5 * sensor.exposure_s / sequence.frame_period_s
     moved = [
