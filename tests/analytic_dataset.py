@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import rsbench
-from rsbench.components.cards import load_card
+from rsbench.components.cards import load_card, parse_card
+from rsbench.components.rig_tables import RigTables, tables_of
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
@@ -54,10 +56,13 @@ def plane_colours(
 
 
 def card_of(rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: int) -> DatasetCard:
+    camera = CameraCard(width=rig.camera.width, height=rig.camera.height, focal=rig.camera.fx)
+    cameras: dict[str, Any] = {"camera": camera, "baseline": rig.baseline}
+    if not rig.aligned:
+        cameras = {"rig": parse_card(RigTables, tables_of(rig), "rig")}
     return DatasetCard(
         name="planes",
-        camera=CameraCard(width=rig.camera.width, height=rig.camera.height, focal=rig.camera.fx),
-        baseline=rig.baseline,
+        **cameras,
         readout_ratio=shutter.readout_ratio,
         frames=frames,
         motion=MotionCard(
@@ -82,7 +87,7 @@ def write_analytic_dataset(
     frames: int = 2,
     twins: tuple[int, ...] = (),
 ) -> None:
-    """Write a dataset of format 1; ``true_motion`` makes depth and images, ``motion`` is what the rest says.
+    """Write a dataset; ``true_motion`` makes depth and images, ``motion`` is what the rest says.
 
     ``twins``: rows of global-shutter twins beside that of row 0.
     """
@@ -93,8 +98,8 @@ def write_analytic_dataset(
     ]
     for name in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    camera = rig.camera
     for side, frame in views_of(frames):
+        camera = rig.sensor(side)
         stated = row_poses(rig, shutter, motion, side, frame)
         write_poses(folder / f"poses/{side}_{frame}.csv", shutter.line_times(frame, side), stated)
         rolling = row_poses(rig, shutter, true_motion or motion, side, frame)
@@ -122,13 +127,17 @@ def write_analytic_dataset(
     write_json(
         out / "dataset.json",
         {
-            "format": 1,
+            "format": manifest["format"],
             "name": "planes",
             "description": "",
             "rsbench": rsbench.__version__,
             "mitsuba": "none",
             "units": UNITS,
-            "card": asdict(card_of(rig, shutter, motion, frames)),
+            "card": {
+                key: value
+                for key, value in asdict(card_of(rig, shutter, motion, frames)).items()
+                if value is not None
+            },
             "sequences": ["planes"],
             "files": {
                 f"planes/{name}": {"sha256": sha256(folder / name), "size": (folder / name).stat().st_size}

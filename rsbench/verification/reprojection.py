@@ -552,7 +552,7 @@ def without_changing_light(
     time."""
     one_time = source.view.side != target.view.side and sequence.shutter.plain and sequence.rig.rectified
     changing = [_changing(each, one_time) for each in (source, target)]
-    if not np.any(changing):
+    if not any(map(np.any, changing)):
         return reprojection
     own = cv2.dilate(changing[0], np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
     other = cv2.dilate(changing[1], np.ones((5, 5), np.uint8)) > 0

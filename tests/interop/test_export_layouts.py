@@ -12,15 +12,20 @@ import pytest
 import yaml
 from analytic_dataset import PLANES
 from evo.tools import file_interface
-from exported_data import HEIGHT, LENSES, MOTION, SAME_PX, WIDTH, dataset, exported, only, opencv_pixels, seen
+from exported_data import LENSES, MOTION, PLACE, SAME_PX, TURN, dataset, exported, only, opencv_pixels, seen
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core.rig import SIDES, views_of
 from rsbench.core.so3 import FloatArray
+from rsbench.interop.readers.layouts import read_colmap
 from rsbench.storage.files import read_json, write_json
 
 K = np.array([[60.0, 0.0, 30.5], [0.0, 61.0, 25.0], [0.0, 0.0, 1.0]])
+K_RIGHT = np.array([[75.0, 0.0, 41.0], [0.0, 74.0, 20.5], [0.0, 0.0, 1.0]])
+"""Of the right camera of a general rig, which has 80 x 45 pixels."""
+RIGHT_FROM_LEFT = np.eye(4)
+RIGHT_FROM_LEFT[:3, :3], RIGHT_FROM_LEFT[:3, 3] = Rotation.from_rotvec(TURN).as_matrix(), PLACE
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +36,14 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Trajectories
 
 
-@pytest.mark.parametrize("scanning", [{}, {"scan": "bottom", "right_scan": "left", "right_delay": -0.1}])
+@pytest.mark.parametrize(
+    "scanning",
+    [
+        {},
+        {"scan": "bottom", "right_scan": "left", "right_delay": -0.1},
+        {"right": "none", "right_scan": "left", "right_readout_ratio": 0.5},
+    ],
+)
 def test_evo_reads_the_pose_of_every_row_in_the_order_of_time(tmp_path: Path, scanning: dict[str, Any]) -> None:
     data = dataset(tmp_path / "data", frames=3, **scanning)
     out, _ = exported(data, "tum", tmp_path / "out")
@@ -44,7 +56,8 @@ def test_evo_reads_the_pose_of_every_row_in_the_order_of_time(tmp_path: Path, sc
         index = np.searchsorted(read.timestamps, 0.1 * tau[shown.lines.astype(int)] - 1e-9)
         camera_from_world = np.linalg.inv(np.array(read.poses_se3)[index])
         x = np.einsum("nij,nj->ni", camera_from_world[:, :3, :3], shown.world) + camera_from_world[:, :3, 3]
-        np.testing.assert_allclose(opencv_pixels(x, K, "none"), shown.pixels, atol=SAME_PX)
+        own = K_RIGHT if side == "right" and "right" in scanning else K
+        np.testing.assert_allclose(opencv_pixels(x, own, "none"), shown.pixels, atol=SAME_PX)
         first = file_interface.read_tum_trajectory_file(out / f"planes/{side}.txt")
         start = np.argmin(tau)
         np.testing.assert_allclose(first.timestamps[frame], 0.1 * tau[start], atol=1e-12)
@@ -65,21 +78,30 @@ def test_a_global_shutter_has_no_trajectory_of_rows(tmp_path: Path) -> None:
 # Calibrations
 
 
-@pytest.mark.parametrize(("lens", "model"), [("none", "none"), ("brown", "radtan"), ("fisheye", "equidistant")])
-def test_a_camera_chain_projects_our_points(tmp_path: Path, lens: str, model: str) -> None:
-    data = dataset(tmp_path / "data", lens)
+MODELS_OF_KALIBR = {"none": "none", "brown": "radtan", "fisheye": "equidistant"}
+
+
+@pytest.mark.parametrize(
+    ("lens", "right"),
+    [("none", ""), ("brown", ""), ("fisheye", ""), ("brown", "fisheye"), ("none", "brown")],
+)
+def test_a_camera_chain_projects_our_points(tmp_path: Path, lens: str, right: str) -> None:
+    data = dataset(tmp_path / "data", lens, right=right)
     path = data / "planes/sequence.json"
     write_json(path, read_json(path) | {"imu": {"time_offset_s": 0.00001, "clock_drift": 1e-5}})
     out, note = exported(data, "kalibr", tmp_path / "out")
     assert "drifts by 1.0e-05" in note["told"][0]
     chain = yaml.safe_load((out / "planes/camchain.yaml").read_text())
-    for camera in chain.values():  # what kalibr_common/ConfigReader.py demands
+    lenses, size = (lens, right or lens), [80, 45] if right else [64, 49]
+    for camera, each, (width, height) in zip(chain.values(), lenses, ([64, 49], size), strict=True):
+        # What kalibr_common/ConfigReader.py demands.
+        model = MODELS_OF_KALIBR[each]
         assert camera["camera_model"] == "pinhole" and camera["distortion_model"] == model
         assert len(camera["distortion_coeffs"]) == (0 if model == "none" else 4)
         assert all(isinstance(value, float) for value in [*camera["intrinsics"], *camera["distortion_coeffs"]])
-        assert camera["resolution"] == [64, 49] and isinstance(camera["rostopic"], str)
+        assert camera["resolution"] == [width, height] and isinstance(camera["rostopic"], str)
         assert isinstance(camera["timeshift_cam_imu"], float) and camera["timeshift_cam_imu"] == 0.00001
-        np.testing.assert_allclose(camera["line_delay"] * 49, 0.08, rtol=1e-12)
+        np.testing.assert_allclose(camera["line_delay"] * height, 0.08, rtol=1e-12)
     assert sorted(yaml.safe_load((out / "planes/imu.yaml").read_text()))[0] == "accelerometer_noise_density"
     sequence = only(data)
     shown = seen(sequence, "right", 1, "gs")
@@ -87,13 +109,18 @@ def test_a_camera_chain_projects_our_points(tmp_path: Path, lens: str, model: st
     in_left = np.append(shown.world @ poses.R[0].T + poses.t[0], np.ones((len(shown.world), 1)), axis=1)
     in_right = in_left @ np.array(chain["cam1"]["T_cn_cnm1"]).T
     fu, fv, pu, pv = chain["cam1"]["intrinsics"]
-    found = opencv_pixels(in_right[:, :3], np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]]), lens)
+    found = opencv_pixels(in_right[:, :3], np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]]), right or lens)
     np.testing.assert_allclose(found, shown.pixels, atol=SAME_PX)
-    if (shape := LENSES[lens]) is not None:
-        order = ("k1", "k2", "p1", "p2") if model == "radtan" else ("k1", "k2", "k3", "k4")
-        assert chain["cam0"]["distortion_coeffs"] == [getattr(shape, name) for name in order]
-    body_from_left = np.linalg.inv(np.array(chain["cam0"]["T_cam_imu"]))
-    np.testing.assert_allclose(body_from_left[:3, 3], [-0.15, 0.0, 0.0])  # half the baseline to the left
+    for camera, each in zip(chain.values(), lenses, strict=True):
+        if (shape := LENSES[each]) is not None:
+            order = ("k1", "k2", "p1", "p2") if each == "brown" else ("k1", "k2", "k3", "k4")
+            assert camera["distortion_coeffs"] == [getattr(shape, name) for name in order]
+    body_from_left, body_from_right = (np.linalg.inv(camera["T_cam_imu"]) for camera in chain.values())
+    half = 0.5 * float(np.linalg.norm(PLACE)) if right else 0.15
+    np.testing.assert_allclose(body_from_left[:3, 3], [-half, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(body_from_right[:3, 3], [half, 0.0, 0.0], atol=1e-15)
+    if right:
+        np.testing.assert_allclose(chain["cam1"]["T_cn_cnm1"], RIGHT_FROM_LEFT, atol=1e-14)
 
 
 # KITTI
@@ -225,6 +252,17 @@ def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("name", "lens", "scanning", "images", "words"),
     [
+        ("kitti", "none", {"right": "none"}, None, "rsbench correct --rectify writes rectified pairs"),
+        ("kalibr", "none", {"right": "rational"}, None, "the right camera's is rational"),
+        ("nerfstudio", "brown", {"right": "fisheye"}, None, "one for all images"),
+        (
+            "nerfstudio",
+            "none",
+            {"right": "none", "right_readout_ratio": 0.5},
+            "rs",
+            "readouts of the cameras differ",
+        ),
+        ("carla-rs", "none", {"right": "none"}, None, "one size and one readout"),
         ("kalibr", "brown-k3", {}, None, "radtan has k1, k2, p1, p2 but no k3"),
         ("kalibr", "none", {"right_scan": "bottom"}, None, "rows that are read from the top"),
         ("kitti", "brown", {}, None, "rectified"),
@@ -255,17 +293,23 @@ def test_a_motion_that_a_format_only_approximates_is_measured(tmp_path: Path) ->
         assert (note["largest_row_error_px"] < SAME_PX) == exact == (not note["told"]), SIDES
 
 
-MODELS = {"none": "PINHOLE", "brown": "OPENCV", "brown-k3": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}
+MODELS = {
+    "rational": "FULL_OPENCV",
+    "none": "PINHOLE",
+    "brown": "OPENCV",
+    "brown-k3": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+}
 
 
-@pytest.fixture(scope="module", params=["none", "brown", "brown-k3", "fisheye"])
+@pytest.fixture(scope="module", params=["none", "brown", "brown-k3", "fisheye", "brown fisheye", "none rational"])
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
-    """Name of the lens, dataset and export: the scan must not matter to global-shutter twins."""
+    """Names of the lenses, dataset and export: the scan must not matter to global-shutter twins."""
     folder = tmp_path_factory.mktemp("colmap")
-    scanning: dict[str, Any] = (
-        {} if request.param == "none" else {"scan": "bottom", "right_scan": "top", "right_delay": 0.1}
-    )
-    data = dataset(folder / "data", request.param, **scanning)
+    scanning: dict[str, Any] = {} if request.param == "none" else {"scan": "bottom", "right_scan": "top"}
+    scanning |= {"right_delay": 0.1} if request.param == "fisheye" else {}
+    lens, _, right = request.param.partition(" ")
+    data = dataset(folder / "data", lens, right=right, **scanning)
     return request.param, data, exported(data, "colmap", folder / "out")[0] / "planes"
 
 
@@ -276,14 +320,39 @@ def _table(path: Path) -> list[list[str]]:
 def test_our_points_fall_on_their_pixels(made: tuple[str, Path, Path]) -> None:
     lens, data, out = made
     left, right = _table(out / "sparse/cameras.txt")
-    assert left[1:] == right[1:] and left[1:4] == [MODELS[lens], "64", "49"]
-    fx, fy, cx, cy = (float(value) for value in left[4:8])
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    lenses = dict(zip(SIDES, (lens.split() * 2)[:2], strict=True))
+    assert left[1:4] == [MODELS[lenses["left"]], "64", "49"]
+    assert right[1:4] == [MODELS[lenses["right"]], "80", "45"] if " " in lens else right[1:] == left[1:]
     poses = {row[-1]: np.array(row[1:8], dtype=float) for row in _table(out / "sparse/images.txt")[::2]}
     for side, frame in views_of(2):
         pose, shown = poses[f"{side}_{frame:04d}.png"], seen(only(data), side, frame, "gs")
+        fx, fy, cx, cy = (float(value) for value in (left if side == "left" else right)[4:8])
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         x = shown.world @ Rotation.from_quat(pose[[1, 2, 3, 0]]).as_matrix().T + pose[4:]
-        np.testing.assert_allclose(opencv_pixels(x, K, lens), shown.pixels + 0.5, atol=SAME_PX)
+        np.testing.assert_allclose(opencv_pixels(x, K, lenses[side]), shown.pixels + 0.5, atol=SAME_PX)
+
+
+def test_the_rig_of_colmap_reads_back(made: tuple[str, Path, Path]) -> None:
+    """By pycolmap and by ours: both cameras of a frame stand as rigs.txt says, and at the same places as alone."""
+    pycolmap = pytest.importorskip("pycolmap")
+    lens, data, out = made
+    if lens == "fisheye":
+        assert not (out / "sparse/rigs.txt").exists()  # a late camera
+        return
+    own = only(data).rig
+    if " " in lens:
+        np.testing.assert_allclose(own.right_from_left.t, PLACE, atol=1e-14)
+    (rig,) = pycolmap.Reconstruction(out / "sparse").rigs.values()
+    (found,) = rig.non_ref_sensors.values()
+    theirs = found.matrix()
+    np.testing.assert_allclose(theirs, np.column_stack(own.right_from_left), atol=1e-12)
+    (recording,) = read_colmap(out / "sparse")
+    assert recording.rig is not None
+    for name in ("left", "right"):
+        np.testing.assert_allclose(recording.rig.own(name).rotation, own.own(name).rotation, atol=1e-12)
+        assert recording.rig.sensor(name) == own.sensor(name)
+    assert set(recording.images) == set(views_of(2))
+    assert all(path.is_file() for path in recording.images.values())
 
 
 def test_pycolmap_reads_every_observation_where_it_projects(made: tuple[str, Path, Path]) -> None:
@@ -346,16 +415,16 @@ def _observations(row: list[str], points: dict[str, FloatArray]) -> tuple[FloatA
 # gsplat
 
 
-def _relative_times(pixels: FloatArray, shutter: str) -> FloatArray:
+def _relative_times(pixels: FloatArray, about: Any) -> FloatArray:
     """``shutter_relative_frame_time`` of gsplat/cuda/_torch_cameras.py, in its pixels."""
-    x, y = pixels.T
+    (x, y), width, height = pixels.T, about["width"], about["height"]
     return {
-        "ROLLING_TOP_TO_BOTTOM": np.floor(y) / (HEIGHT - 1),
-        "ROLLING_LEFT_TO_RIGHT": np.floor(x) / (WIDTH - 1),
-        "ROLLING_BOTTOM_TO_TOP": (HEIGHT - np.ceil(y)) / (HEIGHT - 1),
-        "ROLLING_RIGHT_TO_LEFT": (WIDTH - np.ceil(x)) / (WIDTH - 1),
+        "ROLLING_TOP_TO_BOTTOM": np.floor(y) / (height - 1),
+        "ROLLING_LEFT_TO_RIGHT": np.floor(x) / (width - 1),
+        "ROLLING_BOTTOM_TO_TOP": (height - np.ceil(y)) / (height - 1),
+        "ROLLING_RIGHT_TO_LEFT": (width - np.ceil(x)) / (width - 1),
         "GLOBAL": np.zeros(len(x)),
-    }[shutter]
+    }[about["rolling_shutter"]]
 
 
 def _gsplat_pixels(start: FloatArray, end: FloatArray, world: FloatArray, K: FloatArray, about: Any) -> FloatArray:
@@ -366,7 +435,7 @@ def _gsplat_pixels(start: FloatArray, end: FloatArray, world: FloatArray, K: Flo
     for _ in range(11):
         shift = (1.0 - t)[:, None] * start[:3, 3] + t[:, None] * end[:3, 3]
         pixels = opencv_pixels(turn(np.clip(t, 0.0, 1.0)).apply(world) + shift, K, about["lens"])
-        t = _relative_times(pixels, about["rolling_shutter"])
+        t = _relative_times(pixels, about)
     return pixels
 
 
@@ -380,6 +449,12 @@ def _gsplat_pixels(start: FloatArray, end: FloatArray, world: FloatArray, K: Flo
             ("BOTTOM_TO_TOP", "TOP_TO_BOTTOM"),
         ),
         ("fisheye", {"scan": "left", "right_scan": "right"}, ("LEFT_TO_RIGHT", "RIGHT_TO_LEFT")),
+        (
+            "brown-k3",
+            {"right": "fisheye", "right_scan": "left", "right_readout_ratio": 0.6},
+            ("TOP_TO_BOTTOM", "LEFT_TO_RIGHT"),
+        ),
+        ("none", {"right": "rational"}, ("TOP_TO_BOTTOM", "TOP_TO_BOTTOM")),
     ],
 )
 def test_gsplat_sees_our_points_in_their_pixels(
@@ -389,23 +464,24 @@ def test_gsplat_sees_our_points_in_their_pixels(
     out, note = exported(data, "gsplat", tmp_path / "out")
     assert note["largest_row_error_px"] < SAME_PX and note["told"] == []
     for side, frame in views_of(2):
+        own = scanning.get("right", lens) if side == "right" else lens
         with np.load(out / f"planes/{side}.npz") as arrays:
             loaded = {name: arrays[name] for name in arrays}
         about = json.loads((out / f"planes/{side}.json").read_text())
         assert about["rolling_shutter"] == f"ROLLING_{shutters[SIDES.index(side)]}"
-        assert about["camera_model"] == ("fisheye" if lens == "fisheye" else "pinhole")
+        assert about["camera_model"] == ("fisheye" if own == "fisheye" else "pinhole")
         assert {name: array.shape[1:] for name, array in loaded.items()} == {
             "viewmats": (4, 4),
             "viewmats_rs": (4, 4),
             "Ks": (3, 3),
-            **({} if lens == "none" else {"radial_coeffs": (4,) if lens == "fisheye" else (6,)}),
-            **({"tangential_coeffs": (2,)} if lens == "brown-k3" else {}),
+            **({} if own == "none" else {"radial_coeffs": (4,) if own == "fisheye" else (6,)}),
+            **({"tangential_coeffs": (2,)} if own in ("brown-k3", "rational") else {}),
         }
-        shown = seen(only(data), side, frame, "rs", rows=(1, 24, 47))
+        shown = seen(only(data), side, frame, "rs", rows=(1, 24, 43))
         inside = np.ptp(np.stack([loaded["viewmats"][frame], loaded["viewmats_rs"][frame]]), axis=0)
         assert np.max(inside) > 0.01, "the camera moves"
         start, end = loaded["viewmats"][frame], loaded["viewmats_rs"][frame]
-        found = _gsplat_pixels(start, end, shown.world, loaded["Ks"][frame], about | {"lens": lens})
+        found = _gsplat_pixels(start, end, shown.world, loaded["Ks"][frame], about | {"lens": own})
         # A pixel's centre is half a pixel from where the time of its line would be another's.
         np.testing.assert_allclose(found, shown.pixels + 0.5, atol=SAME_PX)
         image = out / "planes" / about["images"][frame]
@@ -447,27 +523,34 @@ def _pixel_velocities(frame: dict[str, Any], x: FloatArray, K: FloatArray) -> Fl
     return np.stack([across, -K[1, 1] * (v[:, 1] - v[:, 2] * x[:, 1] / z) / z], axis=-1)
 
 
-def test_3dgs_deblur_sees_the_middle_row_in_its_pixels_and_the_rows_move_as_the_camera(tmp_path: Path) -> None:
-    data = dataset(tmp_path / "data", right_delay=0.1)
+@pytest.mark.parametrize("right", ["", "none"])
+def test_3dgs_deblur_sees_the_middle_row_in_its_pixels_and_the_rows_move_as_the_camera(
+    tmp_path: Path, right: str
+) -> None:
+    data = dataset(tmp_path / "data", right=right, right_delay=0.1)
     out, note = exported(data, "nerfstudio", tmp_path / "out")
     content, sequence = json.loads((out / "planes/transforms.json").read_text()), only(data)
     assert content["exposure_time"] == 0.0
     np.testing.assert_allclose(content["rolling_shutter_time"], 0.08)
-    frames, K, worst = {frame["file_path"]: frame for frame in content["frames"]}, _calibration(content), 0.0
+    frames, worst = {frame["file_path"]: frame for frame in content["frames"]}, 0.0
     for side, number in views_of(2):
         frame = frames[f"images/{side}_{number:04d}.png"]
-        middle = seen(sequence, side, number, "rs", rows=(24,))
+        K, rows = _calibration(content | frame), 45 if right and side == "right" else 49
+        middle = seen(sequence, side, number, "rs", rows=(rows // 2,))
         x = _in_camera(frame, middle.world)
         np.testing.assert_allclose(opencv_pixels(x, K, "none"), middle.pixels + 0.5, atol=SAME_PX)
         # Each row's delay, from the poses of the rows around: the error of the difference is below 1e-7 px.
         _, poses = sequence.poses(side, number)
-        ends = (opencv_pixels(middle.world @ poses.R[k].T + poses.t[k], K, "none") for k in (23, 25))
+        ends = (
+            opencv_pixels(middle.world @ poses.R[k].T + poses.t[k], K, "none")
+            for k in (rows // 2 - 1, rows // 2 + 1)
+        )
         before, after = ends
         rates = _pixel_velocities(frame, x, K)
-        np.testing.assert_allclose(rates * content["rolling_shutter_time"] / 49, (after - before) / 2, atol=1e-7)
-        shown = seen(sequence, side, number, "rs", rows=tuple(range(49)))
+        np.testing.assert_allclose(rates * content["rolling_shutter_time"] / rows, (after - before) / 2, atol=1e-7)
+        shown = seen(sequence, side, number, "rs", rows=tuple(range(rows)))
         x = _in_camera(frame, shown.world)
-        roll = content["rolling_shutter_time"] * ((shown.lines + 0.5) / 49 - 0.5)
+        roll = content["rolling_shutter_time"] * ((shown.lines + 0.5) / rows - 0.5)
         law = opencv_pixels(x, K, "none") + roll[:, None] * _pixel_velocities(frame, x, K)
         worst = max(worst, float(np.max(np.linalg.norm(law - shown.pixels - 0.5, axis=-1))))
     # Told, of more columns than these: the law is of first order.
@@ -476,20 +559,28 @@ def test_3dgs_deblur_sees_the_middle_row_in_its_pixels_and_the_rows_move_as_the_
 
 
 @pytest.mark.parametrize(
-    ("lens", "model"), [("none", "OPENCV"), ("brown-k3", "OPENCV"), ("fisheye", "OPENCV_FISHEYE")]
+    ("lens", "model", "right"),
+    [
+        ("none", "OPENCV", ""),
+        ("brown-k3", "OPENCV", ""),
+        ("fisheye", "OPENCV_FISHEYE", ""),
+        ("none", "OPENCV", "brown"),
+    ],
 )
-def test_nerfstudio_sees_global_shutter_twins_in_their_pixels(tmp_path: Path, lens: str, model: str) -> None:
-    data = dataset(tmp_path / "data", lens, scan="right")
+def test_nerfstudio_sees_global_shutter_twins_in_their_pixels(
+    tmp_path: Path, lens: str, model: str, right: str
+) -> None:
+    data = dataset(tmp_path / "data", lens, right=right, scan="right")
     out, note = exported(data, "nerfstudio", tmp_path / "out", "gs")
     content, sequence = json.loads((out / "planes/transforms.json").read_text()), only(data)
     assert content["camera_model"] == model and note["told"] == []
     assert "rolling_shutter_time" not in content and "camera_linear_velocity" not in content["frames"][0]
-    coefficients = {name: content[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2") if name in content}
-    shape = sequence.rig.camera.lens
-    assert coefficients == {name: getattr(shape, name, 0.0) for name in coefficients}
     for (side, number), frame in zip([(s, k) for k in (0, 1) for s in SIDES], content["frames"], strict=True):
-        shown = seen(sequence, side, number, "gs")
-        found = opencv_pixels(_in_camera(frame, shown.world), _calibration(content), lens)
+        shown, own, both = seen(sequence, side, number, "gs"), right if side == "right" else "", content | frame
+        coefficients = {name: both[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2") if name in both}
+        shape = LENSES[own or lens]
+        assert coefficients == {name: getattr(shape, name, 0.0) for name in coefficients}
+        found = opencv_pixels(_in_camera(frame, shown.world), _calibration(both), own or lens)
         np.testing.assert_allclose(found, shown.pixels + 0.5, atol=SAME_PX)
         image = out / "planes" / frame["file_path"]
         assert image.read_bytes() == (data / f"planes/gs/{side}_{number}.png").read_bytes()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import webdataset
-from exported_data import dataset, exported, only
+from exported_data import PLACE, dataset, exported, only
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
@@ -72,6 +72,23 @@ def test_webdataset_reads_every_frame(made: Path, tmp_path: Path, monkeypatch: p
                 )
                 depth = sequence.depth(shutter, side, frame)
                 np.testing.assert_array_equal(sample[f"{side}.{shutter}_depth.npy"], depth)
+
+
+def test_each_camera_of_a_rig_has_its_own_size(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", right="fisheye")
+    (shard,) = exported(data, "webdataset", tmp_path / "out")[0].glob("*.tar")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        sample = next(
+            iter(webdataset.WebDataset(str(shard), shardshuffle=False, empty_check=False).decode("rgb8"))
+        )
+        gc.collect()
+    shapes = [sample[f"{side}.{name}"].shape for side in SIDES for name in ("rs.png", "rs_depth.npy", "poses.npy")]
+    assert shapes == [(49, 64, 3), (49, 64), (49, 3, 4), (45, 80, 3), (45, 80), (45, 3, 4)]
+    assert sample["json"]["cameras"]["right"]["lens"]["model"] == "kannala-brandt"
+    np.testing.assert_allclose(sample["json"]["right_from_left"]["translation"], PLACE, atol=1e-14)
+    lines = exported(data, "huggingface", tmp_path / "folder")[0] / "metadata.jsonl"
+    assert json.loads(lines.read_text().splitlines()[0])["cameras"] == sample["json"]["cameras"]
 
 
 def test_shards_of_the_same_data_have_the_same_bytes(made: Path, tmp_path: Path) -> None:

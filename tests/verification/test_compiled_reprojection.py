@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
+from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.geometry import FixedGeometry, MovingObject
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.views import VIEW_PAIRS, ImageView
 from rsbench.verification import reprojection
@@ -44,6 +45,14 @@ def geometry_of(motion: Motion, lens: Lens | None = None, **shutter: Any) -> Fix
     rig = StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.3)
     whole: dict[str, Any] = {"height": 48, "width": 64, "readout_ratio": 0.9} | shutter
     return FixedGeometry(rig, RollingShutter(**whole), motion, 2)
+
+
+def of_rig(motion: Motion, left: Lens | None, right: Lens | None, scanning: Scanning) -> FixedGeometry:
+    """Two cameras of two sizes and directions."""
+    wide = PinholeCamera(width=80, height=45, fx=70.0, fy=69.0, cx=41.0, cy=20.0, lens=right)
+    turn = so3.exp(np.array([0.05, -0.08, 0.1]))
+    rig = StereoRig.of_cameras(replace(CAMERA, lens=left), wide, turn, (-0.3, 0.05, 0.02))
+    return FixedGeometry(rig, rig.shutter_of(scanning, 0.9), motion, 2)
 
 
 def room(view: ImageView, camera: PinholeCamera) -> DepthMap:
@@ -88,12 +97,22 @@ def check_alike(found: Reprojection, exact: Reprojection) -> None:
         ),
         pytest.param(geometry_of(LinearMotion(W, D), readout_ratio=0.0), id="global"),
         pytest.param(geometry_of(Kinked(W, D)), id="no table"),
+        pytest.param(of_rig(LinearMotion(W, D), None, None, Scanning()), id="rig"),
+        pytest.param(
+            of_rig(TwistMotion(W, D), BROWN, FISHEYE, Scanning(right_scan="left", right_readout_ratio=0.4)),
+            id="rig of lenses",
+        ),
+        pytest.param(
+            of_rig(LinearMotion(W, D), FISHEYE, None, Scanning(right_readout_ratio=0.0, right_delay=0.1)),
+            id="rig, global right",
+        ),
     ],
 )
 def test_every_pixel_lands_where_the_row_equation_says(geometry: FixedGeometry) -> None:
-    camera = geometry.rig.camera
+    rig = geometry.rig
     for source, target in VIEW_PAIRS[:: 1 if geometry.motion.name == "linear" else 5]:
-        check_alike(*both_ways(geometry, room(source, camera), room(target, camera), 2))
+        maps = (room(view, rig.sensor(view.side)) for view in (source, target))
+        check_alike(*both_ways(geometry, *maps, 2))
 
 
 def test_a_motion_that_no_table_follows_has_none() -> None:

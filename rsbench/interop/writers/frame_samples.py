@@ -113,7 +113,10 @@ _WEBDATASET_ABOUT = (
 SHARD_BYTES = 256 << 20
 """A shard with more bytes is closed."""
 SHARD_SAMPLES = 1000
-_LINE_FIELDS = ("camera", "baseline", "readout_ratio", "frame_period_s", "motion")
+_LINE_FIELDS = (
+    *("camera", "cameras", "right_from_left"),  # of an ideal rig the first, of another one the others
+    *("baseline", "readout_ratio", "frame_period_s", "motion"),
+)
 _SAMPLE_FIELDS = (*_LINE_FIELDS, "readout_time_s", "conventions")
 
 
@@ -189,7 +192,7 @@ def _sample_files(sequence: Sequence, frame: int) -> dict[str, bytes]:
         fields |= {f"{side}.{name}.npy": _npy(array) for name, array in arrays.items()}
     starts = {side: first_second(sequence, View(side, frame)) for side in SIDES}
     about = {"sequence": sequence.name, "frame": frame, "first_line_s": starts}
-    known = {name: sequence.manifest[name] for name in _SAMPLE_FIELDS}
+    known = {name: sequence.manifest[name] for name in _SAMPLE_FIELDS if name in sequence.manifest}
     scan = asdict(sequence.shutter.scanning)
     return fields | {"json": json.dumps(about | known | scan, sort_keys=True, allow_nan=False).encode()}
 
@@ -221,7 +224,7 @@ def _write_folder(sequences: list[Sequence], root: Path, images: Images) -> Iter
     """Files and lines of sequences below ``root``."""
     lines = list[str]()
     for sequence in sequences:
-        known = {name: sequence.manifest[name] for name in _LINE_FIELDS}
+        known = {name: sequence.manifest[name] for name in _LINE_FIELDS if name in sequence.manifest}
         known |= asdict(sequence.shutter.scanning)
         for side, frame in views_of(sequence.frames):
             own = {
