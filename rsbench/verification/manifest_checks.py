@@ -17,7 +17,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.manifest import CROISSANT, DATASET, croissant_of, says
-from rsbench.dataset.sequence import FORMATS, UNITS, Sequence, files_of, sequence_manifest
+from rsbench.dataset.sequence import FORMATS, UNITS, Sequence, files_of, format_of, sequence_manifest
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import read_scene_card
 from rsbench.storage.files import read_json, sha256
@@ -87,6 +87,9 @@ def dataset_faults(listing: Listing) -> Iterator[Finding]:
     for key, value in (("name", card.name), ("description", card.description), ("license", card.license)):
         if manifest.get(key, card.license) != value:  # data of rsbench 0.1 do not name their licence
             yield Finding(DATASET, f"{key} = {manifest.get(key)!r}, its card says {value!r}")
+    kind = max(format_of(card.rig_of(each), card.shutter_for(each)) for each in card.sequence)
+    if manifest.get("format") in FORMATS and manifest["format"] != kind:
+        yield Finding(DATASET, f"format = {manifest['format']}, its card makes {kind}")
     made = [sequence.name for sequence in card.sequence]
     if manifest.get("sequences") != made:
         yield Finding(

@@ -111,8 +111,8 @@ def check_alike(found: Reprojection, exact: Reprojection) -> None:
 def test_every_pixel_lands_where_the_row_equation_says(geometry: FixedGeometry) -> None:
     rig = geometry.rig
     for source, target in VIEW_PAIRS[:: 1 if geometry.motion.name == "linear" else 5]:
-        maps = (room(view, rig.sensor(view.side)) for view in (source, target))
-        check_alike(*both_ways(geometry, *maps, 2))
+        here, there = (room(view, rig.sensor(view.side)) for view in (source, target))
+        check_alike(*both_ways(geometry, here, there, 2))
 
 
 def test_a_motion_that_no_table_follows_has_none() -> None:

@@ -126,7 +126,8 @@ def test_pose_file_round_trip_is_exact_to_rounding(dataset: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("format", 2, "format = 2"),
+        ("format", 3, "format = 3"),
+        ("format", 2, "'cameras' is required"),
         ("baseline", -1.0, "baseline = -1.0: must be a positive"),
         ("readout_ratio", 1.5, "readout_ratio = 1.5: must be a number from 0 to 1"),
         ("camera", {"width": 3}, "'camera.height' is required"),
