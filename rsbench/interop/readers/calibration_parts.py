@@ -1,0 +1,220 @@
+"""What readers of calibrations have in common: their result, and lenses, rotations and units of other tools."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rsbench.components.rig_tables import Size
+from rsbench.core import so3
+from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.lens_fit import Profile, kannala_brandt_of
+from rsbench.core.se3 import Pose
+from rsbench.core.so3 import FloatArray
+from rsbench.interop.readers.calibration_trees import Fields
+
+Table = dict[str, Any]
+_LONGEST_M = 2.0
+"""A baseline beyond it is one in another unit than metres, unless a unit is given."""
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+_NEAR = 1e-3
+"""By which printed rotations may miss being rotations."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assumptions:
+    """What a user adds to a file that leaves something open."""
+
+    unit: float | None = None
+    """Metres to the unit of its lengths."""
+    fisheye: bool | None = None
+    """Whether four coefficients are those of a fisheye lens, where the file does not say."""
+    invert: bool = False
+    """Its transform takes the right camera's coordinates to the left one's."""
+    exchange: bool = False
+    """Its second camera is the left one."""
+    frame_size: Callable[[], Size] | None = None
+    """(width, height) of the frames, by which some formats choose a section."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What files say of one camera or of two."""
+
+    format: str
+    left: Table
+    """Of rig.toml: width, height, fx, fy, cx, cy, lens, line_delay_s; what is not known is absent."""
+    right: Table | None = None
+    right_from_left: Pose | None = None
+    """In metres."""
+    right_delay_s: float = 0.0
+    """Seconds by which the right camera reads later than the left one."""
+    notes: tuple[str, ...] = ()
+    """What was assumed or is approximate, a sentence each."""
+    files: tuple[Path, ...] = field(default=())
+
+    def tables(self) -> Table:
+        """Tables of rig.toml without anything about the readout."""
+        found = {"left": _still(self.left)}
+        if self.right is not None and self.right_from_left is not None:
+            R, t = self.right_from_left
+            found["right"] = _still(self.right)
+            found["right_from_left"] = {"rotation": R.tolist(), "translation": t.tolist()}
+        return found
+
+
+def _still(table: Table) -> Table:
+    return {key: value for key, value in table.items() if key != "line_delay_s"}
+
+
+class Files(NamedTuple):
+    """Files of one format that belong together, with what they hold."""
+
+    trees: Mapping[Path, Any]
+    given: Assumptions
+
+    @property
+    def where(self) -> str:
+        return " and ".join(map(str, self.trees))
+
+    def only(self) -> Fields:
+        """The one file."""
+        if len(self.trees) > 1:
+            names = ", ".join(path.name for path in self.trees)
+            raise RsbenchError(f"{next(iter(self.trees)).parent}: holds several calibrations: {names}; give one")
+        ((path, tree),) = self.trees.items()
+        return Fields(tree, str(path))
+
+
+class Format(NamedTuple):
+    name: str
+    holds: Callable[[Any], bool]
+    """Whether the content of a file is of this format."""
+    read: Callable[[Files], Calibration]
+    parts: Callable[[Path, Mapping[Path, Any]], Mapping[Path, Any]] | None = None
+    """Of a file and all files of the format beside it, those that belong to it; None where a file has all."""
+
+
+def table_of(size: Sequence[float] | None, intrinsics: Sequence[float], lens: Lens | None) -> Table:
+    """Of rig.toml, from (width, height), (fx, fy, cx, cy) and a lens."""
+    sizes = {} if size is None else dict(zip(("width", "height"), map(round, size), strict=True))
+    numbers = dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True))
+    return {**sizes, **numbers, **({} if lens is None else {"lens": lens.record()})}
+
+
+def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | None:
+    """A lens of one of our models; coefficients beyond the model's must be 0."""
+    values = [float(value) for value in coefficients]
+    names = COEFFICIENTS[model]  # pyrefly: ignore[bad-index]
+    if any(values[len(names) :]):
+        raise RsbenchError(
+            f"{where}: distortion coefficients {values[len(names) :]} after the first {len(names)}: thin prisms "
+            "and tilted sensors (s1 to s4, tauX, tauY) are not known here; calibrate without them"
+        )
+    try:
+        return Lens(model=model, **dict(zip(names, values, strict=False)))  # pyrefly: ignore[bad-argument-type]
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {error}") from error
+
+
+def brown(coefficients: Iterable[float], where: str) -> Lens | None:
+    """OpenCV's vector of 4, 5, 8, 12 or 14 coefficients."""
+    values = [*map(float, coefficients)]
+    if not any(values):
+        return None
+    return lens_of(
+        "rational" if any(values[5:8]) else "brown-conrady", values if any(values[5:]) else values[:5], where
+    )
+
+
+def fitted(
+    size: Sequence[float] | None, intrinsics: Sequence[float], profile: Profile, name: str, where: str
+) -> tuple[Table, str]:
+    """A camera of a symmetric fisheye model, as the nearest Kannala-Brandt one, and a sentence about that."""
+    if size is None:
+        raise RsbenchError(f"{where}: {name}: needs the size of the images, for which it is fitted")
+    fx, fy, cx, cy = intrinsics
+    try:
+        camera = PinholeCamera(width=round(size[0]), height=round(size[1]), fx=fx, fy=fy, cx=cx, cy=cy)
+        fit = kannala_brandt_of(camera, profile)
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {name}: {error}") from error
+    table = table_of(size, (fit.fx, fit.fy, cx, cy), fit.lens)
+    return (
+        table,
+        f"{name} of {where.rsplit(': ', 1)[-1]} became the nearest kannala-brandt, within {fit.error_px:.2g} px",
+    )
+
+
+def rotation_of(values: FloatArray, where: str) -> FloatArray:
+    """(3, 3) of nine numbers, or of a rotation vector."""
+    if len(values) == 3:
+        return so3.exp(values)
+    R = values.reshape(3, 3)
+    if not np.allclose(R @ R.T, np.eye(3), atol=_NEAR) or np.linalg.det(R) < 0.0:
+        raise RsbenchError(f"{where}: is not a rotation matrix")
+    u, _, vt = np.linalg.svd(R)
+    return u @ vt
+
+
+def quaternion_of(wxyz: Sequence[float], where: str) -> FloatArray:
+    length = float(np.linalg.norm(wxyz))
+    if not abs(length - 1.0) < 1e-2:
+        raise RsbenchError(f"{where}: quaternion of length {length:g}, not 1")
+    return so3.from_quaternion(wxyz)
+
+
+def pose_of(fields: Fields, key: str) -> Pose:
+    """A transform of twelve or sixteen numbers, row by row."""
+    T = fields.numbers(key, 12, 16).reshape(-1, 4)
+    return Pose(rotation_of(T[:3, :3].ravel(), f"{fields.where}: {key}"), T[:3, 3])
+
+
+def in_metres(t: FloatArray, given: Assumptions, where: str) -> tuple[FloatArray, tuple[str, ...]]:
+    """A translation whose unit the file does not say, and a sentence about it."""
+    length = float(np.linalg.norm(t))
+    if given.unit is not None:
+        return t * given.unit, ()
+    if length > _LONGEST_M:
+        raise RsbenchError(
+            f"{where}: the cameras would be {length:.4g} m apart: lengths are in the unit of the board's squares; "
+            "say which: rsbench rig FILE --unit mm -o rig.toml (or cm, inch, m, or metres such as 0.025)"
+        )
+    return t, (
+        f"lengths are taken as metres, as the file does not say their unit: {length:.4g} m between the cameras",
+    )
+
+
+def keyed(tree: Any, *keys: str) -> bool:
+    return isinstance(tree, Mapping) and all(key in tree for key in keys)
+
+
+_NAMES = {
+    "none": "none",
+    "pinhole": "none",
+    "radtan": "brown",
+    "radial-tangential": "brown",
+    "plumb_bob": "brown",
+    "brown_conrady": "brown",
+    "rational_polynomial": "brown",
+    "equidistant": "kannala-brandt",
+    "fisheye": "kannala-brandt",
+    "kannala_brandt4": "kannala-brandt",
+    "kannala_brandt": "kannala-brandt",
+    "kb4": "kannala-brandt",
+}
+
+
+def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None:
+    """A lens by the name that tools give its model."""
+    kind = _NAMES.get(name)
+    if kind is None:
+        raise RsbenchError(f"{where}: lens model {name!r}: must be one of {', '.join(_NAMES)}")
+    if kind == "none":
+        return None
+    return brown(coefficients, where) if kind == "brown" else lens_of(kind, coefficients, where)

@@ -1,0 +1,658 @@
+"""Calibrations of other tools, read as they are: one reader for each format, one result.
+
+A reader gives the tables of rig.toml: ``left``, ``right`` and ``X_right = R X_left + t`` in metres. What differs
+between the tools, from their documents and sources:
+
+**Kalibr** (camchain.yaml, camchain-imucam.yaml; OpenVINS has the same keys): ``T_cn_cnm1`` takes the previous
+camera's coordinates to this one's; ``T_cam_imu`` those of the IMU to the camera's, OpenVINS's ``T_imu_cam`` the
+reverse. ``timeshift_cam_imu`` is what is added to a camera's clock to have the IMU's; ``line_delay`` is the only
+readout that any format here has.
+
+**Basalt**: ``T_imu_cam`` takes a camera's coordinates to the IMU's. **ZED** (SN*.conf): millimetres, a rotation
+vector (RX, CV, RZ), T = (-Baseline, TY, TZ), sections by the size of the images. **DepthAI**: centimetres, x_to =
+R x_this + t along a chain of sockets. **RealSense** has no file of its own: JSON of rs2_intrinsics and
+rs2_extrinsics, whose matrices run down the columns. **COLMAP** (rig_config.json; cameras.txt and rigs.txt): pixels
+from the corner, half a pixel more than here; x_camera = R x_rig + t.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsbench.components.rig_tables import Size
+from rsbench.core import so3
+from rsbench.core.camera import COEFFICIENTS
+from rsbench.core.errors import RsbenchError
+from rsbench.core.lens_fit import fov_profile, mirror_profile, unified_profile
+from rsbench.core.rig import SIDES
+from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.interop.readers.calibration_opencv import (
+    is_opencv,
+    is_ros,
+    opencv_files,
+    read_opencv,
+    read_ros,
+    ros_files,
+)
+from rsbench.interop.readers.calibration_parts import (
+    UNITS,
+    Assumptions,
+    Calibration,
+    Files,
+    Format,
+    Table,
+    brown,
+    by_name,
+    fitted,
+    keyed,
+    lens_of,
+    pose_of,
+    quaternion_of,
+    rotation_of,
+    table_of,
+)
+from rsbench.interop.readers.calibration_trees import Fields, files_in, read_tree
+
+_CORNER = 0.5
+
+
+def read_calibration(path: Path, given: Assumptions | None = None) -> Calibration:
+    """The calibration that a file or folder holds.
+
+    Args:
+        path: a file of one of the formats, or a folder with one or with the files that belong together.
+        given: what is known beside it.
+
+    Raises:
+        RsbenchError: one line with the file, the field, what is wrong and the remedy.
+    """
+    given = given or Assumptions()
+    if path.is_dir():
+        kind, trees = _of_folder(path)
+    else:
+        tree = read_tree(path)
+        kind, trees = _format_of(tree, path), {path: tree}
+        if kind.parts is not None:
+            near = [path.parent, *([path.parent.parent] if kind.name == "ROS camera_info" else [])]
+            trees = kind.parts(path, _all_of(kind, [each for folder in near for each in files_in(folder)]) | trees)
+    found = kind.read(Files(trees, given))
+    return replace(_left_first(found, given, str(path)), files=tuple(trees))
+
+
+def _format_of(tree: Any, path: Path) -> Format:
+    for kind in FORMATS:
+        if kind.holds(tree):
+            return kind
+    raise RsbenchError(
+        f"{path}: is no calibration that is read here; there are: rig.toml, {', '.join(k.name for k in FORMATS)}"
+    )
+
+
+def _all_of(kind: Format, paths: Iterable[Path]) -> dict[Path, Any]:
+    """The files of a format among some, with their trees; others are passed over."""
+    found = dict[Path, Any]()
+    for path in paths:
+        try:
+            tree = read_tree(path)
+        except RsbenchError:
+            continue
+        if next((each for each in FORMATS if each.holds(tree)), None) is kind:
+            found[path] = tree
+    return found
+
+
+def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
+    """The files of the one format that a folder has."""
+    paths = list(files_in(folder))
+    of_kind = {kind.name: (kind, trees) for kind in FORMATS if (trees := _all_of(kind, paths))}
+    if len(of_kind) != 1:
+        listed = "; ".join(f"{next(iter(trees)).name} of {name}" for name, (_, trees) in of_kind.items())
+        raise RsbenchError(f"{folder}: holds {listed or 'no calibration'}; give one file")
+    return next(iter(of_kind.values()))
+
+
+def _left_first(found: Calibration, given: Assumptions, where: str) -> Calibration:
+    """The calibration with its unit, direction and order settled."""
+    if found.right_from_left is None:
+        return found
+    R, t = found.right_from_left
+    apart = inverse(found.right_from_left) if given.invert else found.right_from_left
+    found = replace(found, right_from_left=apart)
+    if given.exchange:
+        found = _exchanged(found)
+    R, t = found.right_from_left or apart
+    if not np.linalg.norm(t) > 0.0:
+        raise RsbenchError(f"{where}: both cameras are at one place: the translation between them is 0")
+    if -(R.T @ t)[0] - t[0] < -np.linalg.norm(t):
+        if found.format not in _NUMBERED:
+            raise RsbenchError(
+                f"{where}: the right camera would stand {abs(t[0]):.4g} m to the left of the left one: the "
+                "cameras are exchanged (rsbench rig --exchange) or their transform inverted (rsbench rig --invert)"
+            )
+        note = "its second camera stands to the left of the first one and is taken as the left camera"
+        found = replace(_exchanged(found), notes=(*found.notes, note))
+    return found
+
+
+def _exchanged(found: Calibration) -> Calibration:
+    assert found.right is not None and found.right_from_left is not None
+    return replace(
+        found,
+        left=found.right,
+        right=found.left,
+        right_from_left=inverse(found.right_from_left),
+        right_delay_s=-found.right_delay_s,
+    )
+
+
+# Kalibr and OpenVINS.
+
+
+def _is_kalibr(tree: Any) -> bool:
+    return (keyed(tree, "cam0") and keyed(tree["cam0"], "intrinsics")) or (
+        keyed(tree, "cam1") and "T_cn_cnm1" in str(tree)
+    )
+
+
+def _read_kalibr(files: Files) -> Calibration:
+    top = files.only()
+    names = sorted((key for key in top.tree if re.fullmatch(r"cam\d+", key)), key=lambda key: int(key[3:]))
+    cameras = [top.inner(name) for name in names]
+    tables, notes = zip(*map(_kalibr_camera, cameras), strict=True)
+    made = [note for each in notes for note in each]
+    if len(cameras) == 1:
+        return Calibration(format="Kalibr", left=tables[0], notes=tuple(made))
+    if len(cameras) > 2:
+        made.append(f"holds {len(cameras)} cameras; {names[0]} and {names[1]} are taken")
+    apart, shifts = _kalibr_apart(*cameras[:2]), [each.number("timeshift_cam_imu", 0.0) for each in cameras[:2]]
+    return Calibration(
+        format="Kalibr",
+        left=tables[0],
+        right=tables[1],
+        right_from_left=apart,
+        right_delay_s=shifts[1] - shifts[0] if all("timeshift_cam_imu" in each for each in cameras[:2]) else 0.0,
+        notes=tuple(made),
+    )
+
+
+def _kalibr_apart(first: Fields, second: Fields) -> Pose:
+    """The second camera's transform from the first one's."""
+    if "T_cn_cnm1" in second:
+        return pose_of(second, "T_cn_cnm1")
+    from_imu = []
+    for camera in (first, second):
+        if "T_cam_imu" in camera:
+            from_imu.append(pose_of(camera, "T_cam_imu"))
+        elif "T_imu_cam" in camera:
+            from_imu.append(inverse(pose_of(camera, "T_imu_cam")))
+        else:
+            raise RsbenchError(
+                f"{camera.where}: T_cn_cnm1: is missing, as are T_cam_imu and T_imu_cam: nothing says how the "
+                "cameras stand; calibrate them together"
+            )
+    return compose(from_imu[1], inverse(from_imu[0]))
+
+
+def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:
+    model, distortion = (
+        camera.text("camera_model", default="pinhole"),
+        camera.text("distortion_model", default="none"),
+    )
+    where, size = camera.where, camera.numbers("resolution", 2)
+    known = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}
+    if model not in known:
+        raise RsbenchError(f"{where}: camera_model = {model!r}: must be one of {', '.join(known)}")
+    *own, fx, fy, cx, cy = camera.numbers("intrinsics", known[model]).tolist()
+    d = camera.numbers("distortion_coeffs").tolist() if camera.get("distortion_coeffs") else []
+    intrinsics, notes = (fx, fy, cx, cy), tuple[str, ...]()
+    if model == "pinhole" and distortion == "fov":
+        table, note = fitted(size, intrinsics, fov_profile(d[0]), "fov", where)
+        notes = (note,)
+    elif model == "pinhole":
+        table = table_of(size, intrinsics, by_name(distortion, d, where))
+    elif model == "ds":
+        table = table_of(size, intrinsics, lens_of("double-sphere", own, where))
+    else:
+        if model == "omni" and (distortion not in ("radtan", "none") or any(d[2:])):
+            raise RsbenchError(
+                f"{where}: omni with {distortion} {d}: tangential and other distortion of omni is not known here; "
+                "calibrate as pinhole-equi, ds-none or eucm-none"
+            )
+        profile = mirror_profile(own[0], *d[:2]) if model == "omni" else unified_profile(*own)
+        table, note = fitted(size, intrinsics, profile, model, where)
+        notes = (note,)
+    if "line_delay" in camera:
+        table["line_delay_s"] = camera.number("line_delay")
+    return table, notes
+
+
+# Basalt.
+
+
+def _read_basalt(files: Files) -> Calibration:
+    top = files.only().inner("value0")
+    sizes = top.get("resolution") or []
+    made = [
+        _basalt_camera(Fields(each, f"{top.where}: intrinsics {k}"), sizes[k] if k < len(sizes) else None)
+        for k, each in enumerate(top.get("intrinsics") or [])
+    ]
+    if not made:
+        raise RsbenchError(f"{top.where}: intrinsics: is missing")
+    notes = tuple(note for _, note in made if note)
+    if len(made) == 1:
+        return Calibration(format="Basalt", left=made[0][0], notes=notes)
+    if len(made) > 2:
+        notes += (f"holds {len(made)} cameras; the first two are taken",)
+    poses = []
+    for k, each in enumerate((top.get("T_imu_cam") or [])[:2]):
+        place = Fields(each, f"{top.where}: T_imu_cam {k}")
+        q = [place.number(key) for key in ("qw", "qx", "qy", "qz")]
+        poses.append(
+            Pose(quaternion_of(q, place.where), np.array([place.number(key) for key in ("px", "py", "pz")]))
+        )
+    if len(poses) < 2:
+        raise RsbenchError(f"{top.where}: T_imu_cam: must be of both cameras")
+    apart = compose(inverse(poses[1]), poses[0])
+    return Calibration(format="Basalt", left=made[0][0], right=made[1][0], right_from_left=apart, notes=notes)
+
+
+def _basalt_camera(camera: Fields, size: Sequence[float] | None) -> tuple[Table, str]:
+    own, kind = camera.inner("intrinsics"), camera.text("camera_type")
+    intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]
+    if kind in ("eucm", "ucm"):
+        profile = unified_profile(own.number("alpha"), own.number("beta", 1.0))
+        return fitted(size, intrinsics, profile, kind, camera.where)
+    models = {
+        "pinhole": None,
+        "kb4": "kannala-brandt",
+        "ds": "double-sphere",
+        "pinhole-radtan8": "rational",
+        "pinhole-radtan5": "brown-conrady",
+    }
+    if kind not in models:
+        raise RsbenchError(
+            f"{camera.where}: camera_type = {kind!r}: must be one of {', '.join([*models, 'eucm', 'ucm'])}"
+        )
+    model, lens = models[kind], None
+    if model is not None:
+        values = [own.number(key, 0.0 if model == "rational" else None) for key in COEFFICIENTS[model]]  # pyrefly: ignore[bad-index]
+        lens = (
+            brown(values, camera.where)
+            if model in ("rational", "brown-conrady")
+            else lens_of(model, values, camera.where)
+        )
+    return table_of(size, intrinsics, lens), ""
+
+
+# ZED.
+
+
+_ZED_SIZES = {
+    "2K": (2208, 1242),
+    "FHD": (1920, 1080),
+    "HD": (1280, 720),
+    "VGA": (672, 376),
+    "FHD1200": (1920, 1200),
+    "SVGA": (960, 600),
+    "4K": (3840, 2160),
+    "QHDPLUS": (3200, 1800),
+}
+"""Sizes of one camera's images by the ending of the names of sections."""
+
+
+def _is_zed(tree: Any) -> bool:
+    return isinstance(tree, Mapping) and any(str(key).upper().startswith("LEFT_CAM_") for key in tree)
+
+
+def _read_zed(files: Files) -> Calibration:
+    top = files.only()
+    known = {key.upper()[9:]: key for key in top.tree if key.upper().startswith("LEFT_CAM_")}
+    sizes = {name: _ZED_SIZES[name] for name in known if name in _ZED_SIZES}
+    wanted = files.given.frame_size() if files.given.frame_size is not None else None
+    if wanted is None and len(sizes) > 1:
+        raise RsbenchError(
+            f"{top.where}: has calibrations of {', '.join(f'{w} x {h}' for w, h in sizes.values())}: say of which "
+            "size the frames of one camera are: rsbench rig FILE --size 1280x720"
+        )
+    name = next((name for name, size in sizes.items() if wanted is None or size == tuple(wanted)), None)
+    if name is None:
+        raise RsbenchError(
+            f"{top.where}: no calibration of frames of {wanted[0]} x {wanted[1]} pixels; there are "  # pyrefly: ignore[unsupported-operation]
+            f"{', '.join(f'{w} x {h}' for w, h in sizes.values())}; frames side by side in one image must be split"
+        )
+    tables = [_zed_camera(top, side, name, _ZED_SIZES[name]) for side in ("LEFT", "RIGHT")]
+    stereo = top.inner("STEREO")
+    turn, shift = [], []
+    for key in ("RX", "CV", "RZ"):
+        own = next((k for k in (f"{key}_{name}", f"R{key[-1:]}_{name}", key) if k in stereo), f"{key}_{name}")
+        turn.append(stereo.number(own, None if key != "CV" or own in stereo else 0.0))
+    for key in ("Baseline", "TY", "TZ"):
+        own = next((k for k in (f"{key}_{name}", key) if k in stereo), key)
+        shift.append(stereo.number(own, None if key == "Baseline" else 0.0))
+    t = np.array([-shift[0], shift[1], shift[2]]) * (files.given.unit or UNITS["mm"])
+    apart = Pose(so3.exp(np.array(turn)), t)
+    return Calibration(format="ZED", left=tables[0], right=tables[1], right_from_left=apart)
+
+
+def _zed_camera(top: Fields, side: str, name: str, size: Size) -> Table:
+    section = next(key for key in top.tree if key.upper() == f"{side}_CAM_{name}")
+    own = top.inner(section)
+    disto = next((top.inner(key) for key in top.tree if key.upper() == f"{side}_DISTO"), own)
+    intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]
+    if "p1" in disto:
+        values = [disto.number(key, 0.0) for key in COEFFICIENTS["rational"]]
+        return table_of(size, intrinsics, brown(values, disto.where))
+    values = [disto.number(key, 0.0) for key in COEFFICIENTS["kannala-brandt"]]
+    fisheye = disto is not own or any(values[2:])
+    lens = (
+        lens_of("kannala-brandt", values, disto.where) if fisheye else brown([*values[:2], 0.0, 0.0], disto.where)
+    )
+    return table_of(size, intrinsics, lens)
+
+
+# DepthAI (OAK).
+
+
+def _read_depthai(files: Files) -> Calibration:
+    top = files.only()
+    cameras = dict[int, Fields]()
+    for each in top.get("cameraData"):
+        if isinstance(each, list) and len(each) == 2:
+            cameras[int(each[0])] = Fields(each[1], f"{top.where}: camera {each[0]}")
+    pair = top.get("stereoRectificationData") or {}
+    left, right = (int(pair.get(f"{side}CameraSocket", -1)) for side in SIDES)
+    left, right = (left, right) if {left, right} <= cameras.keys() else (1, 2)
+    if not {left, right} <= cameras.keys():
+        if len(cameras) == 1:
+            return Calibration(format="DepthAI", left=_depthai_camera(next(iter(cameras.values()))))
+        raise RsbenchError(f"{top.where}: cameraData: must have the sockets 1 (left) and 2 (right)")
+    links = dict[tuple[int, int], Pose]()
+    for socket, camera in cameras.items():
+        apart = camera.inner("extrinsics")
+        to = int(apart.number("toCameraSocket", -1.0))
+        if to in cameras and apart.get("rotationMatrix"):
+            R = rotation_of(apart.numbers("rotationMatrix", 9), f"{apart.where}: rotationMatrix")
+            place = apart.inner("translation")
+            unit = UNITS.get(apart.text("lengthUnit", default="cm")[:2].rstrip("ei"), UNITS["cm"])
+            t = np.array([place.number(key) for key in "xyz"]) * (files.given.unit or unit)
+            links[socket, to], links[to, socket] = Pose(R, t), inverse(Pose(R, t))
+    return Calibration(
+        format="DepthAI",
+        left=_depthai_camera(cameras[left]),
+        right=_depthai_camera(cameras[right]),
+        right_from_left=_chained(links, left, right, top.where),
+    )
+
+
+def _chained(links: Mapping[tuple[int, int], Pose], start: int, end: int, where: str) -> Pose:
+    """The transform from one camera to another along links between cameras."""
+    known = {start: Pose(np.eye(3), np.zeros(3))}
+    todo = [start]
+    while todo:
+        at = todo.pop()
+        for (a, b), step in links.items():
+            if a == at and b not in known:
+                known[b] = compose(step, known[a])
+                todo.append(b)
+    if end not in known:
+        raise RsbenchError(f"{where}: extrinsics: nothing links the camera {start} with {end}")
+    return known[end]
+
+
+def _depthai_camera(camera: Fields) -> Table:
+    K, d = camera.numbers("intrinsicMatrix", 9), camera.numbers("distortionCoeff").tolist()
+    kind = int(camera.number("cameraType", 0.0))
+    if kind not in (0, 1):
+        raise RsbenchError(f"{camera.where}: cameraType = {kind}: must be 0 (perspective) or 1 (fisheye)")
+    lens = brown(d, camera.where) if kind == 0 else lens_of("kannala-brandt", d, camera.where)
+    return table_of((camera.number("width"), camera.number("height")), (K[0], K[4], K[2], K[5]), lens)
+
+
+# RealSense.
+
+
+def _realsense_cameras(tree: Any, name: str = "") -> dict[str, Mapping[str, Any]]:
+    """Tables of intrinsics by the names on the way to them."""
+    if not isinstance(tree, Mapping):
+        return {}
+    if keyed(tree, "fx", "fy", "ppx", "ppy"):
+        return {name: tree}
+    found = dict[str, Mapping[str, Any]]()
+    for key, value in tree.items():
+        found |= _realsense_cameras(value, f"{name} {key}".strip().lower())
+    return found
+
+
+def _realsense_extrinsics(tree: Any, name: str = "") -> dict[str, Mapping[str, Any]]:
+    if not isinstance(tree, Mapping):
+        return {}
+    if keyed(tree, "rotation", "translation"):
+        return {name: tree}
+    found = dict[str, Mapping[str, Any]]()
+    for key, value in tree.items():
+        found |= _realsense_extrinsics(value, f"{name} {key}".strip().lower())
+    return found
+
+
+_IR = (r"left|infra(red)?[ _]?1|ir[ _]?1|fisheye[ _]?1", r"right|infra(red)?[ _]?2|ir[ _]?2|fisheye[ _]?2")
+
+
+def _read_realsense(files: Files) -> Calibration:
+    top = files.only()
+    cameras = _realsense_cameras(top.tree)
+    if len(cameras) == 1:
+        ((name, own),) = cameras.items()
+        return Calibration(format="RealSense", left=_realsense_camera(Fields(own, f"{top.where}: {name}")))
+    sides = [[name for name in cameras if re.search(pattern, name)] for pattern in _IR]
+    if [len(each) for each in sides] != [1, 1]:
+        raise RsbenchError(f"{top.where}: {', '.join(cameras)}: name the cameras left and right")
+    (left,), (right,) = sides
+    apart = None
+    for name, own in _realsense_extrinsics(top.tree).items():
+        words = re.search(rf"({_IR[0]}|{_IR[1]})\w*[ _]+to[ _]+({_IR[0]}|{_IR[1]})", name)
+        at = Fields(own, f"{top.where}: {name or 'extrinsics'}")
+        pose = Pose(
+            rotation_of(at.numbers("rotation", 9).reshape(3, 3).T.ravel(), f"{at.where}: rotation"),
+            at.numbers("translation", 3),
+        )
+        backwards = words is not None and re.match(_IR[1], words[0]) is not None
+        apart = inverse(pose) if backwards else pose
+        if words is not None and not backwards:
+            break
+    if apart is None:
+        raise RsbenchError(f"{top.where}: left_to_right: is missing: rotation (down the columns) and translation")
+    tables = [_realsense_camera(Fields(cameras[name], f"{top.where}: {name}")) for name in (left, right)]
+    return Calibration(format="RealSense", left=tables[0], right=tables[1], right_from_left=apart)
+
+
+_RS2 = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta", "brown_conrady", "kannala_brandt4")
+"""Models by the number that rs2_distortion gives them."""
+
+
+def _realsense_camera(camera: Fields) -> Table:
+    model = camera.text("model", default="none").rsplit(".", 1)[-1].replace(" ", "_").replace("distortion_", "")
+    model = _RS2[int(model)] if model.isdigit() and int(model) < len(_RS2) else model
+    d = camera.numbers("coeffs").tolist() if "coeffs" in camera else []
+    if model in ("inverse_brown_conrady", "modified_brown_conrady", "ftheta") and any(d):
+        raise RsbenchError(
+            f"{camera.where}: model = {model}: with coefficients that are not 0 it is not known here; take the "
+            "infrared or another stream whose coefficients are 0, or calibrate with OpenCV"
+        )
+    lens = by_name(model, d, camera.where) if any(d) or model == "kannala_brandt4" else None
+    size = [camera.number(key) for key in ("width", "height")]
+    return table_of(size, [camera.number(key) for key in ("fx", "fy", "ppx", "ppy")], lens)
+
+
+# COLMAP.
+
+
+_COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
+    "SIMPLE_PINHOLE": ("f cx cy", None),
+    "PINHOLE": ("fx fy cx cy", None),
+    "SIMPLE_RADIAL": ("f cx cy k1", "brown-conrady"),
+    "RADIAL": ("f cx cy k1 k2", "brown-conrady"),
+    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "brown-conrady"),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational"),
+    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "kannala-brandt"),
+    "RADIAL_FISHEYE": ("f cx cy k1 k2", "kannala-brandt"),
+    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "kannala-brandt"),
+    "FOV": ("fx fy cx cy omega", "fov"),
+    "EUCM": ("fx fy cx cy alpha beta", "eucm"),
+}
+"""Parameters in their order, and the lens model."""
+
+
+def _colmap_camera(
+    name: str, params: Sequence[Any], size: Sequence[float] | None, where: str
+) -> tuple[Table, str]:
+    if name not in _COLMAP_MODELS:
+        raise RsbenchError(f"{where}: camera model {name!r}: must be one of {', '.join(_COLMAP_MODELS)}")
+    keys, model = _COLMAP_MODELS[name]
+    numbers = Fields({"params": list(params)}, where).numbers("params", len(keys.split()))
+    values = dict(zip(keys.split(), numbers.tolist(), strict=True))
+    fx, fy = values.pop("fx", values.get("f", 0.0)), values.pop("fy", values.pop("f", 0.0))
+    intrinsics = (fx, fy, values.pop("cx") - _CORNER, values.pop("cy") - _CORNER)
+    if model == "fov":
+        return fitted(size, intrinsics, fov_profile(values["omega"]), name, where)
+    if model == "eucm":
+        return fitted(size, intrinsics, unified_profile(values["alpha"], values["beta"]), name, where)
+    own = list(values.values())
+    lens = (
+        None if model is None else lens_of(model, own, where) if model == "kannala-brandt" else brown(own, where)
+    )
+    return table_of(size, intrinsics, lens), ""
+
+
+def _is_rig_config(tree: Any) -> bool:
+    return isinstance(tree, list) and bool(tree) and all(keyed(each, "cameras") for each in tree)
+
+
+def _read_rig_config(files: Files) -> Calibration:
+    if len(files.trees) > 1:
+        files.only()
+    ((path, tree),) = files.trees.items()
+    cameras = [Fields(each, f"{path}: camera {k}") for k, each in enumerate(tree[0]["cameras"])]
+    notes = [f"holds {len(tree)} rigs; the first is taken"] if len(tree) > 1 else []
+    if len(cameras) > 2:
+        notes.append(f"holds {len(cameras)} cameras; the first two are taken")
+    made, poses = [], []
+    for camera in cameras[:2]:
+        if "camera_params" not in camera:
+            raise RsbenchError(
+                f"{camera.where}: camera_params: is missing, with camera_model_name; add both, or give the folder "
+                "of cameras.txt and rigs.txt"
+            )
+        name = camera.text("camera_model_name").upper()
+        made.append(_colmap_camera(name, camera.get("camera_params"), None, camera.where))
+        if camera.get("ref_sensor"):
+            poses.append(Pose(np.eye(3), np.zeros(3)))
+        elif "cam_from_rig_rotation" in camera:
+            q = camera.numbers("cam_from_rig_rotation", 4).tolist()
+            poses.append(Pose(quaternion_of(q, camera.where), camera.numbers("cam_from_rig_translation", 3)))
+    if len(made) == 2 and len(poses) < 2:
+        raise RsbenchError(f"{path}: cam_from_rig_rotation, cam_from_rig_translation: are missing")
+    notes += [note for _, note in made if note]
+    if len(made) == 1:
+        return Calibration(format="COLMAP", left=made[0][0], notes=tuple(notes))
+    return _colmap_pair([table for table, _ in made], poses, notes, files.given)
+
+
+def _colmap_pair(tables: list[Table], poses: list[Pose], notes: list[str], given: Assumptions) -> Calibration:
+    R, t = compose(poses[1], inverse(poses[0]))
+    notes.append("lengths of COLMAP are metres only if the rig was given in metres")
+    apart = Pose(R, t * (given.unit or 1.0))
+    return Calibration(format="COLMAP", left=tables[0], right=tables[1], right_from_left=apart, notes=tuple(notes))
+
+
+def _colmap_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
+    return {each: tree for each, tree in near.items() if each.parent == path.parent}
+
+
+def _read_colmap(files: Files) -> Calibration:
+    """cameras.txt, with rigs.txt where there are two cameras."""
+    lines = [line for tree in files.trees.values() for line in tree["colmap"]]
+    made = dict[str, tuple[Table, str]]()
+    rigs = list[list[str]]()
+    for words in lines:
+        where = f"{files.where}: {' '.join(words[:3])}"
+        if len(words) > 2 and words[2] in ("CAMERA", "IMU"):
+            rigs.append(words)
+        elif len(words) > 4 and words[1].isupper():
+            size = Fields({"size": words[2:4]}, where).numbers("size", 2).tolist()
+            made[words[0]] = _colmap_camera(words[1], words[4:], size, where)
+    if not made:
+        raise RsbenchError(f"{files.where}: cameras.txt is missing beside it")
+    notes = [note for _, note in made.values() if note]
+    if len(made) == 1:
+        return Calibration(format="COLMAP", left=next(iter(made.values()))[0], notes=tuple(notes))
+    for words in rigs:
+        poses = {words[3]: Pose(np.eye(3), np.zeros(3))} if words[2] == "CAMERA" else {}
+        rest = words[4:]
+        while len(rest) >= 3:
+            values = rest[3:10] if rest[2] == "1" else []
+            if rest[0] == "CAMERA" and len(values) == 7:
+                numbers = Fields({"pose": values}, files.where).numbers("pose", 7)
+                poses[rest[1]] = Pose(quaternion_of(numbers[:4].tolist(), files.where), numbers[4:])
+            rest = rest[3 + len(values) :]
+        if len(poses) >= 2 and set(list(poses)[:2]) <= made.keys():
+            first, second = list(poses)[:2]
+            notes += [f"holds {len(poses)} cameras; {first} and {second} are taken"] if len(poses) > 2 else []
+            return _colmap_pair(
+                [made[first][0], made[second][0]], [poses[first], poses[second]], notes, files.given
+            )
+    raise RsbenchError(
+        f"{files.where}: has {len(made)} cameras and no rig of two: give the folder that also holds rigs.txt"
+    )
+
+
+# EuRoC (ASL).
+
+
+def _read_asl(files: Files) -> Calibration:
+    cameras = [Fields(tree, str(path)) for path, tree in sorted(files.trees.items())]
+    made = []
+    for camera in cameras[:2]:
+        kind = camera.text("distortion_model", default="none")
+        lens = by_name(
+            kind, camera.numbers("distortion_coefficients").tolist() if kind != "none" else [], camera.where
+        )
+        made.append(table_of(camera.numbers("resolution", 2), camera.numbers("intrinsics", 4).tolist(), lens))
+    if len(made) == 1:
+        return Calibration(format="EuRoC", left=made[0])
+    poses = [_of_asl(camera) for camera in cameras[:2]]
+    apart = compose(inverse(poses[1]), poses[0])
+    return Calibration(format="EuRoC", left=made[0], right=made[1], right_from_left=apart)
+
+
+def _of_asl(camera: Fields) -> Pose:
+    """``body_from_camera``."""
+    value = camera.get("T_BS")
+    T = np.ravel(value["data"] if isinstance(value, Mapping) else value)
+    return pose_of(Fields({"T_BS": T}, camera.where), "T_BS")
+
+
+def _asl_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
+    return {path: near[path]}
+
+
+FORMATS: tuple[Format, ...] = (
+    Format("Kalibr", _is_kalibr, _read_kalibr),
+    Format("Basalt", lambda tree: keyed(tree, "value0") and keyed(tree["value0"], "intrinsics"), _read_basalt),
+    Format("ZED", _is_zed, _read_zed),
+    Format("DepthAI", lambda tree: keyed(tree, "cameraData"), _read_depthai),
+    Format("COLMAP rig_config.json", _is_rig_config, _read_rig_config),
+    Format("COLMAP", lambda tree: keyed(tree, "colmap"), _read_colmap, _colmap_files),
+    Format("RealSense", lambda tree: bool(_realsense_cameras(tree)), _read_realsense),
+    Format("EuRoC", lambda tree: keyed(tree, "T_BS", "intrinsics", "resolution"), _read_asl, _asl_files),
+    Format("ROS camera_info", is_ros, read_ros, ros_files),
+    Format("OpenCV", is_opencv, read_opencv, opencv_files),
+)
+"""In the order in which a file is tried."""
+_NUMBERED = ("Kalibr", "Basalt", "COLMAP", "COLMAP rig_config.json", "EuRoC")
+"""Formats whose first camera need not be the left one."""

@@ -1,0 +1,158 @@
+"""Whatever file a user has of cameras: rig.toml, camera.toml, or a calibration of another tool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsbench.components.cards import parse_card, read_toml, with_shutter
+from rsbench.components.rig_tables import Size, with_readouts
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES
+from rsbench.core.se3 import Pose
+from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table
+from rsbench.interop.readers.calibrations import read_calibration
+from rsbench.pipeline.footage import RigCard
+from rsbench.pipeline.mono_camera import OneCameraCard, read_one_camera
+
+_READOUTS = ("readout_ratio", "shutter", "line_delay_s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Readout:
+    """What a user says of the readout beside a file, in place of what the file says."""
+
+    readout_ratio: float | None = None
+    shutter: str | None = None
+    """Name or path of a shutter card."""
+    fps: float | None = None
+    """Frames per second: what is given in seconds needs it."""
+
+    def __post_init__(self) -> None:
+        if self.readout_ratio is not None and self.shutter is not None:
+            raise RsbenchError("--readout-ratio and --shutter exclude each other; leave one out")
+        if self.fps is not None and not 0.0 < self.fps < 1e6:
+            raise RsbenchError(f"--fps {self.fps:g}: must be a positive number of frames per second")
+
+    def into(self, table: Mapping[str, Any]) -> Table:
+        """The tables of a rig or a camera with it."""
+        made = dict(table)
+        if self.readout_ratio is not None or self.shutter is not None:
+            made = _without(made, _READOUTS)
+            made |= {side: _without(made[side], _READOUTS) for side in SIDES if isinstance(made.get(side), dict)}
+            given = {"readout_ratio": self.readout_ratio, "shutter": self.shutter}
+            made |= {key: value for key, value in given.items() if value is not None}
+        return made | ({} if self.fps is None else {"frame_period_s": 1.0 / self.fps})
+
+
+def _without(table: Mapping[str, Any], keys: tuple[str, ...]) -> Table:
+    return {key: value for key, value in table.items() if key not in keys}
+
+
+def read_rig_file(
+    path: Path, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
+) -> tuple[RigCard, tuple[str, ...]]:
+    """The card of a rig from rig.toml or a calibration of another tool, and what was assumed, a sentence each.
+
+    Args:
+        path: the file, or a folder with files that belong together.
+        readout: in place of what the file says of it.
+        frame_size: gives the (width, height) of the frames, by which some formats choose a section.
+
+    Raises:
+        RsbenchError: one line with the file, the field, what is wrong and the remedy.
+    """
+    readout = readout or Readout()
+    if path.suffix == ".toml":
+        return parse_card(RigCard, with_readouts(readout.into(read_toml(path)), str(path)), str(path)), ()
+    found = read_calibration(path, Assumptions(frame_size=frame_size))
+    if found.right is None:
+        more = f": {found.notes[0]}" if found.notes else "; one camera is given by --camera"
+        raise RsbenchError(f"{path}: {found.format}: is of one camera{more}")
+    table, missing = tables_of_calibration(found, readout)
+    card = parse_card(RigCard, with_readouts(table, str(path)), str(path))
+    return card, (*found.notes, *missing)
+
+
+def tables_of_calibration(found: Calibration, readout: Readout) -> tuple[Table, tuple[str, ...]]:
+    """Tables of rig.toml, and sentences about what is in seconds where nobody gave the frames' rate."""
+    table, notes = found.tables(), list[str]()
+    given = readout.readout_ratio is not None or readout.shutter is not None
+    for side, own in (("left", found.left), ("right", found.right)):
+        delay = None if own is None or given else own.get("line_delay_s")
+        if delay == 0.0:
+            table[side]["readout_ratio"] = 0.0
+        elif delay is not None and readout.fps is not None:
+            table[side]["line_delay_s"] = delay
+        elif delay is not None:
+            notes.append(f"{side}: line_delay = {delay:.6g} s is used only with the frames' rate (--fps)")
+    if found.right_delay_s and (readout.fps is not None or readout.shutter is not None):
+        table["right"]["delay_s"] = found.right_delay_s
+    elif found.right_delay_s:
+        notes.append(f"the right camera is {found.right_delay_s:.6g} s late, which is used only with --fps")
+    return readout.into(table), tuple(notes)
+
+
+def read_camera_file(
+    path: Path, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
+) -> tuple[OneCameraCard, tuple[str, ...]]:
+    """The card of one camera from camera.toml or a calibration of another tool; as ``read_rig_file``."""
+    readout = readout or Readout()
+    if path.suffix == ".toml":
+        if readout == Readout():
+            return read_one_camera(path), ()
+        return parse_card(OneCameraCard, with_shutter(readout.into(read_toml(path)), str(path)), str(path)), ()
+    found = read_calibration(path, Assumptions(frame_size=frame_size))
+    notes = list(found.notes)
+    if found.right is not None:
+        notes.append("holds two cameras; the left one is taken")
+    own = dict(found.left)
+    size, delay = (own.pop("width", None), own.pop("height", None)), own.pop("line_delay_s", None)
+    if frame_size is not None and None not in size and size != (wanted := frame_size()):
+        raise RsbenchError(
+            f"{path}: is of images of {size[0]} x {size[1]} pixels, and the frames are {wanted[0]} x {wanted[1]}; "
+            "give the calibration of that size, or rsbench rig --resize where frames were scaled, not cropped"
+        )
+    table = readout.into({"camera": own})
+    if delay is not None and "readout_ratio" not in table and "shutter" not in table:
+        if delay == 0.0:
+            table["readout_ratio"] = 0.0
+        elif readout.fps is not None and size[1] is not None:
+            table["readout_ratio"] = min(delay * size[1] * readout.fps, 1.0)
+        else:
+            notes.append(f"line_delay = {delay:.6g} s is used only with the frames' rate (--fps)")
+    return parse_card(OneCameraCard, with_shutter(table, str(path)), str(path)), tuple(notes)
+
+
+def calibration_of(path: Path, given: Assumptions) -> Calibration:
+    """The calibration in any file, rig.toml and camera.toml too, without what they say of the readout."""
+    if path.suffix != ".toml":
+        return read_calibration(path, given)
+    table = read_toml(path)
+    if "baseline" not in table and "left" not in table:
+        one = parse_card(OneCameraCard, with_shutter(table, str(path)), str(path))
+        if one.camera is None:
+            raise RsbenchError(f"{path}: camera: is required to show or convert it")
+        return Calibration(format="camera.toml", left=_record(one.camera))
+    card = parse_card(RigCard, with_readouts(table, str(path)), str(path))
+    if card.camera is not None:
+        left = right = _record(card.camera)
+    else:
+        assert card.left is not None and card.right is not None
+        left, right = (
+            _record(each) | ({} if each.size is None else dict(zip(("width", "height"), each.size, strict=True)))
+            for each in (card.left, card.right)
+        )
+    t = np.array([-(card.baseline or 0.0), 0.0, 0.0])
+    apart = card.right_from_left
+    pose = Pose(np.eye(3), t) if apart is None else Pose(apart.R, np.array(apart.translation))
+    return Calibration(format="rig.toml", left=left, right=dict(right), right_from_left=pose)
+
+
+def _record(camera: Any) -> Table:
+    own = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    return own | ({} if camera.lens is None else {"lens": camera.lens.record()})
