@@ -204,7 +204,7 @@ def depthai(folder: Path) -> Path:
             "toCameraSocket": to,
         }
 
-    end = {"rotationMatrix": [], "toCameraSocket": -1, "translation": dict.fromkeys("xyz", 0.0)}
+    end: dict[str, Any] = {"rotationMatrix": [], "toCameraSocket": -1, "translation": dict.fromkeys("xyz", 0.0)}
     cameras = [
         [0, camera((1000.0, 1000.0, 640.0, 360.0), D_LEFT, apart(rest, 2))],
         [1, camera(LEFT, D_LEFT, apart(middle, 0))],

@@ -9,13 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_input import EPILOG, GyroscopeOptions, given_frames, sized, target_row
+from rsbench.cli.correct_input import (
+    EPILOG,
+    GyroscopeOptions,
+    ReadoutOptions,
+    given_frames,
+    sized,
+    target_row,
+)
 from rsbench.cli.correct_one_camera import (
     CameraFile,
     Footage,
     Fps,
     GyroFile,
     GyroOffset,
+    ReadoutRatio,
+    ShutterName,
     correct_one_camera,
 )
 from rsbench.cli.correct_output import readout_words, say_calibration, write_page_of
@@ -52,7 +61,10 @@ def correct(
             metavar="LEFT_0 RIGHT_0 LEFT_1 RIGHT_1", help="Four images; or the folder of a rendered sequence."
         ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(metavar="RIG.toml|NAME", help="Cameras and their readout.")] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(metavar="RIG|NAME", help="Calibration of both cameras: rig.toml, or another tool's."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
     left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="The same for the right camera.")] = None,
@@ -75,14 +87,17 @@ def correct(
     gyro: GyroFile = None,
     fps: Fps = None,
     gyro_offset: GyroOffset = None,
+    readout_ratio: ReadoutRatio = None,
+    shutter: ShutterName = None,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
     log = GyroscopeOptions(file=gyro, fps=fps, offset_s=gyro_offset)
+    readout = ReadoutOptions(readout_ratio=readout_ratio, shutter=shutter, fps=fps)
     if camera is not None or footage is not None:
         _refuse_rig_options(ctx)
-        correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log)
+        correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log, readout)
         return
-    given = given_frames(frames, rig, out, left, right, log, row_poses)
+    given = given_frames(frames, rig, out, left, right, log, readout, row_poses)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
     options = _options(features, solver, matcher, corrector, fill, **others)
     _correct_given(given, target, options.faster() if fast else options, inpaint is None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rsbench.core.rig import StereoRig
     from rsbench.core.so3 import FloatArray
+    from rsbench.interop.readers.rig_files import Readout
     from rsbench.pipeline.footage import FrameSource, RigCard
 
 _MOST = 1e9
@@ -23,7 +25,9 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
 
-RIG.toml, for images of cameras side by side (pixels, metres; without readout_ratio and scan both are found):
+RIG is a calibration of Kalibr, OpenCV, ROS, ZED, DepthAI, RealSense, COLMAP, Basalt or OpenVINS as it is, a file
+or a folder of files that belong together ([bold]rsbench rig RIG[/bold] shows what is understood), or rig.toml,
+here of two equal aligned cameras (pixels, metres; without readout_ratio and scan both are found):
 
   baseline = 0.12
   readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
@@ -55,8 +59,8 @@ class GyroscopeOptions:
     def __post_init__(self) -> None:
         from rsbench.core.errors import RsbenchError
 
-        if self.file is None and (self.fps is not None or self.offset_s is not None):
-            raise RsbenchError("--fps, --gyro-offset: need --gyro, a gyroscope's log")
+        if self.file is None and self.offset_s is not None:
+            raise RsbenchError("--gyro-offset: needs --gyro, a gyroscope's log")
 
     def samples(self, source: FrameSource) -> FloatArray | None:
         """(n, 4) tau, w; None without a log.
@@ -101,6 +105,59 @@ class GyroscopeOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReadoutOptions:
+    """The options of a readout, in place of what the file of a rig or camera says."""
+
+    readout_ratio: float | None
+    shutter: str | None
+    fps: float | None
+
+    @property
+    def any(self) -> bool:
+        """Whether the user gave one that is about the readout alone."""
+        return self.readout_ratio is not None or self.shutter is not None
+
+    def beside(self, path: Path | None, gyro: bool, footage: Path | None) -> Readout:
+        """What they say beside this file, with the rate of a video where seconds need one.
+
+        Raises:
+            RsbenchError: options that exclude each other, or ``--fps`` that nothing needs.
+        """
+        from rsbench.core.errors import RsbenchError
+        from rsbench.dataset.corrected_frames import said_fps
+        from rsbench.interop.readers.rig_files import Readout
+
+        tables = path is None or path.suffix == ".toml"
+        if tables and not gyro and self.fps is not None and self.shutter is None:
+            raise RsbenchError("--fps: needs --gyro or --shutter; a .toml file says its own seconds")
+        fps = self.fps if not tables or self.shutter is not None else None
+        if fps is None and footage is not None and not tables:
+            fps = said_fps(footage)
+        return Readout(readout_ratio=self.readout_ratio, shutter=self.shutter, fps=fps)
+
+
+def size_of(frames: list[Path] | Path) -> Callable[[], tuple[int, int]]:
+    """A function that gives the (width, height) of the first of some frames, a folder's or a video's."""
+
+    def size() -> tuple[int, int]:
+        from rsbench.pipeline.footage import FrameSource
+
+        source = FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames)
+        height, width = next(iter(source)).shape[:2]
+        return width, height
+
+    return size
+
+
+def say_notes(option: str, notes: tuple[str, ...]) -> None:
+    """What was assumed of a calibration, a line each, on stderr."""
+    from rsbench.cli.console import echo
+
+    for note in notes:
+        echo(f"rsbench: note: {option}: {note}", err=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RigInput:
     """What is to be corrected, and where to."""
 
@@ -133,24 +190,27 @@ def given_frames(
     left: Path | None,
     right: Path | None,
     gyro: GyroscopeOptions,
+    readout: ReadoutOptions,
     row_poses: bool = False,
 ) -> RigInput:
     """Raises RsbenchError for another combination of arguments."""
     from rsbench.core.errors import RsbenchError
-    from rsbench.pipeline.footage import read_rig_card
+    from rsbench.interop.readers.rig_files import read_rig_file
 
     rendered = frames is not None and len(frames) == 1 and frames[0].is_dir()
     if out is None or (rig is None and not rendered):
         raise RsbenchError(f"--{'out' if rig is not None or rendered else 'rig'}: is required")
     if frames and rendered:
-        if rig or left or right:
+        if rig or left or right or readout.any:
             raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
         return _of_sequence(frames[0], out, gyro, row_poses)
     assert rig is not None
     for option, wanted in (("--row-poses", row_poses), ("--gyro", gyro.file is not None)):
         if wanted and frames:
             raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
-    card = read_rig_card(rig)
+    said = readout.beside(rig, gyro.file is not None, left)
+    card, notes = read_rig_file(rig, said, size_of(frames or left or []))
+    say_notes("--rig", notes)
     if frames is not None and len(frames) == 4 and not (left or right):
         return RigInput(card=card, out=out, four=frames, left=[], right=[], gyro=gyro)
     if frames or not (left and right):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_input import GyroscopeOptions, target_row
+from rsbench.cli.correct_input import GyroscopeOptions, ReadoutOptions, say_notes, size_of, target_row
 from rsbench.cli.correct_output import listed
 
 if TYPE_CHECKING:
@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from rsbench.pipeline.mono_camera import OneCameraCard
     from rsbench.pipeline.mono_sequence import Gyroscope, KnownCamera, MonoMoment, MonoOptions
 
-CameraFile = Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Of one camera, in place of --rig.")]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(metavar="CAMERA", help="Of one camera, in place of --rig: camera.toml or a calibration."),
+]
 Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
 GyroFile = Annotated[
     Path | None,
@@ -25,7 +28,16 @@ GyroFile = Annotated[
         help="What a gyroscope measured; of a rig, over four frames and more. Needs --fps or a video.",
     ),
 ]
-Fps = Annotated[float | None, typer.Option(help="Frames a second, for --gyro. Default: what the video says.")]
+Fps = Annotated[
+    float | None,
+    typer.Option(help="Frames a second, for --gyro, --shutter and a line delay. Default: what the video says."),
+]
+ReadoutRatio = Annotated[
+    float | None, typer.Option(help="Readout time over frame period, in place of what the calibration says.")
+]
+ShutterName = Annotated[
+    str | None, typer.Option("--shutter", metavar="NAME", help="The same from a mode: rsbench list shutters.")
+]
 GyroOffset = Annotated[
     float | None,
     typer.Option(
@@ -49,6 +61,7 @@ def correct_one_camera(
     inpaint: bool | None,
     seed: int,
     gyro: GyroscopeOptions,
+    readout: ReadoutOptions,
 ) -> None:
     """Correct images, or a folder or video, of one camera; exit 1 where some of many frames are not corrected.
 
@@ -56,16 +69,18 @@ def correct_one_camera(
         RsbenchError: arguments that do not go together, or what ``correct_frames`` refuses.
     """
     from rsbench.core.errors import RsbenchError
+    from rsbench.interop.readers.rig_files import read_camera_file
     from rsbench.pipeline.footage import FrameSource
-    from rsbench.pipeline.mono_camera import OneCameraCard, read_one_camera
     from rsbench.pipeline.mono_sequence import Gyroscope
 
     if out is None:
         raise RsbenchError("--out: is required")
     if (frames is None) == (footage is None):
         raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
-    card = OneCameraCard() if camera is None else read_one_camera(camera)
     source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
+    said = readout.beside(camera, gyro.file is not None, source.path)
+    card, notes = read_camera_file(camera, said, size_of(frames or source.path))
+    say_notes("--camera", notes)
     _warn_of_other_rate(card, source, gyro.fps)
     samples = gyro.samples(source)
     log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro.farthest(source))

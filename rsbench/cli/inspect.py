@@ -63,7 +63,7 @@ def inspect(
         ),
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option(metavar="RIG.toml|NAME", help="Cameras and baseline, for frames.")
+        Path | None, typer.Option(metavar="RIG|NAME", help="Calibration of both cameras, for frames.")
     ] = None,
     left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="Folder of images or video of the right camera.")] = None,
@@ -151,11 +151,13 @@ def _of_footage(left: Path | None, right: Path | None, card: Path, options: _Opt
 
 def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, options: _Options) -> _Case:
     """Frames of a user, whose card says the rig."""
-    from rsbench.cli.correct_input import sized
-    from rsbench.pipeline.footage import read_rig_card
+    from rsbench.cli.correct_input import say_notes, sized
+    from rsbench.interop.readers.rig_files import read_rig_file
 
-    given = read_rig_card(card)
-    rig = sized(given, next(iter(left)), next(iter(right)))
+    first, second = next(iter(left)), next(iter(right))
+    given, notes = read_rig_file(card, None, lambda: (first.shape[1], first.shape[0]))
+    say_notes("--rig", notes)
+    rig = sized(given, first, second)
     ratio, scanning = given.readout_ratio, given.scanning
     try:
         shutter = None if ratio is None or scanning is None else rig.shutter_of(scanning, ratio)

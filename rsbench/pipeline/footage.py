@@ -185,9 +185,14 @@ def read_rig_card(path: Path) -> RigCard:
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
-    if not path.suffix and path == Path(path.name) and not path.exists():
-        path = card_path("rigs", path.name)
+    path = rig_path(path)
     return parse_card(RigCard, with_readouts(read_toml(path), str(path)), str(path))
+
+
+def rig_path(path: Path) -> Path:
+    """The path, or that of the card in ``cards/rigs/`` that it names; RsbenchError where it names none."""
+    named = not path.suffix and path == Path(path.name) and not path.exists()
+    return card_path("rigs", path.name) if named else path
 
 
 def rig_card_of(rig: StereoRig, shutter: RollingShutter) -> RigCard:

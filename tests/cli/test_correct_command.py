@@ -255,7 +255,7 @@ def test_a_gyroscope_that_contradicts_the_frames_is_told_and_left_out(
     alone, both = (bytes_below(tmp_path / name / "corrected") for name in ("alone", "both"))
     assert alone == both
     assert_refused(correct(*footage, tmp_path / "no", "--gyro", log), "--fps")
-    assert_refused(correct(*footage, tmp_path / "no", "--fps", 20), "need --gyro")
+    assert_refused(correct(*footage, tmp_path / "no", "--fps", 20), "needs --gyro")
     given = ("--gyro", log, "--fps", 20, "--motion-model", "linear")
     assert_refused(correct(*footage, tmp_path / "no", *given), "--gyro", "four frames and more")
     assert_refused(correct(*footage, tmp_path / "no", *given[:4], "--gyro-offset", 90), "--gyro-offset")

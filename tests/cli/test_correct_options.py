@@ -32,11 +32,13 @@ OTHER = {
     "gyro": ["--gyro", "log.csv"],
     "fps": ["--fps", "30"],
     "gyro_offset": ["--gyro-offset", "0.1"],
+    "readout_ratio": ["--readout-ratio", "0.5"],
+    "shutter": ["--shutter", "gopro-hero6-4k30"],
 }
 """A value of each option that is not its default."""
 OF_INPUT = {"frames", "out", "camera", "footage"}
 """What every run, or one of its two kinds, has to give."""
-ONE_CAMERA = {"target", "inpaint", "seed", "gyro", "fps", "gyro_offset"}
+ONE_CAMERA = {"target", "inpaint", "seed", "gyro", "fps", "gyro_offset", "readout_ratio", "shutter"}
 
 
 def _parameters() -> set[str]:

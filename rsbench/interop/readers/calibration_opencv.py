@@ -44,6 +44,7 @@ _ROLES = (
     ("size", r"size|(image|img)_?size|resolution", (2,)),
 )
 """What a key of any name holds, by its name in lower case and the count of its numbers; camera matrices show."""
+_ARRAYS = (np.ndarray, list)
 _FISHEYE = ("fisheye", "kannala_brandt", "equidistant")
 
 
@@ -68,7 +69,7 @@ class Parts:
         self.fisheye |= plain.endswith("_fe") or str(value).lower() in _FISHEYE
         self.fisheye |= "fisheye" in plain and value in (1, "1", "true", True)
         try:
-            numbers = np.array(value if isinstance(value, np.ndarray | list) else np.nan, dtype=np.float64)
+            numbers = np.array(value if isinstance(value, _ARRAYS) else np.nan, dtype=np.float64)
         except (TypeError, ValueError):
             return
         role = next((role for role, name, _ in _ROLES if re.fullmatch(name, plain)), None)
@@ -262,7 +263,7 @@ def _ros_camera(camera: Fields) -> Table:
     if isinstance(roi, Mapping) and (roi.get("x_offset") or roi.get("y_offset")):
         raise RsbenchError(f"{camera.where}: roi: give a calibration of whole images")
     key = next((k for k in ("distortion_coefficients", "d", "D") if k in camera), None)
-    d = [] if key is None else camera.numbers(key).tolist()
+    d = list[float]() if key is None else camera.numbers(key).tolist()
     lens = by_name(camera.text("distortion_model", default="plumb_bob"), d, camera.where) if any(d) else None
     if camera.text("distortion_model") in ("equidistant", "fisheye"):
         lens = lens_of("kannala-brandt", d, camera.where)

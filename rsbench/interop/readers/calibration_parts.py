@@ -100,7 +100,7 @@ class Format(NamedTuple):
     """Of a file and all files of the format beside it, those that belong to it; None where a file has all."""
 
 
-def table_of(size: Sequence[float] | None, intrinsics: Sequence[float], lens: Lens | None) -> Table:
+def table_of(size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], lens: Lens | None) -> Table:
     """Of rig.toml, from (width, height), (fx, fy, cx, cy) and a lens."""
     sizes = {} if size is None else dict(zip(("width", "height"), map(round, size), strict=True))
     numbers = dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True))
@@ -133,7 +133,7 @@ def brown(coefficients: Iterable[float], where: str) -> Lens | None:
 
 
 def fitted(
-    size: Sequence[float] | None, intrinsics: Sequence[float], profile: Profile, name: str, where: str
+    size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], profile: Profile, name: str, where: str
 ) -> tuple[Table, str]:
     """A camera of a symmetric fisheye model, as the nearest Kannala-Brandt one, and a sentence about that."""
     if size is None:

@@ -26,6 +26,7 @@ _LONGEST = 8 * MB
 """Bytes of a file; COLMAP lists a camera for each image of a collection."""
 _DEEPEST = 16
 """Levels of tables and lists."""
+_LISTS = (list, tuple, np.ndarray)
 _MOST_FILES = 200
 """Files of a folder that are looked at."""
 _SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".conf", ".txt", ".calib")
@@ -103,7 +104,7 @@ def _of_element(element: ElementTree.Element) -> Any:
 
 def _of_ini(text: str) -> Any:
     parser = configparser.ConfigParser(interpolation=None, strict=False)
-    parser.optionxform = str  # pyrefly: ignore[bad-assignment]
+    parser.optionxform = lambda optionstr: optionstr  # pyrefly: ignore[method-assign]
     try:
         parser.read_string(text)
     except configparser.Error as error:
@@ -186,7 +187,7 @@ class Fields:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    if isinstance(value, list | tuple | np.ndarray):
+    if isinstance(value, _LISTS):
         for each in np.ravel(value) if isinstance(value, np.ndarray) else value:
             yield from _flat(each)
     else:

@@ -328,7 +328,7 @@ def _read_zed(files: Files) -> Calibration:
         )
     tables = [_zed_camera(top, side, name, _ZED_SIZES[name]) for side in ("LEFT", "RIGHT")]
     stereo = top.inner("STEREO")
-    turn, shift = [], []
+    turn, shift = list[float](), list[float]()
     for key in ("RX", "CV", "RZ"):
         own = next((k for k in (f"{key}_{name}", f"R{key[-1:]}_{name}", key) if k in stereo), f"{key}_{name}")
         turn.append(stereo.number(own, None if key != "CV" or own in stereo else 0.0))
@@ -541,7 +541,7 @@ def _read_rig_config(files: Files) -> Calibration:
     notes = [f"holds {len(tree)} rigs; the first is taken"] if len(tree) > 1 else []
     if len(cameras) > 2:
         notes.append(f"holds {len(cameras)} cameras; the first two are taken")
-    made, poses = [], []
+    made, poses = list[tuple[Table, str]](), list[Pose]()
     for camera in cameras[:2]:
         if "camera_params" not in camera:
             raise RsbenchError(

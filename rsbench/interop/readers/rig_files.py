@@ -16,8 +16,8 @@ from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose
 from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table
 from rsbench.interop.readers.calibrations import read_calibration
-from rsbench.pipeline.footage import RigCard
-from rsbench.pipeline.mono_camera import OneCameraCard, read_one_camera
+from rsbench.pipeline.footage import RigCard, rig_path
+from rsbench.pipeline.mono_camera import OneCameraCard
 
 _READOUTS = ("readout_ratio", "shutter", "line_delay_s")
 
@@ -46,7 +46,7 @@ class Readout:
             made |= {side: _without(made[side], _READOUTS) for side in SIDES if isinstance(made.get(side), dict)}
             given = {"readout_ratio": self.readout_ratio, "shutter": self.shutter}
             made |= {key: value for key, value in given.items() if value is not None}
-        return made | ({} if self.fps is None else {"frame_period_s": 1.0 / self.fps})
+        return made if self.fps is None else made | {"frame_period_s": 1.0 / self.fps}
 
 
 def _without(table: Mapping[str, Any], keys: tuple[str, ...]) -> Table:
@@ -66,7 +66,7 @@ def read_rig_file(
     Raises:
         RsbenchError: one line with the file, the field, what is wrong and the remedy.
     """
-    readout = readout or Readout()
+    readout, path = readout or Readout(), rig_path(path)
     if path.suffix == ".toml":
         return parse_card(RigCard, with_readouts(readout.into(read_toml(path)), str(path)), str(path)), ()
     found = read_calibration(path, Assumptions(frame_size=frame_size))
@@ -98,14 +98,14 @@ def tables_of_calibration(found: Calibration, readout: Readout) -> tuple[Table, 
 
 
 def read_camera_file(
-    path: Path, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
+    path: Path | None, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
 ) -> tuple[OneCameraCard, tuple[str, ...]]:
     """The card of one camera from camera.toml or a calibration of another tool; as ``read_rig_file``."""
     readout = readout or Readout()
-    if path.suffix == ".toml":
-        if readout == Readout():
-            return read_one_camera(path), ()
-        return parse_card(OneCameraCard, with_shutter(readout.into(read_toml(path)), str(path)), str(path)), ()
+    if path is None or path.suffix == ".toml":
+        table = readout.into({} if path is None else read_toml(path))
+        where = "--shutter, --readout-ratio" if path is None else str(path)
+        return parse_card(OneCameraCard, with_shutter(table, where), where), ()
     found = read_calibration(path, Assumptions(frame_size=frame_size))
     notes = list(found.notes)
     if found.right is not None:
@@ -130,6 +130,7 @@ def read_camera_file(
 
 def calibration_of(path: Path, given: Assumptions) -> Calibration:
     """The calibration in any file, rig.toml and camera.toml too, without what they say of the readout."""
+    path = rig_path(path)
     if path.suffix != ".toml":
         return read_calibration(path, given)
     table = read_toml(path)
@@ -155,4 +156,4 @@ def calibration_of(path: Path, given: Assumptions) -> Calibration:
 
 def _record(camera: Any) -> Table:
     own = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
-    return own | ({} if camera.lens is None else {"lens": camera.lens.record()})
+    return own if camera.lens is None else own | {"lens": camera.lens.record()}
