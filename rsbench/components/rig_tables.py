@@ -21,6 +21,9 @@ from rsbench.core.shutter import StatedShutter
 from rsbench.core.so3 import FloatArray
 
 Size = tuple[int, int]
+_OF_IMAGE = ("width", "height", "fx", "fy", "cx", "cy")
+_MOST = 4.0
+"""Of ``rig_scale``."""
 Vector = tuple[float, float, float]
 _DIGITS = 1e-2
 """Share by which printed line delays may exceed a frame period."""
@@ -252,6 +255,8 @@ RIG_KEY = {
     "``rig``.",
     "right": "The right camera.",
     "right_from_left": "Where the right camera is, and how it is turned.",
+    "rig_scale": "Size of the images over that of the calibration: 0.5 for half as many columns and rows of the "
+    "same rig.",
 }
 """Shorthands of tables in which ``with_rig`` replaces these keys."""
 
@@ -260,10 +265,12 @@ def with_rig(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     """A table of a card whose rig, a name or tables of its own, becomes the table ``rig`` of ``RigTables``.
 
     Raises:
-        RsbenchError: both are given, no such rig card, or as ``with_readouts``.
+        RsbenchError: both are given, no such rig card, a scale without a rig, or as ``with_readouts``.
     """
     made = {key: value for key, value in table.items() if key not in RIG_KEY}
-    if own := {key: table[key] for key in RIG_KEY if key in table}:
+    own = {key: table[key] for key in RIG_KEY if key in table}
+    scale = own.pop("rig_scale", None)
+    if own:
         if "rig" in made:
             raise RsbenchError(f"{where}: rig and {next(iter(own))} exclude each other; leave one out")
         made["rig"] = own
@@ -273,6 +280,28 @@ def with_rig(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     elif isinstance(rig, dict):
         period = {key: made[key] for key in ("frame_period_s",) if key in made}
         made["rig"] = with_readouts(period | rig, where)
+    if scale is not None:
+        known = isinstance(made.get("rig"), dict) and isinstance(scale, int | float)
+        if not known or not 0.0 < scale <= _MOST:
+            raise RsbenchError(
+                f"{where}: rig_scale = {scale}: must be above 0 and at most {_MOST:g}, beside a rig"
+            )
+        made["rig"] = made["rig"] | {side: resized(made["rig"].get(side), scale) for side in SIDES}
+    return made
+
+
+def resized(camera: Any, scale: float) -> Any:
+    """The table of a camera whose images are scaled, to whole sizes; anything else than such a table as it is.
+
+    The outer borders of the image stay: a pixel at x goes to (x + 1/2) s - 1/2.
+    """
+    if not isinstance(camera, dict) or any(not isinstance(camera.get(key), int | float) for key in _OF_IMAGE):
+        return camera
+    made = dict(camera)
+    for size, focal, centre in (("width", "fx", "cx"), ("height", "fy", "cy")):
+        made[size] = max(1, round(scale * camera[size]))
+        s = made[size] / camera[size]
+        made |= {focal: s * camera[focal], centre: s * (camera[centre] + 0.5) - 0.5}
     return made
 
 

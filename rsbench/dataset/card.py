@@ -63,7 +63,8 @@ class SequenceCard:
     scene: str
     """Name of a scene card, or a path to one."""
     viewpoint: str = "default"
-    """Name of a viewpoint of the scene card."""
+    """Name of a viewpoint of the scene card: where the body, the middle of the baseline, stands at time 0 and
+    looks. A vertical rig stands so that its left camera is upright."""
     motion: MotionCard | None = None
     """Motion of this sequence, in place of the dataset's."""
     rig: RigTables | None = None
@@ -417,8 +418,17 @@ class DatasetCard(Scanning):
             varied = self._with_ratio(varied)
             lasting = None if self.frames == len(FRAMES) else self._span(varied)[1]
             things = drawn(varied.moving, self.seed_of(varied), named, lasting)
-            made.append(self._scaled(self._drawn(replace(varied, moving=things), named)))
+            made.append(self._scaled(self._drawn(replace(self._upright(varied), moving=things), named)))
         return made
+
+    def _upright(self, sequence: SequenceCard) -> SequenceCard:
+        """With the left camera upright, from whose axes those of the body of a vertical rig are a quarter turn
+        away."""
+        R = self.rig_of(sequence).own("left").R
+        turn = 0.5 * math.pi * round(2.0 * math.atan2(R[1, 0], R[0, 0]) / math.pi)
+        if turn == 0.0:
+            return sequence
+        return replace(sequence, start=Start(position=(0.0, 0.0, 0.0), quaternion=_about_z(turn)))
 
     def _with_ratio(self, sequence: SequenceCard) -> SequenceCard:
         """With a readout ratio of its own, where they are drawn."""
@@ -462,6 +472,10 @@ class DatasetCard(Scanning):
             )
             for number, pair in enumerate(parts)
         ]
+
+
+def _about_z(angle: float) -> tuple[float, float, float, float]:
+    return math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)
 
 
 def load_dataset_card(
