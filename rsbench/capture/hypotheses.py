@@ -71,7 +71,7 @@ _MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
 
 @dataclass(frozen=True, order=True)
 class Scans:
-    """Where each camera begins to read; cameras that roll share one readout ratio."""
+    """Where each camera begins to read; cameras that roll share one readout ratio, unless both are given."""
 
     left: Start
     right: Start
@@ -104,9 +104,23 @@ ALL_SCANS = tuple(Scans(*starts) for starts in product(get_args(Start), repeat=2
 
 def scans_of(shutter: RollingShutter) -> Scans:
     """The scans of a known shutter."""
-    if shutter.readout_ratio == 0.0:
-        return GLOBAL
-    return Scans(shutter.scan_of("left"), shutter.scan_of("right"))
+    left, right = (shutter.scan_of(side) if shutter.ratio_of(side) > 0.0 else "global" for side in SIDES)
+    return Scans(left, right)
+
+
+def shutter_under(
+    scans: Scans, ratio: float, rig: StereoRig, delay: float = 0.0, right_share: float = 1.0
+) -> RollingShutter:
+    """The shutter of these scans; ``right_share`` as of ``Known``."""
+    sides = [None if scans.start(side) == "global" else scans.start(side) for side in SIDES]
+    left, right = (0.0 if side is None else ratio for side in sides)
+    scanning = Scanning(
+        scan=sides[0] or "top",  # pyrefly: ignore[bad-argument-type]
+        right_scan=sides[1],  # pyrefly: ignore[bad-argument-type]
+        right_delay=delay,
+        right_readout_ratio=None if right * right_share == left else right * right_share,
+    )
+    return rig.shutter_of(scanning, left)
 
 
 def line_of(scans: Scans, side: Side) -> FloatArray:
@@ -157,6 +171,9 @@ class Known:
     """What is known of a capture before its matches are fitted; None: it is estimated."""
 
     ratio: float | None = None
+    """Of the left camera, or of the right one where it alone rolls."""
+    right_share: float = 1.0
+    """Readout ratio of the right camera over the left one's, where both roll."""
     scans: tuple[Scans, ...] = ALL_SCANS
     """Possible ones."""
     delay: float | None = None
@@ -166,6 +183,23 @@ class Known:
     calibration_sigma: tuple[float, ...] = NO_ERRORS
     """Prior standard deviation of each of them, about 0; 0: it is known."""
     models: tuple[str, ...] = MODELS
+
+    def with_shutter(self, shutter: RollingShutter) -> Known:
+        """With all of a shutter known."""
+        left, right = (shutter.ratio_of(side) for side in SIDES)
+        return replace(
+            self,
+            ratio=left or right,
+            right_share=right / left if left * right > 0.0 else 1.0,
+            scans=(scans_of(shutter),),
+            delay=shutter.right_delay,
+        )
+
+    def shutter(self, rig: StereoRig) -> RollingShutter | None:
+        """The shutter where it is ``shutter_known``."""
+        if self.ratio is None or not self.shutter_known:
+            return None
+        return shutter_under(self.scans[0], self.ratio, rig, self.delay or 0.0, self.right_share)
 
     def prior(self, hypothesis: Hypothesis) -> FloatArray:
         """(17,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
@@ -213,18 +247,27 @@ class TimedMatches:
 
     Every end has a time of its own here (``timed_tracks``), whatever the scans, so that all scans are judged
     by the same errors.
+
+    Args:
+        right_share: as of ``Known``.
     """
 
-    def __init__(self, matches: Correspondences, rig: StereoRig, motion_model: str = "linear") -> None:
+    def __init__(
+        self, matches: Correspondences, rig: StereoRig, motion_model: str = "linear", right_share: float = 1.0
+    ) -> None:
         packs = {scan: pack(matches, rig, _late(rig, scan), motion_model) for scan in get_args(Scan)}
         self._base = base = next(iter(packs.values()))
         self.left: BoolArray = base.pairs[:, 6] >= 0.0
         """(n,) which pairs are the left camera's."""
         late = np.where(self.left, 0.0, 1.0)[:, None]
+        pairs, tracks = np.where(self.left, 1.0, right_share)[:, None], np.array([[1.0], [right_share]] * 2)
         self._times: dict[Start, tuple[_Ends, _Ends]] = {
             scan: (
-                _Ends(each.pairs[:, 4:6] - _FRAMES - late, each.tracks[:, :, 2] - (0.0, 1.0, 1.0, 2.0)),
-                _Ends(each.pairs[:, 15:17], each.tracks[:, :, 7:9]),
+                _Ends(
+                    pairs * (each.pairs[:, 4:6] - _FRAMES - late),
+                    tracks[:, 0] * (each.tracks[:, :, 2] - (0.0, 1.0, 1.0, 2.0)),
+                ),
+                _Ends(pairs * each.pairs[:, 15:17], tracks * each.tracks[:, :, 7:9]),
             )
             for scan, each in packs.items()
         }

@@ -35,9 +35,10 @@ from rsbench.capture.hypotheses import (
     fit_capture,
     line_of,
 )
+from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import BoolArray, Correspondences, without_lens
-from rsbench.core.rig import SIDES, StereoRig
-from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.packed import each_term, heavy_tailed
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
@@ -54,7 +55,7 @@ COARSE: tuple[tuple[Scan, float], ...] = (
 _LAG_SAMPLES, _LAG_ROUNDS = 400, 6
 _NOISE_PX, _TIME_SIGMA = 0.5, 0.5
 """Expected noise of a row difference, and expected size of a difference of times, frame periods."""
-_LEAST_PX = 0.1
+_LEAST_PX, _GRID = 0.1, 9
 _LONGEST_LEAP = 0.75
 """Of the image's width or height, over a frame period: far from the reciprocal of the largest ratio, 1 / 1.2."""
 _BEND, _FAR = 0.1, 40.0
@@ -65,22 +66,28 @@ class Lag(NamedTuple):
     """Time of the left camera less that of the right one at one place, frame periods."""
 
     line: FloatArray
-    """(3,) constant, per image width, per image height."""
+    """(3,) constant, per width, per height of the left image."""
     H: FloatArray
     """(3, 3) how well the matches determine it: inverse covariance."""
+    right: FloatArray = np.eye(3)
+    """(3, 3) constant, share of width, of height in the right image, of those in the left one; far away."""
 
-    def at(self, pixels: FloatArray, rig: StereoRig) -> FloatArray:
-        """(n,) at pixels (n, 2)."""
-        return _columns(pixels, rig) @ self.line
+    def at(self, pixels: FloatArray, rig: StereoRig, side: Side = "left") -> FloatArray:
+        """(n,) at pixels (n, 2) of a camera."""
+        line = self.line if side == "left" else np.linalg.solve(self.right.T, self.line)
+        return np.asarray(_columns(pixels, rig, side) @ line)
 
 
 def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
     """From tracks (n, 8) with outliers; 0 where nothing moves across the rows."""
-    prior = np.eye(3) / _TIME_SIGMA**2
+    prior, right = np.eye(3) / _TIME_SIGMA**2, _right_columns(rig)
     if len(tracks) < 3:
-        return Lag(np.zeros(3), prior)
+        return Lag(np.zeros(3), prior, right)
+    places = [_columns(tracks[:, k : k + 2], rig) for k in (0, 4)]
+    if not rig.aligned:
+        tracks = without_lens(Correspondences(tracks=tracks), rig).tracks
     moved = 0.5 * (tracks[:, 5] - tracks[:, 1] + tracks[:, 7] - tracks[:, 3])
-    A = np.concatenate([moved[:, None] * _columns(tracks[:, k : k + 2], rig) for k in (0, 4)])
+    A = np.concatenate([moved[:, None] * each for each in places])
     e = np.concatenate([tracks[:, 1] - tracks[:, 3], tracks[:, 5] - tracks[:, 7]])
     line, H = _sampled(A, e), prior
     for _ in range(_LAG_ROUNDS):
@@ -89,7 +96,7 @@ def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
         weights = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2) ** 2 / scale**2
         H = (A * weights[:, None]).T @ A + prior
         line = np.asarray(np.linalg.solve(H, A.T @ (weights * e)), dtype=np.float64)
-    return Lag(line, H)
+    return Lag(line, H, right)
 
 
 def _sampled(A: FloatArray, e: FloatArray) -> FloatArray:
@@ -104,10 +111,34 @@ def _sampled(A: FloatArray, e: FloatArray) -> FloatArray:
     return np.asarray(lines[np.argmin(errors)])
 
 
-def _columns(pixels: FloatArray, rig: StereoRig) -> FloatArray:
-    camera = rig.sensor("left")
+def _columns(pixels: FloatArray, rig: StereoRig, side: Side = "left") -> FloatArray:
+    camera = rig.sensor(side)
     size = np.array([camera.width, camera.height])
     return np.column_stack([np.ones(len(pixels)), pixels / size])
+
+
+def _right_columns(rig: StereoRig) -> FloatArray:
+    """``Lag.right`` of a rig."""
+    if rig.aligned:
+        return np.eye(3)
+    camera = rig.camera
+    x, y = np.meshgrid(np.linspace(0.0, camera.width - 1, _GRID), np.linspace(0.0, camera.height - 1, _GRID))
+    grid = np.stack([x.ravel(), y.ravel()], axis=-1)
+    left, right = (_columns(rig.eye(side).lens_pixels(grid), rig, side) for side in SIDES)
+    seen = np.all(np.isfinite(left) & np.isfinite(right), axis=1)
+    return np.asarray(np.linalg.lstsq(left[seen], right[seen], rcond=None)[0].T, dtype=np.float64)
+
+
+def _in_ideal(scan: Scan, rig: StereoRig) -> Scan:
+    """The side at which lines of the left camera begin, in the ideal image."""
+    if rig.aligned:
+        return scan
+    eye, rate = rig.eye("left"), rig.shutter_of(Scanning(scan=scan), 1.0).rate("left")
+    middle = np.array([(eye.width - 1) / 2, (eye.height - 1) / 2])
+    slope = rate @ inverse_2x2(eye.ideal_by_pixel(middle))
+    sides: tuple[tuple[Scan, Scan], ...] = (("left", "right"), ("top", "bottom"))
+    axis = int(np.argmax(np.abs(slope)))
+    return sides[axis][int(slope[axis] < 0.0)]
 
 
 def without_lag(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspondences:
@@ -121,8 +152,8 @@ def without_lag(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspon
     tracks[:, 2:4] += lag.at(matches.tracks[:, 0:2], rig)[:, None] * moved
     tracks[:, 6:8] += lag.at(matches.tracks[:, 4:6], rig)[:, None] * moved
     moved = right[:, 2:4] - right[:, 0:2]
-    right[:, 0:2] += lag.at(matches.right[:, 0:2], rig)[:, None] * moved
-    right[:, 2:4] += lag.at(matches.right[:, 2:4], rig)[:, None] * moved
+    right[:, 0:2] += lag.at(matches.right[:, 0:2], rig, "right")[:, None] * moved
+    right[:, 2:4] += lag.at(matches.right[:, 2:4], rig, "right")[:, None] * moved
     return Correspondences(left=ideal.left, right=right, tracks=tracks)
 
 
@@ -145,16 +176,24 @@ def find_start(
 ) -> tuple[RobustEstimate | None, Lag]:
     """The motion that explains most matches, of those under ``COARSE``; None when there is none.
 
-    Matches are undistorted beforehand: their times are then slightly wrong, as they are under any of these.
+    Matches are undistorted beforehand: their times are then slightly wrong, as they are under any of these. Where
+    cameras that differ have a known shutter, it is that one's.
     """
-    lag = find_lag(matches.tracks, rig)
-    taken = without_lag(matches, lag, rig)
-    rig, found = rig.ideal, list[RobustEstimate]()
-    camera = rig.camera
-    for scan, ratio in _coarse(known):
-        shutter = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=scan)
+    lag, found, camera = find_lag(matches.tracks, rig), list[RobustEstimate](), rig.ideal.camera
+    given = known.shutter(rig)
+    if given is None or (rig.aligned and known.scans[0].together):
+        tried = [
+            RollingShutter(
+                height=camera.height, width=camera.width, readout_ratio=ratio, scan=_in_ideal(scan, rig)
+            )
+            for scan, ratio in _coarse(known)
+        ]
+        matches, rig = without_lag(matches, lag, rig), rig.ideal
+    else:
+        tried = [given]
+    for shutter in tried:
         with np.errstate(invalid="ignore", over="ignore"):
-            result = estimate_motion(taken, rig, shutter, RefinedSolver(), options, np.random.default_rng(seed))
+            result = estimate_motion(matches, rig, shutter, RefinedSolver(), options, np.random.default_rng(seed))
         if result.estimate.success:
             found.append(result)
     best = max(found, key=lambda each: (each.inlier_count / each.threshold_px, each.inlier_count), default=None)
@@ -172,9 +211,11 @@ def _coarse(known: Known) -> list[tuple[Scan, float]]:
 
 def first_shutter(scans: Scans, lag: Lag) -> FloatArray:
     """Ratio and delay (2,) of scans that fit a lag best; a ratio of 0.5 where the cameras read alike."""
+    bend = _columns_of_lag(scans, lag)
     if scans.together:
-        return np.array([0.5 if scans.rolls else 0.0, -lag.line[0]])
-    A = np.column_stack([_columns_of_lag(scans), [-1.0, 0.0, 0.0]])
+        ratio = 0.5 if scans.rolls else 0.0
+        return np.array([ratio, ratio * bend[0] - lag.line[0]])
+    A = np.column_stack([bend, [-1.0, 0.0, 0.0]])
     ratio, delay = np.linalg.solve(A.T @ lag.H @ A + 1e-9 * np.eye(2), A.T @ lag.H @ lag.line)
     return np.array([np.clip(ratio, 0.1, 1.0), np.clip(delay, -0.9, 0.9)])
 
@@ -186,7 +227,7 @@ def largest_ratio(scans: Scans, lag: Lag) -> float:
     """
     if scans.together:
         return 1.0
-    bend = _columns_of_lag(scans)
+    bend = _columns_of_lag(scans, lag)
     H = np.linalg.inv(np.linalg.inv(lag.H) + _BEND**2 * np.eye(3))
     constant = np.array([1.0, 0.0, 0.0])
     for ratio in np.arange(1.1, 0.0, -0.05):
@@ -197,9 +238,9 @@ def largest_ratio(scans: Scans, lag: Lag) -> float:
     return 0.0
 
 
-def _columns_of_lag(scans: Scans) -> FloatArray:
+def _columns_of_lag(scans: Scans, lag: Lag) -> FloatArray:
     """(3,) lag per readout ratio."""
-    return line_of(scans, "left") - line_of(scans, "right")
+    return np.asarray(line_of(scans, "left") - line_of(scans, "right") @ lag.right)
 
 
 _SCREENED = 160
@@ -283,7 +324,7 @@ def window_evidence(
 
     Most scans are excluded by some of the matches, under the first motion model. None for too few matches.
     """
-    first = TimedMatches(matches, rig, known.models[0])
+    first = TimedMatches(matches, rig, known.models[0], known.right_share)
     comparison = _Comparison({model: first.under(model) for model in known.models}, known)
     fits = comparison.of_known_shutter(motion) if known.shutter_known else comparison.screened(motion, lag)
     screened = comparison.of_each_model(fits)

@@ -15,7 +15,16 @@ from typing import Any
 import numpy as np
 
 from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, row_pattern, term_sizes
-from rsbench.capture.hypotheses import ALL_SCANS, CALIBRATION, GLOBAL, Known, KnownInputs, Scans, scans_of
+from rsbench.capture.hypotheses import (
+    ALL_SCANS,
+    CALIBRATION,
+    GLOBAL,
+    Known,
+    KnownInputs,
+    Scans,
+    scans_of,
+    shutter_under,
+)
 from rsbench.capture.hypothesis_ranking import COARSE, Peak
 from rsbench.capture.trajectory_tracks import thinned
 from rsbench.capture.two_frame_estimate import (
@@ -33,7 +42,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, StereoRig
-from rsbench.core.shutter import RollingShutter, Scan, Scanning
+from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
@@ -68,14 +77,20 @@ def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Kn
 
     Errors of the calibration that are not given are estimated where the row differences of the left-right matches
     show some; these set their prior, because they come from the same calibration.
+
+    Raises:
+        RsbenchError: a readout ratio of the right camera, but none of the left one.
     """
     ratio, scanning, scans = given.readout_ratio, given.scanning, ALL_SCANS
     if scanning is not None:
+        if ratio is None and scanning.right_readout_ratio is not None:
+            raise RsbenchError(
+                f"right_readout_ratio = {scanning.right_readout_ratio}: give readout_ratio too; it is estimated "
+                "for cameras alone that share one"
+            )
         rolling = scans_of(rig.shutter_of(scanning, 1.0))
         scans = (GLOBAL, rolling, reversed_scans(rolling))
-        if ratio is not None:
-            scans = (rolling if ratio > 0.0 else GLOBAL,)
-    return Known(
+    known = Known(
         ratio=ratio,
         scans=scans,
         delay=None if scanning is None else scanning.right_delay,
@@ -83,6 +98,7 @@ def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Kn
         calibration_sigma=_errors_expected(matches, rig) if given.calibration is None else NO_ERRORS,
         models=given.models,
     )
+    return known if ratio is None or scanning is None else known.with_shutter(rig.shutter_of(scanning, ratio))
 
 
 def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, ...]:
@@ -156,16 +172,14 @@ def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
     """The shutter of a candidate.
 
     Raises:
-        NoMotionError: one camera alone rolls.
+        NoMotionError: one camera alone rolls: so it seems of two with ratios of their own, too.
     """
-    scans = candidate.scans
-    if scans.rolls and "global" in (scans.left, scans.right):
-        raise NoMotionError(f"{scans}: a rig of which one camera alone rolls cannot be corrected")
+    if candidate.scans.rolls and "global" in (candidate.scans.left, candidate.scans.right):
+        raise NoMotionError(
+            f"{candidate.scans}, or with another ratio: give readout_ratio and right_readout_ratio"
+        )
     delay = candidate.delay if abs(candidate.delay) > 2.0 * candidate.delay_sigma else 0.0
-    if not scans.rolls:
-        return rig.shutter_of(Scanning(right_delay=delay), 0.0)
-    scanning = Scanning(scan=scans.left, right_scan=scans.right, right_delay=delay)  # pyrefly: ignore[bad-argument-type]
-    return rig.shutter_of(scanning, candidate.ratio)
+    return shutter_under(candidate.scans, candidate.ratio, rig, delay)
 
 
 def cannot_tell(capture: Capture) -> str:
@@ -222,11 +236,11 @@ def scans_by_laws(
     """
     few, found = thinned([matches], _FEW)[0], None
     for part in (matches,) if few is matches else (few, matches):
-        known = known_of(part, rig, KnownInputs(scanning=shutter.scanning, models=models))
-        known = replace(known, delay=shutter.right_delay)
+        given = known_of(part, rig, KnownInputs(models=models)).with_shutter(shutter)
+        known = replace(given, ratio=None, scans=(GLOBAL, *given.scans, reversed_scans(given.scans[0])))
         best = conclude([examine(part, rig, known, options, seed, start)]).likeliest
         certain = best is not None and best.probability > _CLEARLY and best.sigma <= _NEAR
-        found = best.scans if best and certain and abs(best.ratio - shutter.readout_ratio) <= _NEAR else None
+        found = best.scans if best and certain and abs(best.ratio - (given.ratio or 0.0)) <= _NEAR else None
         if found == scans_of(shutter):
             break
     return found

@@ -85,7 +85,7 @@ def two_frame_spline(
         law: the motion of largest likelihood under a model, where the search begins.
     """
     window = informative(matches)
-    if shutter.readout_ratio == 0.0 or len(window.tracks) < _FEWEST:
+    if shutter.still or len(window.tracks) < _FEWEST:
         return None
     spline = _Spline.through(window, rig, shutter, law, seed)
     if spline is None:
@@ -195,7 +195,7 @@ def camera_two_frame_spline(
         law: the motion under the model that fits best.
         rig, shutter: as there.
     """
-    if shutter.readout_ratio == 0.0 or len(matches) < _FEWEST:
+    if shutter.still or len(matches) < _FEWEST:
         return None
     try:
         found, tracks = _fitted([matches], [law], rig, shutter, _SHARE)

@@ -104,7 +104,10 @@ def _shutter_of(
     if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
         return problem.known_shutter or still, None, ""
     known = known_of(matches, problem.rig, KnownInputs(scanning=problem.scanning))
-    capture = conclude([examine(matches, problem.rig, known, options, seed)])
+    try:
+        capture = conclude([examine(matches, problem.rig, known, options, seed)])
+    except ValueError as error:  # a match where a lens shows no ray
+        return still, None, str(error)
     capture = as_global(capture, [matches], problem.rig, known)
     try:
         return shutter_found(capture, problem.rig), capture, ""
@@ -116,7 +119,7 @@ def _at_rest(
     matches: Correspondences, rig: StereoRig, shutter: RollingShutter, capture: Capture | None
 ) -> Correspondences:
     """The matches without the errors of the calibration that were found with the shutter."""
-    if capture is None or not shutter.rows_together:
+    if capture is None or not rig.rows_together(shutter.scanning):
         return matches
     return recalibrated(matches, rig, capture.calibration)
 
