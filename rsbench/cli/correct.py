@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -34,7 +35,6 @@ from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.cli.correct_input import RigInput
-    from rsbench.pipeline.footage import RigCard
     from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.vision.corrector import CorrectorEntry
     from rsbench.vision.fusion import Fused
@@ -44,10 +44,11 @@ if TYPE_CHECKING:
 _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
 _FAST = "Of a rig: features and depth at half the size, which takes less time and loses little."
 _ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
+_RECTIFY = "Write rectified pairs too, with P1, P2, Q: rectified/."
 _SOLVER = "rs-stereo-refined"
 _RIG_ONLY = (
     *("rig", "left", "right", "sky", "fill", "solver", "motion_model", "matcher", "features", "corrector", "fast"),
-    "row_poses",
+    *("row_poses", "rectify"),
 )
 """Parameters that the correction of one camera's frames does not have."""
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
@@ -82,6 +83,7 @@ def correct(
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     fast: Annotated[bool, typer.Option("--fast", help=_FAST)] = False,
     row_poses: Annotated[bool, typer.Option("--row-poses", help=_ROW_POSES)] = False,
+    rectify: Annotated[bool, typer.Option("--rectify", help=_RECTIFY)] = False,
     camera: CameraFile = None,
     footage: Footage = None,
     gyro: GyroFile = None,
@@ -97,8 +99,9 @@ def correct(
         _refuse_rig_options(ctx)
         correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log, readout)
         return
-    given = given_frames(frames, rig, out, left, right, log, readout, row_poses)
+    given = replace(given_frames(frames, rig, out, left, right, log, readout, row_poses), rectify=rectify)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
+    others |= {"one_time": rectify}
     options = _options(features, solver, matcher, corrector, fill, **others)
     _correct_given(given, target, options.faster() if fast else options, inpaint is None)
 
@@ -125,7 +128,7 @@ def _correct_given(given: RigInput, target: str, options: CorrectionOptions, clo
         with compiling_ahead(), Isolation() as isolation:
             options = isolation.chain(options)
             if given.four:
-                _correct_four(given.four, given.card, given.out, target, options, finish)
+                _correct_four(given, target, options, finish)
             else:
                 correct_sequence_given(given, target, options, close)
     except (NoMotionError, NotCorrectedError) as error:
@@ -136,8 +139,6 @@ def _correct_given(given: RigInput, target: str, options: CorrectionOptions, clo
 def _options(
     features: str, solver: str, matcher: str, corrector: str, fill: bool, **others: Any
 ) -> CorrectionOptions:
-    from dataclasses import replace
-
     from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.pipeline.frame_motion import model_to_use
     from rsbench.solvers.engine.base import load_solver_entry
@@ -156,8 +157,6 @@ def _options(
 
 def _corrector(name: str, fill: bool) -> CorrectorEntry:
     """The corrector; ``--no-fill`` turns the filling of ours off."""
-    from dataclasses import replace
-
     from rsbench.components.imports import component_key
     from rsbench.vision.corrector import load_corrector
     from rsbench.vision.correctors import FusionCorrector
@@ -171,11 +170,7 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     return replace(entry, component=component, key=component_key(component, {}))
 
 
-def _correct_four(
-    paths: list[Path], card: RigCard, out: Path, target: str, options: CorrectionOptions, finish: Finish
-) -> None:
-    from dataclasses import replace
-
+def _correct_four(given: RigInput, target: str, options: CorrectionOptions, finish: Finish) -> None:
     from rsbench.capture.calibration import NO_ERRORS
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import (
@@ -186,15 +181,16 @@ def _correct_four(
         write_frame,
         write_record,
     )
+    from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
     from rsbench.pipeline.chain import correct_four
     from rsbench.pipeline.footage import read_four
     from rsbench.pipeline.sequence_capture import with_found_camera
     from rsbench.report.corrected_page import card_of
     from rsbench.vision.corrector import demand_corrected
 
-    order = (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    card, out, order = given.card, given.out, (("left", 0), ("right", 0), ("left", 1), ("right", 1))
     refuse_video(out)
-    images = read_four(dict(zip(order, paths, strict=True)))  # pyrefly: ignore[bad-argument-type]
+    images = read_four(dict(zip(order, given.four, strict=True)))  # pyrefly: ignore[bad-argument-type]
     rig = sized(card, images["left", 0], images["right", 0])
     options = replace(options, target_row=target_row(target, rig.camera.height))
     with fresh_folder(out) as folder:
@@ -215,6 +211,10 @@ def _correct_four(
         frames = {view: finish(fused) for view, fused in result.frames.items()}
         for (side, frame), fused in frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
+            if given.rectify:
+                write_rectified(folder, f"{side}_{frame}", fused, rig, side)
+        if given.rectify:
+            write_calibration(folder, rig)
         calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
         record = rig_record(rig, result.shutter, result.capture, options, calibration)
         record["camera_note"] = focal

@@ -171,6 +171,8 @@ class RigInput:
     gyro: GyroscopeOptions
     row_poses: bool = False
     """Whether the pose at every row of a sequence is wanted."""
+    rectify: bool = False
+    """Whether rectified pairs are wanted too."""
 
     def footage(self) -> tuple[FrameSource, FrameSource]:
         """Of the left and the right camera."""

@@ -11,6 +11,7 @@ import typer
 from rsbench.cli.console import echo
 from rsbench.cli.correct_input import sized, target_row
 from rsbench.cli.correct_output import listed, readout_words, say_calibration, write_page_of
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.capture.two_frame_estimate import Capture
@@ -36,10 +37,13 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
     from rsbench.cli.console import progress_bar
     from rsbench.core.shutter import Scanning
     from rsbench.dataset.corrected_frames import fresh_folder, is_video, rig_record, video_place
+    from rsbench.interop.writers.rectified_pairs import write_calibration
     from rsbench.pipeline.chain import check_cameras
     from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
 
     sources, card, out = given.footage(), given.card, given.out
+    if given.rectify and is_video(out):
+        raise RsbenchError(f"--rectify: --out {out} is a video; give a folder, for pairs with their calibration")
     gyro = _gyro(given, sources[0], options)
     rig = sized(card, *(next(iter(source)) for source in sources))
     options = replace(options, target_row=target_row(target, rig.camera.height))
@@ -57,17 +61,18 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
         )
         shutter, calibration, capture = found = _look(sources, rig, card, options)
         record = {**rig_record(rig, shutter, capture, options, calibration), "camera_note": focal}
-        record["frames"] = _correct_into(folder, sources, rig, found, options, close, given.row_poses, gyro)
+        record["frames"] = _correct_into(folder, sources, rig, found, options, close, given, gyro)
         if is_video(out):
             _write_both(out, folder, sources, record)
         else:
+            if given.rectify:
+                write_calibration(folder, rig)
             _write_rest(folder, out, sources[0], record, found)
     _say(out, f"readout ratio {readout_words(shutter, capture)}", record, gyro is not None)
 
 
 def _gyro(given: RigInput, left: FrameSource, options: CorrectionOptions) -> FloatArray | None:
     """Samples of a gyroscope, where there is one; RsbenchError where nothing takes them."""
-    from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.sequence_correction import takes_gyro
 
     if given.gyro.file is not None and not takes_gyro(left, options):
@@ -86,7 +91,7 @@ def _run_key(
     from rsbench.core.version import __version__
     from rsbench.dataset.corrected_frames import is_video
 
-    flags = close, given.row_poses, is_video(given.out)
+    flags = close, given.row_poses, is_video(given.out), given.rectify
     parts = [__version__, repr(given.card), repr(options), repr(flags)]
     parts += [each for source in sources for each in source.identity()]
     parts += [] if gyro is None else [hashlib.sha256(gyro.tobytes()).hexdigest()]
@@ -116,7 +121,7 @@ def _correct_into(
     found: Found,
     options: CorrectionOptions,
     close: bool,
-    row_poses: bool,
+    given: RigInput,
     gyro: FloatArray | None,
 ) -> list[dict[str, Any]]:
     """Write every frame that is not there yet; returns what motion.json says of each.
@@ -133,20 +138,29 @@ def _correct_into(
         for entry in entries:
             advance(f"frame {entry['number']}")
         for moment in correct_sequence(*sources, rig, *taken, first=len(entries), gyro=gyro):
-            entries.append(_write(folder, moment, close, shutter if row_poses else None))
+            rows, rectified = shutter if given.row_poses else None, rig if given.rectify else None
+            entries.append(_write(folder, moment, close, rows, rectified))
             advance(f"frame {moment.number}")
     return entries
 
 
-def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShutter | None) -> dict[str, Any]:
+def _write(
+    folder: Path,
+    moment: CorrectedMoment,
+    close: bool,
+    rows: RollingShutter | None,
+    rectified: StereoRig | None,
+) -> dict[str, Any]:
     """Write a corrected time, and then its record: a time with a record is complete.
 
     Args:
         rows: the shutter, where the pose at every row is wanted.
+        rectified: the rig, where rectified pairs are.
     """
     import numpy as np
 
     from rsbench.dataset.corrected_frames import motion_record, write_entry, write_frame, write_poses
+    from rsbench.interop.writers.rectified_pairs import write_rectified
     from rsbench.vision.fusion import finished
 
     finish: Callable[[Fused], Fused] = finished if close else lambda fused: fused
@@ -154,6 +168,8 @@ def _write(folder: Path, moment: CorrectedMoment, close: bool, rows: RollingShut
     for side, fused in moment.frames.items():
         finished = finish(fused)
         write_frame(folder, f"{side}_{moment.number:06d}", finished)
+        if rectified is not None:
+            write_rectified(folder, f"{side}_{moment.number:06d}", finished, rectified, side)
         entry[side] = finished.shares()
     if not moment.frames:
         entry["reason"] = moment.reason

@@ -297,7 +297,7 @@ def correct_known_rows(
 ) -> list[dict[View, Fused]]:
     """``correct_known`` at the times of several target rows, in place of that of the options; its errors."""
     pairs, needs = known.pairs, options.corrector.component.spec.needs
-    if shutter.still:
+    if shutter.still and not (options.one_time and shutter.right_delay and known.motion is not None):
         return [uncorrected(images, views, pairs) for _ in rows]
     if "gyro" in needs and known.gyro is None:
         raise RsbenchError(
@@ -315,6 +315,7 @@ def correct_known_rows(
         disparity_offset=disparity_offset,
         matches=known.matches if "matches" in needs else None,
         gyro=known.gyro if "gyro" in needs else None,
+        one_time=options.one_time,
     )
     return [
         {view: _finish(fused, options) for view, fused in corrected.items()}

@@ -51,6 +51,8 @@ class CorrectionOptions:
     """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.model_choice``."""
     target_row: float = 0.0
     """The time of this row of the frame is the time of its corrected image."""
+    one_time: bool = False
+    """Whether the right camera's corrected image is of the left one's time, where theirs differ."""
     depth_from_motion: bool = True
     """Where the other camera gives no depth, take it from the flow to the other frame and the motion."""
     find_sky: bool = True

@@ -90,6 +90,8 @@ class CorrectionProblem:
     """Matches of the four frames, outliers included; None when the corrector does not need them."""
     gyro: FloatArray | None = None
     """(n, 4) tau, w: samples of a gyroscope, as in ``Correspondences``; None when it does not need them."""
+    one_time: bool = False
+    """Whether the corrected frames of both cameras show the time of the left one's, where theirs differ."""
 
     def camera(self, side: Side, reference: Side) -> PinholeCamera:
         """Camera of one side, in pixels in which the images of ``reference`` have the rig's principal point."""
@@ -112,7 +114,7 @@ class CorrectionProblem:
 
     def target_time(self, view: View) -> FloatArray:
         """Time of the corrected frame: where rows differ, as long after its start as in the left camera."""
-        side, frame = view
+        side, frame = ("left" if self.one_time else view[0]), view[1]
         if side == "left" or (self.shutter.right_readout_ratio, self.shutter.right_size) == (None, None):
             return self.shutter.time_after(self.target_row, frame, side)
         return self.shutter.start(frame, side) + self.shutter.time_after(self.target_row, 0, "left")

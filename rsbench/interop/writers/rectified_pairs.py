@@ -1,0 +1,127 @@
+"""Corrected frames as rectified global-shutter pairs, with the calibration that stereo and SLAM programs read.
+
+A corrected frame has the pixels of its own camera. Here it is resampled, once more, to a camera without a lens
+that looks along the rig's body axes: the cameras of the pair then differ by a shift along their rows alone, as
+after OpenCV's stereoRectify, whose names and conventions R1, R2, P1, P2 and Q have. Frames of an ideal rig without
+a lens are such pairs, and stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.corrected_frames import write_origin
+from rsbench.interop.writers.colmap_and_tum import camera_line
+from rsbench.interop.writers.kitti_and_kalibr import disparity_values
+from rsbench.interop.writers.sequence_views import write_lines
+from rsbench.storage.files import write_depth, write_png, write_png16
+from rsbench.vision.fusion import Fused, Origin
+from rsbench.vision.images import resample
+
+FOLDER = "rectified"
+_ONE_SURFACE = 1.05
+"""Depths around a pixel of ratios below this are of one surface, and are interpolated; others are not mixed."""
+
+
+def rectified_camera(rig: StereoRig) -> PinholeCamera:
+    """Both cameras of the rectified pair, in the body's axes."""
+    if rig.rectified or not rig.aligned:
+        return rig.camera
+    focal = float(np.mean(rig.camera.central_focal))
+    return replace(rig.camera.ideal, fx=focal, fy=focal)
+
+
+def rectify(fused: Fused, rig: StereoRig, side: Side) -> Fused:
+    """A corrected frame in the pixels of ``rectified_camera``, its depth along that camera's axis."""
+    if rig.rectified:
+        return fused
+    camera, sensor = rectified_camera(rig), rig.sensor(side)
+    rays = camera.unproject(camera.pixel_grid())
+    pixels = rig.eye(side).project(rays)
+    seen = sensor.contains(pixels)
+    nearest = np.rint(np.where(seen[..., None], pixels, 0.0)).astype(np.intp)
+    row, column = np.clip(nearest[..., 1], 0, sensor.height - 1), np.clip(nearest[..., 0], 0, sensor.width - 1)
+    origin = np.where(seen, fused.origin[row, column], np.uint8(Origin.NOBODY))
+    image = resample(fused.image, np.where(seen[..., None], pixels, np.nan).astype(np.float32))
+    image[origin == Origin.NOBODY] = 0
+    inverse = _inverse_depth(fused.depth, pixels, row, column)
+    with np.errstate(divide="ignore"):
+        depth = 1.0 / inverse / (rays @ rig.own(side).R[2])
+    depth[origin == Origin.NOBODY] = np.nan
+    return replace(fused, image=image, origin=origin, depth=depth.astype(np.float32))
+
+
+def _inverse_depth(depth: FloatArray, pixels: FloatArray, row: FloatArray, column: FloatArray) -> FloatArray:
+    """1 / z of a depth map at pixels (H, W, 2) beside (row, column); NaN where it is unknown.
+
+    Of planes 1 / z is linear in the pixel of a camera without a lens, and nearly so through one.
+    """
+    known = np.where(depth > 0.0, depth, np.nan)
+    inverse = np.where(np.isnan(known), np.float32(-1.0), np.float32(1.0) / known).astype(np.float32)
+    around = np.ones((3, 3), np.uint8)
+    low = cv2.erode(inverse, around)
+    smooth = (cv2.dilate(inverse, around) <= _ONE_SURFACE * low) & (low >= 0.0)
+    x, y = (np.nan_to_num(part).astype(np.float32) for part in (pixels[..., 0], pixels[..., 1]))
+    between = cv2.remap(inverse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    found = np.where(smooth[row, column], between, inverse[row, column]).astype(np.float64)
+    return np.where(found >= 0.0, found, np.nan)
+
+
+def projections(rig: StereoRig) -> dict[str, FloatArray]:
+    """R1, R2 (3, 3), P1, P2 (3, 4) and Q (4, 4), as OpenCV's stereoRectify names them; metres."""
+    camera = rectified_camera(rig)
+    P1 = np.concatenate([camera.K, np.zeros((3, 1))], axis=1)
+    P2 = P1.copy()
+    P2[0, 3] = -camera.fx * rig.baseline
+    ratio = camera.fx / camera.fy
+    Q = np.array(
+        [
+            [1.0, 0.0, 0.0, -camera.cx],
+            [0.0, ratio, 0.0, -ratio * camera.cy],
+            [0.0, 0.0, 0.0, camera.fx],
+            [0.0, 0.0, 1.0 / rig.baseline, 0.0],
+        ]
+    )
+    R1, R2 = (rig.own(side).R.T for side in SIDES)
+    return {"R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
+
+
+def write_rectified(folder: Path, name: str, fused: Fused, rig: StereoRig, side: Side) -> None:
+    """NAME.png, depth/NAME.exr, disparity/NAME.png and mask/NAME.png below ``folder`` / rectified."""
+    place, frame = folder / FOLDER, rectify(fused, rig, side)
+    for part in ("depth", "disparity", "mask"):
+        (place / part).mkdir(parents=True, exist_ok=True)
+    write_png(place / f"{name}.png", frame.image)
+    write_origin(place / "mask" / f"{name}.png", frame.origin)
+    finite = np.isfinite(frame.depth)
+    write_depth(place / "depth" / f"{name}.exr", np.where(finite, frame.depth, np.float32(0.0)))
+    shift = rectified_camera(rig).fx * rig.baseline
+    disparity = shift / np.where(finite, frame.depth, np.nan).astype(np.float64)
+    write_png16(place / "disparity" / f"{name}.png", disparity_values(disparity)[0])
+
+
+def write_calibration(folder: Path, rig: StereoRig) -> None:
+    """calibration.yml, for OpenCV's FileStorage, and cameras.txt of COLMAP below ``folder`` / rectified."""
+    place, camera = folder / FOLDER, rectified_camera(rig)
+    storage = cv2.FileStorage(str(place / "calibration.yml"), cv2.FILE_STORAGE_WRITE)
+    for key, value in (("image_width", camera.width), ("image_height", camera.height)):
+        storage.write(key, value)
+    for number, side in enumerate(SIDES, start=1):
+        sensor = rig.sensor(side)
+        lens = sensor.lens
+        storage.write(f"lens{number}", "none" if lens is None else lens.model)
+        storage.write(f"size{number}", np.array([[sensor.width, sensor.height]]))
+        storage.write(f"M{number}", sensor.ideal.K)
+        storage.write(f"D{number}", np.array([(0.0,) * 5 if lens is None else lens.coefficients]))
+    R, T = rig.right_from_left
+    for key, matrix in {"R": R, "T": T.reshape(3, 1), **projections(rig)}.items():
+        storage.write(key, np.ascontiguousarray(matrix))
+    storage.release()
+    write_lines(place / "cameras.txt", [camera_line(number, camera) for number in (1, 2)])
