@@ -107,6 +107,24 @@ def test_four_frames(tmp_path: Path, castle: Sequence, frames: list[Path], rig: 
     assert (out / "corrected" / "left_0.png").read_bytes() == before
 
 
+def test_rectified_pairs_of_an_ideal_rig_are_its_corrected_frames(
+    tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path
+) -> None:
+    out = tmp_path / "out"
+    assert correct(*frames, "--rig", rig, "--out", out, "--rectify").returncode == 0
+    for name in ORDER:
+        assert (out / f"rectified/{name}.png").read_bytes() == (out / f"corrected/{name}.png").read_bytes()
+    storage = cv2.FileStorage(str(out / "rectified/calibration.yml"), cv2.FILE_STORAGE_READ)
+    Q = storage.getNode("Q").mat()
+    disparity = cv2.imread(str(out / "rectified/disparity/left_1.png"), cv2.IMREAD_UNCHANGED) / np.float32(256)
+    depth, near = read_depth(out / "depth/left_1.exr"), disparity > 1.0
+    z = cv2.reprojectImageTo3D(disparity, Q)[..., 2]
+    np.testing.assert_allclose(z[near], depth[near], rtol=0.5 / 256 + 1e-6)  # rounded to 1/256 px of 1 and more
+    assert_refused(
+        correct(castle.folder, "--out", tmp_path / "pair.mp4", "--rectify"), "--rectify: --out", "folder"
+    )
+
+
 @pytest.mark.slow
 def test_a_camera_that_is_not_sure_is_looked_for_and_told(
     tmp_path: Path, castle: Sequence, frames: list[Path], rig: Path

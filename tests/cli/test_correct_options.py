@@ -26,6 +26,7 @@ OTHER = {
     "seed": ["--seed", "3"],
     "fast": ["--fast"],
     "row_poses": ["--row-poses"],
+    "rectify": ["--rectify"],
     "rig": ["--rig", "rig.toml"],
     "left": ["--left", "left"],
     "right": ["--right", "right"],
