@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import SIDES, Side, StereoRig
@@ -58,7 +59,9 @@ def rectify(fused: Fused, rig: StereoRig, side: Side) -> Fused:
     return replace(fused, image=image, origin=origin, depth=depth.astype(np.float32))
 
 
-def _inverse_depth(depth: FloatArray, pixels: FloatArray, row: FloatArray, column: FloatArray) -> FloatArray:
+def _inverse_depth(
+    depth: NDArray[np.float32], pixels: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp]
+) -> FloatArray:
     """1 / z of a depth map at pixels (H, W, 2) beside (row, column); NaN where it is unknown.
 
     Of planes 1 / z is linear in the pixel of a camera without a lens, and nearly so through one.
