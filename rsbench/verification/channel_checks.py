@@ -146,7 +146,9 @@ def channels_again(
             of_a_row = _OF_A_ROW if channel.name in PAIR_CHANNELS else 1.0
             bad = _many(wrong, everywhere, _FEW_AGAIN, of_a_row)
             what = f"{_percent(wrong, everywhere)} differ from what is made again"
-            in_rows = np.isin(np.arange(sequence.shutter.height), np.asarray(rows)[np.any(wrong, axis=1)])
+            in_rows = np.isin(
+                np.arange(sequence.rig.sensor(view.side).height), np.asarray(rows)[np.any(wrong, axis=1)]
+            )
             same = np.array_equal(stored, made.astype(stored.dtype), equal_nan=stored.dtype.kind == "f")
             yield file, Finding(file, what, rows_of(in_rows)) if bad else None, same
 

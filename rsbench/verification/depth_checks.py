@@ -309,15 +309,16 @@ def likely_cause(sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: I
     depth = maps[view].depth
     if not np.any(depth[rows]):
         return "zeroed"
-    same = [other for other in maps if other != view and np.array_equal(depth[rows], maps[other].depth[rows])]
+    others = [each for each in maps if each != view and maps[each].depth.shape == depth.shape]
+    same = [other for other in others if np.array_equal(depth[rows], maps[other].depth[rows])]
     if same:
         return f"the same as {same[0].depth}"
     partners = [maps[partner] for partner in view.partners() if partner in maps]
     if not partners:
         return ""
     best, words = _agreeing(sequence, maps[view], partners, rows) + 0.3, ""
-    for name, candidate in _depth_candidates(sequence, maps, view):
-        share = _agreeing(sequence, candidate, partners, rows)
+    for name, candidate, geometry in _depth_candidates(sequence, maps, view):
+        share = _agreeing(geometry, candidate, partners, rows)
         if share > max(best, _EXPLAINED):
             best, words = share, name
     if words:
@@ -330,12 +331,27 @@ def likely_cause(sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: I
 
 def _depth_candidates(
     sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView
+) -> Iterator[tuple[str, DepthMap, Sequence]]:
+    """Depth maps that the stored one may have been, or the views whose depth it may be, and sequences."""
+    for words, candidate in _changed_maps(sequence, maps, view):
+        yield words, candidate, sequence
+    shutter = sequence.shutter
+    if view.shutter == "rs" and shutter.ratio_of("left") != shutter.ratio_of("right"):
+        ratio = shutter.ratio_of(view.other_side.side)
+        other = replace(shutter, readout_ratio=ratio, right_readout_ratio=None)
+        words = "looks read at the times of the other camera's lines"
+        yield words, maps[view], replace(sequence, shutter=other)
+
+
+def _changed_maps(
+    sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView
 ) -> Iterator[tuple[str, DepthMap]]:
-    """Depth maps that the stored one may have been, or the views whose depth it may be."""
     stored = maps[view]
     depth = stored.depth
     for other in nearby_views(view, sequence.frames):
-        yield f"looks like {other.depth}", replace(stored, view=other)
+        camera = sequence.rig.sensor(other.side)
+        if depth.shape == (camera.height, camera.width):
+            yield f"looks like {other.depth}", replace(stored, view=other, camera=camera)
     lines = sequence.shutter.lines(view.side)
     for line in {1, 2, lines // 4, lines // 2, 3 * lines // 4, lines - 1} if view.shutter == "gs" else set():
         words = f"looks like the global shutter at the pose of line {line}"

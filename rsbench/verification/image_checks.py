@@ -350,9 +350,9 @@ def colour_faults(
     """A finding for each image that the others contradict."""
     wrong = list(wrong_images(agreements))
     suspects = {view for view, _ in wrong}
-    bands = band_of_row(sequence.shutter.height)
     for view, pairs in wrong:
-        unlike = np.any([each.unlike for each in pairs], axis=0)
+        bands = band_of_row(sequence.rig.sensor(view.side).height)
+        unlike = np.any([_of_bands(each.unlike, int(bands[-1]) + 1) for each in pairs], axis=0)
         others = sorted({(each.target if each.source == view else each.source).image for each in pairs})
         beyond = 100 * max(float(np.max(each.beyond[each.unlike])) for each in pairs)
         what = (
@@ -363,6 +363,11 @@ def colour_faults(
         if partners and not cause:
             cause = _image_cause(sequence, maps, pictures, view, partners[0], agreements, other_images)
         yield view, Finding(view.image, what, rows_of(unlike[bands]), cause)
+
+
+def _of_bands(unlike: BoolArray, count: int) -> BoolArray:
+    """Flags of bands (B,) as of an image with so many, all of them for an image of another height."""
+    return unlike if len(unlike) == count else np.full(count, np.any(unlike))
 
 
 def _image_cause(

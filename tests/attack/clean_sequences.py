@@ -23,9 +23,12 @@ import numpy as np
 from small_scenes import write_box_scene
 
 from attack.wet_castle import WET_CASTLE
-from rsbench.components.cards import card_path, list_cards
+from rsbench.components.cards import card_path, list_cards, parse_card
+from rsbench.components.rig_tables import RigTables, tables_of
+from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import Scan, Scanning
 from rsbench.dataset import generation
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
@@ -83,7 +86,7 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
         right_scan=scanning.right_scan,
         right_delay=scanning.right_delay,
         sensor=_sensor(rng, period),
-        channels=_channels(rng, camera, scanning),
+        channels=_channels(rng, camera.lens is not None, scanning),
         twins=("middle", "last") if rng.random() < 0.3 and _in_one_direction(scanning) else (),
         motion=_motion(rng),
         renderer=str(folder / f"{'traced' if number % 2 else rng.choice(DIRECT)}.toml"),
@@ -93,7 +96,49 @@ def _card(rng: np.random.Generator, number: int, scene: str, folder: Path, seque
             for k in range(sequences)
         ),
     )
-    return _with_moving(card, number).expanded()
+    return _with_rig(_with_moving(card, number), number).expanded()
+
+
+def _with_rig(card: DatasetCard, number: int) -> DatasetCard:
+    """Every third card with two cameras that differ and look in different directions; drawn by themselves."""
+    if number % 3 != 1:
+        return card
+    rng = np.random.default_rng([card.seed, number, 1])
+    while True:
+        left, right = (_pinhole(rng) for _ in SIDES)
+        place = card.baseline * np.array([-1.0, *rng.uniform(-0.3, 0.3, 2)])
+        place = place[[1, 0, 2]] if rng.random() < 0.3 else place  # one above the other
+        with contextlib.suppress(ValueError):
+            rig = StereoRig.of_cameras(left, right, so3.exp(rng.uniform(-0.15, 0.15, 3)), place)
+            break
+    own = replace(
+        card,
+        camera=None,  # pyrefly: ignore[bad-argument-type]
+        baseline=None,  # pyrefly: ignore[bad-argument-type]
+        rig=parse_card(RigTables, tables_of(rig), "rig"),
+        right_readout_ratio=[None, 0.0, float(rng.uniform(0, 1))][rng.integers(3)],
+        twins=(),
+        channels=(),
+    )
+    channels = _channels(np.random.default_rng(card.seed), True, own)
+    known = TAKEN if card.sequence[0].moving else channels
+    return replace(own, channels=tuple(each for each in channels if each in known))
+
+
+def _pinhole(rng: np.random.Generator) -> PinholeCamera:
+    """A camera whose centre is not quite in the middle, of any lens model."""
+    width, height = (int(size) for size in rng.integers(48, 97, 2))
+    fx, fy = width * rng.uniform(0.7, 1.6) * rng.uniform(0.95, 1.05, 2)
+    cx, cy = (np.array([width, height]) - 1) / 2 + rng.uniform(-4, 4, 2)
+    while True:
+        lens = _lens(rng)
+        if rng.random() < 0.2:
+            k = rng.uniform(-0.2, 0.2, 4)
+            lens = Lens(model="rational", k1=k[0], k2=k[1], k4=k[2], k5=0.2 * k[3])
+        elif rng.random() < 0.2:
+            lens = Lens(model="double-sphere", xi=rng.uniform(-0.3, 0.3), alpha=rng.uniform(0.4, 0.7))
+        with contextlib.suppress(ValueError):
+            return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
 
 
 def _with_moving(card: DatasetCard, number: int) -> DatasetCard:
@@ -191,12 +236,12 @@ def _processing(rng: np.random.Generator) -> dict[str, Any]:
     return own
 
 
-def _channels(rng: np.random.Generator, camera: CameraCard, scanning: Scanning) -> tuple[Channel, ...]:
-    """Some of those that such cameras can have."""
+def _channels(rng: np.random.Generator, bent: bool, scanning: Scanning) -> tuple[Channel, ...]:
+    """Some of those that cameras with lenses, or not rectified, or others can have."""
     chosen: list[Channel] = []
     for channel in CHANNELS:
         with contextlib.suppress(ValueError):
-            check_channels((*chosen, channel), camera.lens is not None, scanning.plain)
+            check_channels((*chosen, channel), bent, scanning.plain)
             chosen += [channel] if rng.random() < 0.5 else []
     return tuple(chosen)
 
@@ -236,7 +281,9 @@ def _generated(card: DatasetCard, out: Path) -> int:
 def _words(card: DatasetCard) -> str:
     """What is special about a card."""
     words = [Path(card.sequence[0].scene).stem, Path(card.renderer).stem]
-    words += [card.camera.lens.model] if card.camera.lens else []
+    rig = card.rig_of(card.sequence[0])
+    lenses = [rig.sensor(side).lens for side in (SIDES[:1] if rig.aligned else SIDES)]
+    words += ["rig"] * (not rig.aligned) + [lens.model for lens in lenses if lens]
     words += [] if card.plain else [f"{card.scan}/{card.right_scan}/{card.right_delay:.2f}"]
     words += [f"exposure {card.sensor.exposure_s:.3f}"] if card.sensor else []
     words += ["twins"] if card.twins else []

@@ -36,10 +36,12 @@ from attack.planting import (
     times,
 )
 from attack.wet_castle import WET_CASTLE
-from rsbench.components.cards import load_card
-from rsbench.core.camera import Lens
+from rsbench.components.cards import load_card, parse_card
+from rsbench.components.rig_tables import RigTables, tables_of
+from rsbench.core import so3
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.sequence import Sequence, read_sequence
@@ -248,6 +250,12 @@ GLOSS_FAULTS = (*_mask_faults(), *_others())
 
 BROWN = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.004)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.05, k2=0.01)
+TWO = StereoRig.of_cameras(
+    PinholeCamera(width=128, height=96, fx=110.0, fy=111.0, cx=62.0, cy=49.0, lens=BROWN),
+    PinholeCamera(width=144, height=88, fx=118.0, fy=117.0, cx=73.0, cy=41.0, lens=FISHEYE),
+    so3.exp(np.array([0.03, -0.06, 0.05])),
+    (-0.3, 0.02, -0.03),
+)
 CAMERAS: dict[str, dict[str, Any]] = {
     "barrel": {"lens": BROWN, "channels": ("flow", "gs_flow")},
     "fisheye columns": {"lens": FISHEYE, "scan": "left", "right_scan": "right"},
@@ -257,6 +265,7 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "processed": {"sensor": CAMERA},
     "glossy": {"scene": str(WET_CASTLE), "focal": 150.0},
     "frames": {"frames": 4, "channels": ("timing", "imu", "tracks", "affine", "matches")},
+    "two cameras": {"rig": TWO, "right_readout_ratio": 0.5, "channels": ("flow", "gs_flow", "timing", "tracks")},
 }
 """What differs from the cameras of cards/datasets/smoke.toml, by name; ``thin`` sees hardly a flat place."""
 
@@ -266,6 +275,9 @@ def card_of(name: str) -> DatasetCard:
     smoke, change = load_dataset_card("smoke"), dict(CAMERAS[name])
     camera = CameraCard(width=128, height=96, focal=change.pop("focal", 110.0), lens=change.pop("lens", None))
     sequence = replace(smoke.sequence[0], name=VICTIM, scene=change.pop("scene", VICTIM))
+    if "rig" in change:
+        change |= {"rig": parse_card(RigTables, tables_of(change["rig"]), name), "camera": None, "baseline": None}
+        return replace(smoke, sequence=(sequence,), **change)
     return replace(smoke, camera=camera, sequence=(sequence,), **change)
 
 
@@ -408,7 +420,7 @@ def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tup
             R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
         options = load_card(RendererOptions, "renderers", "preview")
         columns = sequence.shutter.axis(side) == 0
-        seen = render(scene_of_victim(), sequence.rig.camera, LinePoses(R, t, columns=columns), options)
+        seen = render(scene_of_victim(), sequence.rig.sensor(side), LinePoses(R, t, columns=columns), options)
         write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
         write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
 
@@ -537,6 +549,109 @@ def _opposite_faults() -> Iterator[Fault]:
     yield Fault("right frame from the top", seen, ("rs_depth/right_0.exr", "differs"), slow=True)
 
 
+def _of_rig(change: Callable[[StereoRig], StereoRig]) -> Callable[[Sequence], Sequence]:
+    """Another rig, and a shutter of its cameras' sizes."""
+
+    def changed(sequence: Sequence) -> Sequence:
+        rig, shutter = change(sequence.rig), sequence.shutter
+        return replace(sequence, rig=rig, shutter=rig.shutter_of(shutter.scanning, shutter.readout_ratio))
+
+    return changed
+
+
+def _rig_with(
+    left: PinholeCamera | None = None, right: PinholeCamera | None = None, turn: Pixels | None = None
+) -> Callable[[Sequence], Sequence]:
+    """The rig with other cameras, or another rotation from the left one to the right one."""
+
+    def change(rig: StereoRig) -> StereoRig:
+        R, t = rig.right_from_left
+        cameras = left or rig.sensor("left"), right or rig.sensor("right")
+        return StereoRig.of_cameras(*cameras, R if turn is None else turn, t)
+
+    return _of_rig(change)
+
+
+def _of_body(*views: ImageView) -> Plant:
+    """Depth along the axes of the rig in place of the camera's own, but for the first line."""
+
+    def plant(folder: Path) -> None:
+        sequence = read_sequence(folder / VICTIM)
+        for view in views:
+            own = sequence.rig.own_depth(view.side, sequence.rig.sensor(view.side).pixel_grid())
+            own[0] = 1.0
+            path = sequence.folder / view.depth
+            write_depth(path, (read_depth(path) / own).astype(np.float32))
+
+    return plant
+
+
+def _rig_faults() -> Iterator[Fault]:
+    own, depth = f"{VICTIM}/sequence.json", ("sequence.json", "pairs of depth maps disagree", "right_from_left")
+    left, right = TWO.sensor("left"), TWO.sensor("right")
+    R, t = TWO.right_from_left
+    yield Fault("rotation inverted everywhere", other_geometry(_rig_with(turn=R.T)), depth)
+    yield Fault("no rotation everywhere", other_geometry(_rig_with(turn=np.eye(3))), depth)
+    little = so3.exp(np.array([0.0, 0.001, 0.0])) @ R
+    yield Fault("right camera turned by a milliradian everywhere", other_geometry(_rig_with(turn=little)), depth)
+    exchanged = replace(right, fx=left.fx, fy=left.fy)
+    yield Fault("focal length of the left camera everywhere", other_geometry(_rig_with(right=exchanged)), depth)
+    moved = replace(right, cx=(right.width - 1) / 2, cy=(right.height - 1) / 2)
+    yield Fault("right centre in the middle everywhere", other_geometry(_rig_with(right=moved)), depth)
+    lenses = replace(left, lens=FISHEYE), replace(right, lens=BROWN)
+    yield Fault("lenses exchanged everywhere", other_geometry(_rig_with(*lenses)), depth)
+    swap = other_geometry(_rig_with(right, left))
+    yield Fault("cameras exchanged everywhere", swap, ("rs/left_0.png", "128 x 96 pixels, the camera 144 x 88"))
+    together = other_geometry(_read(right_readout_ratio=None))
+    yield Fault("right rows at the left camera's times everywhere", together, ("rs_depth/right_1.exr", "differs"))
+    inverse = {"translation": (-R.T @ t).tolist(), "rotation": R.T.tolist()}
+    for name, tables in (
+        ("sequence.json", (own, "right_from_left")),
+        ("the card", ("dataset.json", "card", "rig")),
+    ):
+        file, *keys = tables
+        keys += ["right_from_left"] if name == "the card" else []
+        words = (file.rpartition("/")[2], "would stand", "to the left of the left one")
+        yield Fault(f"right_from_left inverted in {name}", manifest_of(file, put(*keys, inverse)), words)
+    turned = manifest_of(own, put("right_from_left", "rotation", R.T.tolist()))
+    yield Fault("rotation inverted in sequence.json", turned, ("sequence.json", "right_from_left contradicts"))
+    scaled = manifest_of(own, put("right_from_left", "rotation", (1.01 * R).tolist()))
+    yield Fault("no rotation matrix in sequence.json", scaled, ("sequence.json", "right_from_left"))
+    focal = manifest_of(own, put("cameras", "right", "fx", left.fx))
+    yield Fault("another focal length in sequence.json", focal, ("sequence.json", "cameras", "the card"))
+    size = manifest_of(own, put("cameras", "right", "width", left.width))
+    yield Fault("another size in sequence.json", size, ("rs/right_0.png", "144 x 88 pixels, the camera 128 x 88"))
+    ratio = manifest_of(own, put("right_readout_ratio", None))
+    yield Fault("one readout ratio in sequence.json", ratio, ("poses/right_0.csv", "differs from the motion"))
+    card = manifest_of("dataset.json", put("card", "right_readout_ratio", 0.6))
+    yield Fault("another readout ratio in the card", card, ("sequence.json", "right_readout_ratio"))
+    yield Fault("format 1", manifest_of("dataset.json", put("format", 1)), ("dataset.json", "its card makes 2"))
+    yield from _rig_file_faults()
+
+
+def _rig_file_faults() -> Iterator[Fault]:
+    """In single files of a rig."""
+    body = ImageView("rs", "right", 1)
+    yield Fault("depth along the axes of the rig", _of_body(body), (body.depth, "axes of the rig"))
+    every = _of_body(*(view for view in IMAGE_VIEWS if view.side == "right"))
+    yield Fault("all right depth along the axes of the rig", every, ("sequence.json", "never agree"))
+    straight = _poses_as(_rig_with(turn=np.eye(3)), ("right", 0))
+    yield Fault("poses of a camera that looks ahead", straight, ("poses/right_0.csv", "differs"))
+    at_once = _read(right_readout_ratio=None)
+    yield Fault(
+        "poses at the left camera's times", _poses_as(at_once, ("right", 1)), ("poses/right_1.csv", "differs")
+    )
+    table = "timing/right_1.csv"
+    yield Fault("times of the left camera", _times_as(at_once, (table,)), (table, "time_ns"))
+    exchange = swapped(("rs/left_0.png", "rs/right_0.png"))
+    yield Fault("left and right images exchanged", exchange, ("rs/left_0.png", "is 144 x 88 pixels"))
+    seen = _rendered_as(at_once, "rs", ("right", 1))
+    words = ("rs_depth/right_1.exr", "looks read at the times of the other camera's lines")
+    yield Fault("frame at the left camera's times", seen, words, slow=True)
+    ahead = _rendered_as(_rig_with(turn=np.eye(3)), "gs", ("right", 0))
+    yield Fault("twin of a camera that looks ahead", ahead, ("gs_depth/right_0.exr", "differs"), slow=True)
+
+
 def _thin_faults() -> Iterator[Fault]:
     """What is named though no place is flat."""
     for view in ("left_0", "right_1"):
@@ -579,5 +694,6 @@ CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {
     "processed": SENSOR_FAULTS,
     "glossy": GLOSS_FAULTS,
     "frames": tuple(_frame_faults()),
+    "two cameras": tuple(_rig_faults()),
 }
 """Of each of ``CAMERAS``."""

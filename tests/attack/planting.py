@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attack.wet_castle import WET_CASTLE
+from rsbench.components.cards import parse_card
+from rsbench.components.rig_tables import RigTables, tables_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.manifest import croissant_of
@@ -235,8 +237,12 @@ def other_geometry(change: Callable[[Sequence], Sequence]) -> Plant:
             write_timing(path.parent, shutter, period, sequence.sensor, sequence.frames)
         dataset = read_json(folder / "dataset.json")
         card = dataset["card"]
-        card |= {"baseline": rig.baseline, "readout_ratio": shutter.readout_ratio, **asdict(shutter.scanning)}
-        card["camera"] |= {"focal": rig.camera.fx, "lens": rig.camera.lens and asdict(rig.camera.lens)}
+        card |= {"readout_ratio": shutter.readout_ratio, **asdict(shutter.scanning)}
+        if rig.aligned:
+            card["baseline"] = rig.baseline
+            card["camera"] |= {"focal": rig.camera.fx, "lens": rig.camera.lens and asdict(rig.camera.lens)}
+        else:
+            card["rig"] = asdict(parse_card(RigTables, tables_of(rig), "rig"))
         write_json(folder / "dataset.json", dataset)
 
     return plant
