@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 from general_rigs import LEFT, RIGS, SCANS
 
+from rsbench.benchmark.simulated.bound import Views, motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.components.motion_models import make_motion
-from rsbench.core.correspondences import without_lens
+from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import list_solvers, load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "cameras.md"
 IDEAL = StereoRig(camera=LEFT.ideal, baseline=0.25)
@@ -36,6 +38,7 @@ CASES = {
         )
     },
 }
+W, D = np.array([0.01, 0.03, -0.02]), np.array([0.05, -0.1, 0.12])
 COLUMNS = {"lens": 1, "scan": 2}
 """Of the table of docs/reference/cameras.md; the fourth is any other rig."""
 
@@ -52,9 +55,7 @@ def table() -> dict[str, list[str]]:
 def simulated(case: str, model: str, ratio: float, size: float) -> Simulation:
     rig, scanning = CASES[case]
     parameters = {"acceleration": 0.2} if model == "accelerated" else {}
-    motion = make_motion(
-        model, size * np.array([0.01, 0.03, -0.02]), size * np.array([0.05, -0.1, 0.12]), parameters
-    )
+    motion = make_motion(model, size * W, size * D, parameters)
     options = SimulationOptions(
         pairs=60, tracks=60, lines=20, depth=(3.0, 8.0), gyro_rate=400, gravity=True, affine=True
     )
@@ -97,3 +98,49 @@ def test_a_solver_finds_the_motion_of_a_rig_or_refuses_it_as_the_page_says(name:
         # What is exact to first order leaves a fourth of the error, over the motion, in a fourth of the motion.
         smaller = errors(name, case, 0.25)
         assert smaller is not None and np.all(smaller <= np.maximum(0.5 * found, 5.0 * usual)), (name, case, found)
+
+
+@pytest.mark.parametrize(
+    ("name", "pairs", "tracks"),
+    [("rs-stereo-refined", 60, 60), pytest.param("rs-stereo-refined-pairs", 150, 0, marks=pytest.mark.slow)],
+)
+@pytest.mark.parametrize("case", list(CASES)[4:])
+def test_errors_of_cameras_of_two_resolutions_are_the_stated_ones_and_those_of_the_bound(
+    case: str, name: str, pairs: int, tracks: int
+) -> None:
+    """Noise of 0.3 px in each camera's own pixels; squared errors over their covariances are chi-squared."""
+    (rig, scanning), solver = CASES[case], load_solver_entry(name).solver
+    motion, shutter = make_motion("linear", 2.0 * W, D), rig.shutter_of(scanning, 0.8)
+    options = SimulationOptions(pairs=pairs, tracks=tracks, depth=(3.0, 8.0))
+    exact = simulate(rig, shutter, motion, options, np.random.default_rng(3)).correspondences
+    views: Views = "four-view" if tracks else "pairs"
+    bound = motion_bound(exact, rig, shutter, motion, 0.3, views).covariance
+    assert bound is not None
+    stated, ideal, noise = list[float](), list[float](), list[float]()
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        sets = {key: getattr(exact, key) for key in ("left", "right", "tracks")}
+        matches = Correspondences(**{key: x + 0.3 * rng.standard_normal(x.shape) for key, x in sets.items()})
+        found = solver.estimate(matches, rig, shutter)
+        error = np.concatenate([found.w - motion.w, found.d - motion.d])
+        assert found.covariance is not None and found.noise_px is not None
+        stated.append(float(error @ np.linalg.solve(found.covariance, error)))
+        ideal.append(float(error @ np.linalg.solve(bound, error)))
+        noise.append(found.noise_px)
+    spread = 4.0 * np.sqrt(2.0 * 6 / 100)  # four deviations of a mean of 100
+    assert abs(np.mean(stated) - 6.0) < spread and abs(np.mean(ideal) - 6.0) < spread
+    assert np.mean(noise) == pytest.approx(0.3, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["rs-stereo-refined", "gs-stereo-tracks"])
+def test_the_robust_loop_finds_the_noise_of_two_resolutions(name: str) -> None:
+    """0.3 px in each camera's own pixels, which are 0.41 and 0.24 px of the ideal camera; a tenth is wrong."""
+    rig, ratio = RIGS["turned"], 0.0 if name.startswith("gs") else 0.8
+    shutter = rig.shutter_of(Scanning(), ratio)
+    options = SimulationOptions(tracks=300, depth=(3.0, 8.0), noise_px=0.3, outlier_ratio=0.1, outlier_px=20.0)
+    data = simulate(rig, shutter, make_motion("linear", W, D), options, np.random.default_rng(8))
+    solver = load_solver_entry(name).solver
+    found = estimate_motion(data.correspondences, rig, shutter, solver, RobustOptions(), np.random.default_rng(0))
+    assert found.estimate.noise_px == pytest.approx(0.3, rel=0.05)
+    wrong = data.outliers["tracks"]
+    assert np.mean(found.inliers["tracks"][~wrong]) > 0.97 and np.mean(found.inliers["tracks"][wrong]) < 0.1

@@ -112,8 +112,8 @@ class SolverSpec:
     cameras: Cameras = "ideal"
     """What it takes beside equal aligned cameras without a lens that read rows from the top at the same times: a
     lens; other scans and a late right camera too; or any rig. It then has times from ``shutter.pixel_time`` alone
-    and rays from ``camera.unproject``, of any rig from ``rig.eye(side).unproject``. Of a global shutter it does
-    not matter: its matches and its rig are those of an ideal rig that sees the same."""
+    and rays from ``camera.unproject``, of any rig from ``rig.eye(side).unproject``. Of a global shutter it
+    does not matter: unless it says ``rig``, matches and rig are those of an ideal rig that sees the same."""
     motion_parameters: Mapping[str, Any] = field(default_factory=dict)
     """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 

@@ -369,8 +369,8 @@ def estimate_motion(
     scaled so that one threshold rejects as many good tracks as good pairs. Too few matches or no consensus is a
     failed estimate with the reason.
 
-    A global-shutter solver is given the matches as cameras without a lens would have them. One that does not take
-    such cameras is a failure with the reason.
+    A global-shutter solver is given the matches as an ideal rig would have them, unless it takes any rig. One that
+    does not take such cameras is a failure with the reason.
 
     Left-right matches count as parts of tracks; where no tracks are given, those are joined (``join_stereo``).
 
@@ -390,7 +390,9 @@ def estimate_motion(
         return _refused(correspondences, str(error), solver, options)
     if refusal:
         return _refused(correspondences, refusal, solver, options)
-    if solver.spec.shutter == "global":
+    if solver.spec.shutter == "global" and solver.spec.cameras == "rig" and not rig.aligned:
+        shutter = shutter.at_once()
+    elif solver.spec.shutter == "global":
         given, rig, shutter = ideal, rig.ideal, shutter if shutter.plain else shutter.at_once()
     task = _Task(given, rig, shutter, solver, options)
     found = task.by_solver() if loop == "own" else task.by_ransac(rng)
