@@ -377,13 +377,14 @@ def test_those_that_take_no_lens_are_few() -> None:
     refused = {name for name in list_cards("solvers") if load_solver(name).spec.refusal(REAL_RIG, REAL_SHUTTER)}
     # Their coefficients are of rows of a pinhole camera.
     free = {"rs-12param", "rs-12param-affine", "rs-dai-linear", "rs-dai-uniform"}
-    assert refused == free | {"rs-stereo-iterated-metric", "rs-r6p", "rs-r6p-single"}
+    assert refused == free | {"rs-r6p", "rs-r6p-single"}
 
 
 def test_other_scans_and_delays_are_refused_by_name() -> None:
     takes = {name: load_solver(name).spec.refusal(REAL_RIG, LATE) for name in list_cards("solvers")}
     assert not takes["rs-stereo-refined"] and not takes["rs-stereo-linear"] and not takes["gs-8pt"]
-    assert takes["gs-stereo-tracks-scaled"] == (
+    lens = replace(load_solver("rs-r6p").spec, cameras="lens")
+    assert lens.refusal(REAL_RIG, LATE) == (
         "it takes rows from the top that both cameras read at once, and no other scan or delay"
     )
 
