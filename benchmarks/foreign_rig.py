@@ -213,11 +213,12 @@ def short_card(rig: Rig, told: bool) -> str:
 
 def card(rig: Rig, told: bool) -> str:
     """Any rig as ``rsbench correct --rig`` takes it."""
+    period = f"frame_period_s = {FRAME_SECONDS}\n" if told else ""
     cameras = "".join(
         f"[{side}]\n{_intrinsics(rig.camera(side))}{_reading(rig.camera(side)) if told else ''}" for side in SIDES
     )
     rotation = ", ".join(_list(row) for row in rig.R)
-    return f"{cameras}[right_from_left]\nrotation = [{rotation}]\ntranslation = {_list(rig.t)}\n"
+    return f"{period}{cameras}[right_from_left]\nrotation = [{rotation}]\ntranslation = {_list(rig.t)}\n"
 
 
 def _reading(camera: Camera) -> str:
