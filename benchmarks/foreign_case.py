@@ -75,7 +75,7 @@ def seen(drawn: frames.Case, rng: np.random.Generator) -> Seen:
 
 def corrected(images: list[NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter) -> Any:
     """What ``rsbench.correct`` makes of them where the shutter and the law are given."""
-    return rsbench.correct(images, rig, shutter.readout_ratio, motion_model="linear")
+    return rsbench.correct(images, rig, shutter.readout_ratio, scanning=shutter.scanning, motion_model="linear")
 
 
 @cache
