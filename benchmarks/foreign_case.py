@@ -51,7 +51,7 @@ def ours(rig: Rig) -> tuple[StereoRig, RollingShutter]:
     left, right = rig.left, rig.right
     scanning = Scanning(
         scan=left.scan,  # type: ignore[arg-type]
-        right_scan=right.scan,  # type: ignore[arg-type]
+        right_scan=None if right.scan == left.scan else right.scan,  # type: ignore[arg-type]
         right_delay=right.delay - left.delay,
         right_readout_ratio=None if right.ratio == left.ratio else right.ratio,
     )

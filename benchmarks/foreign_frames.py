@@ -9,7 +9,7 @@ such frames cannot be right by a mistake that both share.
 Each case gets a folder ROW-SEED: left_0.png, right_0.png ... of two times, or left/ and right/ of more; the same
 below gs/, at the time of each frame's first line, without noise; told.toml and untold.toml, rigs for ``rsbench
 correct`` with and without what the shutter does; of the rows of general rigs camchain.yaml, the same as Kalibr
-writes it, without the shutter; and truth.json.
+writes it; and truth.json.
 """
 
 from __future__ import annotations

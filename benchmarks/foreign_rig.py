@@ -237,8 +237,8 @@ def _list(values: Sequence[float] | Array) -> str:
 
 
 def camchain(rig: Rig) -> str:
-    """Any rig as Kalibr writes it; its rolling-shutter tool alone writes a line's seconds."""
-    text = ""
+    """Any rig as Kalibr writes it, with what its rolling-shutter tool and the one with an IMU add."""
+    text, late = "", any(rig.camera(side).delay for side in SIDES)
     for number, side in enumerate(SIDES):
         c = rig.camera(side)
         model, k = ("radtan", padded(c)[:4]) if c.lens == BROWN else ("equidistant", padded(c))
@@ -249,5 +249,7 @@ def camchain(rig: Rig) -> str:
             text += "  T_cn_cnm1:\n" + "".join(f"  - {_list(row)}\n" for row in matrix)
         text += f"  cam_overlaps: [{1 - number}]\n  camera_model: pinhole\n  distortion_coeffs: {_list(k)}\n"
         text += f"  distortion_model: {model}\n  intrinsics: {_list([c.fx, c.fy, *c.centre])}\n"
+        text += f"  line_delay: {c.ratio * FRAME_SECONDS / (c.height if c.rows else c.width)}\n"
+        text += f"  timeshift_cam_imu: {c.delay * FRAME_SECONDS}\n" if late else ""
         text += f"  resolution: [{c.width}, {c.height}]\n  rostopic: /{side}/image_raw\n"
     return text

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from foreign_frames import RIGS, ROWS, grey, picture, write_case
 from foreign_motion import Array
-from foreign_rig import SIDES, short_card
+from foreign_rig import FRAME_SECONDS, SIDES, short_card
 from foreign_world import read_photographs
 from numpy.typing import NDArray
 from rectify_study import errors, psnr, rectified
@@ -98,6 +98,7 @@ def run_case(folder: Path, way: str, again: bool, model: str | None = None) -> t
     shutil.rmtree(folder / f"corrected-{way}", ignore_errors=True)
     card = {"kalibr": "camchain.yaml", "untold": "untold.toml"}.get(way, "told.toml")
     arguments = [*frames, "--rig", str(source / card), "--out", str(folder / f"corrected-{way}")]
+    arguments += ["--fps", str(1.0 / FRAME_SECONDS)] if way == "kalibr" else []
     law = None if way == "untold" else truth["motion_model"]
     code, message, seconds = _correct(arguments, law or model)
     if law and code == 2 and "--motion-model" in message:

@@ -310,7 +310,7 @@ Made by `python benchmarks/rectify_study.py --out results/rectify`; versions, da
 ## Points
 
 {tracks} points seen by both cameras at both times, {noise} px of noise, no wrong matches, {seeds} scenes and
-motions of each cell; solver `rs-stereo-refined`. As it is, e_T is {own:.4f} deg (median of all cells; {own_worst:.3f} at
+motions of each cell; solver `rs-stereo-refined`. As it is, e_T is {own:.4f} deg (median; {own_worst:.3f} at
 worst) and e_R {own_R:.5f} deg. Rectified, e_T is about **{share:.2f} deg per degree of misalignment and unit of
 readout ratio** (95 % of all below {largest:.2f}), whatever the speed, for the error of a pixel grows with the
 motion as the motion does; e_R is {turn:.4f} deg per degree, unit of readout ratio and unit of speed. More matches

@@ -20,6 +20,7 @@ from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, 
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.interop.readers.rig_files import Readout, read_rig_file
 from rsbench.pipeline.footage import read_rig_card
 
 SMALL = {"width": 160, "height": 120, "focal": 130.0}
@@ -185,6 +186,23 @@ def test_rsbench_has_the_poses_that_rigs_were_traced_with(programs_: Programs) -
             np.testing.assert_allclose(pose.R, R, atol=1e-12, err_msg=row)
             np.testing.assert_allclose(pose.t, t, atol=1e-12, err_msg=row)
             np.testing.assert_allclose(shutter.line_times(1, side), foreign.camera(side).times(1), atol=1e-12)
+
+
+@pytest.mark.parametrize("row", RIGS)
+def test_rsbench_reads_the_files_of_a_rig_as_it_was_traced(programs_: Programs, row: str, tmp_path: Path) -> None:
+    foreign = programs_.frames.RIGS[row]
+    rig, shutter = programs_.case.ours(foreign)
+    (tmp_path / "rig.toml").write_text(programs_.rig.card(foreign, True), "utf-8")
+    (tmp_path / "camchain.yaml").write_text(programs_.rig.camchain(foreign), "utf-8")
+    for name, fps in (("rig.toml", None), ("camchain.yaml", 30.0)):
+        card = read_rig_file(tmp_path / name, Readout(fps=fps))[0]
+        found = card.rig(*((c.width, c.height) for c in (foreign.left, foreign.right)))
+        assert [found.sensor(side) for side in SIDES] == [rig.sensor(side) for side in SIDES]
+        np.testing.assert_allclose(found.right_from_left.R, foreign.R, atol=1e-12)
+        np.testing.assert_allclose(found.right_from_left.t, foreign.t, atol=1e-12)
+        assert found.aligned == rig.aligned == (row == "ideal")
+        assert card.readout_ratio == shutter.readout_ratio
+        assert card.scanning == shutter.scanning
 
 
 def _centroid(image: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[np.float64]:

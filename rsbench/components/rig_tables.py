@@ -203,7 +203,7 @@ def _ratio_of_lines(camera: dict[str, Any], rig: Mapping[str, Any], where: str) 
         raise RsbenchError(
             f"{where}: line_delay_s = {delay}: {count} lines would take {ratio:.4g} frame periods, and 1 is most"
         )
-    return min(ratio, 1.0)
+    return round(min(ratio, 1.0), 12)  # without rounding, which would make two cameras differ
 
 
 @dataclass(frozen=True, kw_only=True)

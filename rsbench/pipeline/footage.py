@@ -23,7 +23,7 @@ from rsbench.components.rig_tables import CameraTable, RightFromLeft, Size, rig_
 from rsbench.core.arguments import LARGEST_M, LARGEST_SIZE, check_number, check_positive
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import StereoRig, View
+from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
 from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes
 
@@ -237,25 +237,28 @@ def _checked(pixels: NDArray[Any], where: str) -> NDArray[Any]:
 
 
 def read_four(paths: dict[View, Path]) -> dict[View, NDArray[Any]]:
-    """The four frames of one motion; all of one size and kind.
+    """The four frames of one motion; all of one kind, those of a camera of one size.
 
     Raises:
         RsbenchError: see ``read_frame`` and ``check_alike``.
     """
     frames = {view: read_frame(path) for view, path in paths.items()}
-    check_alike({str(paths[view]): frame for view, frame in frames.items()})
+    for side in SIDES:
+        check_alike({str(paths[view]): frame for view, frame in frames.items() if view[0] == side})
+    check_alike({str(paths[view]): frame for view, frame in frames.items()}, sizes=False)
     return frames
 
 
-def check_alike(frames: dict[str, NDArray[Any]]) -> None:
-    """All frames must have the size, channels and depth of the first.
+def check_alike(frames: dict[str, NDArray[Any]], *, sizes: bool = True) -> None:
+    """All frames must have the channels and depth of the first, and its size unless ``sizes`` may differ.
 
     Raises:
         RsbenchError: names the frame that differs.
     """
     first_name, first = next(iter(frames.items()))
     for name, frame in frames.items():
-        if frame.shape != first.shape or frame.dtype != first.dtype:
+        same = frame.shape == first.shape if sizes else frame.shape[2:] == first.shape[2:]
+        if not same or frame.dtype != first.dtype:
             raise RsbenchError(
                 f"{name}: is {_kind(frame)}, but {first_name} is {_kind(first)}; all frames must be alike"
             )

@@ -55,16 +55,17 @@ def window_images(left: FrameSource, right: FrameSource) -> Iterator[Images]:
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:
-    """Left and right image of every time, all alike."""
-    first: NDArray[Any] | None = None
+    """Left and right image of every time, all of one kind, those of a camera of one size."""
+    first: tuple[NDArray[Any], NDArray[Any]] | None = None
     number = -1
     for number, (a, b) in enumerate(itertools.zip_longest(left, right)):
         if a is None or b is None:
             shorter, longer = (left, right) if a is None else (right, left)
             raise RsbenchError(f"{shorter.path}: has {number} frames, fewer than {longer.path}")
-        first = a if first is None else first
-        check_alike({f"{left.path}, frame 0": first, f"{left.path}, frame {number}": a})
-        check_alike({f"{left.path}, frame {number}": a, f"{right.path}, frame {number}": b})
+        first = first or (a, b)
+        for source, begin, image in zip((left, right), first, (a, b), strict=True):
+            check_alike({f"{source.path}, frame 0": begin, f"{source.path}, frame {number}": image})
+        check_alike({f"{left.path}, frame {number}": a, f"{right.path}, frame {number}": b}, sizes=False)
         yield {"left": a, "right": b}
     if number < 1:
         raise RsbenchError(f"{left.path}: has {number + 1} frames; at least 2 are needed")
