@@ -48,6 +48,7 @@ NAMES = [
     "pose_errors",
     "project",
     "read_dataset",
+    "read_rig",
     "simulate",
     "stereo_depth",
     "verify",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from rsbench.benchmark.simulated.simulation import Simulation
     from rsbench.dataset.sequence import Sequence
+    from rsbench.interop.readers.rig_files import KnownRig
     from rsbench.solvers.engine.base import MotionEstimate, Solver
     from rsbench.solvers.engine.robust_motion import RobustEstimate
     from rsbench.verification import Rerender, SequenceReport
@@ -247,6 +248,46 @@ def read_dataset(folder: AnyPath) -> list[Sequence]:
     from rsbench.dataset import sequence
 
     return sequence.read_dataset(arguments.path("folder", folder))
+
+
+def read_rig(
+    path: AnyPath,
+    size: tuple[int, int] | tuple[tuple[int, int], tuple[int, int]] | None = None,
+    *,
+    fps: float | None = None,
+) -> KnownRig:
+    """The cameras of a rig from a calibration of another tool as it is, from rig.toml, or from a card by its name.
+
+    ``correct(images, found.rig, found.readout_ratio, scanning=found.scanning)`` then takes all that the file says.
+
+    Args:
+        path: of Kalibr, OpenVINS, OpenCV, ROS, Basalt, ZED, DepthAI, RealSense, COLMAP or EuRoC: a file, or a
+            folder of files that belong together. Its content says of which tool it is.
+        size: (width, height) of the images, or those of the left and of the right ones, where the file does not
+            say them or has several.
+        fps: frames a second, for readouts that the file gives in seconds.
+
+    Returns:
+        ``rig``; ``readout_ratio`` and ``scanning``, None where the frames have to tell; ``notes``, sentences about
+        what was assumed.
+
+    Raises:
+        RsbenchError: a file that cannot be read or represented, or another size than its own.
+    """
+    from rsbench.interop.readers.rig_files import known_rig
+
+    sizes = None
+    if size is not None:
+        given = arguments.real_array("size", size)
+        if given.shape not in ((2,), (2, 2)):
+            raise ValueError(f"size = {size!r}: must be (width, height), or two of these, left and right")
+        for value in given.ravel():
+            arguments.check_number("size", value, 1.0, arguments.LARGEST_SIZE)
+        left, right = np.broadcast_to(given.astype(int), (2, 2)).tolist()
+        sizes = (left[0], left[1]), (right[0], right[1])
+    if fps is not None:
+        arguments.check_positive("fps", fps, 1e6, "frames a second")
+    return known_rig(arguments.path("path", path), sizes, fps)
 
 
 def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, workers: int = 1) -> list[Sequence]:

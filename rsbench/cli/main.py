@@ -19,6 +19,7 @@ from rsbench.cli import (
     inspect,
     leaderboard,
     reproduce,
+    rig,
     simulate,
     solve,
     verify,
@@ -85,6 +86,7 @@ app.command(epilog=VIEW_EPILOG)(view)
 app.command(epilog=EXPORT_EPILOG)(export)
 solve.register(app)
 inspect.register(app)
+rig.register(app)
 app.command("check-solver", epilog=CHECK_SOLVER_EPILOG)(check_solver)
 evaluate.register(app)
 correct.register(app)

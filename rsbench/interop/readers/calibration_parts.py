@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,8 @@ Table = dict[str, Any]
 _LONGEST_M = 2.0
 """A baseline beyond it is one in another unit than metres, unless a unit is given."""
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+_PROPORTION = 0.005
+"""By which the proportions of scaled images may differ: whole pixels."""
 _NEAR = 1e-3
 """By which printed rotations may miss being rotations."""
 
@@ -54,6 +56,8 @@ class Calibration:
     """In metres."""
     right_delay_s: float = 0.0
     """Seconds by which the right camera reads later than the left one."""
+    readout: Table = field(default_factory=dict)
+    """Of rig.toml alone: readout_ratio, scan, right_delay and so on, above its tables."""
     notes: tuple[str, ...] = ()
     """What was assumed or is approximate, a sentence each."""
     files: tuple[Path, ...] = field(default=())
@@ -218,3 +222,42 @@ def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None
     if kind == "none":
         return None
     return brown(coefficients, where) if kind == "brown" else lens_of(kind, coefficients, where)
+
+
+def with_size(found: Calibration, size: Size) -> Calibration:
+    """The calibration with images of this size where it does not say one.
+
+    Raises:
+        RsbenchError: it says another one.
+    """
+
+    def sized(table: Table) -> Table:
+        known = (table.get("width", size[0]), table.get("height", size[1]))
+        if known != size:
+            raise RsbenchError(
+                f"--size {size[0]}x{size[1]}: the calibration is of images of {known[0]} x {known[1]} px; "
+                "--resize where frames were scaled, not cropped"
+            )
+        return table | {"width": size[0], "height": size[1]}
+
+    return replace(found, left=sized(found.left), right=None if found.right is None else sized(found.right))
+
+
+def resized(found: Calibration, size: Size) -> Calibration:
+    """The calibration of the same images scaled to another size; RsbenchError where the proportions differ."""
+
+    def scaled(table: Table) -> Table:
+        if "width" not in table:
+            raise RsbenchError("--resize: the calibration does not say the size of its images: give --size too")
+        across, down = (new / table[name] for new, name in zip(size, ("width", "height"), strict=True))
+        if abs(across / down - 1.0) > _PROPORTION:
+            raise RsbenchError(
+                f"--resize {size[0]}x{size[1]}: images of {table['width']} x {table['height']} pixels have other "
+                "proportions: frames that were cropped need cx and cy less what is cut off; edit rig.toml"
+            )
+        made = dict(table) | {"width": size[0], "height": size[1]}
+        for axis, by in (("x", across), ("y", down)):
+            made[f"f{axis}"], made[f"c{axis}"] = by * table[f"f{axis}"], by * (table[f"c{axis}"] + 0.5) - 0.5
+        return made if "line_delay_s" not in table else made | {"line_delay_s": table["line_delay_s"] / down}
+
+    return replace(found, left=scaled(found.left), right=None if found.right is None else scaled(found.right))

@@ -55,7 +55,9 @@ def read_tree(path: Path) -> Any:
     text = read_text(path, _LONGEST).lstrip("\ufeff")
     try:
         return _arrays(_parsed(text, path))
-    except (ValueError, RecursionError) as error:
+    except RecursionError as error:
+        raise RsbenchError(f"{path}: nested too deeply") from error
+    except ValueError as error:
         raise RsbenchError(f"{path}: {' '.join(str(error).split())[:200]}") from error
 
 

@@ -81,7 +81,13 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
         if kind.parts is not None:
             near = [path.parent, *([path.parent.parent] if kind.name == "ROS camera_info" else [])]
             trees = kind.parts(path, _all_of(kind, [each for folder in near for each in files_in(folder)]) | trees)
-    found = kind.read(Files(trees, given))
+    try:
+        found = kind.read(Files(trees, given))
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError, OverflowError) as error:
+        words = " ".join(str(error).split())
+        raise RsbenchError(
+            f"{path}: is not as {kind.name} has it: {type(error).__name__}: {words[:100]}"
+        ) from error
     return replace(_left_first(found, given, str(path)), files=tuple(trees))
 
 

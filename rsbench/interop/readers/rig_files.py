@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rsbench.components.cards import parse_card, read_toml, with_shutter
-from rsbench.components.rig_tables import Size, with_readouts
+from rsbench.components.rig_tables import RightFromLeft, Size, with_readouts
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
+from rsbench.core.shutter import Scanning
 from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table
 from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.pipeline.footage import RigCard, rig_path
@@ -128,8 +129,34 @@ def read_camera_file(
     return parse_card(OneCameraCard, with_shutter(table, str(path)), str(path)), tuple(notes)
 
 
+class KnownRig(NamedTuple):
+    """What a file says of a rig."""
+
+    rig: StereoRig
+    readout_ratio: float | None
+    """Readout time over frame period; None where the frames have to tell."""
+    scanning: Scanning | None
+    """From which side lines are read, and how the right camera differs; None where the frames have to tell."""
+    notes: tuple[str, ...]
+    """What was assumed of the file, or needs the frames' rate."""
+
+
+def known_rig(path: Path, sizes: tuple[Size, Size] | None = None, fps: float | None = None) -> KnownRig:
+    """The rig of a file; see ``rsbench.read_rig``."""
+    card, notes = read_rig_file(path, Readout(fps=fps), None if sizes is None else lambda: sizes[0])
+    left, right = (None if side is None else side.size for side in (card.left, card.right))
+    if sizes is None and (left is None or right is None):
+        raise RsbenchError(f"{path}: does not say the size of the images: give size = (width, height)")
+    left, right = sizes or (left, right)
+    assert left is not None and right is not None
+    try:
+        return KnownRig(card.rig(left, right), card.readout_ratio, card.scanning, notes)
+    except ValueError as error:
+        raise RsbenchError(f"{path}: {error}") from error
+
+
 def calibration_of(path: Path, given: Assumptions) -> Calibration:
-    """The calibration in any file, rig.toml and camera.toml too, without what they say of the readout."""
+    """The calibration in any file, rig.toml and camera.toml too."""
     path = rig_path(path)
     if path.suffix != ".toml":
         return read_calibration(path, given)
@@ -138,22 +165,25 @@ def calibration_of(path: Path, given: Assumptions) -> Calibration:
         one = parse_card(OneCameraCard, with_shutter(table, str(path)), str(path))
         if one.camera is None:
             raise RsbenchError(f"{path}: camera: is required to show or convert it")
-        return Calibration(format="camera.toml", left=_record(one.camera))
+        return Calibration(format="camera.toml", left=_record(one.camera), readout=_readout(one))
     card = parse_card(RigCard, with_readouts(table, str(path)), str(path))
-    if card.camera is not None:
-        left = right = _record(card.camera)
-    else:
-        assert card.left is not None and card.right is not None
-        left, right = (
-            _record(each) | ({} if each.size is None else dict(zip(("width", "height"), each.size, strict=True)))
-            for each in (card.left, card.right)
-        )
-    t = np.array([-(card.baseline or 0.0), 0.0, 0.0])
-    apart = card.right_from_left
-    pose = Pose(np.eye(3), t) if apart is None else Pose(apart.R, np.array(apart.translation))
-    return Calibration(format="rig.toml", left=left, right=dict(right), right_from_left=pose)
+    apart = card.right_from_left or RightFromLeft(translation=(-(card.baseline or 0.0), 0.0, 0.0))
+    return Calibration(
+        format="rig.toml",
+        left=_record(card.camera or card.left),
+        right=_record(card.camera or card.right),
+        right_from_left=Pose(apart.R, np.array(apart.translation)),
+        readout=_readout(card),
+    )
 
 
 def _record(camera: Any) -> Table:
-    own = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    own = {name: value for name in names if (value := getattr(camera, name, None)) is not None}
     return own if camera.lens is None else own | {"lens": camera.lens.record()}
+
+
+def _readout(card: RigCard | OneCameraCard) -> Table:
+    names = ("readout_ratio", "scan", "right_readout_ratio", "right_scan", "right_delay", "frame_period_s")
+    known = {name: value for name in names if (value := getattr(card, name, None)) is not None}
+    return known if known.get("right_delay") else _without(known, ("right_delay",))

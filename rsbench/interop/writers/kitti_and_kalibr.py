@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.camera import LensModel
+from rsbench.core.camera import LensModel, PinholeCamera
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
@@ -120,10 +120,10 @@ def _kalibr_fault(sequence: Sequence, images: Images) -> str:
     lenses = [sequence.rig.sensor(side).lens for side in SIDES]
     if any(lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0 for lens in lenses):
         return "its lens radtan has k1, k2, p1, p2 but no k3; choose other sequences"
-    return lens_fault(sequence.rig, *_KALIBR_LENSES)
+    return lens_fault(sequence.rig, *KALIBR_LENSES)
 
 
-_KALIBR_LENSES: Mapping[LensModel, tuple[str, str]] = {
+KALIBR_LENSES: Mapping[LensModel, tuple[str, str]] = {
     "brown-conrady": ("pinhole", "radtan"),
     "kannala-brandt": ("pinhole", "equidistant"),
     "double-sphere": ("ds", "none"),
@@ -154,8 +154,20 @@ def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
-    rig, camera, lens = sequence.rig, sequence.rig.sensor(side), sequence.rig.sensor(side).lens
-    model, distortion = ("pinhole", "none") if lens is None else _KALIBR_LENSES[lens.model]
+    rig = sequence.rig
+    lines = kalibr_camera(rig.sensor(side), side, line_delay(sequence, side))
+    if side == "right":
+        lines += yaml_transform("T_cn_cnm1", rig.right_from_left)
+    if sequence.imu is not None:
+        lines += yaml_transform("T_cam_imu", Pose(rig.own(side).R, rig.own(side).R @ rig.offset(side)))
+        lines.append(f"timeshift_cam_imu: {number(sequence.imu.time_offset_s)}")
+    return lines
+
+
+def kalibr_camera(camera: PinholeCamera, side: Side, line_delay_s: float | None) -> list[str]:
+    """Lines of a camera of camchain.yaml; its lens must be one of ``KALIBR_LENSES``."""
+    lens = camera.lens
+    model, distortion = ("pinhole", "none") if lens is None else KALIBR_LENSES[lens.model]
     coefficients = () if lens is None else lens.coefficients[:4]
     before, after = (coefficients, ()) if model == "ds" else ((), coefficients)
     lines = [
@@ -165,17 +177,12 @@ def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
         f"distortion_coeffs: {_yaml_list([*after])}",
         f"resolution: [{camera.width}, {camera.height}]",
         f"rostopic: /{side}/image_raw",
-        f"line_delay: {number(line_delay(sequence, side))}",
     ]
-    if side == "right":
-        lines += _yaml_transform("T_cn_cnm1", rig.right_from_left)
-    if sequence.imu is not None:
-        lines += _yaml_transform("T_cam_imu", Pose(rig.own(side).R, rig.own(side).R @ rig.offset(side)))
-        lines.append(f"timeshift_cam_imu: {number(sequence.imu.time_offset_s)}")
-    return lines
+    return lines if line_delay_s is None else [*lines, f"line_delay: {number(line_delay_s)}"]
 
 
-def _yaml_transform(name: str, pose: Pose) -> list[str]:
+def yaml_transform(name: str, pose: Pose) -> list[str]:
+    """Lines of a matrix (4, 4)."""
     return [f"{name}:", *(f"- {_yaml_list(row)}" for row in matrix(pose).tolist())]
 
 
