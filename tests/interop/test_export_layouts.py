@@ -15,9 +15,13 @@ from evo.tools import file_interface
 from exported_data import LENSES, MOTION, PLACE, SAME_PX, TURN, dataset, exported, only, opencv_pixels, seen
 from scipy.spatial.transform import Rotation, Slerp
 
+from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import LinearMotion, TwistMotion
-from rsbench.core.rig import SIDES, views_of
+from rsbench.components.rig_tables import RigTables
+from rsbench.core.rig import SIDES, StereoRig, views_of
 from rsbench.core.so3 import FloatArray
+from rsbench.interop.readers.calibration_parts import Calibration
+from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.interop.readers.layouts import read_colmap
 from rsbench.storage.files import read_json, write_json
 
@@ -121,6 +125,16 @@ def test_a_camera_chain_projects_our_points(tmp_path: Path, lens: str, right: st
     np.testing.assert_allclose(body_from_right[:3, 3], [half, 0.0, 0.0], atol=1e-15)
     if right:
         np.testing.assert_allclose(chain["cam1"]["T_cn_cnm1"], RIGHT_FROM_LEFT, atol=1e-14)
+    check_rig(read_calibration(out / "planes/camchain.yaml"), sequence.rig)
+
+
+def check_rig(found: Calibration, rig: StereoRig) -> None:
+    """What was written is the rig, to rounding."""
+    read = parse_card(RigTables, found.tables(), "read").rig()
+    for side in SIDES:
+        assert read.sensor(side) == rig.sensor(side)
+        np.testing.assert_allclose(read.own(side).rotation, rig.own(side).rotation, atol=1e-12)
+    assert abs(read.baseline - rig.baseline) < 1e-12
 
 
 # KITTI
@@ -351,6 +365,7 @@ def test_the_rig_of_colmap_reads_back(made: tuple[str, Path, Path]) -> None:
     for name in ("left", "right"):
         np.testing.assert_allclose(recording.rig.own(name).rotation, own.own(name).rotation, atol=1e-12)
         assert recording.rig.sensor(name) == own.sensor(name)
+    check_rig(read_calibration(out / "sparse"), own)
     assert set(recording.images) == set(views_of(2))
     assert all(path.is_file() for path in recording.images.values())
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rsbench.components.rig_tables import Size
+from rsbench.components.cards import parse_card
+from rsbench.components.rig_tables import CameraTable, Size
 from rsbench.core import so3
 from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
@@ -109,6 +110,14 @@ def table_of(size: Sequence[float] | FloatArray | None, intrinsics: Sequence[flo
     sizes = {} if size is None else dict(zip(("width", "height"), map(round, size), strict=True))
     numbers = dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True))
     return {**sizes, **numbers, **({} if lens is None else {"lens": lens.record()})}
+
+
+def camera_of(table: Table, where: str) -> PinholeCamera:
+    """The camera of such a table; RsbenchError for one that cannot be."""
+    try:
+        return parse_card(CameraTable, table, where).camera()
+    except ValueError as error:
+        raise RsbenchError(f"{where}: {error}") from error
 
 
 def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | None:

@@ -32,6 +32,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.lens_fit import fov_profile, mirror_profile, unified_profile
 from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose, compose, inverse
+from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_opencv import (
     is_opencv,
     is_ros,
@@ -514,9 +515,10 @@ _COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
 """Parameters in their order, and the lens model."""
 
 
-def _colmap_camera(
-    name: str, params: Sequence[Any], size: Sequence[float] | None, where: str
+def colmap_camera(
+    name: str, params: Sequence[Any], size: Sequence[float] | FloatArray | None, where: str
 ) -> tuple[Table, str]:
+    """Table of a camera from the model's name and parameters, and a sentence where it was fitted."""
     if name not in _COLMAP_MODELS:
         raise RsbenchError(f"{where}: camera model {name!r}: must be one of {', '.join(_COLMAP_MODELS)}")
     keys, model = _COLMAP_MODELS[name]
@@ -533,6 +535,19 @@ def _colmap_camera(
         None if model is None else lens_of(model, own, where) if model == "kannala-brandt" else brown(own, where)
     )
     return table_of(size, intrinsics, lens), ""
+
+
+def colmap_poses(words: Sequence[str], where: str) -> dict[str, Pose]:
+    """``camera_from_rig`` by the camera's number, from the words of a line of rigs.txt; its reference first."""
+    poses = {words[3]: Pose(np.eye(3), np.zeros(3))} if words[2:3] == ["CAMERA"] and len(words) > 3 else {}
+    rest = words[4:]
+    while len(rest) >= 3:
+        values = rest[3:10] if rest[2] == "1" else []
+        if rest[0] == "CAMERA" and values:
+            numbers = Fields({"pose": values}, where).numbers("pose", 7)
+            poses[rest[1]] = Pose(quaternion_of(numbers[:4].tolist(), where), numbers[4:])
+        rest = rest[3 + len(values) :]
+    return poses
 
 
 def _is_rig_config(tree: Any) -> bool:
@@ -555,7 +570,7 @@ def _read_rig_config(files: Files) -> Calibration:
                 "of cameras.txt and rigs.txt"
             )
         name = camera.text("camera_model_name").upper()
-        made.append(_colmap_camera(name, camera.get("camera_params"), None, camera.where))
+        made.append(colmap_camera(name, camera.get("camera_params"), None, camera.where))
         if camera.get("ref_sensor"):
             poses.append(Pose(np.eye(3), np.zeros(3)))
         elif "cam_from_rig_rotation" in camera:
@@ -591,21 +606,14 @@ def _read_colmap(files: Files) -> Calibration:
             rigs.append(words)
         elif len(words) > 4 and words[1].isupper():
             size = Fields({"size": words[2:4]}, where).numbers("size", 2).tolist()
-            made[words[0]] = _colmap_camera(words[1], words[4:], size, where)
+            made[words[0]] = colmap_camera(words[1], words[4:], size, where)
     if not made:
         raise RsbenchError(f"{files.where}: cameras.txt is missing beside it")
     notes = [note for _, note in made.values() if note]
     if len(made) == 1:
         return Calibration(format="COLMAP", left=next(iter(made.values()))[0], notes=tuple(notes))
     for words in rigs:
-        poses = {words[3]: Pose(np.eye(3), np.zeros(3))} if words[2] == "CAMERA" else {}
-        rest = words[4:]
-        while len(rest) >= 3:
-            values = rest[3:10] if rest[2] == "1" else []
-            if rest[0] == "CAMERA" and len(values) == 7:
-                numbers = Fields({"pose": values}, files.where).numbers("pose", 7)
-                poses[rest[1]] = Pose(quaternion_of(numbers[:4].tolist(), files.where), numbers[4:])
-            rest = rest[3 + len(values) :]
+        poses = colmap_poses(words, files.where)
         if len(poses) >= 2 and set(list(poses)[:2]) <= made.keys():
             first, second = list(poses)[:2]
             notes += [f"holds {len(poses)} cameras; {first} and {second} are taken"] if len(poses) > 2 else []
@@ -622,21 +630,23 @@ def _read_colmap(files: Files) -> Calibration:
 
 def _read_asl(files: Files) -> Calibration:
     cameras = [Fields(tree, str(path)) for path, tree in sorted(files.trees.items())]
-    made = []
-    for camera in cameras[:2]:
-        kind = camera.text("distortion_model", default="none")
-        lens = by_name(
-            kind, camera.numbers("distortion_coefficients").tolist() if kind != "none" else [], camera.where
-        )
-        made.append(table_of(camera.numbers("resolution", 2), camera.numbers("intrinsics", 4).tolist(), lens))
+    made = [asl_camera(camera) for camera in cameras[:2]]
     if len(made) == 1:
         return Calibration(format="EuRoC", left=made[0])
-    poses = [_of_asl(camera) for camera in cameras[:2]]
+    poses = [asl_pose(camera) for camera in cameras[:2]]
     apart = compose(inverse(poses[1]), poses[0])
     return Calibration(format="EuRoC", left=made[0], right=made[1], right_from_left=apart)
 
 
-def _of_asl(camera: Fields) -> Pose:
+def asl_camera(camera: Fields) -> Table:
+    """Table of the camera of a sensor.yaml."""
+    kind = camera.text("distortion_model", default="none")
+    values = camera.numbers("distortion_coefficients").tolist() if kind != "none" else []
+    lens = by_name(kind, values, camera.where)
+    return table_of(camera.numbers("resolution", 2), camera.numbers("intrinsics", 4).tolist(), lens)
+
+
+def asl_pose(camera: Fields) -> Pose:
     """``body_from_camera``."""
     value = camera.get("T_BS")
     T = np.ravel(value["data"] if isinstance(value, Mapping) else value)

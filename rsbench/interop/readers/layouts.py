@@ -48,7 +48,7 @@ size ``S_rect_0k``: ``P_rect_0k = K [I | t]``, t from the rectified camera 0. Th
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -58,13 +58,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rsbench.components.cards import choices
 from rsbench.core import so3
-from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, View
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, from_quaternion
 from rsbench.dataset.recording import PoseAt, Recording
+from rsbench.interop.readers.calibration_parts import brown, camera_of, rotation_of, table_of
+from rsbench.interop.readers.calibration_trees import Fields, read_tree
+from rsbench.interop.readers.calibrations import asl_camera, asl_pose, colmap_camera, colmap_poses
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.mono_camera import DEFAULT_FOCAL
 from rsbench.storage.files import read_grey_png
@@ -107,20 +110,9 @@ def rotation(q: FloatArray, where: object) -> FloatArray:
     return from_quaternion(q)
 
 
-def _pinhole(
-    size: Iterable[float],
-    intrinsics: Iterable[float],
-    where: object,
-    lens_model: str | None = None,
-    coefficients: Mapping[str, float] | None = None,
-) -> PinholeCamera:
-    """A camera from (width, height), (fx, fy, cx, cy) and a lens; RsbenchError for impossible values."""
-    (width, height), (fx, fy, cx, cy) = map(int, size), intrinsics
-    try:
-        lens = Lens(model=lens_model, **(coefficients or {})) if lens_model else None  # pyrefly: ignore[bad-argument-type]
-        return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
+def _pinhole(size: Sequence[float], K: FloatArray, where: object, lens: Lens | None = None) -> PinholeCamera:
+    """A camera from (width, height), a calibration matrix (3, 3 or more) and a lens."""
+    return camera_of(table_of(size, K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), lens), str(where))
 
 
 def _nanoseconds(stamp: str, where: str) -> int:
@@ -135,18 +127,6 @@ def _numbered_images(folder: Path, digits: int, kind: str) -> dict[int, Path]:
     return {int(path.name[:digits]): path for path in found if path.suffix in (".png", ".jpg")}
 
 
-_COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
-    "SIMPLE_PINHOLE": ("f cx cy", None),
-    "PINHOLE": ("fx fy cx cy", None),
-    "SIMPLE_RADIAL": ("f cx cy k1", "brown-conrady"),
-    "RADIAL": ("f cx cy k1 k2", "brown-conrady"),
-    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "brown-conrady"),
-    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational"),
-    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "kannala-brandt"),
-    "RADIAL_FISHEYE": ("f cx cy k1 k2", "kannala-brandt"),
-    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "kannala-brandt"),
-}
-"""Parameters in their order, and the lens model."""
 _CORNER = 0.5
 
 
@@ -212,22 +192,14 @@ def _colmap_rigs(folder: Path, cameras: Mapping[str, PinholeCamera]) -> list[_Co
     """The rigs of rigs.txt that have two cameras, of which each has a pose; none without the file."""
     path, found = folder / "rigs.txt", list[_ColmapRig]()
     for where, line in lines(path) if path.is_file() else ():
-        number, count, *words = line.split()
-        poses = {words[1]: Pose(np.eye(3), np.zeros(3))} if words[:1] == ["CAMERA"] else {}
-        words = words[2:]
-        while len(words) >= 3:
-            kind, sensor, known = words[:3]
-            values = words[3:10] if known == "1" else []
-            words = words[3 + len(values) :]
-            if kind == "CAMERA" and values:
-                q, t = np.split(numbers(" ".join(values), where, 7), [4])
-                poses[sensor] = Pose(rotation(q, where), t)
-        if words or len(poses) > int(numbers(count, where, 1)[0]) or not poses.keys() <= cameras.keys():
-            raise RsbenchError(f"{where}: must be a number, a count of sensors, and those with their poses")
+        words = line.split()
+        poses = colmap_poses(words, where)
+        if not poses.keys() <= cameras.keys():
+            raise RsbenchError(f"{where}: has a camera that cameras.txt lacks")
         if len(poses) == len(SIDES):
             (one, at_one), (two, at_two) = poses.items()
             sides, apart = _left_first((one, two), compose(at_two, inverse(at_one)))
-            found.append(_ColmapRig(number, sides, apart, _colmap_times(folder, number)))
+            found.append(_ColmapRig(words[0], sides, apart, _colmap_times(folder, words[0])))
     return found
 
 
@@ -254,18 +226,10 @@ def _colmap_times(folder: Path, rig: str) -> list[list[str]]:
 
 def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
     words = line.split()
-    if len(words) < 5 or words[1] not in _COLMAP_MODELS:
-        known = ", ".join(_COLMAP_MODELS)
-        raise RsbenchError(f"{where}: camera model {words[1] if len(words) > 1 else ''!r}: must be one of {known}")
-    keys, model = _COLMAP_MODELS[words[1]]
-    values = dict(zip(keys.split(), numbers(" ".join(words[4:]), where, len(keys.split())).tolist(), strict=True))
-    size = numbers(" ".join(words[2:4]), where, 2)
-    fx, fy = values.pop("fx", values.get("f", 0.0)), values.pop("fy", values.pop("f", 0.0))
-    cx, cy = values.pop("cx") - _CORNER, values.pop("cy") - _CORNER
-    if model == "rational" and values["k4"] == values["k5"] == values["k6"] == 0.0:
-        model = "brown-conrady"
-        values = {key: values[key] for key in COEFFICIENTS["brown-conrady"]}
-    return words[0], _pinhole(size, (fx, fy, cx, cy), where, model, values)
+    if len(words) < 5:
+        raise RsbenchError(f"{where}: must be a number, a camera model, a size and parameters")
+    table, _ = colmap_camera(words[1], words[4:], numbers(" ".join(words[2:4]), where, 2), where)
+    return words[0], camera_of(table, where)
 
 
 def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
@@ -334,13 +298,7 @@ def _pose_of_image(known: Mapping[int, Pose], tau: FloatArray) -> Pose:
     return Pose(R, t)
 
 
-_LENSES = {
-    "radial-tangential": ("brown-conrady", ("k1", "k2", "p1", "p2")),
-    "radtan": ("brown-conrady", ("k1", "k2", "p1", "p2")),
-    "equidistant": ("kannala-brandt", ("k1", "k2", "k3", "k4")),
-}
 _EUROC_POSES = ("state_groundtruth_estimate0", "mocap0", "gt0")
-_YAML_KEY = re.compile(r"^[ \t]*(\w+):[ \t]*(\[[^\]]*\]|[^\n#]*)", re.MULTILINE)
 
 
 def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) -> list[Recording]:
@@ -356,9 +314,10 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
     sensors = {side: root / f"cam{k}" for k, side in enumerate(SIDES) if (root / f"cam{k}").is_dir()}
     if "left" not in sensors:
         raise RsbenchError(f"{root}: holds no folder cam0")
-    yamls = {side: _read_yaml(path / "sensor.yaml") for side, path in sensors.items()}
-    cameras = {side: _euroc_camera(yamls[side], sensors[side] / "sensor.yaml") for side in sensors}
-    body_from = {side: _euroc_extrinsics(yamls[side], sensors[side] / "sensor.yaml") for side in sensors}
+    files = {side: path / "sensor.yaml" for side, path in sensors.items()}
+    yamls = {side: Fields(read_tree(path), str(path)) for side, path in files.items()}
+    cameras = {side: camera_of(asl_camera(each), each.where) for side, each in yamls.items()}
+    body_from = {side: asl_pose(each) for side, each in yamls.items()}
     times = {side: _euroc_times(path) for side, path in sensors.items()}
     stamps = [stamp for stamp in times["left"] if all(stamp in times[side] for side in sensors)]
     if len(stamps) < 2:
@@ -383,35 +342,6 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
             notes=() if shutters else ("the layout does not say how rows are read",),
         )
     ]
-
-
-def _read_yaml(path: Path) -> dict[str, str]:
-    return {key: value.strip() for key, value in _YAML_KEY.findall(read_text(path))}
-
-
-def _yaml_numbers(fields: Mapping[str, str], key: str, path: Path, count: int) -> FloatArray:
-    if key not in fields:
-        raise RsbenchError(f"{path}: {key!r} is required")
-    return numbers(fields[key].strip("[]").replace("\n", " "), f"{path}: {key}", count)
-
-
-def _euroc_camera(fields: Mapping[str, str], path: Path) -> PinholeCamera:
-    size = _yaml_numbers(fields, "resolution", path, 2)
-    centre = _yaml_numbers(fields, "intrinsics", path, 4)
-    model = fields.get("distortion_model", "none").strip('"')
-    if model not in (*_LENSES, "none"):
-        raise RsbenchError(f"{path}: distortion_model = {model!r}: must be one of {', '.join(_LENSES)}")
-    name, keys = _LENSES.get(model, (None, ()))
-    values = _yaml_numbers(fields, "distortion_coefficients", path, len(keys)) if name else np.zeros(0)
-    return _pinhole(size, centre, path, name, dict(zip(keys, values.tolist(), strict=True)))
-
-
-def _euroc_extrinsics(fields: Mapping[str, str], path: Path) -> Pose:
-    """``body_from_camera``."""
-    T = _yaml_numbers(fields, "data", path, 16).reshape(4, 4)
-    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
-        raise RsbenchError(f"{path}: T_BS: is not a rotation")
-    return Pose(T[:3, :3], T[:3, 3])
 
 
 def _euroc_times(folder: Path) -> dict[int, Path]:
@@ -611,7 +541,7 @@ def _middlebury(folder: Path) -> Recording:
     K0, K1 = (numbers(re.sub(r"[\[\];]", " ", fields[key]), path, 9).reshape(3, 3) for key in ("cam0", "cam1"))
     width, height, baseline = (float(numbers(fields[key], path, 1)[0]) for key in ("width", "height", "baseline"))
     offset = float(numbers(fields["doffs"], path, 1)[0]) if "doffs" in fields else float(K1[0, 2] - K0[0, 2])
-    left, right = (_pinhole((width, height), K[[0, 1, 0, 1], [0, 1, 2, 2]], path) for K in (K0, K1))
+    left, right = (_pinhole((width, height), K, path) for K in (K0, K1))
     images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
     disparities: dict[View, Callable[[], FloatArray]] = {}
     views: tuple[View, ...] = (("left", 0), ("right", 0))
@@ -678,7 +608,7 @@ def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, 
         for frame in (0, 1)
     }
     height, width = read_frame(files["left", 0]).shape[:2]
-    left, right = (_pinhole((width, height), P[[0, 1, 0, 1], [0, 1, 2, 2]], path) for P in matrices)
+    left, right = (_pinhole((width, height), P, path) for P in matrices)
     baseline = matrices[0][0, 3] / matrices[0][0, 0] - matrices[1][0, 3] / matrices[1][0, 0]
     offset = right.cx - left.cx
     found = folder / (truth or "") / f"{number}_10.png"
@@ -714,7 +644,7 @@ def _kitti_drive(drive: Path) -> Recording:
     if names is None:
         raise RsbenchError(f"{drive}: holds one camera alone; image_02 and image_03, or image_00 and image_01")
     path = only_file(drive if (drive / "calib_cam_to_cam.txt").is_file() else drive.parent, "calib_cam_to_cam.txt")
-    fields = {key.strip(): value for _, line in lines(path) for key, _, value in [line.partition(":")]}
+    table = {key.strip(): value.split() for _, line in lines(path) for key, _, value in [line.partition(":")]}
     images: dict[View, Path] = {
         (side, int(file.stem)): file
         for side, name in zip(SIDES, names, strict=True)
@@ -723,7 +653,7 @@ def _kitti_drive(drive: Path) -> Recording:
     if not images:
         raise RsbenchError(f"{drive / names[0] / 'data'}: holds no 0000000000.png")
     height, width = read_frame(next(iter(images.values()))).shape[:2]
-    both = [_kitti_camera(fields, name[-2:], (width, height), path) for name in names]
+    both = [_kitti_camera(Fields(table, str(path)), name[-2:], (width, height)) for name in names]
     cameras = dict(zip(SIDES, (camera for camera, _ in both), strict=True))
     return Recording(
         name=drive.name,
@@ -737,30 +667,19 @@ def _kitti_drive(drive: Path) -> Recording:
     )
 
 
-def _kitti_camera(
-    fields: Mapping[str, str], number: str, size: tuple[int, int], path: Path
-) -> tuple[PinholeCamera, Pose]:
+def _kitti_camera(fields: Fields, number: str, size: tuple[int, int]) -> tuple[PinholeCamera, Pose]:
     """Camera ``number`` of calib_cam_to_cam.txt for images of this size, and its pose from camera 0."""
-
-    def read(key: str, count: int) -> FloatArray:
-        if f"{key}_{number}" not in fields:
-            raise RsbenchError(f"{path}: {key}_{number} is required")
-        return numbers(fields[f"{key}_{number}"], f"{path}: {key}_{number}", count)
-
-    raw, rectified = (tuple(map(int, read(key, 2))) for key in ("S", "S_rect"))
+    raw, rectified = (tuple(map(int, fields.numbers(f"{key}_{number}", 2))) for key in ("S", "S_rect"))
     if size == raw:
-        K, lens = (
-            read("K", 9).reshape(3, 3),
-            dict(zip(COEFFICIENTS["brown-conrady"], read("D", 5).tolist(), strict=True)),
-        )
-        pose = Pose(read("R", 9).reshape(3, 3), read("T", 3))
-        return _pinhole(size, K[[0, 1, 0, 1], [0, 1, 2, 2]], path, "brown-conrady", lens), pose
+        K, d, R, t = (fields.numbers(f"{key}_{number}", n) for key, n in (("K", 9), ("D", 5), ("R", 9), ("T", 3)))
+        pose = Pose(rotation_of(R, f"{fields.where}: R_{number}"), t)
+        return _pinhole(size, K.reshape(3, 3), fields.where, brown(d, fields.where)), pose
     if size == rectified:
-        P = read("P_rect", 12).reshape(3, 4)
-        camera = _pinhole(size, P[[0, 1, 0, 1], [0, 1, 2, 2]], path)
-        return camera, Pose(np.eye(3), np.asarray(np.linalg.inv(P[:, :3]) @ P[:, 3], dtype=np.float64))
+        P = fields.numbers(f"P_rect_{number}", 12).reshape(3, 4)
+        t = np.asarray(np.linalg.inv(P[:, :3]) @ P[:, 3], dtype=np.float64)
+        return _pinhole(size, P, fields.where), Pose(np.eye(3), t)
     raise RsbenchError(
-        f"{path}: its images are {size[0]} x {size[1]} pixels: neither S_{number} nor S_rect_{number}"
+        f"{fields.where}: its images are {size[0]} x {size[1]} pixels: neither S_{number} nor S_rect_{number}"
     )
 
 
