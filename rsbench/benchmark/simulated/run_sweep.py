@@ -243,12 +243,22 @@ def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
         "format": FORMAT,
         "rsbench": __version__,
         "code": simulator_version(),
-        "card": asdict(card),
+        "card": asdict(card) | {"setting": card.setting.record},
         "solvers": [_identity(e) for e in solvers],
         "motions": {name: source_version(motion_model(name)) for name in _motions(card, solvers)},
-        "cells": [asdict(cell) for cell in card.cells()],
+        "cells": [asdict(cell) | {"setting": cell.setting.record} for cell in card.cells()],
+        **_rigs(card),
     }
     return json.loads(json.dumps(content))  # as it will be read
+
+
+def _rigs(card: SweepCard) -> dict[str, Any]:
+    """What the rig cards say that the sweep names; nothing where it names none."""
+    named = {cell.setting.rig_card: cell.setting.tables for cell in card.cells()}
+    found = {
+        name: asdict(tables) for name, tables in named.items() if isinstance(name, str) and tables is not None
+    }
+    return {"rigs": found} if found else {}
 
 
 def _motions(card: SweepCard, solvers: list[Entrant]) -> list[str]:
@@ -309,6 +319,7 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
     words += [
         f"{key} was {stored.get(key)}, is {plan[key]}" for key in ("rsbench",) if stored.get(key) != plan[key]
     ]
+    words += ["of other rigs"] if stored.get("rigs") != plan.get("rigs") else []
     if any(stored.get(key) != plan[key] for key in ("code", "motions")):
         words.append("simulated by other code")
     return words or (["differs in cells"] if stored.get("cells") != plan["cells"] else [])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -12,12 +13,13 @@ from rsbench.benchmark.simulated.simulation import GYRO_RATE, SceneShape, Simula
 from rsbench.components.cards import card_path, load_card, parse_card
 from rsbench.components.imports import search
 from rsbench.components.motion_models import drawn_parameters, fixed_endpoint, make_motion
+from rsbench.components.rig_tables import RigTables, load_rig
 from rsbench.core.arguments import check_whole
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.storage.untrusted_files import check_name
 
 Axis = Literal[
@@ -36,22 +38,33 @@ Axis = Literal[
     "affine_noise",
 ]
 Vector = tuple[float, float, float]
+_IDEAL = ("width", "height", "focal")
+"""What ``rig_card`` stands in place of."""
+
+
+@lru_cache(maxsize=64)
+def _rig_tables(name: str) -> RigTables:
+    return load_rig(name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
     """One simulated experiment; the paper leaves depth, points, rotation, translation and baseline open."""
 
-    width: int
-    """Width of the images, pixels."""
-    height: int
+    width: int = None  # pyrefly: ignore[bad-assignment]
+    """Width of the images, pixels. Required, unless there is a ``rig_card``, as is all that follows."""
+    height: int = None  # pyrefly: ignore[bad-assignment]
     """Height of the images, pixels."""
-    focal: float
+    focal: float = None  # pyrefly: ignore[bad-assignment]
     """Focal length, pixels; the principal point is centred."""
-    baseline: float
-    """Full distance between the cameras, metres."""
-    readout_ratio: float
-    """Readout time over frame period of the shutter that makes the images, 0 to 1."""
+    baseline: float = None  # pyrefly: ignore[bad-assignment]
+    """Full distance between the cameras, metres; beside a ``rig_card``, in place of the calibration's."""
+    readout_ratio: float = None  # pyrefly: ignore[bad-assignment]
+    """Readout time over frame period of the shutter that makes the images, 0 to 1; beside a ``rig_card``, where
+    that does not state it."""
+    rig_card: RigTables | str | None = None
+    """Name of a rig card (``rsbench list rigs``) or a path to one, or its tables: two calibrated cameras, in place
+    of two equal aligned ones."""
     points: int
     """Matches over time per camera, of points of its own; and tracks, for solvers that need all four images."""
     depth: tuple[float, float]
@@ -104,6 +117,13 @@ class Setting:
             raise ValueError(f"outlier_ratio must lie in [0, 1), got {self.outlier_ratio}")
         if not 0 < self.depth[0] <= self.depth[1]:
             raise ValueError(f"depth must be two positive numbers in order, got {list(self.depth)}")
+        if self.rig_card is not None and (given := [name for name in _IDEAL if getattr(self, name) is not None]):
+            raise ValueError(f"rig_card and {given[0]} exclude each other")
+        tables = self.tables
+        needed = (*_IDEAL, "baseline", "readout_ratio") if tables is None else ("readout_ratio",)
+        for name in needed if tables is None or tables.readout_ratio is None else ():
+            if getattr(self, name) is None:
+                raise ValueError(f"{name!r} is required")
         self.rig()
         self.shutter()
         self.told_shutter()
@@ -111,16 +131,36 @@ class Setting:
             raise ValueError("motion_parameters must leave the motion free: rotation_deg and translation set it")
         self.motion(np.random.default_rng(0))
 
+    @property
+    def record(self) -> dict[str, Any]:
+        """For JSON, without the keys of another kind of rig."""
+        of_rigs = (*_IDEAL, "baseline", "readout_ratio", "rig_card")
+        return {name: value for name, value in asdict(self).items() if value is not None or name not in of_rigs}
+
+    @property
+    def tables(self) -> RigTables | None:
+        """Those of ``rig_card``."""
+        return _rig_tables(self.rig_card) if isinstance(self.rig_card, str) else self.rig_card
+
     def rig(self) -> StereoRig:
-        return StereoRig(camera=PinholeCamera.centred(self.width, self.height, self.focal), baseline=self.baseline)
+        tables = self.tables
+        if tables is None:
+            camera = PinholeCamera.centred(self.width, self.height, self.focal)
+            return StereoRig(camera=camera, baseline=self.baseline)
+        return tables.rig() if self.baseline is None else replace(tables.rig(), baseline=self.baseline)
 
     def shutter(self) -> RollingShutter:
         """The shutter that made the images."""
-        return RollingShutter(height=self.height, readout_ratio=self.readout_ratio)
+        tables = self.tables
+        if tables is None:
+            return RollingShutter(height=self.height, readout_ratio=self.readout_ratio)
+        ratio = self.readout_ratio if tables.readout_ratio is None else tables.readout_ratio
+        return self.rig().shutter_of(tables.scanning or Scanning(), ratio)
 
     def told_shutter(self) -> RollingShutter:
         """The shutter that the solver believes in."""
-        return RollingShutter(height=self.height, readout_ratio=self.readout_ratio + self.readout_ratio_error)
+        shutter = self.shutter()
+        return shutter.with_ratio(shutter.readout_ratio + self.readout_ratio_error)
 
     def motion(self, rng: np.random.Generator) -> Motion:
         """Motion of one trial; equal generators give equal random directions, whatever the magnitudes."""
@@ -172,7 +212,7 @@ class Setting:
         Raises:
             RsbenchError: one line beginning with ``where`` if a field does not exist or cannot have its value.
         """
-        return parse_card(Setting, {**asdict(self), **changes}, where)
+        return parse_card(Setting, self.record | dict(changes), where)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,7 +270,10 @@ class SweepCard:
         if not names or len(set(names)) < len(names):
             raise ValueError("each [[variant]] needs a name of its own")
         check_whole("trials", self.trials, 1, 1_000_000)
-        self.cells()
+        for cell in self.cells():
+            tables = cell.setting.tables
+            if self.axis == "readout_ratio" and tables is not None and tables.readout_ratio is not None:
+                raise ValueError(f"axis = 'readout_ratio': the rig of variant {cell.variant!r} states its own")
 
     def cells(self) -> list[Cell]:
         """All cells, variant by variant."""

@@ -27,6 +27,7 @@ from rsbench.benchmark.simulated.run_sweep import (
 from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
 from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
 from rsbench.components.motion_models import LinearMotion
+from rsbench.components.rig_tables import load_rig
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.isolated_components import SolverRunner
@@ -289,6 +290,45 @@ def test_a_wrong_readout_ratio_reaches_the_solver_only() -> None:
     right, wrong = (trials(s, ("rs-stereo-linear",), 0, 0, 3) for s in (SETTING, told))
     np.testing.assert_array_equal(right["w"], wrong["w"])
     assert not np.any(right["w_est"] == wrong["w_est"])
+
+
+OF_RIG = Setting(
+    rig_card="shuttum-vertical", points=100, depth=(2.0, 10.0), rotation_deg=2.0, translation=0.3, noise_px=0.3
+)
+
+
+def test_a_sweep_of_rigs_is_at_their_bounds_and_read_again(tmp_path: Path) -> None:
+    """A global camera above one that rolls, 6 cm apart: what moves in between hides their disparity."""
+    zed = Variant(name="zed2", setting={"rig_card": "zed2"})
+    card = SweepCard(
+        name="rigs",
+        axis="noise_px",
+        values=(0.3,),
+        solvers=("rs-stereo-refined",),
+        trials=16,
+        setting=OF_RIG,
+        variant=(Variant(name="vertical"), zed),
+    )
+    run_sweep(card, tmp_path / "out", workers=1)
+    table = summarise_sweep(tmp_path / "out")
+    assert np.all(table.success_share == 1.0)
+    assert np.all(table[["e_R_over_bound", "e_T_over_bound"]] < 1.5)  # of 16 trials
+    assert read_json(tmp_path / "out" / "sweep.json")["rigs"]["zed2"]["source"]
+    run_sweep(card, tmp_path / "out", workers=1)
+
+
+def test_rigs_of_settings_are_those_of_their_cards() -> None:
+    rig = load_rig("shuttum-vertical")
+    assert OF_RIG.rig() == rig.rig() and replace(OF_RIG, rig_card=rig).shutter() == OF_RIG.shutter()
+    assert OF_RIG.shutter().still is False and OF_RIG.shutter().ratio_of("left") == 0.0
+    assert replace(OF_RIG, baseline=0.3).rig().baseline == 0.3
+    for changes, message in (
+        ({"width": 640}, "rig_card and width exclude each other"),
+        ({"rig_card": None}, "'width' is required"),
+        ({"rig_card": replace(rig, readout_ratio=None)}, "'readout_ratio' is required"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(OF_RIG, **changes)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_bound_of_the_left_camera_agrees_with_finite_differences_of_its_residuals() -> None:
