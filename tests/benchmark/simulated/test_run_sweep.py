@@ -322,13 +322,14 @@ def test_rigs_of_settings_are_those_of_their_cards() -> None:
     assert OF_RIG.rig() == rig.rig() and replace(OF_RIG, rig_card=rig).shutter() == OF_RIG.shutter()
     assert OF_RIG.shutter().still is False and OF_RIG.shutter().ratio_of("left") == 0.0
     assert replace(OF_RIG, baseline=0.3).rig().baseline == 0.3
-    for changes, message in (
+    wrong: tuple[tuple[dict[str, Any], str], ...] = (
         ({"width": 640}, "rig_card and width exclude each other"),
         ({"rig_card": None}, "'width' is required"),
         ({"rig_card": replace(rig, readout_ratio=None)}, "'readout_ratio' is required"),
-    ):
+    )
+    for changes, message in wrong:
         with pytest.raises(ValueError, match=message):
-            replace(OF_RIG, **changes)  # pyrefly: ignore[bad-argument-type]
+            replace(OF_RIG, **changes)
 
 
 def test_bound_of_the_left_camera_agrees_with_finite_differences_of_its_residuals() -> None:
