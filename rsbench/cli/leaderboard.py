@@ -107,7 +107,7 @@ def export(
     check_place(split, out)
     with work_folder(out), progress_bar(f"exporting {split.name}", len(split.truths)) as advance:
         if data is not None and split.track.gives_images:
-            write_frames(split, data, out)
+            write_frames(split, out)
         write_inputs(split, _counted(split.track.problems(data, seed_file, len(split.truths)), advance), out)
     echo(f"{split.track.id}, split {split.name}, {len(split.truths)} problems: {out}")
     echo(f"fingerprint: {split.fingerprint}")

@@ -577,34 +577,37 @@ _PLACED = Score(
     "higher",
 )
 _WITHOUT_FLIP = tuple(score for score in _FRAMES if not score.key.startswith("flip_"))
+OF_SENSORS: dict[str, Any] = _RIG | {
+    "scores": (
+        Score(
+            "corrected",
+            "placed x picture",
+            "the product of the two: what stands in its place and looks like the scene there",
+            "share",
+            "higher",
+        ),
+        _PLACED,
+        Score(
+            "picture",
+            "picture",
+            "SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
+            "share",
+            "higher",
+        ),
+        *_WITHOUT_FLIP,
+    ),
+    "flips": False,
+    "error": "shortfall",
+    "error_title": "1 - placed x picture",
+    "beside": ("placed", "picture", "failure"),
+}
+"""Fields of a track of frames as a global shutter of the same sensor shows them."""
 TRACKS: tuple[Track, ...] = (
     SensorTrack(
-        **_RIG,
+        **OF_SENSORS,
         name="correction-3",
         id="correction-3",
         title="Corrected frames, by where things stand and how they look",
-        scores=(
-            Score(
-                "corrected",
-                "placed x picture",
-                "the product of the two: what stands in its place and looks like the scene there",
-                "share",
-                "higher",
-            ),
-            _PLACED,
-            Score(
-                "picture",
-                "picture",
-                "SSIM of blurred images to what a global shutter of the same sensor shows, 0 where not drawn",
-                "share",
-                "higher",
-            ),
-            *_WITHOUT_FLIP,
-        ),
-        flips=False,
-        error="shortfall",
-        error_title="1 - placed x picture",
-        beside=("placed", "picture", "failure"),
     ),
     PlacedTrack(
         **_RIG,

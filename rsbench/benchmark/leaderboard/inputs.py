@@ -21,9 +21,8 @@ from rsbench.benchmark.leaderboard.pictures import VIEW
 from rsbench.benchmark.leaderboard.submissions import write_truth
 from rsbench.benchmark.leaderboard.track import Split, Track
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import SIDES, VIEWS
 from rsbench.dataset.layout import picture_file
-from rsbench.dataset.sequence import read_pairs
 from rsbench.pipeline.frame_depth import Images
 from rsbench.pipeline.problem import COLUMNS, Problem, parse_problem, problem_record
 from rsbench.storage.files import read_png, save_arrays, write_bytes, write_json
@@ -32,6 +31,8 @@ from rsbench.storage.work_folder import HIDDEN, named
 
 RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "readout_ratio")
 """Columns of problems.csv after the name."""
+OF_ANY_RIG = ("baseline", "readout_ratio")
+"""Those of rigs whose cameras differ or are turned, which problems.jsonl describes."""
 
 
 def check_place(split: Split, out: Path) -> None:
@@ -53,7 +54,8 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     """
     given = list(problems)
     out.mkdir(parents=True, exist_ok=True)
-    columns = RIG if split.track.gives_readout else RIG[:-1]
+    columns = RIG if all(problem.rig.aligned for problem in given) else OF_ANY_RIG
+    columns = columns if split.track.gives_readout else columns[:-1]
     records = [_record(problem, split.track) for problem in given]
     write_bytes(out / "problems.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
     write_bytes(out / "problems.csv", _csv(("name", *columns), ((p.name, *_rig(p, columns)) for p in given)))
@@ -101,8 +103,8 @@ def _record(problem: Problem, track: Track) -> dict[str, Any]:
 
 
 def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:
-    values = (getattr(problem.rig.camera, key) for key in RIG[:6])
-    return (*values, problem.rig.baseline, problem.shutter.readout_ratio)[: len(columns)]
+    known = {"baseline": problem.rig.baseline, "readout_ratio": problem.shutter.readout_ratio}
+    return tuple(known[key] if key in known else getattr(problem.rig.camera, key) for key in columns)
 
 
 def _requested_rows(split: Split) -> Iterator[tuple[str, str, int, float]]:
@@ -137,7 +139,7 @@ def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArra
 # Frames, and inputs of runs
 
 
-def write_frames(split: Split, data: Path, out: Path) -> None:
+def write_frames(split: Split, out: Path) -> None:
     """Copy the rolling-shutter frames, as ``frames/<problem>/left_0.png`` to ``right_1.png``.
 
     Raises:
@@ -146,8 +148,9 @@ def write_frames(split: Split, data: Path, out: Path) -> None:
     for truth in split.truths:
         if truth.pictures is not None:
             truth.pictures.check()
-    for sequence in read_pairs(data):
-        folder = out / "frames" / sequence.name
+    for truth in split.truths:
+        sequence, folder = truth.sequence, out / "frames" / truth.name
+        assert sequence is not None
         folder.mkdir(parents=True, exist_ok=True)
         for side, frame in VIEWS:
             sequence.image("rs", side, frame)  # that it can be read
@@ -159,11 +162,11 @@ def read_frames(inputs: Path, problem: Problem) -> Images:
     """The frames of a problem, as ``write_frames`` wrote them.
 
     Raises:
-        RsbenchError: one is missing, or is no image of the camera's size.
+        RsbenchError: one is missing, or is no image of its camera's size.
     """
-    folder, camera = inputs / "frames" / problem.name, problem.rig.camera
-    size = camera.width, camera.height
-    return {view: read_png(folder / f"{view[0]}_{view[1]}.png", size) for view in VIEWS}
+    folder = inputs / "frames" / problem.name
+    sizes = {side: (camera.width, camera.height) for side in SIDES for camera in [problem.rig.sensor(side)]}
+    return {view: read_png(folder / f"{view[0]}_{view[1]}.png", sizes[view[0]]) for view in VIEWS}
 
 
 def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, folder: Path) -> None:
@@ -180,7 +183,7 @@ def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, fold
     stored = read_record(folder / "split.json")
     if stored is None or stored.get("fingerprint") != split.fingerprint:
         if data is not None and split.track.gives_images:
-            write_frames(split, data, folder)
+            write_frames(split, folder)
         problems = split.track.problems(data, seed_file, len(split.truths))
         write_inputs(replace(split, public=False), problems, folder)
 

@@ -486,7 +486,7 @@ def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) ->
         row |= {"motion": truth.facts["motion"]}
 
 
-def _add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:
+def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:
     """pose-2: areas under the curves of the rotation and of the direction, apart."""
     for row, truth in zip(rows, split.truths, strict=True):
         R = max(0.0, 1.0 - row["e_R_deg"] / _AREAS_DEG[0])
@@ -661,6 +661,21 @@ _POSES: dict[str, Any] = {
     "inputs": Frames(),
 }
 _SEVERAL_MODELS: dict[str, Any] = {"parting": "motion", "choosing": True, "rounds": True}
+
+
+def pose_fields(inputs: Frames) -> dict[str, Any]:
+    """Fields of a track of motions from given matches of frames under several laws of motion."""
+    scores = (
+        Score("auc_apart", "AUC apart", "mean of AUC of e_R to 0.1 deg and of e_T to 1 deg", "share", "higher"),
+        *(
+            Score(key, title, f"area under the curve of {title[4:]}", "share", "higher")
+            for key, title in (("auc_R", "AUC e_R to 0.1 deg"), ("auc_T", "AUC e_T to 1 deg"))
+        ),
+        *_SHOWN_TOO,
+    )
+    return _SHARED | _POSES | _SEVERAL_MODELS | {"inputs": inputs, "scores": scores}
+
+
 TRACKS: tuple[Track, ...] = (
     MotionTrack(
         **_SHARED
@@ -697,21 +712,11 @@ TRACKS: tuple[Track, ...] = (
         smoke=_SMOKE,
     ),
     MotionTrack(
-        **_SHARED | _POSES | _SEVERAL_MODELS,
+        **pose_fields(Frames()),
         name="pose-2",
         id="pose-2",
         title="Motion from given matches of rendered frames, under several laws of motion",
-        scores=(
-            Score(
-                "auc_apart", "AUC apart", "mean of AUC of e_R to 0.1 deg and of e_T to 1 deg", "share", "higher"
-            ),
-            *(
-                Score(key, title, f"area under the curve of {title[4:]}", "share", "higher")
-                for key, title in (("auc_R", "AUC e_R to 0.1 deg"), ("auc_T", "AUC e_T to 1 deg"))
-            ),
-            *_SHOWN_TOO,
-        ),
-        more_columns=_add_area_columns,
+        more_columns=add_area_columns,
     ),
     MotionTrack(
         **_SHARED | _POSES,

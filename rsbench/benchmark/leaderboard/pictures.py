@@ -70,7 +70,8 @@ class TruePictures:
     @cached_property
     def size(self) -> tuple[int, int]:
         """Width and height."""
-        return self.sequence.rig.camera.width, self.sequence.rig.camera.height
+        camera = self.sequence.rig.sensor(VIEW[0])
+        return camera.width, camera.height
 
     def path(self, each: RequestedPicture) -> Path:
         """File of the true picture."""

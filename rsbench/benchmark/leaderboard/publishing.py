@@ -120,7 +120,7 @@ def publish(
     check_place(split, out)
     with work_folder(out):
         if track.gives_images:
-            write_frames(split, data, out)
+            write_frames(split, out)
         write_inputs(split, track.problems(data, None, len(split.truths)), out)
         names = [name for name in files_below(out) if name != ANNOUNCEMENT and not name.startswith(HIDDEN)]
         made = replace(made, files={name: sha256(out / name) for name in sorted(names)})

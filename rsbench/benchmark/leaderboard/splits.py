@@ -302,11 +302,13 @@ class Frames(Inputs):
 
     distinct_ratios: bool = False
     """Whether each sequence must have its own readout ratio, so that no constant wins."""
+    any_rig: bool = False
+    """Whether pictures may be of cameras with lenses, scans and sizes of their own."""
 
     def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
         folder = _dataset_of(track, data, seed_file)
-        label, pairs = label_of(folder), read_pairs(folder)
-        pictures = _true_pictures(folder, pairs, track) if track.pictures else {}
+        label, pairs = label_of(folder), self.pairs(track, folder)
+        pictures = _true_pictures(folder, pairs, track, self.any_rig) if track.pictures else {}
         truths = tuple(truth_of(sequence, pictures.get(sequence.name)) for sequence in pairs)
         if self.distinct_ratios:
             ratio, count = Counter(truth.shutter.readout_ratio for truth in truths).most_common(1)[0]
@@ -319,14 +321,18 @@ class Frames(Inputs):
 
     def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
         assert data is not None
-        pairs = read_pairs(data)[:count]
+        pairs = self.pairs(track, data)[:count]
         if not track.gives_images:
             options = CorrectionOptions(features=load_features(FEATURES))
             yield from (matched(sequence, options) for sequence in pairs)
             return
         for sequence in pairs:
-            problem = _problem(sequence, Correspondences())
+            problem = unmatched(sequence)
             yield with_gyro(problem, sequence) if "gyro" in track.allowed else problem
+
+    def pairs(self, track: Track, folder: Path) -> list[Sequence]:
+        """The sequences that the track asks about."""
+        return read_pairs(folder)
 
 
 class WholeSequences(Inputs):
@@ -403,7 +409,9 @@ def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
     )
 
 
-def _true_pictures(folder: Path, sequences: Iterable[Sequence], track: Track) -> dict[str, TruePictures]:
+def _true_pictures(
+    folder: Path, sequences: Iterable[Sequence], track: Track, any_rig: bool
+) -> dict[str, TruePictures]:
     """By the names of the sequences of a dataset.
 
     Raises:
@@ -412,7 +420,8 @@ def _true_pictures(folder: Path, sequences: Iterable[Sequence], track: Track) ->
     listed = read_dataset_manifest(folder).files
     found = {}
     for sequence in sequences:
-        if sequence.rig.camera.lens is not None or not sequence.shutter.plain or sequence.moving:
+        plain = any_rig or (sequence.rig.rectified and sequence.shutter.plain)
+        if not plain or sequence.moving:
             raise RsbenchError(
                 f"{folder}: {sequence.name}: {track.id} is of cameras without a lens that read rows together "
                 "from the top, and of scenes without motion; choose another dataset"
@@ -442,6 +451,11 @@ def matched(sequence: Sequence, options: CorrectionOptions) -> Problem:
 
 def _problem(sequence: Sequence, matches: Correspondences) -> Problem:
     return Problem(name=sequence.name, correspondences=matches, rig=sequence.rig, known_shutter=sequence.shutter)
+
+
+def unmatched(sequence: Sequence) -> Problem:
+    """Two frames whose matches a method finds itself."""
+    return _problem(sequence, Correspondences())
 
 
 def with_gyro(problem: Problem, sequence: Sequence) -> Problem:

@@ -11,7 +11,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -257,6 +257,8 @@ class Truth:
     """Where the truth of rendered frames lies."""
     pictures: TruePictures | None = None
     """On tracks whose answers are pictures."""
+    given_rig: StereoRig | None = None
+    """What methods are given of the rig, where that is not the true one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -314,7 +316,8 @@ def _identity(truth: Truth) -> dict[str, Any]:
     else:
         moved = motion_record(motion)
     files = {} if truth.pictures is None else {"files": truth.pictures.files}
-    return {**problem_record(problem), "motion": moved, **files}
+    given = {} if truth.given_rig is None else {"given": problem_record(replace(problem, rig=truth.given_rig))}
+    return {**problem_record(problem), "motion": moved, **files, **given}
 
 
 # Tracks

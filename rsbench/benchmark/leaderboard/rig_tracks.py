@@ -1,0 +1,181 @@
+"""Tracks of rigs as they are: any two cameras, with the true calibration and with a loose one.
+
+Each sequence is two problems of the same frames. In one the given calibration is the true one. In the other the
+right camera is turned, and focal lengths and principal points of both cameras are off, each by a fixed size in a
+direction that the name draws. The truth is the motion of the left camera, in its own axes, which no calibration
+moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.correction_tracks import OF_SENSORS, SensorTrack
+from rsbench.benchmark.leaderboard.motion_tracks import MotionTrack, add_area_columns, motion_row, pose_fields
+from rsbench.benchmark.leaderboard.splits import FEATURES, Frames, matched, unmatched
+from rsbench.benchmark.leaderboard.submissions import Submission
+from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Step, Track, Truth
+from rsbench.benchmark.seeds import generator
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import RsbenchError
+from rsbench.core.pose_errors import translation_of_offset
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.so3 import FloatArray
+from rsbench.dataset.sequence import Sequence as Rendered
+from rsbench.dataset.sequence import read_pairs
+from rsbench.jobs.process_jobs import Workers
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.problem import Problem
+from rsbench.vision.feature_matcher import load_features
+
+LOOSE = "-loose"
+"""End of the name of a problem whose given calibration is not the true one."""
+TURN_DEG = 0.2
+"""Angle by which the right camera of a loose calibration is turned, about a drawn axis; its place stays."""
+FOCAL = 0.005
+"""Share by which the focal length of each camera is too long or too short."""
+CENTRE_PX = 0.5
+"""Distance of the principal point of each camera from the true one, in a drawn direction."""
+
+
+def loose_rig(rig: StereoRig, rng: np.random.Generator) -> StereoRig:
+    """A rig as a loose calibration has it; the centres of both cameras in the left one's axes are right."""
+    cameras = {side: _loose_camera(rig.sensor(side), rng) for side in SIDES}
+    R, t = rig.right_from_left
+    axis = rng.standard_normal(3)
+    turn = so3.exp(np.radians(TURN_DEG) * axis / np.linalg.norm(axis))
+    return replace(StereoRig.of_cameras(*cameras.values(), turn @ R, turn @ t), origin=rig.origin)
+
+
+def _loose_camera(camera: PinholeCamera, rng: np.random.Generator) -> PinholeCamera:
+    gain, angle = 1.0 + FOCAL * rng.choice([-1.0, 1.0]), rng.uniform(0.0, 2.0 * np.pi)
+    cx, cy = camera.cx + CENTRE_PX * np.cos(angle), camera.cy + CENTRE_PX * np.sin(angle)
+    return replace(camera, fx=gain * camera.fx, fy=gain * camera.fy, cx=float(cx), cy=float(cy))
+
+
+@dataclass(frozen=True)
+class RigFrames(Frames):
+    """Each two frames of the sequences of a dataset, with the true calibration and with a loose one."""
+
+    any_rig: bool = True
+
+    def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
+        split = super().split(track, data, seed_file, secret)
+        return replace(split, truths=tuple(each for truth in split.truths for each in _both(truth)))
+
+    def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
+        assert data is not None
+        options = CorrectionOptions(features=load_features(FEATURES))
+        for sequence in self.pairs(track, data)[: count // 2]:
+            loose = replace(sequence, name=sequence.name + LOOSE, rig=loose_of(sequence.name, sequence.rig))
+            for each in (sequence, loose):
+                yield unmatched(each) if track.gives_images else matched(each, options)
+
+    def pairs(self, track: Track, folder: Path) -> list[Rendered]:
+        """Of a track of pictures, which are of the left camera, those in which it rolls."""
+        found = read_pairs(folder)
+        return [each for each in found if each.shutter.ratio_of("left") > 0.0] if track.pictures else found
+
+
+def loose_of(name: str, rig: StereoRig) -> StereoRig:
+    """The loose calibration of a sequence of this name."""
+    return loose_rig(rig, generator(0, "leaderboard", "loose calibration", name))
+
+
+def _both(truth: Truth) -> tuple[Truth, Truth]:
+    name, pictures = truth.name + LOOSE, truth.pictures
+    loose = replace(
+        truth,
+        name=name,
+        given_rig=loose_of(truth.name, truth.rig),
+        facts=truth.facts | {"calibration": "loose"},
+        pictures=None if pictures is None else replace(pictures, sequence=replace(pictures.sequence, name=name)),
+    )
+    return replace(truth, facts=truth.facts | {"calibration": "true"}), loose
+
+
+def left_camera_motion(
+    w: FloatArray, d: FloatArray, point: str, given: StereoRig, wanted: StereoRig
+) -> tuple[FloatArray, FloatArray]:
+    """The motion of the left camera in the body's axes of ``wanted``, from one in those of ``given``.
+
+    Both rigs have one left camera, whose own axes no calibration moves.
+
+    Args:
+        w: rotation vector (3,) of one frame period.
+        d: translation (3,) of ``point``.
+        point: ``body`` or ``left``.
+        given: the rig in whose axes w and d are.
+        wanted: the other one.
+    """
+    turn = wanted.own("left").R.T @ given.own("left").R
+    left = d if point == "left" else translation_of_offset(w, d, given.offset("left"))
+    return turn @ w, turn @ left
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigMotionTrack(MotionTrack):
+    """The motion of a rig of any two cameras: scored as that of its left camera, in that camera's axes."""
+
+    def true_answer(self, truth: Truth) -> Mapping[str, Any]:
+        w, d = left_camera_motion(truth.motion.w, truth.motion.d, "body", truth.rig, truth.given_rig or truth.rig)
+        return {"w": w.tolist(), "d": d.tolist(), "metric": True, "reference_point": "left"}
+
+    def row(self, truth: Truth, answer: Answer | None) -> Row:
+        if answer is not None and answer.w is not None and answer.d is not None:
+            given, point = truth.given_rig or truth.rig, answer.reference_point
+            w, d = left_camera_motion(np.array(answer.w), np.array(answer.d), point, given, truth.rig)
+            answer = replace(answer, w=tuple(w), d=tuple(d), reference_point="left", covariance=None)
+        return motion_row(truth, answer)
+
+
+def _add_columns(rows: list[Row], submission: Submission, split: Split) -> None:
+    add_area_columns(rows, submission, split)
+    for row, truth in zip(rows, split.truths, strict=True):
+        row |= {"calibration": truth.facts["calibration"]}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigCorrectionTrack(SensorTrack):
+    """Frames of the left of any two cameras, as a global shutter of its sensor would have taken them."""
+
+    rows: tuple[str, ...] = ("first",)
+
+    def mark(
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+    ) -> list[pd.DataFrame | RsbenchError]:
+        tables = super().mark(submissions, split, workers, step, kept)
+        named = {truth.name: truth.facts["calibration"] for truth in split.truths}
+        for table in tables:
+            if isinstance(table, pd.DataFrame):
+                table["calibration"] = table["problem"].map(named)
+        return tables
+
+
+TRACKS: tuple[Track, ...] = (
+    RigMotionTrack(
+        **pose_fields(RigFrames()) | {"parting": "calibration"},
+        name="pose-rigs",
+        id="pose-rigs-1",
+        title="Motion from given matches of rigs as they are, with true and with loose calibrations",
+        more_columns=_add_columns,
+    ),
+    RigCorrectionTrack(
+        **OF_SENSORS
+        | {
+            "inputs": RigFrames(),
+            "parting": "calibration",
+            "scores": tuple(score for score in OF_SENSORS["scores"] if score.key != "psnr_middle"),
+        },
+        name="correction-rigs",
+        id="correction-rigs-1",
+        title="Corrected frames of rigs as they are, with true and with loose calibrations",
+    ),
+)
