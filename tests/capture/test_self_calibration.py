@@ -23,6 +23,7 @@ from rsbench.capture.self_calibration import PRIOR, PairFocal, _mended, conclude
 from rsbench.components.motion_models import InertialMotion, make_motion
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.solvers.engine.robust_motion import RobustOptions
@@ -51,6 +52,13 @@ def with_card(rig: StereoRig, factor: float, k1_too_large: float = 0.0) -> Stere
 
 
 FISHEYE = Lens(model="kannala-brandt", k1=-0.05)
+
+
+def test_k1_of_a_lens_without_one_is_refused() -> None:
+    lens = Lens(model="double-sphere", xi=-0.2, alpha=0.6)
+    rig = StereoRig(camera=replace(CAMERA, lens=lens), baseline=0.3)
+    with pytest.raises(RsbenchError, match=r"k1_sigma = 0\.02: a double-sphere lens has no k1"):
+        find_camera([], rig, CardSigma(k1=0.02))
 
 
 @pytest.mark.parametrize("lens", [None, BARREL, FISHEYE])

@@ -76,8 +76,11 @@ def _check_outputs(out: Path, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def test_a_rendered_sequence_is_footage_that_knows_its_rig(tmp_path: Path, castle: Sequence, rig: Path) -> None:
-    result = correct(castle.folder, "--out", tmp_path / "out")
+    result = correct(castle.folder, "--out", tmp_path / "out", "--rectify")
     assert result.returncode == 0, result.stderr
+    pairs = {path.stem for path in (tmp_path / "out/rectified").glob("*.png")}
+    assert pairs == {f"{side}_00000{k}" for side in ("left", "right") for k in (0, 1)}
+    assert (tmp_path / "out/rectified/calibration.yml").is_file()
     record = _check_outputs(
         tmp_path / "out", tuple(f"{side}_00000{k}" for side in ("left", "right") for k in (0, 1))
     )
