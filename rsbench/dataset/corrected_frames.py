@@ -6,7 +6,6 @@ import os
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,14 @@ from rsbench.capture.calibration import NO_ERRORS, OFFSET, TERMS, in_words
 from rsbench.capture.shutter_decision import record_of
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.two_frame_estimate import Capture
+from rsbench.components.rig_tables import camera_record
 from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
+from rsbench.dataset.sequence import cameras_record
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion
@@ -223,6 +225,12 @@ def _gyro_record(gyro: GyroFound) -> Any:
     return {name: np.asarray(value).tolist() for name, value in found.items()}
 
 
+def _ideal_record(camera: PinholeCamera) -> dict[str, Any]:
+    known = camera_record(camera)
+    lens = known.pop("lens", None)
+    return {"camera": known, "lens": lens}
+
+
 def rig_record(
     rig: StereoRig,
     shutter_: RollingShutter,
@@ -231,13 +239,12 @@ def rig_record(
     calibration: tuple[float, ...] = NO_ERRORS,
 ) -> dict[str, Any]:
     """What the correction assumed or found, and which components it was made with, ready for JSON."""
-    camera, best = rig.camera, None if capture is None else capture.likeliest
+    best = None if capture is None else capture.likeliest
     components = {name: {"name": entry.name, "key": entry.key} for name, entry in options.components.items()}
     return {
         "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
-        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
-        "lens": None if camera.lens is None else camera.lens.record(),
-        "scan": asdict(shutter_.scanning),
+        **(_ideal_record(rig.camera) if rig.aligned else cameras_record(rig)),
+        "scan": shutter_.scanning.record,
         "baseline": rig.baseline,
         "readout_ratio": shutter_.readout_ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,

@@ -115,6 +115,29 @@ class CamerasManifest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RigManifest:
+    """What files say of a rig whose cameras differ."""
+
+    cameras: CamerasManifest
+    right_from_left: RightFromLeft
+    baseline: float
+
+    @property
+    def rig(self) -> StereoRig:
+        """The rig; ValueError where the extrinsics contradict the cameras."""
+        rig = StereoRig.of_body(self.cameras.left.own, self.cameras.right.own, self.baseline)
+        R, t = rig.right_from_left
+        stated = self.right_from_left.R, np.array(self.right_from_left.translation)
+        if not (np.allclose(stated[0], R, atol=_SAME) and np.allclose(stated[1], t, atol=_SAME * self.baseline)):
+            raise ValueError("right_from_left contradicts rotation_from_body of the cameras or the baseline")
+        return rig
+
+
+_SAME = 1e-9
+"""Largest difference of two statements of one rotation, or of directions."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SequenceManifest(Scanning):
     """What sequence.json must hold; it holds more."""
 
@@ -184,16 +207,8 @@ class SequenceManifest(Scanning):
             return StereoRig(camera=self.camera, baseline=self.baseline)
         if self.cameras is None or self.right_from_left is None:
             raise ValueError(f"'{'right_from_left' if self.cameras else 'cameras'}' is required")
-        rig = StereoRig.of_body(self.cameras.left.own, self.cameras.right.own, self.baseline)
-        R, t = rig.right_from_left
-        stated = self.right_from_left.R, np.array(self.right_from_left.translation)
-        if not (np.allclose(stated[0], R, atol=_SAME) and np.allclose(stated[1], t, atol=_SAME * self.baseline)):
-            raise ValueError("right_from_left contradicts rotation_from_body of the cameras or the baseline")
-        return rig
-
-
-_SAME = 1e-9
-"""Largest difference of two statements of one rotation, or of directions."""
+        cameras, apart = self.cameras, self.right_from_left
+        return RigManifest(cameras=cameras, right_from_left=apart, baseline=self.baseline).rig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -387,7 +402,7 @@ def sequence_manifest(
         "format": kind,
         "conventions": conventions_of(rig.rectified and shutter.plain, frames, moves),
         "name": name,
-        **({"camera": camera_record(rig.camera)} if kind == FORMAT else _cameras_record(rig)),
+        **({"camera": camera_record(rig.camera)} if kind == FORMAT else cameras_record(rig)),
         "baseline": rig.baseline,
         "readout_ratio": shutter.readout_ratio,
         "frame_period_s": frame_period_s,
@@ -399,8 +414,8 @@ def sequence_manifest(
     }
 
 
-def _cameras_record(rig: StereoRig) -> dict[str, Any]:
-    """``cameras`` and ``right_from_left`` of format 2."""
+def cameras_record(rig: StereoRig) -> dict[str, Any]:
+    """``cameras`` and ``right_from_left`` of format 2; ``RigManifest`` reads them."""
     tables = tables_of(rig)
     turned = {side: tables.pop(side) | {"rotation_from_body": list(rig.own(side).rotation)} for side in SIDES}
     return {"cameras": turned, **tables}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -153,8 +153,8 @@ def _rig_record(rig: StereoRig) -> dict[str, Any]:
 def _shutter_record(problem: Problem) -> dict[str, Any]:
     shutter, scanning = problem.known_shutter, problem.scanning
     if shutter is None:
-        return {} if scanning is None else asdict(scanning)
-    return {"readout_ratio": shutter.readout_ratio, **({} if shutter.plain else asdict(shutter.scanning))}
+        return {} if scanning is None else scanning.record
+    return {"readout_ratio": shutter.readout_ratio, **({} if shutter.plain else shutter.scanning.record)}
 
 
 def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:

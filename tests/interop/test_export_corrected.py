@@ -10,12 +10,15 @@ import pytest
 from commands import assert_refused, run_here
 from evo.tools import file_interface
 from exported_data import HEIGHT, dataset, only
+from general_rigs import RIGS, SCANS
 from scipy.spatial.transform import Rotation
 
 from rsbench.core.rig import SIDES, Side
+from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import join_poses, rig_record, write_frame, write_poses, write_record
 from rsbench.dataset.sequence import Sequence
+from rsbench.interop.writers.colmap_and_tum import read_corrected_folder
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.storage.files import read_json, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, remove
@@ -79,6 +82,17 @@ def test_evo_reads_the_cameras_of_a_corrected_sequence(tmp_path: Path, data: Pat
         poses = np.linalg.inv(np.array(read.poses_se3))
         np.testing.assert_allclose(poses[:, :3, :3], R, atol=_NINE_DIGITS)
         np.testing.assert_allclose(poses[:, :3, 3], t, atol=_NINE_DIGITS)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_the_record_of_a_rig_is_read_to_the_bit(tmp_path: Path, name: str) -> None:
+    rig = RIGS[name]
+    shutter = rig.shutter_of(SCANS["late"], 0.8)
+    write_record(tmp_path, {**rig_record(rig, shutter, None, CorrectionOptions()), "frames": []})
+    write_poses(tmp_path, "trajectory", 0, [0.0, 1.0], Pose(np.stack([np.eye(3)] * 2), np.zeros((2, 3))))
+    join_poses(tmp_path, "trajectory")
+    found = read_corrected_folder(tmp_path)
+    assert found.rig == rig and found.shutter == shutter
 
 
 def _images(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -30,7 +30,7 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import MARKER, read_corrected
 from rsbench.dataset.motion_cards import FORMAT
-from rsbench.dataset.sequence import Sequence
+from rsbench.dataset.sequence import RigManifest, Sequence
 from rsbench.interop.writers.sequence_views import (
     CORNER_PX,
     Format,
@@ -262,11 +262,13 @@ def read_corrected_folder(folder: Path) -> Corrected:
         )
     record = read_json(path)
     try:
-        camera, lens = record["camera"], record["lens"]
-        known = None if lens is None else parse_card(Lens, lens, str(path))
-        rig = StereoRig(camera=PinholeCamera(**camera, lens=known), baseline=record["baseline"])
-        scanning = parse_card(Scanning, record["scan"], str(path))
-        shutter = scanning.shutter_of(rig.camera.width, rig.camera.height, record["readout_ratio"])
+        if "cameras" in record:
+            rig = parse_card(RigManifest, record, str(path), extra="ignore").rig
+        else:
+            camera, lens = record["camera"], record["lens"]
+            known = None if lens is None else parse_card(Lens, lens, str(path))
+            rig = StereoRig(camera=PinholeCamera(**camera, lens=known), baseline=record["baseline"])
+        shutter = rig.shutter_of(parse_card(Scanning, record["scan"], str(path)), record["readout_ratio"])
         row = float(record["target_row"])
     except (KeyError, TypeError, ValueError) as error:
         raise RsbenchError(

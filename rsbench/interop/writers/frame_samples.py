@@ -19,7 +19,6 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from collections.abc import Sequence as Series
 from contextlib import ExitStack
-from dataclasses import asdict
 from itertools import accumulate
 from os import PathLike
 from pathlib import Path
@@ -193,7 +192,7 @@ def _sample_files(sequence: Sequence, frame: int) -> dict[str, bytes]:
     starts = {side: first_second(sequence, View(side, frame)) for side in SIDES}
     about = {"sequence": sequence.name, "frame": frame, "first_line_s": starts}
     known = {name: sequence.manifest[name] for name in _SAMPLE_FIELDS if name in sequence.manifest}
-    scan = asdict(sequence.shutter.scanning)
+    scan = sequence.shutter.scanning.record
     return fields | {"json": json.dumps(about | known | scan, sort_keys=True, allow_nan=False).encode()}
 
 
@@ -225,7 +224,7 @@ def _write_folder(sequences: list[Sequence], root: Path, images: Images) -> Iter
     lines = list[str]()
     for sequence in sequences:
         known = {name: sequence.manifest[name] for name in _LINE_FIELDS if name in sequence.manifest}
-        known |= asdict(sequence.shutter.scanning)
+        known |= sequence.shutter.scanning.record
         for side, frame in views_of(sequence.frames):
             own = {
                 "file_name": picture_file("rs", side, frame),
