@@ -611,14 +611,14 @@ class _Eye(NamedTuple):
 
         It errs by an eighth of the square of the turn between two lines, 1e-10 of a fast one.
         """
-        R, t = self.poses
-        count = len(t)
+        numbers = np.concatenate([self.poses.R.reshape(-1, 9), self.poses.t], axis=1)
+        steps, count = np.diff(numbers, axis=0), len(numbers)
         line = np.clip(np.nan_to_num(pixels[..., self.axis]), -count, 2 * count)
         below = np.clip(np.floor(line).astype(np.int64), 0, count - 2)
-        share = (line - below)[..., None]
-        return Pose(
-            R[below] + share[..., None] * (R[below + 1] - R[below]), t[below] + share * (t[below + 1] - t[below])
-        )
+        found = np.take(steps, below, axis=0)
+        found *= (line - below)[..., None]
+        found += np.take(numbers, below, axis=0)
+        return Pose(found[..., :9].reshape(*line.shape, 3, 3), found[..., 9:])
 
 
 class _Looked(NamedTuple):
@@ -673,30 +673,33 @@ def _of_side(
     own = images[side] if camera.is_ideal else resample(images[side], _shown(camera, wide, grid))
     rho = np.zeros(grid.shape[:2])
     for _ in range(_ROUNDS):
-        ends = _ends(level, eyes[side], eyes[other], sign, rho)
+        ends, column = _ends(level, eyes[side], eyes[other], sign, rho)
         seen = resample(images[other], _inside(there_camera, ends).astype(np.float32))
         left, right = (own, seen) if side == "left" else (seen, own)
         both = find_disparities(entry, left, right, level)
         here, there = both if side == "left" else both[::-1]
         partner = grid + _across(sign * there)
         before, gain = rho, rig.camera.fx * rig.baseline
-        rho = _without_holes(_inverse_depth(eyes[side], eyes[other], _looked(camera, wide, partner), ends))
+        looked = _looked(camera, wide, partner)
+        rho = _without_holes(_inverse_depth(eyes[side], eyes[other], looked, ends, column))
         if np.mean(gain * np.abs(rho - before) > _STILL_PX) < _SETTLED:
             break
     known = np.isfinite(here)
     places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
     moved = (ends - grid).astype(np.float32)
     ends = places + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
-    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), _inside(there_camera, ends))
+    ends = _inside(there_camera, ends)
+    column = there_camera.unproject(ends)[..., 0]
+    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), ends, column)
     disparity = np.where(known, gain * rho, np.nan)
     return _on_sensor(camera, wide, disparity.astype(np.float32))
 
 
-def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) -> FloatArray:
+def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where the other camera, at its own times, sees what it would see at its ideal pixels at those of ``eye``.
 
     (H, W, 2) px of the other image, NaN where it does not; ``rho`` (H, W) 1 / m is the inverse depth there, and
-    that of the partner in ``eye``, whose line's time is meant.
+    that of the partner in ``eye``, whose line's time is meant. And x / z (H, W) of their rays.
     """
     grid = rig.camera.pixel_grid()
     partner = _looked(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
@@ -705,19 +708,22 @@ def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) 
     ends = _pixels(other.camera, rig.camera, grid)
     for _ in range(_STEPS):
         R, t = other.pose_at(ends)
-        ends = other.camera.project(_turned(R, X) + rho[..., None] * t)
-    return ends
+        seen = _turned(R, X) + rho[..., None] * t
+        ends = other.camera.project(seen)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return ends, seen[..., 0] / seen[..., 2]
 
 
-def _inverse_depth(eye: _Eye, other: _Eye, own: _Looked, ends: FloatArray) -> FloatArray:
+def _inverse_depth(eye: _Eye, other: _Eye, own: _Looked, ends: FloatArray, column: FloatArray) -> FloatArray:
     """Inverse depth (H, W), 1 / m, of pixels (H, W, 2) whose points the other camera sees at ``ends``; NaN: none.
 
-    By the columns of the ends, as disparities are; the rows hold the guess that the image was resampled by.
+    By the ``column`` of the ends, x / z (H, W), as disparities are; the rows hold the guess that the image was
+    resampled by.
     """
     (R, t), (S, s) = eye.pose_at(own.pixels), other.pose_at(ends)
     turn = S @ np.swapaxes(R, -1, -2)
     ray, step = _turned(turn, own.rays), s - _turned(turn, t)
-    column = other.camera.unproject(ends)[..., 0]
+    column = np.where(np.isfinite(ends[..., 0]), column, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         rho = (ray[..., 0] - column * ray[..., 2]) / (column * step[..., 2] - step[..., 0])
         return np.where(np.isfinite(rho) & (rho >= 0.0), rho, np.nan)
