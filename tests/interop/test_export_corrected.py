@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 from evo.tools import file_interface
-from exported_data import HEIGHT, dataset, only
+from exported_data import HEIGHT, PLACE, dataset, only, opencv_pixels
 from general_rigs import RIGS, SCANS
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +18,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import join_poses, rig_record, write_frame, write_poses, write_record
 from rsbench.dataset.sequence import Sequence
+from rsbench.interop.readers.layouts import read_colmap
 from rsbench.interop.writers.colmap_and_tum import read_corrected_folder
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.storage.files import read_json, write_json, write_png
@@ -37,7 +38,7 @@ def _corrected(data: Path, out: Path, row: int = 0, rows: bool = False) -> Seque
         for side in SIDES if frame < FRAMES - 1 else ():
             fused = Fused(
                 image=sequence.image("gs", side, frame, row),
-                origin=np.full((HEIGHT, 64), int(Origin.HERE), dtype=np.uint8),
+                origin=np.full(sequence.image("gs", side, frame).shape[:2], int(Origin.HERE), dtype=np.uint8),
                 depth=sequence.depth("gs", side, frame, row),
             )
             write_frame(out, f"{side}_{frame:06d}", fused)
@@ -198,6 +199,37 @@ def test_cameras_that_read_apart_have_no_pair_of_one_time(tmp_path: Path) -> Non
     _corrected(data, tmp_path / "walk")
     result = run_here("export", tmp_path / "walk", "--to", "colmap", "--out", tmp_path / "out")
     assert_refused(result, "do not read each row at one time", "--to tum")
+
+
+def test_two_cameras_that_differ_are_exported_as_they_are(tmp_path: Path) -> None:
+    """Points of the left depth lie in the right frame where their colour is, by OpenCV's model of its lens."""
+    data = dataset(tmp_path / "data", "brown", frames=FRAMES, right="fisheye", right_readout_ratio=0.4)
+    sequence = _corrected(data, tmp_path / "walk")
+    note = _export(tmp_path / "walk", "colmap", tmp_path / "out")["walk"]
+    _export(tmp_path / "walk", "tum", tmp_path / "tum")
+    found = _images(tmp_path / "out/walk/sparse/images.txt")
+    for name, (R, t) in found.items():
+        side: Side = "left" if name.startswith("left") else "right"
+        true = sequence.rig.cam_from_world(sequence.motion, float(int(name[-10:-4])), side)
+        np.testing.assert_allclose(R, true.R, atol=_NINE_DIGITS)
+        np.testing.assert_allclose(t, true.t, atol=_NINE_DIGITS)
+        read = file_interface.read_tum_trajectory_file(tmp_path / f"tum/walk/{side}.txt")
+        camera_from_world = np.linalg.inv(read.poses_se3[int(name[-10:-4])])
+        np.testing.assert_allclose(camera_from_world[:3, :3], true.R, atol=_NINE_DIGITS)
+        np.testing.assert_allclose(camera_from_world[:3, 3], true.t, atol=_NINE_DIGITS)
+    points = np.loadtxt(tmp_path / "out/walk/sparse/points3D.txt")
+    points = points[points[:, 0] <= note["points"] / (FRAMES - 1)]
+    R, t = found["right_000000.png"]
+    K = np.array([[75.0, 0.0, 41.0], [0.0, 74.0, 20.5], [0.0, 0.0, 1.0]])
+    x = points[:, 1:4] @ R.T + t
+    pixels = np.round(opencv_pixels(x, K, "fisheye")).astype(int)
+    inside = np.all((pixels >= 0) & (pixels < [80, 45]), axis=1)
+    seen = sequence.image("gs", "right", 0)[pixels[inside, 1], pixels[inside, 0]].astype(float)
+    assert np.median(np.abs(seen - points[inside, 4:7])) < 13.0 and np.count_nonzero(inside) > 300
+    (recording,) = read_colmap(tmp_path / "out/walk/sparse")
+    assert recording.rig is not None
+    np.testing.assert_allclose(recording.rig.right_from_left.t, PLACE, atol=1e-12)
+    assert recording.rig.sensor("right") == sequence.rig.sensor("right")
 
 
 @pytest.mark.parametrize(

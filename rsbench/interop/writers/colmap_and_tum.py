@@ -311,11 +311,18 @@ def check_corrected(corrected: Corrected, name: str) -> None:
         )
     if name == "colmap" and (fault := lens_fault(corrected.rig, *_MODELS)):
         raise RsbenchError(f"--to {name}: {corrected.folder}: {fault}")
-    if name == "colmap" and not corrected.shutter.rows_together:
+    if name == "colmap" and not _of_one_time(corrected):
         raise RsbenchError(
             f"--to {name}: {corrected.folder}: its cameras do not read each row at one time, so that a "
             "corrected pair has two; take --to tum"
         )
+
+
+def _of_one_time(corrected: Corrected) -> bool:
+    """Whether both frames of a pair were corrected to one time; see ``CorrectionProblem.target_time``."""
+    shutter = corrected.shutter
+    by_left = (shutter.right_readout_ratio, shutter.right_size) != (None, None)
+    return shutter.rows_together or (shutter.right_delay == 0.0 and (by_left or corrected.row == 0.0))
 
 
 def _camera_pose(corrected: Corrected, side: Side, body: Pose) -> Pose:
