@@ -352,7 +352,10 @@ class RefinedSolver(Solver):
 
     def _descend(self, packed: Packed, rig: StereoRig) -> Minimum | None:
         if len(packed.tracks) > 0:
-            return self._checked(packed, self._minimise(packed.tracks_only(), np.zeros(6), self.iterations).theta)
+            tracks, start = packed.tracks_only(), np.zeros(6)
+            if packed.apart:
+                start = self._minimise(tracks.at_once(), start, self.iterations).theta
+            return self._checked(packed, self._minimise(tracks, start, self.iterations).theta)
         starts = linear_starts(packed, (15, 11, 9), rig)
         if not starts:
             return None

@@ -12,8 +12,9 @@ import pytest
 from general_rigs import LEFT, RIGS, SCANS
 
 from rsbench.benchmark.simulated.bound import Views, motion_bound
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import make_motion
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import StereoRig
@@ -144,3 +145,19 @@ def test_the_robust_loop_finds_the_noise_of_two_resolutions(name: str) -> None:
     assert found.estimate.noise_px == pytest.approx(0.3, rel=0.05)
     wrong = data.outliers["tracks"]
     assert np.mean(found.inliers["tracks"][~wrong]) > 0.97 and np.mean(found.inliers["tracks"][wrong]) < 0.1
+
+
+@pytest.mark.parametrize("seed", [1, 3, 11, 14, 22])
+def test_a_rolling_and_a_global_camera_next_to_each_other_show_the_motion(seed: int) -> None:
+    """Matches move by more than their disparities while lines are read: no motion at all is no start."""
+    rig = StereoRig(camera=PinholeCamera.centred(1280, 720, 912.0), baseline=0.015)
+    shutter = rig.shutter_of(Scanning(right_readout_ratio=0.0), 0.8)
+    motion = random_motion(np.random.default_rng(seed), np.radians(2.0), 0.06)
+    options = SimulationOptions(tracks=100, noise_px=0.3)
+    matches = simulate(rig, shutter, motion, options, np.random.default_rng(seed)).correspondences
+    solver = load_solver_entry("rs-stereo-refined").solver
+    found = solver.estimate(matches, rig, shutter)
+    assert found.noise_px == pytest.approx(0.3, abs=0.06)
+    np.testing.assert_allclose(found.w, motion.w, atol=3e-3)
+    robust = estimate_motion(matches, rig, shutter, solver, RobustOptions(), np.random.default_rng(0))
+    assert robust.inlier_count >= 90

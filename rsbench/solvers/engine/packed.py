@@ -55,6 +55,8 @@ class Packed:
     baseline: float
     kernel: MotionKernel
     """The kernel of the motion model."""
+    apart: bool = False
+    """Whether descents begin at ``at_once``, since the two ends of stereo pairs have very different times."""
 
     @property
     def law(self) -> MotionKernel:
@@ -107,6 +109,19 @@ class Packed:
         """Without the pairs."""
         return self._of(self.pairs[:0], self.tracks, self.row_checks)
 
+    def at_once(self) -> Packed:
+        """The ends of the right camera where it would have seen them when the left one did, to first order.
+
+        At no motion the others show no depth: what moves more than a disparity while lines are read spoils it.
+        """
+        tracks = self.tracks.copy()
+        left, right = tracks[:, ::2], tracks[:, 1::2]
+        moved = right[:, 1, :3] - right[:, 0, :3]
+        rate = moved[:, :2] / np.maximum(moved[:, 2:], _LEAST_DURATION)
+        right[:, :, :2] += (left[:, :, 2] - right[:, :, 2])[:, :, None] * rate[:, None]
+        right[:, :, 2] = left[:, :, 2]
+        return replace(self, tracks=tracks)
+
     def only(self, wanted: BoolArray) -> Packed:
         """The pairs and then the tracks of a mask (n + m,)."""
         pairs, tracks = np.split(wanted, [len(self.pairs)])
@@ -114,7 +129,7 @@ class Packed:
 
     def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
         # Contiguous: other arrays would need another compilation of the kernels.
-        same = {name: getattr(self, name) for name in ("focal", "h", "baseline", "kernel")}
+        same = {name: getattr(self, name) for name in ("focal", "h", "baseline", "kernel", "apart")}
         pairs, tracks = np.ascontiguousarray(pairs), np.ascontiguousarray(tracks)
         return Packed(pairs=pairs, tracks=tracks, row_checks=row_checks, **same)
 
@@ -216,16 +231,18 @@ def pack(
             matches = temporal_pairs(correspondences, side)
         if len(matches):
             pairs.append(pack_pairs(matches, side, rig, shutter))
-    camera = rig.camera
+    camera, packed_tracks = rig.camera, (_pack_timed_tracks if timed else pack_tracks)(tracks, rig, shutter)
+    apart = timed and (not rig.aligned or shutter.right_readout_ratio is not None)
     checks = 0.5 * ((tracks[:, 1] - tracks[:, 3]) ** 2 + (tracks[:, 5] - tracks[:, 7]) ** 2)
     return Packed(
         pairs=np.concatenate(pairs),
-        tracks=_pack_timed_tracks(tracks, rig, shutter) if timed else pack_tracks(tracks, rig, shutter),
+        tracks=packed_tracks,
         row_checks=np.zeros(len(tracks)) if timed else checks,
         focal=np.array([camera.fx, camera.fy]),
         h=float(shutter.rate("left")[1]),
         baseline=rig.baseline,
         kernel=kernel,
+        apart=apart and bool(np.any(np.abs(packed_tracks[:, ::2, 2] - packed_tracks[:, 1::2, 2]) > _APART)),
     )
 
 
@@ -517,16 +534,22 @@ def _bounded(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray)
 
 
 _TRIPLE_DAMPING = 1e-4
+_APART, _LEAST_DURATION = 0.05, 0.05
+"""Frame periods between the two ends of a stereo pair from which on they are apart; and that an end takes to the
+next frame, at least, but for wrong ones."""
 
 
 def solve_triples(packed: Packed, samples: NDArray[np.int64], iterations: int = 4) -> FloatArray:
     """Parameters (b, 6) of samples (b, k) of k >= 3 tracks; NaN where the step is not determined.
 
-    Damped Gauss-Newton from no motion at all, whose first step is the linear stereo pose-from-points solution.
+    Damped Gauss-Newton from no motion at all, whose first step is the linear stereo pose-from-points solution;
+    where the ends of stereo pairs are ``apart``, from the solution of those ``at_once``.
     A step that does not lower the cost is not taken and the damping grows.
     """
     out = np.zeros((len(samples), 6))
-    _descend(packed.tracks, samples, packed.law, packed.focal, packed.h, packed.baseline, iterations, out)
+    for each in (packed.at_once(), packed) if packed.apart else (packed,):
+        out[~np.all(np.isfinite(out), axis=1)] = 0.0
+        _descend(each.tracks, samples, packed.law, packed.focal, packed.h, packed.baseline, iterations, out)
     return out
 
 
@@ -548,7 +571,9 @@ def _descend(
     trial_H, trial_gradient = np.zeros((6, 6)), np.zeros(6)
     for s in range(len(samples)):
         chosen = tracks[samples[s]]
-        theta[:], H[:], gradient[:], damping = 0.0, 0.0, 0.0, _TRIPLE_DAMPING
+        H[:], gradient[:], damping = 0.0, 0.0, _TRIPLE_DAMPING
+        for k in range(6):
+            theta[k] = out[s, k]
         track_terms(theta, kernel, chosen, focal, h, baseline, squares, H, gradient, want)
         cost = squares.sum()
         for _ in range(iterations):
