@@ -50,6 +50,9 @@ def rig(
     resize: Annotated[
         str | None, typer.Option(metavar="WxH", help="Of the same images scaled to another size.")
     ] = None,
+    crop: Annotated[
+        str | None, typer.Option(metavar="WxH+X+Y", help="Of frames cropped to this size from column X and row Y.")
+    ] = None,
     unit: Annotated[
         str | None, typer.Option(metavar="UNIT", help="Of lengths: m, cm, mm, inch, or metres, such as 0.025.")
     ] = None,
@@ -67,13 +70,15 @@ def rig(
     """Show what is understood of a calibration, and convert it between the formats of tools."""
     import dataclasses
 
-    from rsbench.interop.readers.calibration_parts import resized, with_size
+    from rsbench.interop.readers.calibration_parts import cropped, refuse_unseen, resized, with_size
     from rsbench.interop.readers.rig_files import calibration_of
 
     wanted = None if size is None else _size("--size", size)
     found = calibration_of(file, _assumptions(wanted, unit, lens, invert, exchange))
     found = found if wanted is None else with_size(found, wanted)
     found = found if resize is None else resized(found, _size("--resize", resize))
+    found = found if crop is None else cropped(found, crop)
+    refuse_unseen(found, file)
     if fps is not None:
         if not 0.0 < fps < 1e6:
             raise RsbenchError(f"--fps {fps:g}: must be a positive number of frames a second")

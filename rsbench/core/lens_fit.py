@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -87,3 +88,53 @@ def mirror_profile(xi: float, k1: float = 0.0, k2: float = 0.0) -> Profile:
 def fov_profile(omega: float) -> Profile:
     """The field-of-view model of F. Devernay, O. Faugeras, 2001; omega in rad, above 0."""
     return lambda angle: np.arctan2(2.0 * math.tan(omega / 2.0) * np.sin(angle), np.cos(angle)) / omega
+
+
+_LEAST_SLOPE, _MOST_ADDED, _WEIGHT = 0.3, 0.15, 0.03
+
+
+class Continued(NamedTuple):
+    """A rational lens in place of one whose polynomial folds just before the corners of the image."""
+
+    lens: Lens
+    until: float
+    """Distorted radius, in focal lengths, from which it is continued."""
+    error: float
+    """Largest distance between the two lenses' images of a ray before that, in focal lengths."""
+
+
+def continued(lens: Lens, corner: float) -> Continued | None:
+    """A lens that does not fold before the corner of the image, which a calibration has seen no points of.
+
+    From where the distorted radius grows by less than 0.3 of the ideal one, it goes on growing so; the nearest
+    rational lens is fitted to that, tangential distortion kept.
+
+    Args:
+        lens: ``brown-conrady`` or ``rational``.
+        corner: distorted radius, in focal lengths, up to which the image reaches.
+
+    Returns:
+        None where the lens folds far from the corner, or not at all.
+    """
+    radial = replace(lens, p1=0.0, p2=0.0)
+    r = np.linspace(0.0, min(lens.reach, 1e3) * (1 - 1e-9), _CHECKED)[1:]
+    bent = radial.distort(np.stack([r, np.zeros_like(r)], axis=-1))
+    y, slope = bent.xy[:, 0], bent.jacobian[:, 0, 0]
+    turn = int(np.argmax(slope < _LEAST_SLOPE))
+    if not slope[turn] < _LEAST_SLOPE or not corner * (1 - _MOST_ADDED) < y[turn]:
+        return None
+    more = np.linspace(0.0, max(1.02 * corner - y[turn], 0.0) / slope[turn], _NODES)[1:]
+    inside = turn + 1
+    r, y = np.append(r[:inside], r[turn] + more), np.append(y[:inside], y[turn] + slope[turn] * more)
+    s, gain = r * r, y / r
+    columns = np.stack([s, s**2, s**3, -gain * s, -gain * s**2, -gain * s**3], axis=-1)
+    weight = np.where(np.arange(len(r)) < inside, 1.0, _WEIGHT) * r
+    c = np.zeros(6)
+    for _ in range(_NODES // 10):  # the denominator's weight follows the fit
+        below = 1.0 + s * (c[3] + s * (c[4] + s * c[5]))
+        c = np.linalg.lstsq(columns * (weight / below)[:, None], (gain - 1.0) * weight / below, rcond=None)[0]
+    k1, k2, k3, k4, k5, k6 = map(float, c)
+    made = Lens(model="rational", k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6, p1=lens.p1, p2=lens.p2)
+    ideal = np.stack([r[:inside], np.zeros(inside)], axis=-1)
+    off = np.abs(replace(made, p1=0.0, p2=0.0).distort(ideal).xy[:, 0] - y[:inside])
+    return Continued(made, float(y[turn]), float(np.max(off)))

@@ -383,6 +383,45 @@ def test_a_zed_with_distortion_in_its_own_section(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig.right_from_left.R, R, atol=1e-9)
 
 
+def test_a_polynomial_that_folds_at_the_corners_is_continued(tmp_path: Path) -> None:
+    """A ZED 2 as it is calibrated in the factory: k3 bends its outermost 20 px back."""
+    d = (-0.0592102, 0.0358082, -0.000315399, -8.94399e-05, -0.0144553)
+    own = (534.25, 534.065, 639.57, 368.0055)
+    path = made.zed(tmp_path)
+    text = re.sub(r"(k|p)\d=[^\n]*\n", "", path.read_text())
+    lines = dict(zip(("k1", "k2", "p1", "p2", "k3"), d, strict=True)) | dict(
+        zip(("fx", "fy", "cx", "cy"), own, strict=True)
+    )
+    section = "".join(f"{key}={value}\n" for key, value in lines.items())
+    path.write_text(re.sub(r"(_CAM_HD\]\n)(f[^\n]*\n|c[xy][^\n]*\n)*", lambda found: found[1] + section, text))
+    found = rsbench.read_rig(path, SIZE)
+    words = re.search(r"continued from ([\d.]+) on, ([\d.]+) px off", found.notes[0])
+    assert words is not None and float(words[2]) < 0.5
+    camera = found.rig.sensor("left")
+    X = np.random.default_rng(0).uniform([-1.5, -1, 1], [1.5, 1, 1], (4000, 3))
+    seen, _ = cv2.projectPoints(X, np.zeros(3), np.zeros(3), made.matrix(own), np.array(d))
+    radius = np.linalg.norm((seen[:, 0] - own[2:]) / own[:2], axis=-1)
+    inside = (radius < float(words[1])) & (np.linalg.norm(X[:, :2], axis=-1) < 1.5)
+    off = np.linalg.norm(camera.project(X) - seen[:, 0], axis=-1)[inside]
+    assert np.max(off) < float(words[2]) + 0.05 and np.median(off) < 0.06
+
+
+def test_a_fisheye_that_sees_behind_itself_needs_a_crop(tmp_path: Path) -> None:
+    text = CAMERA.replace("radtan", "equidistant").replace(str(list(D_LEFT)), str(list(KB)))
+    text = text.replace(str(list(LEFT)), str([286.6, 286.5, 640.8, 358.1]))
+    path = chain(tmp_path, text, text)
+    with pytest.raises(RsbenchError, match=r"shows no ray.*--crop \d+x\d+\+\d+\+\d+") as refused:
+        rsbench.read_rig(path)
+    words = re.search(r"--crop (\S+)", str(refused.value))
+    assert words is not None
+    width, height, x, y = map(int, re.split(r"[x+]", words[1]))
+    out = tmp_path / "rig.toml"
+    assert run_here("rig", path, "--crop", words[1], "-o", out).returncode == 0
+    camera = rsbench.read_rig(out).rig.sensor("left")
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (width, height, 640.8 - x, 358.1 - y)
+    assert_refused(run_here("rig", path, "--crop", "2000x20+0+0"), "--crop 2000x20+0+0: must lie inside")
+
+
 def test_an_inverse_lens_of_realsense_is_refused_unless_it_is_none(tmp_path: Path) -> None:
     path = made.realsense(tmp_path)
     text = path.read_text().replace("brown_conrady", "inverse_brown_conrady")
@@ -391,6 +430,16 @@ def test_an_inverse_lens_of_realsense_is_refused_unless_it_is_none(tmp_path: Pat
         rsbench.read_rig(path)
     path.write_text(re.sub(r'"coeffs": \[[^\]]*\]', '"coeffs": [0, 0, 0, 0, 0]', text))
     assert rsbench.read_rig(path).rig.sensor("right").lens is None
+
+
+def test_units_of_depthai(tmp_path: Path) -> None:
+    path = made.depthai(tmp_path)
+    text = path.read_text()
+    path.write_text(text.replace('"toCameraSocket": 0', '"toCameraSocket": 0, "lengthUnit": 1'))
+    same_numbers(rsbench.read_rig(path).rig)
+    path.write_text(text.replace('"toCameraSocket": 0', '"toCameraSocket": 0, "lengthUnit": 9'))
+    with pytest.raises(RsbenchError, match="lengthUnit = 9"):
+        rsbench.read_rig(path)
 
 
 def test_lenses_of_basalt(tmp_path: Path) -> None:

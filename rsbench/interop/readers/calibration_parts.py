@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from rsbench.components.rig_tables import CameraTable, Size
 from rsbench.core import so3
 from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens_fit import Profile, kannala_brandt_of
+from rsbench.core.lens_fit import Profile, continued, kannala_brandt_of
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_trees import Fields
@@ -115,7 +116,7 @@ def table_of(size: Sequence[float] | FloatArray | None, intrinsics: Sequence[flo
 def camera_of(table: Table, where: str) -> PinholeCamera:
     """The camera of such a table; RsbenchError for one that cannot be."""
     try:
-        return parse_card(CameraTable, table, where).camera()
+        return parse_card(CameraTable, _still(table), where).camera()
     except ValueError as error:
         raise RsbenchError(f"{where}: {error}") from error
 
@@ -231,6 +232,95 @@ def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None
     if kind == "none":
         return None
     return brown(coefficients, where) if kind == "brown" else lens_of(kind, coefficients, where)
+
+
+def unfolded(found: Calibration, given: Assumptions) -> Calibration:
+    """The calibration with lenses that do not fold at the corners of the image, and a sentence about each such."""
+    tables, notes = list[Table | None](), list(found.notes)
+    for side, table in (("left", found.left), ("right", found.right)):
+        size = None if table is None else _size_of(table)
+        if table is not None and size is None and given.frame_size is not None:
+            size = given.frame_size()
+        made = None if table is None or size is None else _continued(table, size)
+        tables.append(table if made is None else made[0])
+        notes += [] if made is None else [f"{side}: {made[1]}"]
+    left, right = tables
+    assert left is not None
+    return replace(found, left=left, right=right, notes=tuple(notes))
+
+
+def _size_of(table: Table) -> Size | None:
+    return (table["width"], table["height"]) if "width" in table else None
+
+
+def _camera(table: Table, size: Size) -> PinholeCamera:
+    """The camera of a table with images of this size; ValueError where its lens cannot be one of such images."""
+    lens = None if "lens" not in table else Lens(**table["lens"])
+    intrinsics = {name: table[name] for name in ("fx", "fy", "cx", "cy")}
+    return PinholeCamera(width=size[0], height=size[1], lens=lens, **intrinsics)
+
+
+def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
+    """A camera whose lens folds before the corners of the image, with one that does not; None for any other."""
+    if table.get("lens", {}).get("model") not in ("brown-conrady", "rational"):
+        return None
+    fx, fy, cx, cy = (table[key] for key in ("fx", "fy", "cx", "cy"))
+    across, down = (max(c + 0.5, extent - 0.5 - c) / f for c, extent, f in ((cx, size[0], fx), (cy, size[1], fy)))
+    try:
+        _camera(table, size)
+        return None
+    except ValueError:
+        made = continued(Lens(**table["lens"]), float(np.hypot(across, down)))
+    if made is None:
+        return None
+    words = (
+        f"its polynomial folds before the corners of the image, {np.hypot(across, down):.3f} focal lengths from "
+        f"the centre: it is continued from {made.until:.3f} on, {made.error * fx:.2g} px off at most before that"
+    )
+    return table | {"lens": made.lens.record()}, words
+
+
+def refuse_unseen(found: Calibration, where: object) -> None:
+    """Raises RsbenchError, with a crop that helps, where corners of an image show no ray before the camera."""
+    for side, table in (("left", found.left), ("right", found.right)):
+        size = None if table is None else _size_of(table)
+        if table is None or size is None:
+            continue
+        try:
+            _camera(table, size)
+        except ValueError as error:
+            for share in np.arange(0.98, 0.3, -0.02):
+                width, height = (2 * round(share * extent / 2) for extent in size)
+                crop = f"{width}x{height}+{(size[0] - width) // 2}+{(size[1] - height) // 2}"
+                try:
+                    _camera(
+                        cropped(found, crop).left if side == "left" else cropped(found, crop).right or {},
+                        (width, height),
+                    )
+                except ValueError:
+                    continue
+                raise RsbenchError(
+                    f"{where}: {side}: {error}; or crop the frames to what is seen before the camera, and "
+                    f"rsbench rig --crop {crop} -o rig.toml"
+                ) from error
+            raise RsbenchError(f"{where}: {side}: {error}") from error
+
+
+def cropped(found: Calibration, crop: str) -> Calibration:
+    """The calibration of frames that are cropped to WxH+X+Y; RsbenchError where that is not inside them."""
+    numbers = re.fullmatch(r"(\d{1,6})x(\d{1,6})\+(\d{1,6})\+(\d{1,6})", crop)
+    if numbers is None:
+        raise RsbenchError(f"--crop {crop!r}: must be WIDTHxHEIGHT+X+Y, such as 640x480+104+160")
+    width, height, x, y = map(int, numbers.groups())
+
+    def cut(table: Table) -> Table:
+        whole = _size_of(table)
+        if whole is None or not (0 < width <= whole[0] - x and 0 < height <= whole[1] - y):
+            shown = "of unknown size: give --size" if whole is None else f"of {whole[0]} x {whole[1]} px"
+            raise RsbenchError(f"--crop {crop}: must lie inside the images, {shown}")
+        return table | {"width": width, "height": height, "cx": table["cx"] - x, "cy": table["cy"] - y}
+
+    return replace(found, left=cut(found.left), right=None if found.right is None else cut(found.right))
 
 
 def with_size(found: Calibration, size: Size) -> Calibration:

@@ -57,6 +57,7 @@ from rsbench.interop.readers.calibration_parts import (
     quaternion_of,
     rotation_of,
     table_of,
+    unfolded,
 )
 from rsbench.interop.readers.calibration_trees import Fields, files_in, read_tree
 
@@ -89,7 +90,7 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
         raise RsbenchError(
             f"{path}: is not as {kind.name} has it: {type(error).__name__}: {words[:100]}"
         ) from error
-    return replace(_left_first(found, given, str(path)), files=tuple(trees))
+    return unfolded(replace(_left_first(found, given, str(path)), files=tuple(trees)), given)
 
 
 def _format_of(tree: Any, path: Path) -> Format:
@@ -386,7 +387,7 @@ def _read_depthai(files: Files) -> Calibration:
         if to in cameras and apart.get("rotationMatrix"):
             R = rotation_of(apart.numbers("rotationMatrix", 9), f"{apart.where}: rotationMatrix")
             place = apart.inner("translation")
-            unit = UNITS.get(apart.text("lengthUnit", default="cm")[:2].rstrip("ei"), UNITS["cm"])
+            unit = _depthai_unit(apart)
             t = np.array([place.number(key) for key in "xyz"]) * (files.given.unit or unit)
             links[socket, to], links[to, socket] = Pose(R, t), inverse(Pose(R, t))
     return Calibration(
@@ -395,6 +396,17 @@ def _read_depthai(files: Files) -> Calibration:
         right=_depthai_camera(cameras[right]),
         right_from_left=_chained(links, left, right, top.where),
     )
+
+
+def _depthai_unit(apart: Fields) -> float:
+    """Metres; centimetres where the file does not say."""
+    known = {"0": 1.0, "1": 0.01, "2": 0.001, "3": 0.0254, "4": 0.3048}
+    unit = known.get(apart.text("lengthUnit", default="1"))
+    if unit is None:
+        raise RsbenchError(
+            f"{apart.where}: lengthUnit = {apart.get('lengthUnit')}: must be one of {', '.join(known)}"
+        )
+    return unit
 
 
 def _chained(links: Mapping[tuple[int, int], Pose], start: int, end: int, where: str) -> Pose:

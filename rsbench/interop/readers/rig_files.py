@@ -15,7 +15,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import Scanning
-from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table
+from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table, refuse_unseen
 from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.pipeline.footage import RigCard, rig_path
 from rsbench.pipeline.mono_camera import OneCameraCard
@@ -74,6 +74,7 @@ def read_rig_file(
     if found.right is None:
         more = f": {found.notes[0]}" if found.notes else "; one camera is given by --camera"
         raise RsbenchError(f"{path}: {found.format}: is of one camera{more}")
+    refuse_unseen(found, path)
     table, missing = tables_of_calibration(found, readout)
     card = parse_card(RigCard, with_readouts(table, str(path)), str(path))
     return card, (*found.notes, *missing)

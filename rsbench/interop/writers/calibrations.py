@@ -16,10 +16,9 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.interop.readers.calibration_parts import Calibration, Table
+from rsbench.interop.readers.calibration_parts import Calibration, Table, camera_of
 from rsbench.interop.writers.colmap_and_tum import camera_line
 from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, yaml_transform
-from rsbench.pipeline.footage import CameraCard
 from rsbench.storage.files import write_bytes
 
 
@@ -43,18 +42,8 @@ def cameras_of(found: Calibration) -> dict[Side, PinholeCamera]:
             raise RsbenchError(
                 f"{side}: the size of the images is not known: give --size, such as --size 1280x720"
             )
-        numbers = {name: table[name] for name in ("fx", "fy", "cx", "cy", "lens") if name in table}
-        try:
-            made[side] = CameraCard(**_with_lens(numbers)).camera((table["width"], table["height"]))
-        except ValueError as error:
-            raise RsbenchError(f"{side}: {error}") from error
+        made[side] = camera_of(table, side)
     return made
-
-
-def _with_lens(numbers: Table) -> Table:
-    from rsbench.core.camera import Lens
-
-    return numbers if "lens" not in numbers else numbers | {"lens": Lens(**numbers["lens"])}
 
 
 def rig_of(found: Calibration) -> StereoRig | None:
