@@ -1,0 +1,306 @@
+"""What frames show of a rig's calibration: the right camera's rotation, the baseline's direction, focal lengths.
+
+A calibration that is a little wrong moves the left-right matches off the epipolar lines. In ideal pixels of the
+rig these lines are rows, and to first order a rotation (x, y, z) of the right camera and a ratio of focal lengths
+move the rows of its rays (u, v, 1) by
+
+    -(1 + v^2) x + u v y + u z + v log(f_right / f_left).
+
+``rotation_of_rows`` fits that to matches with outliers, without a motion or a shutter: enough to look for matches
+along the lines. ``refine_rig`` then estimates all of it with the motion: tracks of four images also show, by the
+depth that the motion gives them, how far the cameras converge and how long their focal lengths are. Its errors
+are whitened reprojection errors with heavy tails, as everywhere (``residuals.add_tracks``); what the tracks do not
+show stays at the prior, and its deviation says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rsbench.core import so3
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import RigCamera, StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.core.so3 import FloatArray
+from rsbench.solvers.engine.packed import Packed, heavy_tailed, inverse_definite, pack
+from rsbench.solvers.engine.residuals import add_tracks
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.refined import RefinedSolver
+
+ERRORS = (
+    "right_x",
+    "right_y",
+    "right_z",
+    "baseline_y",
+    "baseline_z",
+    "focal_left",
+    "focal_right",
+    "right_delay",
+)
+"""Rotation of the right camera about the body's axes, rad; of both cameras against the baseline, rad; logarithms of
+the focal lengths; frame periods by which the right camera is later: added to what the calibration says."""
+_FOCAL, _DELAY = (5, 6), len(ERRORS) - 1
+_STEP = 1e-6
+_SAMPLES, _ROUNDS, _REFITS = 2000, 8, 3
+_ROW_PX = 1.0
+"""Row difference of a match that counts for a rotation in the search, px."""
+_FEWEST, _LEAST_SHARE = 30, 0.15
+"""Matches that must agree on a rotation, and their share: matches of other scenes agree by chance on less."""
+_WIDE = np.array([np.deg2rad(6.0), np.deg2rad(1.0), np.deg2rad(6.0), 0.08])
+"""Prior standard deviations of x, y, z and log(f_right / f_left) in the search by rows, which hardly show y."""
+_LEAST = np.array([np.deg2rad(0.2)] * 5 + [0.005, 0.005])
+"""Prior standard deviations of ``ERRORS``, at least: what an ordinary calibration has wrong."""
+_TIMES_FOUND = 1.5
+"""Prior standard deviations of what rows do not show, over what they do: both come from one calibration."""
+_ITERATIONS, _STILL = 15, 1e-4
+_LEAST_NOISE_PX = 0.3
+_SHARED_PX = 0.03
+"""Error, px, that matches of one pair of images have in common."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundRig:
+    """A rig whose calibration was corrected by its own frames."""
+
+    rig: StereoRig
+    shutter: RollingShutter
+    errors: FloatArray
+    """(8,) of ``ERRORS`` that were added to the calibration."""
+    sigma: FloatArray
+    """(8,) their standard deviations; 0: not estimated."""
+    tracks: int
+    """That they are estimated from."""
+
+    @property
+    def words(self) -> str:
+        """Such as "right camera turned by 0.21, -0.10, 0.35 deg (+- 0.01, 0.05, 0.01); focal lengths ..."."""
+        turn, turn_sigma = np.rad2deg(self.errors[:3]), np.rad2deg(self.sigma[:3])
+        text = "right camera turned by {:.2f}, {:.2f}, {:.2f}".format(*turn)
+        text += " +- {:.2f}, {:.2f}, {:.2f} deg".format(*turn_sigma)
+        longer, sigma = 100.0 * np.expm1(self.errors[5:7]), 100.0 * self.sigma[5:7]
+        text += f"; focal lengths {longer[0]:+.1f} +- {sigma[0]:.1f} % and {longer[1]:+.1f} +- {sigma[1]:.1f} %"
+        late = f"; right camera later by {self.errors[_DELAY]:.4f} +- {self.sigma[_DELAY]:.4f} frame periods"
+        return text + (late if self.sigma[_DELAY] > 0.0 else "")
+
+
+def with_errors(rig: StereoRig, errors: FloatArray) -> StereoRig:
+    """The rig after ``ERRORS`` (8,) are added to its calibration; its body's axes stay on the baseline."""
+    both = np.array([0.0, errors[3], errors[4]])
+    turns = both, both + errors[:3]
+    cameras = []
+    for side, turn, log_focal in zip(("left", "right"), turns, errors[5:7], strict=True):
+        own = rig.own(side)  # pyrefly: ignore[bad-argument-type]
+        longer = float(np.exp(log_focal))
+        camera = replace(own.camera, fx=own.camera.fx * longer, fy=own.camera.fy * longer)
+        cameras.append(RigCamera(camera=camera, rotation=tuple(so3.log(own.R @ so3.exp(turn)))))
+    return replace(rig, camera=rig.camera.ideal, left=cameras[0], right=cameras[1])
+
+
+def _row_columns(rays: FloatArray) -> FloatArray:
+    """(n, 4) by which rows (v) of right rays (n, 2) move with x, y, z and log(f_right / f_left)."""
+    u, v = rays[:, 0], rays[:, 1]
+    return np.stack([-(1.0 + v * v), u * v, u, v], axis=-1)
+
+
+def rotation_of_rows(stereo: FloatArray, rig: StereoRig, seed: int = 0) -> tuple[FloatArray, FloatArray] | None:
+    """Errors (8,) of a calibration from left-right matches (n, 4), ideal px, of whole images, with many outliers.
+
+    Returns:
+        The errors that put the matches on one row, and the mask (n,) of those; None where too few agree.
+    """
+    focal, camera = rig.camera.fx, rig.camera
+    centre = np.array([camera.cx, camera.cy])
+    left, right = ((stereo[:, k : k + 2] - centre) / focal for k in (0, 2))
+    if len(stereo) < _FEWEST:
+        return None
+    rng, found, inside = np.random.default_rng(seed), np.zeros(4), np.zeros(len(stereo), dtype=np.bool_)
+    for refit in range(_REFITS):
+        turned = _turned(right, found)
+        A, off = _row_columns(turned), left[:, 1] - turned[:, 1]
+        prior = np.diag((_ROW_PX / focal / _WIDE) ** 2)
+        if refit == 0:
+            chosen = rng.integers(0, len(stereo), (_SAMPLES, 4))
+            normal = np.swapaxes(A[chosen], 1, 2) @ A[chosen] + prior
+            lines = np.linalg.solve(normal, np.swapaxes(A[chosen], 1, 2) @ off[chosen][..., None])[..., 0]
+            scores = [np.count_nonzero(np.abs(off - A @ line) * focal < _ROW_PX) for line in lines]
+            step = lines[int(np.argmax(scores))]
+        else:
+            step = np.zeros(4)
+        for _ in range(_ROUNDS):
+            inside = np.abs(off - A @ step) * focal < _ROW_PX
+            step = np.linalg.solve(A[inside].T @ A[inside] + prior, A[inside].T @ off[inside])
+        found = found + step
+    if np.count_nonzero(inside) < max(_FEWEST, _LEAST_SHARE * len(stereo)):
+        return None
+    errors = np.zeros(len(ERRORS))
+    # Rays that have to turn by +x are those of a camera that is turned by -x.
+    errors[:3], errors[5:7] = -found[:3], [0.5 * found[3], -0.5 * found[3]]
+    return errors, inside
+
+
+def _turned(rays: FloatArray, found: FloatArray) -> FloatArray:
+    """Rays (n, 2) of the right camera turned by x, y, z, and longer by the fourth's exponential."""
+    xyz = np.concatenate([rays * np.exp(found[3]), np.ones((len(rays), 1))], axis=1) @ so3.exp(found[:3]).T
+    return xyz[:, :2] / xyz[:, 2:]
+
+
+def prior_of(errors: FloatArray, delay_sigma: float = 0.0) -> FloatArray:
+    """(8,) standard deviations of the errors of a calibration whose rows show ``errors`` (8,)."""
+    turn = _TIMES_FOUND * float(np.max(np.abs(errors[[0, 2]])))
+    focal = _TIMES_FOUND * float(np.max(np.abs(errors[5:7])))
+    sizes = np.array([turn] * 3 + [0.5 * turn] * 2 + [focal] * 2)
+    return np.append(np.maximum(_LEAST, sizes), delay_sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Tracks of one pair of times, and their motion."""
+
+    tracks: FloatArray
+    trust: FloatArray
+    nu: float
+    scale: float
+
+
+def refine_rig(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    start: FloatArray,
+    prior: FloatArray,
+    robust: RobustOptions | None = None,
+    seed: int = 0,
+    motion_model: str = "linear",
+) -> FoundRig | None:
+    """The rig with the errors of its calibration that tracks show, jointly with a motion of each window.
+
+    Args:
+        windows: matches of pairs of times, with tracks, in pixels of the images.
+        rig: as calibrated.
+        shutter: known.
+        start: (8,) errors near the right ones, such as ``rotation_of_rows`` gives.
+        prior: (8,) standard deviations of the errors about 0; 0 is exact.
+
+    Returns:
+        None where no motion explains the tracks.
+    """
+    solver, found = RefinedSolver(motion_model=motion_model, use_pairs=False), list[_Window]()
+    thetas = list[FloatArray]()
+    first, read = with_errors(rig, start), _read(shutter, start)
+    for matches in windows:
+        tracks = Correspondences(tracks=matches.tracks)
+        options = robust or RobustOptions()
+        result = estimate_motion(tracks, first, read, solver, options, np.random.default_rng(seed))
+        if not result.estimate.success:
+            continue
+        packed = pack(tracks, first, read, motion_model)
+        theta = packed.theta(result.estimate.w, result.estimate.d)
+        inliers = result.inliers["tracks"]
+        some = Correspondences(tracks=matches.tracks[inliers])
+        noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
+        tailed = heavy_tailed(pack(some, first, read, motion_model), theta, noise)
+        if tailed is None:
+            continue
+        found.append(_Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale))
+        thetas.append(theta)
+    if not found:
+        return None
+    problem = _Problem(found, rig, shutter, prior, motion_model)
+    errors, thetas, H = problem.solved(start.copy(), thetas)
+    inverse = inverse_definite(H)
+    sigma = np.zeros(len(ERRORS))
+    if inverse is None:
+        return None
+    sigma[problem.free] = np.sqrt(np.diagonal(inverse))
+    # Errors that matches share move all of them alike: no number of matches averages them away.
+    shared = _SHARED_PX / rig.camera.fx
+    sigma[problem.free] = np.minimum(np.hypot(sigma[problem.free], shared), prior[problem.free])
+    count = sum(len(each.tracks) for each in found)
+    return FoundRig(
+        rig=with_errors(rig, errors), shutter=_read(shutter, errors), errors=errors, sigma=sigma, tracks=count
+    )
+
+
+def _read(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
+    late = shutter.right_delay + float(errors[_DELAY])
+    return shutter if errors[_DELAY] == 0.0 else replace(shutter, right_delay=float(np.clip(late, -1.0, 1.0)))
+
+
+class _Problem:
+    """Tracks of all windows as a function of the errors and of the windows' motions; the motions are left out."""
+
+    def __init__(
+        self,
+        windows: Sequence[_Window],
+        rig: StereoRig,
+        shutter: RollingShutter,
+        prior: FloatArray,
+        motion_model: str,
+    ) -> None:
+        self.windows, self.rig, self.shutter, self.prior, self.model = windows, rig, shutter, prior, motion_model
+        self.free = np.flatnonzero(prior > 0.0)
+
+    def _packed(self, window: _Window, errors: FloatArray) -> Packed:
+        matches = Correspondences(tracks=window.tracks)
+        return pack(matches, with_errors(self.rig, errors), _read(self.shutter, errors), self.model)
+
+    def local(
+        self, errors: FloatArray, thetas: Sequence[FloatArray]
+    ) -> tuple[float, FloatArray, FloatArray, list[tuple[FloatArray, FloatArray]]]:
+        """Negative log-likelihood, its gradient and Hessian by the free errors, and what gives the motions' steps.
+
+        Derivatives of rays and times by the errors are differences: exact to 1e-6 of what they change. A focal
+        length also changes how many pixels an error of a ray is, which its gradient must have.
+        """
+        k = len(self.free)
+        cost, g, H, backs = 0.0, np.zeros(k), np.zeros((k, k)), []
+        weight = self.prior[self.free] ** -2.0
+        for window, theta in zip(self.windows, thetas, strict=True):
+            packed, size = self._packed(window, errors), 6 + k
+            by, stretched = np.zeros((len(packed.tracks), 4, k, 3)), dict[int, FloatArray]()
+            for j, index in enumerate(self.free):
+                ahead = self._packed(window, errors + _STEP * np.eye(len(ERRORS))[index])
+                by[:, :, j] = (ahead.tracks[:, :, :3] - packed.tracks[:, :, :3]) / _STEP
+                if index in _FOCAL:
+                    stretched[j] = ahead.tracks
+            gradient, whole = np.zeros(size), np.zeros((size, size))
+            tails = np.array([window.nu, window.scale])
+            rest = packed.focal, packed.baseline, tails, window.trust
+            here = add_tracks(theta, packed.law, packed.tracks, by, *rest, gradient, whole)
+            for j, longer in stretched.items():
+                unused = np.zeros(size), np.zeros((size, size))
+                gradient[6 + j] = (add_tracks(theta, packed.law, longer, by, *rest, *unused) - here) / _STEP
+            cost += here / window.scale**2
+            gradient, whole = gradient / window.scale**2, whole / window.scale**2
+            back = np.linalg.pinv(whole[:6, :6], hermitian=True)
+            g += gradient[6:] - whole[6:, :6] @ back @ gradient[:6]
+            H += whole[6:, 6:] - whole[6:, :6] @ back @ whole[:6, 6:]
+            backs.append((back @ gradient[:6], back @ whole[:6, 6:]))
+        values = errors[self.free]
+        return cost + 0.5 * float(weight @ values**2), g + weight * values, H + np.diag(weight), backs
+
+    def solved(
+        self, errors: FloatArray, thetas: list[FloatArray]
+    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+        """Errors (8,), motions and the Hessian by the free errors at the minimum."""
+        cost, g, H, backs = self.local(errors, thetas)
+        damping = 1e-6
+        for _ in range(_ITERATIONS):
+            step = np.linalg.solve(H + damping * np.diag(np.diagonal(H)), -g)
+            trial = errors.copy()
+            trial[self.free] += step
+            moved = [theta - a - B @ step for theta, (a, B) in zip(thetas, backs, strict=True)]
+            new = self.local(trial, moved)
+            if new[0] <= cost:
+                gain, damping = cost - new[0], damping * 0.1
+                errors, thetas, (cost, g, H, backs) = trial, moved, new
+                if gain < _STILL:
+                    break
+            else:
+                damping = max(damping, 1e-8) * 10.0
+                if damping > 1e6:
+                    break
+        return errors, thetas, H
