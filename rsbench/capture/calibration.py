@@ -195,9 +195,11 @@ _CLEARLY = 5.0
 class RefusedFramesError(RsbenchError):
     """Frames that contradict what is given; ``reason`` says why without naming them."""
 
-    def __init__(self, reason: str, where: str = "frames") -> None:
+    def __init__(self, reason: str, where: str = "frames", stereo: FloatArray | None = None) -> None:
         super().__init__(f"{where}: {reason}")
         self.reason = reason
+        self.stereo = stereo
+        """(n, 4) left-right matches, ideal px, of frames that are refused for their rows; None for others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,17 +285,21 @@ def judge_stereo(stereo: FloatArray, rig: StereoRig, row_tolerance: float) -> No
     if pattern is not None and _is_distorted(pattern, share):
         raise RefusedFramesError(
             f"the row differences of left and right matches show a lens that was not undistorted (k1 about "
-            f"{pattern.distortion:.2f}); give the lens, or undistort and rectify the images first"
+            f"{pattern.distortion:.2f}); give the lens, or undistort and rectify the images first",
+            stereo=stereo,
         )
     if share < _SAME_ROW and not rig.aligned:
         raise RefusedFramesError(
             f"only {share:.0%} of the left-right matches lie on the rig's epipolar lines: left and right are "
-            "exchanged or of two times, or the calibration is not that of these frames"
+            "exchanged or of two times, or the calibration is not that of these frames",
+            stereo=stereo,
         )
     if share < _SAME_ROW:
         raise RefusedFramesError(
             f"only {share:.0%} of the left-right matches lie on the same row; the frames must be rectified, in "
-            "the order LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, and left and right of one time (is one camera a frame late?)"
+            "the order LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, and left and right of one time (is one camera a frame "
+            "late?)",
+            stereo=stereo,
         )
     disparity = stereo[:, 0] - stereo[:, 2]
     clear = disparity[np.abs(disparity) > _BACK_PX]

@@ -40,8 +40,8 @@ ERRORS = (
     "focal_right",
     "right_delay",
 )
-"""Rotation of the right camera about the body's axes, rad; of both cameras against the baseline, rad; logarithms of
-the focal lengths; frame periods by which the right camera is later: added to what the calibration says."""
+"""Rotation of the right camera about the body's axes, rad; of both cameras against the baseline, rad; logarithms
+of the focal lengths; frame periods by which the right camera is later: added to what the calibration says."""
 _FOCAL, _DELAY = (5, 6), len(ERRORS) - 1
 _STEP = 1e-6
 _SAMPLES, _ROUNDS, _REFITS = 2000, 8, 3

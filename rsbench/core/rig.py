@@ -37,7 +37,7 @@ FRAMES = (0, 1)
 """The frames of a pair; every estimate is of one pair."""
 _ALIGNED_RAD = 1e-9
 """Rotations below this move no pixel by more than rounding: the camera counts as aligned."""
-_TOGETHER = 0.02
+_TOGETHER = 0.04
 """Readout times between the ends of a match below which it is looked for, and its depth found, on one row."""
 _NEAR = 0.125
 """Disparity of near things, in widths of the image."""
@@ -272,7 +272,7 @@ class StereoRig:
         return np.asarray(self.eye(side).unproject(pixels) @ self.own(side).R[2])
 
     def rows_together(self, scanning: Scanning) -> bool:
-        """Whether both ends of a match are read at one time, or nearly: an ideal row of both within a fiftieth.
+        """Whether both ends of a match are read at one time, or nearly: an ideal row of both within a 25th.
 
         Of an ideal rig what ``scanning`` says, for its lens bends rows of both cameras alike.
         """

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import of_offset
+from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, of_offset
 from rsbench.capture.hypotheses import KnownInputs
+from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -31,7 +32,14 @@ from rsbench.pipeline.frame_depth import (
     moving_pairs,
     timed_pairs,
 )
-from rsbench.pipeline.frame_motion import FoundMotion, match_frames, match_unknown, solve_frames
+from rsbench.pipeline.frame_motion import (
+    FoundMotion,
+    find_rig,
+    match_frames,
+    match_unknown,
+    rig_of_matches,
+    solve_frames,
+)
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
 from rsbench.vision.features import forget_features
 from rsbench.vision.fusion import Fused, Origin, inpaint
@@ -71,6 +79,8 @@ class CorrectedFrames:
     """The frames with the depth that they were corrected with."""
     rig: StereoRig
     """The cameras, with estimated values where ``rsbench.correct`` estimated some."""
+    rig_found: FoundRig | None
+    """What the frames showed of the rig's calibration; None where their rows agree with it."""
     frames: dict[View, Fused]
     at_rows: list[dict[View, Fused]]
     """At each of the further requested rows."""
@@ -119,7 +129,8 @@ def correct_four(
     clock, needs = _Clock(step), options.corrector.component.spec.needs
     calibration = None if disparity_offset is None else of_offset(disparity_offset)
     inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration)
-    matches, found, shutter, capture = _solve(images, rig, inputs, options, given, clock)
+    matches, found, shutter, capture, rig_found = _solve(images, rig, inputs, options, given, clock)
+    rig = rig if rig_found is None else rig_found.rig
     offset = disparity_offset or 0.0 if found is None else found.disparity_offset
     if capture is not None:
         check_cameras(rig, shutter.scanning, options, disparity_offset, given.pairs is not None)
@@ -141,6 +152,7 @@ def correct_four(
         matches=matches,
         pairs=pairs,
         rig=rig,
+        rig_found=rig_found,
         frames=frames,
         at_rows=at_rows,
         seconds=clock.seconds,
@@ -198,8 +210,8 @@ def _solve(
     options: CorrectionOptions,
     given: Given,
     clock: _Clock,
-) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, Capture | None]:
-    """Matches, motion and shutter, as far as they are needed and not given."""
+) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, Capture | None, FoundRig | None]:
+    """Matches, motion, shutter and errors of the rig, as far as they are needed and not given."""
     needs = options.corrector.component.spec.needs
     wanted = given.motion is None and "motion" in needs
     matched = given.matches is not None or "matches" not in needs
@@ -207,16 +219,34 @@ def _solve(
     if inputs.readout_ratio is not None and not wanted and matched:
         clock("matching")
         clock("motion")
-        return matches, None, inputs.shutter_of(rig), None
+        return matches, None, inputs.shutter_of(rig), None, None
     forget_features()
-    if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
-        matches, doubt = match_unknown(images, rig, options)
-    elif matches is None:
-        matches = match_frames(images, rig, options, inputs.scanning)
-    clock("matching")
-    solved = solve_frames(matches, rig, inputs, options, doubt=doubt, with_motion=wanted)
+    own = matches is None and rig.rows_together(inputs.scanning or Scanning())
+    rig_found = None
+    try:
+        if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
+            matches, doubt = match_unknown(images, rig, options)
+        elif matches is None:
+            matches = match_frames(images, rig, options, inputs.scanning)
+        clock("matching")
+        if own and doubt is None and not rig.aligned and inputs.calibration is None:
+            rig_found = rig_of_matches(matches, rig, inputs, options)
+        rig, inputs = _as_found(rig, inputs, rig_found)
+        solved = solve_frames(matches, rig, inputs, options, doubt=doubt, with_motion=wanted)
+    except RefusedFramesError as refusal:
+        if refusal.stereo is None or not own:
+            raise
+        rig_found, matches = find_rig(images, rig, inputs, options, refusal)
+        rig, inputs = _as_found(rig, inputs, rig_found)
+        solved = solve_frames(matches, rig, inputs, options, with_motion=wanted)
     clock("motion")
-    return solved.matches, solved.found, solved.shutter, solved.capture
+    return solved.matches, solved.found, solved.shutter, solved.capture, rig_found
+
+
+def _as_found(rig: StereoRig, inputs: KnownInputs, found: FoundRig | None) -> tuple[StereoRig, KnownInputs]:
+    """The rig as its frames show it; the errors of one that is not ideal are looked for nowhere else."""
+    rig = rig if found is None else found.rig
+    return rig, inputs if rig.aligned else replace(inputs, calibration=inputs.calibration or NO_ERRORS)
 
 
 def find_depth(

@@ -9,6 +9,7 @@ import numpy as np
 from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, check_rig, recalibrated
 from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
+from rsbench.capture.rig_calibration import FoundRig, prior_of, refine_rig, rotation_of_rows, with_errors
 from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
     NoMotionError,
@@ -112,6 +113,61 @@ def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
     if not isinstance(component, SiftMatcher):
         return options
     return replace(options, features=replace(options.features, component=replace(component, enough_tracks=tracks)))
+
+
+def find_rig(
+    images: Images, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions, refusal: RefusedFramesError
+) -> tuple[FoundRig, Correspondences]:
+    """The rig as its frames show it, where their rows contradict its calibration, and the matches under it.
+
+    Args:
+        inputs: with or without a readout ratio.
+        refusal: why the frames are refused under ``rig``.
+
+    Raises:
+        RefusedFramesError: the same, where no rotation of the right camera puts the matches on the epipolar lines.
+        NoMotionError: the frames determine no motion or readout ratio.
+    """
+    rows = None if refusal.stereo is None else rotation_of_rows(refusal.stereo, rig, options.seed)
+    if rows is None:
+        raise refusal
+    turned = with_errors(rig, rows[0])
+    try:
+        matches = match_frames(images, turned, options, inputs.scanning)
+    except RefusedFramesError:
+        raise refusal from None
+    found = _refined(matches, rig, rows[0], inputs, options)
+    if found is None:
+        raise refusal
+    return found, matches
+
+
+def rig_of_matches(
+    matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+) -> FoundRig | None:
+    """The rig as matches along its epipolar lines show it; None where they agree with its calibration.
+
+    Raises:
+        NoMotionError: the matches determine no readout ratio.
+    """
+    if not any(known_of(matches, rig, inputs).calibration_sigma):
+        return None
+    ideal = without_lens(matches, rig)
+    rows = rotation_of_rows(np.concatenate([ideal.stereo_0, ideal.stereo_1]), rig, options.seed)
+    return None if rows is None else _refined(matches, rig, rows[0], inputs, options)
+
+
+def _refined(
+    matches: Correspondences, rig: StereoRig, start: FloatArray, inputs: KnownInputs, options: CorrectionOptions
+) -> FoundRig | None:
+    """``refine_rig`` under the shutter that is given, or that the matches show near the right rig."""
+    turned, inputs = with_errors(rig, start), replace(inputs, calibration=NO_ERRORS)
+    if inputs.readout_ratio is not None:
+        shutter = inputs.shutter_of(turned)
+    else:
+        shutter = solve_frames(matches, turned, inputs, options, with_motion=False).shutter
+    model = options.motion_model if options.motion_model in MODELS else "linear"
+    return refine_rig([matches], rig, shutter, start, prior_of(start), options.robust, options.seed, str(model))
 
 
 def match_unknown(
