@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -75,13 +76,19 @@ class FoundRig:
     """That they are estimated from."""
 
     @property
+    def record(self) -> dict[str, Any]:
+        """Values and deviations by name, ready for JSON; angles in rad."""
+        pairs = zip(ERRORS, self.errors.tolist(), self.sigma.tolist(), strict=True)
+        return {name: {"value": value, "sigma": sigma} for name, value, sigma in pairs if sigma > 0.0}
+
+    @property
     def words(self) -> str:
         """Such as "right camera turned by 0.21, -0.10, 0.35 deg (+- 0.01, 0.05, 0.01); focal lengths ..."."""
         turn, turn_sigma = np.rad2deg(self.errors[:3]), np.rad2deg(self.sigma[:3])
-        text = "right camera turned by {:.2f}, {:.2f}, {:.2f}".format(*turn)
-        text += " +- {:.2f}, {:.2f}, {:.2f} deg".format(*turn_sigma)
+        text = "right camera turned by {:.3f}, {:.3f}, {:.3f}".format(*turn)
+        text += " +- {:.3f}, {:.3f}, {:.3f} deg".format(*turn_sigma)
         longer, sigma = 100.0 * np.expm1(self.errors[5:7]), 100.0 * self.sigma[5:7]
-        text += f"; focal lengths {longer[0]:+.1f} +- {sigma[0]:.1f} % and {longer[1]:+.1f} +- {sigma[1]:.1f} %"
+        text += f"; focal lengths {longer[0]:+.2f} +- {sigma[0]:.2f} % and {longer[1]:+.2f} +- {sigma[1]:.2f} %"
         late = f"; right camera later by {self.errors[_DELAY]:.4f} +- {self.sigma[_DELAY]:.4f} frame periods"
         return text + (late if self.sigma[_DELAY] > 0.0 else "")
 

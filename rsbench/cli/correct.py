@@ -208,6 +208,7 @@ def _correct_four(given: RigInput, target: str, options: CorrectionOptions, fini
                 scanning=card.scanning,
             )
         demand_corrected(result.frames, options.corrector.name)
+        rig = result.rig
         frames = {view: finish(fused) for view, fused in result.frames.items()}
         for (side, frame), fused in frames.items():
             write_frame(folder, f"{side}_{frame}", fused)
@@ -216,7 +217,7 @@ def _correct_four(given: RigInput, target: str, options: CorrectionOptions, fini
         if given.rectify:
             write_calibration(folder, rig)
         calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
-        record = rig_record(rig, result.shutter, result.capture, options, calibration)
+        record = rig_record(rig, result.shutter, result.capture, options, calibration, result.rig_found)
         record["camera_note"] = focal
         record["motion"] = None if result.found is None else motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}

@@ -39,7 +39,7 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
     from rsbench.dataset.corrected_frames import fresh_folder, is_video, rig_record, video_place
     from rsbench.interop.writers.rectified_pairs import write_calibration
     from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
+    from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera, with_found_rig
 
     sources, card, out = given.footage(), given.card, given.out
     if given.rectify and is_video(out):
@@ -59,8 +59,10 @@ def correct_sequence_given(given: RigInput, target: str, options: CorrectionOpti
             card.scanning,
             progress_bar,
         )
+        turned = with_found_rig(rig, *sources, options, card.readout_ratio, card.scanning)
+        rig = rig if turned is None else turned.rig
         shutter, calibration, capture = found = _look(sources, rig, card, options)
-        record = {**rig_record(rig, shutter, capture, options, calibration), "camera_note": focal}
+        record = {**rig_record(rig, shutter, capture, options, calibration, turned), "camera_note": focal}
         record["frames"] = _correct_into(folder, sources, rig, found, options, close, given, gyro)
         if is_video(out):
             _write_both(out, folder, sources, record)
@@ -106,6 +108,7 @@ def _look(sources: Sources, rig: StereoRig, card: RigCard, options: CorrectionOp
     from rsbench.pipeline.sequence_capture import WINDOWS, estimate_sequence_capture
 
     ratio, calibration, scanning = card.readout_ratio, card.calibration, card.scanning
+    calibration = calibration if rig.aligned else calibration or NO_ERRORS  # found as errors of the rig
     if ratio is not None and calibration is not None:
         return rig.shutter_of(scanning or Scanning(), ratio), calibration, None
     with progress_bar("looking at the shutter", min(max(sources[0].count - 1, 1), WINDOWS)) as advance:

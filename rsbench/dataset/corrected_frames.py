@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.capture.calibration import NO_ERRORS, OFFSET, TERMS, in_words
+from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.shutter_decision import record_of
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.two_frame_estimate import Capture
@@ -237,6 +238,7 @@ def rig_record(
     capture: Capture | None,
     options: CorrectionOptions,
     calibration: tuple[float, ...] = NO_ERRORS,
+    rig_found: FoundRig | None = None,
 ) -> dict[str, Any]:
     """What the correction assumed or found, and which components it was made with, ready for JSON."""
     best = None if capture is None else capture.likeliest
@@ -252,7 +254,8 @@ def rig_record(
         "disparity_offset": calibration[OFFSET],
         "disparity_offset_sigma": None if capture is None else capture.offset_sigma,
         "calibration_errors": dict(zip(TERMS, calibration, strict=True)) if any(calibration) else None,
-        "calibration_note": in_words(calibration, rig),
+        "calibration_note": in_words(calibration, rig) if rig_found is None else rig_found.words,
+        **({} if rig_found is None else {"rig_errors": rig_found.record}),
         "capture": None if capture is None else record_of(capture),
         "target_row": options.target_row,
         "components": components,

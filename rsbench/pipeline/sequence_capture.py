@@ -10,8 +10,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import CardSigma, RefusedFramesError
+from rsbench.capture.calibration import CardSigma, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
+from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
@@ -24,7 +25,14 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.pipeline.footage import FrameSource, Progress, check_alike, no_progress
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
-from rsbench.pipeline.frame_motion import match_frames, match_unknown, models_asked, with_enough
+from rsbench.pipeline.frame_motion import (
+    find_rig,
+    match_frames,
+    match_unknown,
+    models_asked,
+    rig_of_matches,
+    with_enough,
+)
 
 JUDGED = 3
 """First windows whose rig is looked at; when all of them are refused, so is the sequence."""
@@ -298,3 +306,28 @@ def with_found_camera(
         found = camera_of_frames(windows, rig, sigma, options, readout_ratio, scanning)
         advance("")
     return found.rig, found.words(rig, sigma)
+
+
+def with_found_rig(
+    rig: StereoRig,
+    left: FrameSource,
+    right: FrameSource,
+    options: CorrectionOptions,
+    readout_ratio: float | None = None,
+    scanning: Scanning | None = None,
+) -> FoundRig | None:
+    """The rig as the first frames show it; None where their rows agree with its calibration, or do not tell."""
+    images = next(iter(window_images(left, right)), None)
+    if images is None or not rig.rows_together(scanning or Scanning()):
+        return None
+    inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning)
+    try:
+        if rig.aligned:
+            check_rig(images["left", 0], images["right", 0], rig)
+            return None
+        return rig_of_matches(match_frames(images, rig, options, scanning), rig, inputs, options)
+    except RefusedFramesError as refusal:
+        try:
+            return find_rig(images, rig, inputs, options, refusal)[0]
+        except (RefusedFramesError, NoMotionError):
+            return None  # the correction says so of each window

@@ -1,0 +1,108 @@
+"""What tracks show of a calibration that is wrong, against the true one that they were simulated with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsbench.capture.rig_calibration import prior_of, refine_rig, rotation_of_rows, with_errors
+from rsbench.components.motion_models import make_motion
+from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.projection import rs_project
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
+
+TRUE = StereoRig.of_cameras(
+    PinholeCamera.centred(640, 480, 520.0),
+    PinholeCamera.centred(640, 480, 527.0),
+    so3.exp(np.deg2rad([0.4, 0.8, -0.6])),
+    (-0.2, 0.001, -0.002),
+)
+SHUTTER: RollingShutter = TRUE.shutter_of(Scanning(), 0.8)
+LOOSE = np.array([*np.deg2rad([0.2, 0.2, 0.2, 0.1, 0.1]), 0.005, 0.005, 0.0])
+"""Standard deviations of a loose calibration, in the order of ``ERRORS``."""
+
+
+def tracks_of(rng: np.random.Generator, noise_px: float, count: int) -> FloatArray:
+    """Tracks (n, 8) of 2 deg and 0.25 m a frame period."""
+    w, d = rng.normal(size=(2, 3))
+    motion = make_motion("linear", w * np.deg2rad(2.0) / np.linalg.norm(w), d * 0.25 / np.linalg.norm(d))
+    X = rng.uniform([-6.0, -4.0, 2.0], [6.0, 4.0, 14.0], (6 * count, 3))
+    X[:, :2] *= X[:, 2:] / 8.0
+    ends = [rs_project(TRUE, SHUTTER, motion, side, frame, X).pixels for frame in (0, 1) for side in SIDES]
+    tracks = np.concatenate(ends, axis=1)
+    tracks = tracks[np.all(np.isfinite(tracks), axis=1)][:count]
+    return np.asarray(tracks + rng.normal(0.0, noise_px, tracks.shape))
+
+
+def ideal(rows: FloatArray, rig: StereoRig) -> FloatArray:
+    ends = [rig.eye(side).ideal_pixels(rows[:, k : k + 2]) for k, side in zip((0, 2), SIDES, strict=True)]
+    return np.concatenate(ends, axis=1)
+
+
+def test_errors_added_and_taken_away_leave_the_rig() -> None:
+    errors = np.array([0.01, -0.02, 0.03, 0.004, -0.005, 0.01, -0.02, 0.0])
+    there = with_errors(TRUE, errors)
+    assert np.rad2deg(so3.angle(there.right_from_left.R @ TRUE.right_from_left.R.T)) > 1.0
+    for side in SIDES:
+        back = with_errors(with_errors(TRUE, np.eye(8)[6] * 0.01), np.eye(8)[6] * -0.01)
+        np.testing.assert_allclose(back.own(side).R, TRUE.own(side).R, atol=1e-12)
+        assert back.sensor(side).fx == pytest.approx(TRUE.sensor(side).fx)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_show_the_rotation_among_outliers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    errors = np.array([*np.deg2rad(rng.uniform(-4.0, 4.0, 3)), 0.0, 0.0, 0.01, -0.01, 0.0])
+    tracks = tracks_of(rng, 0.2, 200)
+    wrong = rng.uniform(0.0, 480.0, (120, 4))
+    given = with_errors(TRUE, errors)
+    found = rotation_of_rows(ideal(np.concatenate([tracks[:, :4], wrong]), given), given)
+    assert found is not None
+    start, inside = found
+    assert np.mean(inside[:200]) > 0.9
+    assert np.mean(inside[200:]) < 0.1
+    np.testing.assert_allclose(
+        start[[0, 2]], -errors[[0, 2]], atol=np.deg2rad(0.3)
+    )  # the search is of first order
+
+
+def test_matches_of_another_scene_show_no_rotation() -> None:
+    stereo = np.random.default_rng(0).uniform(0.0, 480.0, (300, 4))
+    assert rotation_of_rows(stereo, TRUE) is None
+
+
+def test_a_loose_calibration_is_found_within_the_stated_deviations() -> None:
+    scores = []
+    for seed in range(12):
+        rng = np.random.default_rng(100 + seed)
+        tracks, errors = tracks_of(rng, 0.3, 250), LOOSE * rng.normal(size=8)
+        given = with_errors(TRUE, errors)
+        rows = rotation_of_rows(ideal(tracks[:, :4], given), given)
+        assert rows is not None
+        found = refine_rig([Correspondences(tracks=tracks)], given, SHUTTER, rows[0], prior_of(rows[0]))
+        assert found is not None
+        # The right rotation about the baseline and the viewing direction within 0.02 deg, from 250 matches.
+        assert np.all(np.abs(found.errors + errors)[[0, 2]] < np.deg2rad(0.03))
+        scores.append((found.errors + errors)[:7] / found.sigma[:7])
+    squares = np.array(scores) ** 2
+    assert np.mean(squares < 9.0) >= 0.95
+    # Chi-squared of 84: the mean lies between 0.6 and 1.6 in all but one of ten thousand.
+    assert 0.4 < np.mean(squares) < 1.6
+
+
+def test_a_late_right_camera_is_found_with_its_rotation() -> None:
+    rng = np.random.default_rng(7)
+    tracks, errors = tracks_of(rng, 0.1, 300), np.array([*np.deg2rad([0.2, -0.1, 0.1, 0.0, 0.0]), 0.0, 0.0, 0.0])
+    given = with_errors(TRUE, errors)
+    early = TRUE.shutter_of(Scanning(right_delay=-0.02), 0.8)
+    prior = prior_of(-errors, delay_sigma=0.05)
+    found = refine_rig([Correspondences(tracks=tracks)], given, early, -errors, prior)
+    assert found is not None
+    assert abs(found.errors[7] - 0.02) < 4.0 * found.sigma[7]
+    assert found.sigma[7] < 0.005
+    assert found.shutter.right_delay == pytest.approx(-0.02 + found.errors[7])
+    assert "right camera later by" in found.words
