@@ -19,8 +19,7 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.correction_tracks import OF_SENSORS, SensorTrack
 from rsbench.benchmark.leaderboard.motion_tracks import MotionTrack, add_area_columns, motion_row, pose_fields
 from rsbench.benchmark.leaderboard.splits import FEATURES, Frames, matched, unmatched
-from rsbench.benchmark.leaderboard.submissions import Submission
-from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Step, Track, Truth
+from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Step, Submission, Track, Truth
 from rsbench.benchmark.seeds import generator
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
@@ -47,11 +46,11 @@ CENTRE_PX = 0.5
 
 def loose_rig(rig: StereoRig, rng: np.random.Generator) -> StereoRig:
     """A rig as a loose calibration has it; the centres of both cameras in the left one's axes are right."""
-    cameras = {side: _loose_camera(rig.sensor(side), rng) for side in SIDES}
+    left, right = (_loose_camera(rig.sensor(side), rng) for side in SIDES)
     R, t = rig.right_from_left
     axis = rng.standard_normal(3)
     turn = so3.exp(np.radians(TURN_DEG) * axis / np.linalg.norm(axis))
-    return replace(StereoRig.of_cameras(*cameras.values(), turn @ R, turn @ t), origin=rig.origin)
+    return replace(StereoRig.of_cameras(left, right, turn @ R, turn @ t), origin=rig.origin)
 
 
 def _loose_camera(camera: PinholeCamera, rng: np.random.Generator) -> PinholeCamera:
