@@ -15,12 +15,14 @@ from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import rotation_error, translation_error
-from rsbench.core.rig import Side, StereoRig, View
+from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.recording import Recording
 from rsbench.pipeline.footage import check_alike, read_frame
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.corrector import CorrectionProblem, CorrectorEntry, find_corrected_rows
 from rsbench.vision.features import Gate, detect, match
@@ -52,9 +54,11 @@ def depth_scores(recordings: Sequence[Recording], matcher: MatcherEntry) -> pd.D
 
 
 def pose_scores(recordings: Sequence[Recording], seed: int) -> pd.DataFrame:
-    """A row for every two successive frames of a camera whose shutter and poses are known, by rs-mono-refined."""
+    """A row for every two successive frames of a camera whose shutter and poses are known, by rs-mono-refined, and
+    one of both cameras where they are a rig, by rs-stereo-refined."""
     rows: list[dict[str, Any]] = []
     for recording in recordings:
+        rows += _rig_rows(recording, seed)
         for side in recording.poses:
             frames = sorted(frame for each, frame in recording.images if each == side)
             if side not in recording.shutters:
@@ -65,6 +69,29 @@ def pose_scores(recordings: Sequence[Recording], seed: int) -> pd.DataFrame:
                     score = _pose_score(recording, side, first, second, truth, seed)
                     rows.append({"recording": recording.name, "camera": side, "frame": first, **score})
     return pd.DataFrame(rows)
+
+
+def _rig_rows(recording: Recording, seed: int) -> Iterator[dict[str, Any]]:
+    rig, shutter = recording.rig, recording.shutter
+    if rig is None or shutter is None or "left" not in recording.poses:
+        return
+    frames = [frame for frame in range(recording.frames) if {(s, frame) for s in SIDES} <= recording.images.keys()]
+    cam_from_body = Pose(rig.own("left").R, rig.own("left").R @ rig.offset("left"))
+    options = CorrectionOptions(seed=seed)
+    for first, second in pairwise(frames):
+        truth = _relative(recording, "left", first, second)
+        if truth is None:
+            continue
+        moved = compose(compose(inverse(cam_from_body), Pose(so3.exp(truth[0]), truth[1])), cam_from_body)
+        paths = {(side, k): recording.images[side, first + k] for side in SIDES for k in (0, 1)}
+        images = dict(zip(paths, eight_bit([read_frame(path) for path in paths.values()]), strict=True))
+        matches = find_matches_of_rig(images, rig, shutter.scanning, options)
+        solver = options.solver.solver
+        found = estimate_motion(matches, rig, shutter, solver, options.robust, np.random.default_rng(seed))
+        score = _motion_score(found, so3.log(moved.R), moved.t, matches)
+        length = np.linalg.norm(found.estimate.d) / np.linalg.norm(moved.t) if found.estimate.success else np.nan
+        scale = {"e_s": float(np.abs(np.log(length)))}
+        yield {"recording": recording.name, "camera": "both", "frame": first, **score, **scale}
 
 
 def _relative(recording: Recording, side: Side, first: int, second: int) -> tuple[FloatArray, FloatArray] | None:
@@ -89,14 +116,19 @@ def _pose_score(
     solver = RefinedSolver(one_camera=True)
     shutter, rng = recording.shutters[side], np.random.default_rng(seed)
     found = estimate_motion(matches, rig, shutter, solver, RobustOptions(), rng)
-    w, d = truth
+    return _motion_score(found, *truth, matches)
+
+
+def _motion_score(found: RobustEstimate, w: FloatArray, d: FloatArray, matches: Correspondences) -> dict[str, Any]:
+    """Errors of an estimate; 180 degrees of one that failed."""
+    count = sum(len(getattr(matches, name)) for name in ("left", "right", "stereo_0", "stereo_1"))
     if not found.estimate.success:
-        return {"e_R_deg": 180.0, "e_T_deg": 180.0, "inliers": 0, "matches": len(pairs)}
+        return {"e_R_deg": 180.0, "e_T_deg": 180.0, "inliers": 0, "matches": count}
     return {
         "e_R_deg": float(np.rad2deg(rotation_error(found.estimate.w, w))),
         "e_T_deg": float(np.rad2deg(translation_error(found.estimate.d, d))),
         "inliers": found.inlier_count,
-        "matches": len(pairs),
+        "matches": count,
     }
 
 

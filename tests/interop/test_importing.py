@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from exported_data import dataset, exported, only
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from programs import ROOT
 
-from rsbench.benchmark.recordings import correction_scores, pairs_with_truth
+from rsbench.benchmark.recordings import correction_scores, pairs_with_truth, pose_scores
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
@@ -303,6 +305,58 @@ def test_tum_rsvi_has_its_line_delay(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig.right_from_left.R, right_from_left[:3, :3], atol=1e-12)
     np.testing.assert_allclose(rig.right_from_left.t, right_from_left[:3, 3], atol=1e-12)
     assert rig.sensor("right") == recording.cameras["right"]
+
+
+IMU_FROM_LEFT = np.eye(4)
+IMU_FROM_LEFT[:3, :3] = scipy.linalg.expm(skew(np.array([0.3, -1.2, 0.4])))
+IMU_FROM_LEFT[:3, 3] = [0.05, -0.02, 0.01]
+
+
+def write_rsvi(root: Path, case: Any, rolling: dict[tuple[str, int], Array]) -> Path:
+    """A traced rig of a global camera and one that rolls in the layout of TUM RS-VI, whose line delay is fixed."""
+    period = round(1e9 * 29.4737e-6 * case.rig.right.height / case.rig.right.ratio)
+    right_from_left = np.eye(4)
+    right_from_left[:3, :3], right_from_left[:3, 3] = case.rig.R, case.rig.t
+    places = {"left": IMU_FROM_LEFT, "right": IMU_FROM_LEFT @ np.linalg.inv(right_from_left)}
+    for k, (side, T) in enumerate(places.items()):
+        camera, home = case.rig.camera(side), root / "mav0" / f"cam{k}"
+        intrinsics = [float(each) for each in (camera.fx, camera.fy, *camera.centre)]
+        write(
+            home / "sensor.yaml",
+            f"T_BS:\n  cols: 4\n  rows: 4\n  data: {T.ravel().tolist()}\nresolution: "
+            f"[{camera.width}, {camera.height}]\nintrinsics: {intrinsics}\ndistortion_model: none\n",
+        )
+        write(home / "data.csv", "".join(f"{START + n * period},{n}.png\n" for n in (0, 1)))
+        for n in (0, 1):
+            image = np.clip(np.rint(rolling[side, n]), 0, 255).astype(np.uint8)
+            write_image(home / "data" / f"{n}.png", image)
+    rows = []
+    for n in range(-10, 40):
+        tau = np.array([n / 20])
+        R, t = case.rig.poses(case.law, "left", tau)
+        left_from_world = np.eye(4)
+        left_from_world[:3, :3], left_from_world[:3, 3] = R[0], t[0]
+        T = np.linalg.inv(left_from_world) @ np.linalg.inv(IMU_FROM_LEFT)
+        q = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+        values = ",".join(f"{value:.12f}" for value in (*T[:3, 3], *q))
+        rows.append(f"{START + n * period // 20},{values}\n")
+    write(root / "mav0" / "mocap0" / "data.csv", "".join(rows))
+    return root
+
+
+@pytest.mark.slow
+def test_a_global_camera_beside_one_that_rolls_is_scored_as_a_rig(tmp_path: Path) -> None:
+    """Traced by a program that shares no code; the frames of each camera alone say less, and no length."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "benchmarks"))
+        frames = importlib.import_module("foreign_frames")
+        case, rng = frames.draw_case("global-left", 0)
+        traced = frames.trace_case(case, rng, frames.read_photographs(None))
+    (recording,) = read_others(write_rsvi(tmp_path, case, traced.rolling), "tum-rsvi")
+    assert all(not sight.fault and sight.share > 0.8 for sight in sights(recording))
+    table = pose_scores([recording], 0).set_index("camera")
+    assert table["e_R_deg"]["both"] < 0.01 and table["e_T_deg"]["both"] < 0.3
+    assert table["e_s"]["both"] < 0.01 and np.all(np.isnan(table["e_s"][["left", "right"]]))
 
 
 # COLMAP
