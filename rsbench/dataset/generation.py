@@ -381,7 +381,7 @@ _LISTED_BYTES = 200
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Of a whole dataset; bytes and seconds are those of one camera's frames times their number."""
+    """Of a whole dataset; bytes and seconds are those of the left frames times the number of all, by pixels."""
 
     sequences: int
     files: int
@@ -459,10 +459,12 @@ def _of_kind(
                     pass
             times.append(time.monotonic() - begun)
         written = sum((Path(temporary) / name).stat().st_size for name in files_below(Path(temporary)))
-    cameras = len(SIDES) * card.frames * len(sequences)
+    rig = card.rig_of(sequences[0])
+    left, right = (rig.sensor(side).width * rig.sensor(side).height for side in SIDES)
+    cameras = (1.0 + right / left) * card.frames * len(sequences)
     return Estimate(
         sequences=len(sequences),
         files=len(sequences) * (len(own) + 1),
-        bytes=cameras * written,
+        bytes=round(cameras * written),
         seconds=max(times[0] - times[-1], 0.0) + cameras * times[-1],
     )

@@ -14,13 +14,16 @@ from small_scenes import write_box_scene
 from traced_truth import first_hit
 
 from rsbench.components.cards import load_card
+from rsbench.components.rig_tables import load_rig
+from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, VIEWS, Side
-from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.card import DatasetCard, load_dataset_card, read_dataset_card
 from rsbench.dataset.generation import build_scene, generate_dataset, render_view, seen_scene
-from rsbench.dataset.sequence import read_dataset, read_dataset_manifest
+from rsbench.dataset.sequence import read_dataset, read_dataset_manifest, read_sequence
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.options import RendererOptions
+from rsbench.storage.files import write_json
 
 Array = NDArray[np.float64]
 LEFT: dict[str, Any] = {"width": 96, "height": 72, "fx": 80.0, "fy": 81.0, "cx": 46.0, "cy": 37.0}
@@ -205,3 +208,85 @@ def test_rows_have_the_bits_of_global_images_at_their_poses(
         for part in ("image", "depth"):
             np.testing.assert_array_equal(getattr(still, part)[place], getattr(rolling, part)[place])
     assert np.array_equal(rolling.depth, sequence.depth("rs", side, 1))
+
+
+def test_rigs_of_sequences_and_grids_are_those_that_the_card_names(tmp_path: Path) -> None:
+    scene = write_box_scene(tmp_path, "box")
+    path = tmp_path / "many.toml"
+    path.write_text(
+        f"""
+name = "many"
+readout_ratio = 0.7
+scan = "bottom"
+rig = "zed2"
+[grid.rig.same]
+[grid.rig.phone]
+rig = "tum-rsvi"
+[motion]
+rotation_deg = 1
+rotation_axis = [0, 1, 0]
+translation = 0.1
+translation_axis = [1, 0, 0]
+[[sequence]]
+name = "box"
+scene = "{scene}"
+[[sequence]]
+name = "near"
+scene = "{scene}"
+scale = 2.0
+rig = "euroc"
+readout_ratio = 0.4
+"""
+    )
+    card = load_dataset_card(path)
+    found = {each.name: (card.rig_of(each), card.shutter_for(each), each) for each in card.sequence}
+    rig, shutter, _ = found["box-same"]
+    assert rig == load_rig("zed2").rig()
+    assert shutter.readout_ratio == load_rig("zed2").readout_ratio and shutter.scan == "top"
+    rig, shutter, sequence = found["box-phone"]
+    assert rig == load_rig("tum-rsvi").rig() and (shutter.ratio_of("left"), card.period_of(sequence)) == (
+        0.0,
+        0.05,
+    )
+    assert shutter.ratio_of("right") == load_rig("tum-rsvi").right_readout_ratio
+    rig, shutter, sequence = found["near-same"]
+    assert shutter.readout_ratio == 0.4  # a sequence's own goes first
+    np.testing.assert_allclose(rig.right_from_left.t, 2.0 * load_rig("euroc").rig().right_from_left.t)
+    assert np.linalg.norm(card.motion_of(sequence).d) == pytest.approx(0.2)
+    assert read_dataset_card(path).rig == load_rig("zed2") and card.manifest_of(sequence)["format"] == 2
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("camera = { width = 64, height = 48, focal = 60.0 }", "rig and camera exclude each other"),
+        ('rig = "zed2"', "rig and left exclude each other"),
+        ('channels = ["disparity"]', "'disparity' needs"),
+        ('twins = ["middle"]', "twins: cameras of which one has more rows"),
+    ],
+)
+def test_cards_that_cannot_be_are_refused(tmp_path: Path, more: str, message: str) -> None:
+    with pytest.raises(RsbenchError, match=message):
+        load_dataset_card(write_card(tmp_path, "two-sizes", more))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"right_from_left": None}, "'right_from_left' is required"),
+        ({"cameras": None}, "'cameras' is required"),
+        ({"baseline": 0.5}, "right_from_left contradicts"),
+        ({"format": 3}, "this version reads 1 and 2"),
+        ({"format": 1}, "'camera' is required"),
+    ],
+)
+def test_wrong_manifests_are_refused_in_one_line(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    card = load_dataset_card(write_card(tmp_path, "two-sizes"))
+    manifest = {**card.manifest_of(card.sequence[0]), **change}
+    (tmp_path / "box").mkdir()
+    write_json(
+        tmp_path / "box/sequence.json", {key: value for key, value in manifest.items() if value is not None}
+    )
+    with pytest.raises(RsbenchError, match=message) as refused:
+        read_sequence(tmp_path / "box")
+    assert "\n" not in str(refused.value)
