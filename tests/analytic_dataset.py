@@ -84,10 +84,11 @@ def write_analytic_dataset(
     motion: Motion,
     *,
     true_motion: Motion | None = None,
+    true_cameras: tuple[StereoRig, RollingShutter] | None = None,
     frames: int = 2,
     twins: tuple[int, ...] = (),
 ) -> None:
-    """Write a dataset; ``true_motion`` makes depth and images, ``motion`` is what the rest says.
+    """Write a dataset; ``true_motion`` and ``true_cameras`` make depth and images, the others are what files say.
 
     ``twins``: rows of global-shutter twins beside that of row 0.
     """
@@ -99,10 +100,11 @@ def write_analytic_dataset(
     for name in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
     for side, frame in views_of(frames):
-        camera = rig.sensor(side)
+        true_rig, true_shutter = true_cameras or (rig, shutter)
+        camera = true_rig.sensor(side)
         stated = row_poses(rig, shutter, motion, side, frame)
         write_poses(folder / f"poses/{side}_{frame}.csv", shutter.line_times(frame, side), stated)
-        rolling = row_poses(rig, shutter, true_motion or motion, side, frame)
+        rolling = row_poses(true_rig, true_shutter, true_motion or motion, side, frame)
         pictures: list[tuple[Shutter, int]] = [("rs", 0), *(("gs", row) for row in (0, *twins))]
         for kind, row in pictures:
             line = abs(shutter.first_line(side) - row)

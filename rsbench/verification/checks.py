@@ -243,8 +243,10 @@ CHECKS = (
         name="manifest",
         stage="sequence",
         reads="`sequence.json`, the card in `dataset.json`",
-        finds="camera, baseline, shutter, motion, seed, viewpoint and times that are not those of the card, the "
-        "folder or the rest of the file; options of the renderer where this version wrote the file",
+        finds="camera or both cameras, baseline, shutter, motion, seed, viewpoint and times that are not those of "
+        "the card, the folder or the rest of the file; a `right_from_left` that is no rotation, contradicts "
+        "`rotation_from_body` or puts the right camera on the left; options of the renderer where this version "
+        "wrote the file",
         costs="almost nothing",
         run=lambda state: sequence_faults(state.sequence, state.name, state.listing),
     ),
@@ -308,7 +310,7 @@ CHECKS = (
         name="images and depth maps",
         stage="frames",
         reads="images by their headers, then all pixels; depth maps",
-        finds="files that cannot be read, images that are not 8-bit RGB of the camera's size",
+        finds="files that cannot be read, images that are not 8-bit RGB of their camera's size",
         costs="every picture is read once",
         run=lambda state: state.fresh.faults,
     ),
@@ -345,7 +347,8 @@ CHECKS = (
         name="depth and colours",
         stage="frames",
         reads="depth maps and images of each two successive frames, eight of each",
-        finds="surfaces that the twin, the other camera or the other time see elsewhere; under diffuse light, "
+        finds="surfaces that the twin, the other camera or the other time see elsewhere, each in its own axes "
+        "and by its own lens and readout; under diffuse light, "
         "colours that these see otherwise, of the sky too; in sequences of "
         "[many](../reference/dataset-format.md#many-frames), frames of another time, which are tried at other "
         "places and named",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ import pytest
 from analytic_dataset import write_analytic_dataset
 
 from rsbench.components.motion_models import LinearMotion, TwistMotion
-from rsbench.core.camera import PinholeCamera
+from rsbench.core import so3
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.sequence import read_dataset
 from rsbench.storage.files import read_depth, read_poses, sha256, write_depth
 from rsbench.verification import SequenceReport, verification_steps, verify_dataset
@@ -62,6 +64,67 @@ def test_depth_of_another_motion_is_found(tmp_path: Path, wrong: Motion) -> None
     write_analytic_dataset(tmp_path, RIG, SHUTTER, MOTION, true_motion=wrong)
     faults = verify(tmp_path).faults
     assert any("pairs of depth maps disagree" in fault and "motion" in fault for fault in faults)
+
+
+def rig_of(w: tuple[float, float, float], right: PinholeCamera) -> StereoRig:
+    """A left camera with a lens, and a right one that is turned by w."""
+    lens = Lens(model="brown-conrady", k1=-0.2, k2=0.03, p1=0.002)
+    left = PinholeCamera(width=96, height=80, fx=100.0, fy=101.0, cx=46.0, cy=41.0, lens=lens)
+    return StereoRig.of_cameras(left, right, so3.exp(np.array(w)), (-0.3, 0.02, -0.03))
+
+
+TURN = (0.03, -0.06, 0.05)
+WIDE = PinholeCamera(
+    width=112, height=72, fx=110.0, fy=109.0, cx=57.0, cy=33.0, lens=Lens(model="kannala-brandt", k1=-0.04)
+)
+TWO = rig_of(TURN, WIDE)
+SCANS = {
+    "rows": Scanning(),
+    "own ratio": Scanning(right_readout_ratio=0.4),
+    "global right": Scanning(right_readout_ratio=0.0),
+    "late columns": Scanning(right_scan="right", right_delay=0.15),
+}
+
+
+@pytest.mark.parametrize("scanning", SCANS.values(), ids=SCANS)
+def test_a_sound_rig_of_two_cameras_has_no_faults(tmp_path: Path, scanning: Scanning) -> None:
+    write_analytic_dataset(tmp_path, TWO, TWO.shutter_of(scanning, 0.9), MOTION)
+    report = verify(tmp_path)
+    assert report.name == "planes" and report.faults == ()
+    assert len(report.agreements) == 24
+    for agreement in report.agreements:
+        assert agreement.share == 1.0 and agreement.p99 < 1e-5 and agreement.compared > 2000
+
+
+OWN = SCANS["own ratio"]
+
+
+@pytest.mark.parametrize(
+    ("rig", "scanning", "words"),
+    [
+        (rig_of((-0.03, 0.06, -0.05), WIDE), OWN, "right_from_left"),
+        (rig_of((0.03, -0.0595, 0.05), WIDE), OWN, "right_from_left"),
+        (rig_of(TURN, replace(WIDE, fx=TWO.sensor("left").fx)), OWN, "right_from_left"),
+        (rig_of(TURN, replace(WIDE, lens=TWO.sensor("left").lens)), OWN, "right_from_left"),
+        (TWO, Scanning(), "rs_depth/right_"),
+        (TWO, Scanning(right_readout_ratio=0.0), "rs_depth/right_"),
+    ],
+    ids=["rotation inverted", "half a milliradian", "focal length", "lens", "rows at the left's times", "global"],
+)
+def test_cameras_of_another_rig_are_found(tmp_path: Path, rig: StereoRig, scanning: Scanning, words: str) -> None:
+    """Every file states the other rig; depth and images are of the true one."""
+    true = TWO, TWO.shutter_of(OWN, 0.9)
+    write_analytic_dataset(tmp_path, rig, rig.shutter_of(scanning, 0.9), MOTION, true_cameras=true)
+    assert any(words in fault for fault in verify(tmp_path).faults)
+
+
+def test_depth_along_the_axes_of_the_rig_is_named(tmp_path: Path) -> None:
+    write_analytic_dataset(tmp_path, TWO, TWO.shutter_of(OWN, 0.9), MOTION)
+    path = tmp_path / "planes/gs_depth/right_1.exr"
+    depth = read_depth(path) / TWO.own_depth("right", WIDE.pixel_grid())
+    write_depth(path, depth.astype(np.float32))
+    _update_checksum(tmp_path, "planes/gs_depth/right_1.exr")
+    assert any("gs_depth/right_1.exr" in fault and "axes of the rig" in fault for fault in verify(tmp_path).faults)
 
 
 def test_swapped_cameras_are_found(dataset: Path) -> None:
