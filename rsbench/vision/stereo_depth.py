@@ -686,8 +686,10 @@ def _of_side(
             break
     known = np.isfinite(here)
     places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
-    moved = (ends - grid).astype(np.float32)
-    ends = places + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
+    # A turned camera's pixels are not near the ideal ones: only what the motion adds is alike in neighbours.
+    rest, at_rest = (grid, places) if rig.aligned else (_pixels(there_camera, wide, p) for p in (grid, places))
+    moved = (ends - rest).astype(np.float32)
+    ends = at_rest + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
     ends = _inside(there_camera, ends)
     column = there_camera.unproject(ends)[..., 0]
     rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), ends, column)

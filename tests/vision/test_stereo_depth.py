@@ -347,3 +347,21 @@ def test_depth_is_that_of_the_planes(lens: Lens | None, scanning: dict[str, Any]
     still = stereo_disparities(images["left"], images["right"], rig.ideal)[0]
     wrong = ~(np.abs(still - rig.disparity(truth["left"])) <= 1.0)
     assert np.mean(wrong) > 2 * np.mean(~(np.abs(found[0] - rig.disparity(truth["left"])) <= 1.0))
+
+
+def test_depth_of_a_vertical_rig_is_that_of_the_planes() -> None:
+    """Columns of a level rig are rows of one that is turned by 90 degrees, and its pixels those turned."""
+    level = StereoRig(camera=CAMERA, baseline=0.4)
+    turned = PinholeCamera.centred(120, 160, 140.0)
+    rig = StereoRig.of_cameras(turned, turned, np.eye(3), [0.0, -0.4, 0.0])
+    columns, rows = Scanning(scan="left").shutter_of(160, 120, 0.9), Scanning().shutter_of(120, 160, 0.9)
+    images, truth = dict[Side, NDArray[np.uint8]](), dict[Side, NDArray[np.float32]]()
+    for side in SIDES:
+        image, truth[side] = seen(level, columns, side)
+        images[side] = np.ascontiguousarray(np.rot90(image, -1))
+    found = moving_disparities(load_matcher("sgm"), images, rig, rows, MOTION, 0)
+    for side, disparity in zip(SIDES, found, strict=True):
+        off = np.abs(np.rot90(disparity) - level.disparity(truth[side]))
+        known = np.isfinite(off)
+        assert np.mean(known) > 0.6
+        assert np.median(off[known]) < 0.1 and np.mean(off[known] > 1.0) < 0.05
