@@ -135,12 +135,6 @@ _NOISIER = 10.0
 """Times the noise, with which a motion does not explain what another one does."""
 _NEARLY_PLANAR = 0.15
 """Share of the flow that a homography leaves, at most, for its motions to be tried; 0.2 and more off a plane."""
-_APART_IN_TIME = 0.02
-"""Frame periods between the times at which two cameras read a point, from which disparities are no start."""
-_STARTS_IN_BASELINES = (0.5, 5.0)
-"""Lengths of d with which a descent on tracks starts in the direction that pairs tell."""
-_LOWER = 0.9
-"""Of the cost: less of a gain is the same minimum but for rounding."""
 _LEAST_NOISE_PX = 0.01
 """Noise assumed at least when judging whether data determine a rotation: exact data fit anything exactly."""
 
@@ -247,34 +241,7 @@ class RefinedSolver(Solver):
         best = self._descend(packed, rig)
         if best is None:
             return MotionEstimate.failed("no start found: degenerate motion or scene")
-        if packed.tracks.ndim == 3 and np.ptp(packed.tracks[:, :2, 2], axis=1).max(initial=0.0) > _APART_IN_TIME:
-            best = self._from_pairs(packed, best, correspondences, rig, shutter)
         return self.report(packed, *self._settle(packed, best, rig))
-
-    def _from_pairs(
-        self,
-        packed: Packed,
-        best: Minimum,
-        correspondences: Correspondences,
-        rig: StereoRig,
-        shutter: RollingShutter,
-    ) -> Minimum:
-        """The lowest of the minima from the motion that each camera's pairs alone tell, and of another one.
-
-        Of cameras that read a point at different times, the motion in between hides the disparity: from no motion
-        at all the descent may end behind the cameras.
-        """
-        seen, parameters = shutter.at_once() if self.shutter == "global" else shutter, self.motion_parameters
-        pairs = pack(correspondences, rig, seen, self.motion_model, use_tracks=False, motion_parameters=parameters)
-        found = self._descend(pairs, rig)
-        if found is None:
-            return best
-        w, d = found.theta[:3], found.theta[3:]
-        unit = d / max(float(np.linalg.norm(d)), 1e-300)
-        for length in _STARTS_IN_BASELINES:
-            other = self._minimise(packed, np.concatenate([w, length * rig.baseline * unit]), self.iterations)
-            best = other if other.cost < _LOWER * best.cost else best
-        return best
 
     def sample_sizes(self, correspondences: Correspondences) -> dict[MatchSet, int]:
         """Three tracks, else five matches of the camera that has more of them."""
