@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from small_scenes import write_box_scene
 from traced_truth import first_hit
 
 from rsbench.components.cards import load_card
-from rsbench.components.rig_tables import load_rig
+from rsbench.components.rig_tables import CameraTable, load_rig
 from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, VIEWS, Side
@@ -23,7 +24,7 @@ from rsbench.dataset.generation import build_scene, generate_dataset, render_vie
 from rsbench.dataset.sequence import read_dataset, read_dataset_manifest, read_sequence
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.options import RendererOptions
-from rsbench.storage.files import write_json
+from rsbench.storage.files import read_png, write_json
 
 Array = NDArray[np.float64]
 LEFT: dict[str, Any] = {"width": 96, "height": 72, "fx": 80.0, "fy": 81.0, "cx": 46.0, "cy": 37.0}
@@ -290,3 +291,36 @@ def test_wrong_manifests_are_refused_in_one_line(tmp_path: Path, change: dict[st
     with pytest.raises(RsbenchError, match=message) as refused:
         read_sequence(tmp_path / "box")
     assert "\n" not in str(refused.value)
+
+
+def test_stitched_frames_have_the_bits_of_the_single_pass_and_keep_a_whole_frame_of_each_row(
+    tmp_path: Path,
+) -> None:
+    sizes = {"left": (20, 12), "right": (16, 18)}
+    card = load_dataset_card(write_card(tmp_path, "two-sizes"))
+    assert card.rig is not None
+    small = {side: small_camera(getattr(card.rig, side), *size) for side, size in sizes.items()}
+    card = card.with_rig(replace(card.rig, **small))  # pyrefly: ignore[bad-argument-type]
+    generate_dataset(card, tmp_path / "one")
+    generate_dataset(card, tmp_path / "whole", full_frames=True)
+    one, whole = (read_dataset(tmp_path / name)[0] for name in ("one", "whole"))
+    for side, frame in VIEWS:
+        assert np.array_equal(one.image("rs", side, frame), whole.image("rs", side, frame))
+        assert np.array_equal(one.depth("rs", side, frame), whole.depth("rs", side, frame))
+        stack = sorted((whole.folder / "gs_stack" / f"{side}_{frame}").iterdir())
+        assert len(stack) == sizes[side][1]
+        last = read_png(stack[-1], sizes[side])
+        assert np.array_equal(last[-1], whole.image("rs", side, frame)[-1])
+
+
+def small_camera(table: CameraTable, width: int, height: int) -> CameraTable:
+    return replace(
+        table,
+        width=width,
+        height=height,
+        fx=0.8 * width,
+        fy=0.8 * width,
+        cx=0.5 * width,
+        cy=0.45 * height,
+        lens=None,
+    )
