@@ -346,7 +346,7 @@ def test_camera_info_of_single_cameras_has_no_extrinsics(tmp_path: Path) -> None
     with pytest.raises(RsbenchError, match=r"P\[0, 3\] = 0.*calibrate them as a pair"):
         rsbench.read_rig(tmp_path / "left.yaml")
     (tmp_path / "right.yaml").unlink()
-    with pytest.raises(RsbenchError, match="is of one camera"):
+    with pytest.raises(RsbenchError, match="is of one camera alone: give the folder"):
         rsbench.read_rig(tmp_path / "left.yaml")
 
 
@@ -494,6 +494,30 @@ def test_broken_files_are_refused_in_one_line(tmp_path: Path, text: str, words: 
     with pytest.raises(RsbenchError, match=words) as refused:
         rsbench.read_rig(path, SIZE)
     assert "\n" not in str(refused.value) and str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    path, rng = WRITERS[name](tmp_path), np.random.default_rng(0)
+    files = [each for each in sorted(tmp_path.rglob("*")) if each.is_file()]
+    numbers = [b"0", b"-1", b"1e30", b"nan", b"99999999999", b"x", b"[]", b"null"]
+    for _ in range(12):
+        file = files[rng.integers(len(files))]
+        whole = file.read_bytes()
+        found = list(re.finditer(rb"-?\d+\.?\d*", whole))
+        where = found[rng.integers(len(found))]
+        start = int(rng.integers(len(whole)))
+        damaged = (
+            whole[: where.start()] + numbers[rng.integers(8)] + whole[where.end() :],
+            whole[:start] + whole[start + 9 :],
+            whole[:start] + bytes([rng.integers(256)]) + whole[start:],
+        )[rng.integers(3)]
+        file.write_bytes(damaged)
+        try:
+            rsbench.read_rig(path, SIZE, fps=20.0)
+        except RsbenchError as error:
+            assert "\n" not in str(error)
+        file.write_bytes(whole)
 
 
 def test_folders_of_two_tools_or_of_none_are_refused(tmp_path: Path) -> None:

@@ -184,6 +184,8 @@ def _apart(found: Parts, where: str) -> Pose:
 
 def _apart_of_rectified(R1: FloatArray, R2: FloatArray, P2: FloatArray, where: str) -> Pose:
     """From what rectifies both cameras."""
+    if not (P2[0, 0] > 0.0 and P2[1, 1] > 0.0):
+        raise RsbenchError(f"{where}: projection: focal lengths {P2[0, 0]:g}, {P2[1, 1]:g}: must be positive")
     first, second = (rotation_of(R.ravel(), f"{where}: rectification") for R in (R1, R2))
     return Pose(second.T @ first, second.T @ np.array([P2[0, 3] / P2[0, 0], P2[1, 3] / P2[1, 1], 0.0]))
 
@@ -221,10 +223,7 @@ def read_ros(files: Files) -> Calibration:
     tables = [_ros_camera(camera) for camera in cameras]
     P = [(_numbers_of(camera, 12, "projection_matrix", "p", "P")).reshape(3, 4) for camera in cameras]
     if len(cameras) == 1:
-        other = (
-            " the file of the other camera was not found beside it; give the folder of both" if P[0][0, 3] else ""
-        )
-        return Calibration(format="ROS camera_info", left=tables[0], notes=(other.strip(),) if other else ())
+        return Calibration(format="ROS camera_info", left=tables[0])
     shift = [p[0, 3] if abs(p[0, 3]) >= abs(p[1, 3]) else p[1, 3] for p in P]
     if not any(shift):
         raise RsbenchError(

@@ -265,6 +265,8 @@ def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
     if table.get("lens", {}).get("model") not in ("brown-conrady", "rational"):
         return None
     fx, fy, cx, cy = (table[key] for key in ("fx", "fy", "cx", "cy"))
+    if not (fx > 0.0 and fy > 0.0):
+        return None
     across, down = (max(c + 0.5, extent - 0.5 - c) / f for c, extent, f in ((cx, size[0], fx), (cy, size[1], fy)))
     try:
         _camera(table, size)

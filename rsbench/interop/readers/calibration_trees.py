@@ -184,7 +184,9 @@ class Fields:
             found = np.full(1, np.nan)
         if not np.all(np.isfinite(found)) or (counts and len(found) not in counts):
             wanted = f"{' or '.join(map(str, counts))} " if counts else ""
-            raise RsbenchError(f"{self.where}: {key} = {str(value)[:60]}: must be {wanted}finite numbers")
+            raise RsbenchError(
+                f"{self.where}: {key} = {' '.join(str(value).split())[:60]}: must be {wanted}finite numbers"
+            )
         return found
 
 

@@ -349,7 +349,7 @@ def _read_zed(files: Files) -> Calibration:
 
 
 def _zed_camera(top: Fields, side: str, name: str, size: Size) -> Table:
-    section = next(key for key in top.tree if key.upper() == f"{side}_CAM_{name}")
+    section = next((key for key in top.tree if key.upper() == f"{side}_CAM_{name}"), f"{side}_CAM_{name}")
     own = top.inner(section)
     disto = next((top.inner(key) for key in top.tree if key.upper() == f"{side}_DISTO"), own)
     intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]

@@ -72,8 +72,10 @@ def read_rig_file(
         return parse_card(RigCard, with_readouts(readout.into(read_toml(path)), str(path)), str(path)), ()
     found = read_calibration(path, Assumptions(frame_size=frame_size))
     if found.right is None:
-        more = f": {found.notes[0]}" if found.notes else "; one camera is given by --camera"
-        raise RsbenchError(f"{path}: {found.format}: is of one camera{more}")
+        raise RsbenchError(
+            f"{path}: {found.format}: is of one camera alone: give the folder that holds both, or --camera for "
+            "frames of one"
+        )
     refuse_unseen(found, path)
     table, missing = tables_of_calibration(found, readout)
     card = parse_card(RigCard, with_readouts(table, str(path)), str(path))
