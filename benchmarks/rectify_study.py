@@ -1,6 +1,7 @@
 """What it costs to rectify rolling-shutter frames by resampling, against the rig as it is.
 
-    nice python benchmarks/rectify_study.py --out results/rectify       # half an hour of a processor
+    nice python benchmarks/rectify_study.py --out results/rectify                # an hour of a processor
+    nice python benchmarks/rectify_study.py --out results/rectify --frames 0     # points alone: five minutes
 
 The right camera is turned by an angle about a random axis. Rectified is ``cv2.stereoRectify`` and ``cv2.remap``
 with the true calibration, where users are told to; then everything is as for an ideal rig. The new cameras are
@@ -238,7 +239,7 @@ def measured(kind: str, seeds: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def page(points: pd.DataFrame, seen: pd.DataFrame) -> str:
+def page(points: pd.DataFrame, seen: pd.DataFrame | None) -> str:
     """The results in Markdown."""
     usual = points[(points.speed == USUAL["speed"]) & (points.way == "rectified")]
     by_ratio = usual.pivot_table(index="angle", columns="ratio", values="e_T", aggfunc="median")
@@ -249,7 +250,6 @@ def page(points: pd.DataFrame, seen: pd.DataFrame) -> str:
     turn = biased.e_R / (biased.angle * biased.ratio * biased.speed)
     return PAGE.format(
         seeds=points.seed.nunique(),
-        frame_seeds=seen.seed.nunique(),
         tracks=TRACKS,
         noise=NOISE_PX,
         own=as_it_is.e_T.median(),
@@ -265,8 +265,7 @@ def page(points: pd.DataFrame, seen: pd.DataFrame) -> str:
         turn_by_speed=_pivot(
             slow.pivot_table(index="angle", columns="speed", values="e_R", aggfunc="median"), "angle (deg), speed"
         ),
-        frames=_frames(seen),
-    )
+    ) + ("" if seen is None else FRAMES.format(seeds=seen.seed.nunique(), frames=_frames(seen)))
 
 
 def _pivot(table: pd.DataFrame, corner: str) -> str:
@@ -305,7 +304,7 @@ keep rows as near as possible to where they were, then everything as for an idea
 a frame period; the law of motion is linear in both, and readout ratio and law are given.
 
 Made by `python benchmarks/rectify_study.py --out results/rectify`; versions, date and seeds:
-[provenance.json](provenance.json). Tables: [points.csv](points.csv), [frames.csv](frames.csv).
+[provenance.json](provenance.json). Every case: [points.csv](points.csv).
 
 ## Points
 
@@ -327,12 +326,15 @@ e_T (deg) rectified, medians, at readout ratio 0.8:
 e_R (deg) rectified, medians, at readout ratio 0.8:
 
 {turn_by_speed}
+"""
 
+FRAMES = """
 ## Frames
 
 Traced by code that shares nothing with rsbench's geometry (`benchmarks/foreign_frames.py`), noise 1.5 grey levels,
-corrected by `rsbench.correct`; medians [and worst] of {frame_seeds} scenes and motions. PSNR (dB) is against the
-traced global-shutter frames, of rectified frames against these resampled alike.
+corrected by `rsbench.correct`; medians [and worst] of {seeds} scenes and motions. PSNR (dB) is against the
+traced global-shutter frames, of rectified frames against these resampled alike. Every case:
+[frames.csv](frames.csv).
 
 {frames}
 """
@@ -348,11 +350,12 @@ def main() -> int:
     from rsbench.storage.files import write_bytes, write_json, write_table
 
     given.out.mkdir(parents=True, exist_ok=True)
-    found = {"points": measured("points", given.points), "frames": measured("frames", given.frames)}
+    wanted = {"points": given.points, "frames": given.frames}
+    found = {kind: measured(kind, seeds) for kind, seeds in wanted.items() if seeds}
     for kind, table in found.items():
         write_table(given.out / f"{kind}.csv", table)
-    write_bytes(given.out / "README.md", page(found["points"], found["frames"]).encode())
-    command = f"python benchmarks/rectify_study.py --out {given.out.as_posix()}"
+    write_bytes(given.out / "README.md", page(found["points"], found.get("frames")).encode())
+    command = f"python benchmarks/rectify_study.py --out {given.out.as_posix()} --frames {given.frames}"
     sizes = {"points": given.points, "frames": given.frames, "tracks": TRACKS, "noise_px": NOISE_PX}
     write_json(given.out / "provenance.json", provenance(command, **sizes))
     return 0

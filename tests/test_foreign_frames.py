@@ -34,6 +34,7 @@ class Programs(NamedTuple):
     case: ModuleType
     frames: ModuleType
     motion: ModuleType
+    rectify: ModuleType
     rig: ModuleType
     table: ModuleType
     world: ModuleType
@@ -44,7 +45,8 @@ def programs_() -> Iterator[Programs]:
     """The programs, which find each other in their folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
-        yield Programs(*(importlib.import_module(f"foreign_{name}") for name in Programs._fields))
+        names = ["rectify_study" if name == "rectify" else f"foreign_{name}" for name in Programs._fields]
+        yield Programs(*map(importlib.import_module, names))
 
 
 def _laws(motion: ModuleType) -> list[tuple[Any, type[Motion], dict[str, float]]]:
@@ -238,6 +240,24 @@ def _nearest(quads: list[Any], start: NDArray[np.float64], ray: NDArray[np.float
         if 0.0 <= u <= 1.0 and 0.0 <= v <= 1.0 and z > 0.0:
             hits.append((z, number))
     return min(hits)[1]
+
+
+@pytest.mark.parametrize("row", RIGS)
+def test_rectified_points_are_those_of_the_ideal_rig_in_axes_that_turn_into_the_bodys(
+    programs_: Programs, row: str
+) -> None:
+    foreign, rng = programs_.frames.RIGS[row], np.random.default_rng(3)
+    new = programs_.rectify.rectified(foreign)
+    rig, ideal = (programs_.case.ours(each)[0] for each in (foreign, new.rig))
+    points = rng.uniform(-0.35, 0.35, (40, 3)) * [4.0, 4.0, 1.0] + [0.0, 0.0, 4.0]
+    for side in SIDES:
+        seen = rig.eye(side).project(points + rig.offset(side))
+        there = points @ new.body + ideal.offset(side)  # body from new axes, of rows
+        np.testing.assert_allclose(new.pixels(side, seen), ideal.camera.project(there), atol=0.01)
+        sensor, shown = rig.sensor(side), new.shown(side)
+        image = np.zeros((sensor.height, sensor.width), dtype=np.uint8)
+        assert new.resample(side, image).shape == shown.shape == (ideal.camera.height, ideal.camera.width)
+        assert np.mean(shown) > 0.5
 
 
 def test_a_line_of_a_rolling_frame_is_that_of_the_global_frame_at_its_time(programs_: Programs) -> None:
