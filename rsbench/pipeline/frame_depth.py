@@ -157,9 +157,23 @@ def depth_of_pair(
         sky = sky_mask(levels[side], disparities[side]) if find_sky else np.zeros(levels[side].shape[:2], np.bool_)
         disparity = np.where(sky, np.float32(0.0), disparities[side])
         depth[side] = metres(disparity, rig, side)
-        filled = fill_holes(disparity)
+        filled = _without_holes(disparity, rig, side)
         guess[side] = np.where(np.isnan(disparity), metres(filled, rig, side), np.float32(0.0))
     return FramePair(images=images, depth=depth, guess=guess, timed=rig.rectified)
+
+
+def _without_holes(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -> NDArray[np.float32]:
+    """Disparity (H, W) with its holes filled along the baseline by the farther neighbour, see ``fill_holes``.
+
+    Cameras that differ see different rows: one that the other does not show at all is filled by those beside it.
+    """
+    if rig.aligned:
+        return fill_holes(disparity)
+    R = rig.own(side).R
+    vertical = abs(R[1, 0]) > abs(R[0, 0])
+    along = fill_holes(disparity.T if vertical else disparity)
+    filled = np.where(np.isnan(along), fill_holes(along.T).T, along)
+    return filled.T if vertical else filled
 
 
 def moving_pairs(

@@ -707,7 +707,7 @@ def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) 
     partner = _looked(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
     R, t = eye.pose_at(partner.pixels)
     X = _turned(np.swapaxes(R, -1, -2), partner.rays - rho[..., None] * t)
-    ends = _pixels(other.camera, rig.camera, grid)
+    ends, seen = _pixels(other.camera, rig.camera, grid), X
     for _ in range(_STEPS):
         R, t = other.pose_at(ends)
         seen = _turned(R, X) + rho[..., None] * t

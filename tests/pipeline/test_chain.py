@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -14,13 +14,14 @@ from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
+from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, uncorrected
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions, depth_of_pair
 from rsbench.pipeline.frame_motion import match_frames, motion_of, solve_frames
 from rsbench.solvers.engine.base import MotionEstimate, load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
@@ -290,3 +291,22 @@ def test_sixteen_bits_use_one_factor_for_all() -> None:
     dark, bright = np.full((40, 40), 1000, np.uint16), np.full((40, 40), 4000, np.uint16)
     a, b = eight_bit([dark, bright])
     assert a[0, 0] == 64 and b[0, 0] == 255
+
+
+@pytest.mark.parametrize("vertical", [False, True])
+def test_what_one_camera_alone_shows_is_guessed_as_far_as_what_lies_beside_it(vertical: bool) -> None:
+    """Rows at the rim of a camera that sees more; below a vertical rig's lower camera, all along the baseline."""
+    camera = PinholeCamera.centred(64, 48, 50.0)
+    t = [0.0, -0.2, 0.0] if vertical else [-0.2, 0.0, 0.0]
+    rig = StereoRig.of_cameras(camera, replace(camera, fx=55.0, fy=55.0), np.eye(3), t)
+    near_and_far = np.where(np.arange(64) < 30, np.float32(8.0), np.float32(2.0))
+    disparity = np.tile(near_and_far, (48, 1))
+    disparity[:7], disparity[20:23, 28:32] = np.nan, np.nan  # the rim, and a hole across an edge
+    grey = np.full((48, 64), 100, np.uint8)
+    pair = depth_of_pair(grey, grey, [disparity, disparity], rig, find_sky=False)
+    depth, guess = pair.depth["left"], pair.guess["left"]
+    np.testing.assert_allclose(guess[:7], np.tile(depth[7], (7, 1)), rtol=0.02)  # depths of rows differ a little
+    hole = guess[20:23, 28:32]
+    edge = depth[19, 28:32] if vertical else depth[20, [32] * 4]  # along the baseline the farther one
+    np.testing.assert_allclose(hole, np.tile(edge, (3, 1)), rtol=0.02)
+    assert np.all(guess[np.isfinite(disparity)] == 0.0)
