@@ -52,6 +52,8 @@ class _Options(NamedTuple):
     windows: int
     features: str
     seed: int
+    fps: float | None
+    """Frames a second, for the line delays of a calibration of another tool."""
 
 
 def inspect(
@@ -75,13 +77,17 @@ def inspect(
     features: Annotated[str, named("features", "Feature matcher for frames: a name or a card.")] = "sift-refined",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per rig, each on a line.")] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames a second, for a calibration's line delay. Default: what the video says."),
+    ] = None,
 ) -> None:
     """Estimate scan direction, readout ratio and delay of each camera from matches, where they tell it."""
     from rsbench.capture.hypotheses import MODELS
     from rsbench.capture.two_frame_estimate import conclude
     from rsbench.components.motion_models import load_kernel
 
-    options = _Options(tuple(motion_model or MODELS), windows, features, seed)
+    options = _Options(tuple(motion_model or MODELS), windows, features, seed, fps)
     for model in options.models:
         load_kernel(model)
     answers, wrong, determined = list[dict[str, Any]](), False, True
@@ -151,11 +157,12 @@ def _of_footage(left: Path | None, right: Path | None, card: Path, options: _Opt
 
 def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, options: _Options) -> _Case:
     """Frames of a user, whose card says the rig."""
-    from rsbench.cli.correct_input import say_notes, sized
+    from rsbench.cli.correct_input import ReadoutOptions, say_notes, sized
     from rsbench.interop.readers.rig_files import read_rig_file
 
     first, second = next(iter(left)), next(iter(right))
-    given, notes = read_rig_file(card, None, lambda: (first.shape[1], first.shape[0]))
+    readout = ReadoutOptions(readout_ratio=None, shutter=None, fps=options.fps).beside(card, False, left.path)
+    given, notes = read_rig_file(card, readout, lambda: (first.shape[1], first.shape[0]))
     say_notes("--rig", notes)
     rig = sized(given, first, second)
     ratio, scanning = given.readout_ratio, given.scanning
