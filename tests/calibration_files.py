@@ -273,6 +273,18 @@ def colmap(folder: Path) -> Path:
     return folder
 
 
+def rig_config_and_cameras(folder: Path) -> Path:
+    """Without parameters, which cameras.txt has."""
+    colmap(folder)
+    (folder / "rigs.txt").unlink()
+    path = rig_config(folder)
+    tree = json.loads(path.read_text())
+    for camera in tree[0]["cameras"]:
+        del camera["camera_model_name"], camera["camera_params"]
+    path.write_text(json.dumps(tree))
+    return path
+
+
 def euroc(folder: Path) -> Path:
     body = np.vstack(
         [np.column_stack([Rotation.from_rotvec([0.3, 1.5, -0.2]).as_matrix(), [0.1, -0.2, 0.05]]), [0, 0, 0, 1]]
@@ -318,6 +330,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "depthai": depthai,
     "realsense": realsense,
     "colmap rig_config": rig_config,
+    "colmap rig_config with cameras.txt": rig_config_and_cameras,
     "colmap text": colmap,
     "euroc": euroc,
 }

@@ -8,6 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rsbench.components.cards import parse_card
@@ -35,16 +37,18 @@ def test_tables_make_the_rig_that_opencv_projects_with_the_same_numbers() -> Non
     np.testing.assert_allclose(rig.sensor("right").project(X @ found_R.T + found_t), seen[:, 0], atol=1e-9)
 
 
-def test_forms_of_a_rotation_are_one() -> None:
-    turn = Rotation.from_euler("xyz", [3.0, -20.0, 100.0], degrees=True)
+@given(st.tuples(*[st.floats(-80.0, 80.0)] * 3))
+def test_forms_of_a_rotation_are_one(degrees: tuple[float, float, float]) -> None:
+    turn = Rotation.from_euler("xyz", degrees, degrees=True)  # about fixed axes: Rz Ry Rx
     x, y, z, w = turn.as_quat()
     forms: tuple[dict[str, Any], ...] = (
         {"rotation": tuple(map(tuple, turn.as_matrix().tolist()))},
         {"quaternion_wxyz": (w, x, y, z)},
-        {"rotation_deg": (3.0, -20.0, 100.0)},
+        {"rotation_deg": degrees},
     )
+    t: Any = tuple((turn.as_matrix() @ [-1.0, 0.0, 0.0]).tolist())
     for form in forms:
-        np.testing.assert_allclose(RightFromLeft(translation=(-1, 0, 0), **form).R, turn.as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(RightFromLeft(translation=t, **form).R, turn.as_matrix(), atol=1e-12)
 
 
 def test_tables_of_a_rig_make_it_again() -> None:

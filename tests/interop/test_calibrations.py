@@ -533,8 +533,15 @@ def test_one_camera_is_taken_from_any_file(tmp_path: Path) -> None:
     card, notes = read_camera_file(chain(tmp_path, text + "  line_delay: 2.56e-05\n"), Readout(fps=30.0))
     assert card.camera is not None and card.camera.fx == LEFT[0] and not notes
     assert card.readout_ratio == pytest.approx(720 * 25.6e-6 * 30.0)
+    with pytest.raises(RsbenchError, match=r"has a lens \(brown-conrady\)"):
+        read_camera_file(made.kalibr(_sub(tmp_path)))
     with pytest.raises(RsbenchError, match="640 x 480"):
         read_camera_file(tmp_path / "camchain.yaml", frame_size=lambda: (640, 480))
+
+
+def _sub(folder: Path) -> Path:
+    (folder / "sub").mkdir()
+    return folder / "sub"
 
 
 def test_a_scaled_camera_sees_the_same_rays(tmp_path: Path) -> None:

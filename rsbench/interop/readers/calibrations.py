@@ -64,6 +64,9 @@ from rsbench.interop.readers.calibration_trees import Fields, files_in, read_tre
 _CORNER = 0.5
 
 
+_RIG_CONFIG = "COLMAP rig_config.json"
+
+
 def read_calibration(path: Path, given: Assumptions | None = None) -> Calibration:
     """The calibration that a file or folder holds.
 
@@ -119,6 +122,8 @@ def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
     """The files of the one format that a folder has."""
     paths = list(files_in(folder))
     of_kind = {kind.name: (kind, trees) for kind in FORMATS if (trees := _all_of(kind, paths))}
+    if _RIG_CONFIG in of_kind:  # cameras.txt beside it is a part
+        of_kind.pop("COLMAP", None)
     if len(of_kind) != 1:
         listed = "; ".join(f"{next(iter(trees)).name} of {name}" for name, (_, trees) in of_kind.items())
         raise RsbenchError(f"{folder}: holds {listed or 'no calibration'}; give one file")
@@ -574,15 +579,20 @@ def _read_rig_config(files: Files) -> Calibration:
     notes = [f"holds {len(tree)} rigs; the first is taken"] if len(tree) > 1 else []
     if len(cameras) > 2:
         notes.append(f"holds {len(cameras)} cameras; the first two are taken")
-    made, poses = list[tuple[Table, str]](), list[Pose]()
-    for camera in cameras[:2]:
-        if "camera_params" not in camera:
+    made, poses, beside = list[tuple[Table, str]](), list[Pose](), path.with_name("cameras.txt")
+    known = _colmap_cameras(read_tree(beside)["colmap"], str(beside)) if beside.is_file() else {}
+    for number, camera in enumerate(cameras[:2]):
+        own = camera.text("camera_id") or [*known, "", ""][number]
+        if "camera_params" in camera:
+            name = camera.text("camera_model_name").upper()
+            made.append(colmap_camera(name, camera.get("camera_params"), None, camera.where))
+        elif own in known and ("camera_id" in camera or len(known) == len(cameras)):
+            made.append(known[own])
+        else:
             raise RsbenchError(
-                f"{camera.where}: camera_params: is missing, with camera_model_name; add both, or give the folder "
-                "of cameras.txt and rigs.txt"
+                f"{camera.where}: camera_params: is missing, with camera_model_name; add both, or put "
+                "cameras.txt of as many cameras beside it"
             )
-        name = camera.text("camera_model_name").upper()
-        made.append(colmap_camera(name, camera.get("camera_params"), None, camera.where))
         if camera.get("ref_sensor"):
             poses.append(Pose(np.eye(3), np.zeros(3)))
         elif "cam_from_rig_rotation" in camera:
@@ -607,18 +617,22 @@ def _colmap_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
     return {each: tree for each, tree in near.items() if each.parent == path.parent}
 
 
+def _colmap_cameras(lines: Iterable[list[str]], where: str) -> dict[str, tuple[Table, str]]:
+    """Cameras of cameras.txt by their numbers, each with a sentence where it is approximate."""
+    made = dict[str, tuple[Table, str]]()
+    for words in lines:
+        if len(words) > 4 and words[1].isupper() and words[2] not in ("CAMERA", "IMU"):
+            at = f"{where}: {' '.join(words[:3])}"
+            size = Fields({"size": words[2:4]}, at).numbers("size", 2).tolist()
+            made[words[0]] = colmap_camera(words[1], words[4:], size, at)
+    return made
+
+
 def _read_colmap(files: Files) -> Calibration:
     """cameras.txt, with rigs.txt where there are two cameras."""
     lines = [line for tree in files.trees.values() for line in tree["colmap"]]
-    made = dict[str, tuple[Table, str]]()
-    rigs = list[list[str]]()
-    for words in lines:
-        where = f"{files.where}: {' '.join(words[:3])}"
-        if len(words) > 2 and words[2] in ("CAMERA", "IMU"):
-            rigs.append(words)
-        elif len(words) > 4 and words[1].isupper():
-            size = Fields({"size": words[2:4]}, where).numbers("size", 2).tolist()
-            made[words[0]] = colmap_camera(words[1], words[4:], size, where)
+    made = _colmap_cameras(lines, files.where)
+    rigs = [words for words in lines if words[2:3] in (["CAMERA"], ["IMU"])]
     if not made:
         raise RsbenchError(f"{files.where}: cameras.txt is missing beside it")
     notes = [note for _, note in made.values() if note]
@@ -674,7 +688,7 @@ FORMATS: tuple[Format, ...] = (
     Format("Basalt", lambda tree: keyed(tree, "value0") and keyed(tree["value0"], "intrinsics"), _read_basalt),
     Format("ZED", _is_zed, _read_zed),
     Format("DepthAI", lambda tree: keyed(tree, "cameraData"), _read_depthai),
-    Format("COLMAP rig_config.json", _is_rig_config, _read_rig_config),
+    Format(_RIG_CONFIG, _is_rig_config, _read_rig_config),
     Format("COLMAP", lambda tree: keyed(tree, "colmap"), _read_colmap, _colmap_files),
     Format("RealSense", lambda tree: bool(_realsense_cameras(tree)), _read_realsense),
     Format("EuRoC", lambda tree: keyed(tree, "T_BS", "intrinsics", "resolution"), _read_asl, _asl_files),
@@ -682,5 +696,5 @@ FORMATS: tuple[Format, ...] = (
     Format("OpenCV", is_opencv, read_opencv, opencv_files),
 )
 """In the order in which a file is tried."""
-_NUMBERED = ("Kalibr", "Basalt", "COLMAP", "COLMAP rig_config.json", "EuRoC")
+_NUMBERED = ("Kalibr", "Basalt", "COLMAP", "EuRoC")
 """Formats whose first camera need not be the left one."""
