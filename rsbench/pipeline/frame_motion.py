@@ -142,6 +142,10 @@ def find_rig(
     return found, matches
 
 
+_CLEAR = 3.0
+"""Deviations beyond which an error of a calibration is one: to estimate none costs accuracy of the motion."""
+
+
 def rig_of_matches(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> FoundRig | None:
@@ -154,7 +158,10 @@ def rig_of_matches(
         return None
     ideal = without_lens(matches, rig)
     rows = rotation_of_rows(np.concatenate([ideal.stereo_0, ideal.stereo_1]), rig, options.seed)
-    return None if rows is None else _refined(matches, rig, rows[0], inputs, options)
+    found = None if rows is None else _refined(matches, rig, rows[0], inputs, options)
+    # Rows differ by the motion too, where both cameras read a point at two times: that is no error.
+    agrees = found is None or bool(np.all(np.abs(found.errors) <= _CLEAR * found.sigma))
+    return None if agrees else found
 
 
 def _refined(
