@@ -114,6 +114,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Callable[
             {"sequence": [matches], "rig": rig, "shutter": shutter, "features": "sift", "seed": 0, "gyro": None},
         ),
         "read_dataset": (rsbench.read_dataset, {"folder": nowhere}),
+        "read_rig": (rsbench.read_rig, {"path": nowhere, "size": (640, 480), "fps": 20.0}),
         "generate": (rsbench.generate, {"card": "nowhere", "out": nowhere, "sequences": None, "workers": 1}),
         "verify": (rsbench.verify, {"folder": nowhere, "stride": 1, "rerender": "no", "scenes": ()}),
         "evaluate": (

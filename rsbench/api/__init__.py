@@ -280,7 +280,9 @@ def read_rig(
     if size is not None:
         given = arguments.real_array("size", size)
         if given.shape not in ((2,), (2, 2)):
-            raise ValueError(f"size = {size!r}: must be (width, height), or two of these, left and right")
+            raise ValueError(
+                f"size = {arguments.shown(size)}: must be (width, height), or two of these, left and right"
+            )
         for value in given.ravel():
             arguments.check_number("size", value, 1.0, arguments.LARGEST_SIZE)
         left, right = np.broadcast_to(given.astype(int), (2, 2)).tolist()
