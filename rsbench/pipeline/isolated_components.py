@@ -44,7 +44,13 @@ from rsbench.solvers.engine.base import (
     SolverSpec,
     load_solver_entry,
 )
-from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import (
+    MatchCount,
+    RobustEstimate,
+    RobustOptions,
+    estimate_motion,
+    inputs_of,
+)
 from rsbench.solvers.refined import warm_up
 from rsbench.vision.corrector import (
     CORRECTORS,
@@ -134,6 +140,10 @@ class SolverRunner:
         self, entry: SolverEntry, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> tuple[MotionEstimate, float]:
         """``Solver.estimate`` on all matches, and its seconds of processor time; NaN when its process ended."""
+        try:
+            correspondences, rig, shutter = inputs_of(entry.solver.spec, correspondences, rig, shutter)
+        except ValueError as error:
+            return MotionEstimate.failed(str(error)), 0.0
         if entry.built_in:
             return _timed(entry.solver, correspondences, rig, shutter)
         outcome = self._call(entry, "bare", correspondences, rig, shutter)

@@ -15,13 +15,13 @@ from rsbench.benchmark.simulated.bound import Views, motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import Correspondences, without_lens
+from rsbench.core.correspondences import Correspondences
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import list_solvers, load_solver_entry
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion, inputs_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "cameras.md"
 IDEAL = StereoRig(camera=LEFT.ideal, baseline=0.25)
@@ -70,12 +70,13 @@ def errors(name: str, case: str, size: float) -> FloatArray | None:
     solver = load_solver_entry(name).solver
     spec, still = solver.spec, solver.spec.shutter == "global"
     data = simulated(case, spec.motion_model, 0.0 if still else 0.8, size)
-    matches, rig, (w, d) = data.correspondences, data.rig, (data.motion.w, data.motion.d)
-    if spec.refusal(rig, data.shutter):
+    w, d = data.motion.w, data.motion.d
+    try:
+        matches, rig, shutter = inputs_of(spec, data.correspondences, data.rig, data.shutter)
+    except ValueError as error:
+        assert str(error) == spec.refusal(data.rig, data.shutter)
         return None
-    if still:
-        matches, rig = without_lens(matches, rig), rig.ideal
-    found = solver.estimate(matches, rig, data.shutter)
+    found = solver.estimate(matches, rig, shutter)
     assert found.success, found.reason
     if spec.reference_point == "left":
         d = translation_of_offset(w, d, rig.offset("left"))

@@ -25,7 +25,7 @@ from rsbench.core.correspondences import (
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import SENSORS, MatchSet, MotionEstimate, Solver
+from rsbench.solvers.engine.base import SENSORS, MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
 from rsbench.solvers.engine.ransac import IntArray, RansacOptions, msac_score, ransac
 
@@ -384,16 +384,9 @@ def estimate_motion(
         given, note = joined.correspondences, joined.note
     start = time.perf_counter()
     try:
-        ideal = without_lens(given, rig)
-        refusal = solver.spec.refusal(rig, shutter)
+        given, rig, shutter = inputs_of(solver.spec, given, rig, shutter)
     except ValueError as error:
         return _refused(correspondences, str(error), solver, options)
-    if refusal:
-        return _refused(correspondences, refusal, solver, options)
-    if solver.spec.shutter == "global" and solver.spec.cameras == "rig" and not rig.aligned:
-        shutter = shutter.at_once()
-    elif solver.spec.shutter == "global":
-        given, rig, shutter = ideal, rig.ideal, shutter if shutter.plain else shutter.at_once()
     task = _Task(given, rig, shutter, solver, options)
     found = task.by_solver() if loop == "own" else task.by_ransac(rng)
     seconds = time.perf_counter() - start
@@ -410,6 +403,24 @@ def estimate_motion(
         threshold_px=found.threshold_px,
         reference_point=solver.spec.reference_point,
     )
+
+
+def inputs_of(
+    spec: SolverSpec, matches: Correspondences, rig: StereoRig, shutter: RollingShutter
+) -> tuple[Correspondences, StereoRig, RollingShutter]:
+    """What a solver is given of matches and cameras: see ``SolverSpec.cameras``.
+
+    Raises:
+        ValueError: it does not take such cameras, or one of them shows no ray at a match.
+    """
+    ideal = without_lens(matches, rig)
+    if refusal := spec.refusal(rig, shutter):
+        raise ValueError(refusal)
+    if spec.shutter != "global":
+        return matches, rig, shutter
+    if spec.cameras == "rig" and not rig.aligned:
+        return matches, rig, shutter.at_once()
+    return ideal, rig.ideal, shutter if shutter.plain else shutter.at_once()
 
 
 def _refused(
