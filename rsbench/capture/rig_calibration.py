@@ -57,6 +57,8 @@ _LEAST = np.array([np.deg2rad(0.2)] * 5 + [0.005, 0.005])
 _TIMES_FOUND = 1.5
 """Prior standard deviations of what rows do not show, over what they do: both come from one calibration."""
 _ITERATIONS, _STILL = 15, 1e-4
+_MOST = 400
+"""Tracks of a window: more would not be what limits the estimate."""
 _LEAST_NOISE_PX = 0.3
 _SHARED_PX = 0.03
 """Error, px, that matches of one pair of images have in common."""
@@ -206,7 +208,8 @@ def refine_rig(
         packed = pack(tracks, first, read, motion_model)
         theta = packed.theta(result.estimate.w, result.estimate.d)
         inliers = result.inliers["tracks"]
-        some = Correspondences(tracks=matches.tracks[inliers])
+        chosen = matches.tracks[inliers]
+        some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST, 1)])
         noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
         tailed = heavy_tailed(pack(some, first, read, motion_model), theta, noise)
         if tailed is None:

@@ -47,6 +47,7 @@ from rsbench.vision.stereo_matcher import (
     body_depth,
     find_disparities,
     own_depths,
+    pixel_rays,
     widened,
 )
 
@@ -451,11 +452,10 @@ def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig
     lens the two times are so near that the difference is lost in that pixel.
     """
     sign, there_side = (1.0, "right") if side == "left" else (-1.0, "left")
-    camera, other_camera = rig.eye(side), rig.eye(there_side)
+    other_camera = rig.eye(there_side)
     disparity = np.nan_to_num(rig.disparity(body_depth(depth, rig, side)))
     other = np.nan_to_num(rig.disparity(body_depth(other_depth, rig, there_side)))
-    row, column = np.indices(depth.shape)
-    ideal = camera.ideal_pixels(np.stack([column, row], axis=-1))
+    ideal = rig.camera.ideal.project(pixel_rays(rig, side))
     partner = other_camera.lens_pixels(np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1))
     x, y = np.moveaxis(np.rint(np.nan_to_num(partner, nan=-1.0)).astype(np.int64), -1, 0)
     height, width = other_depth.shape
@@ -565,7 +565,7 @@ def timed_depth(
     """
     sign = 1.0 if side == "left" else -1.0
     other: Side = "right" if side == "left" else "left"
-    camera, ideal, partner = rig.eye(side), rig.camera.ideal, rig.eye(other)
+    all_rays, ideal, partner = pixel_rays(rig, side), rig.camera.ideal, rig.eye(other)
     out, depth = depth.copy(), body_depth(depth, rig, side)
     y, x = np.nonzero((depth > 0.0) & np.isfinite(depth))
     poses, axis = rig.eye_from_world(motion, shutter.line_times(frame, side), side), shutter.axis(side)
@@ -573,7 +573,7 @@ def timed_depth(
         part = slice(start, start + _CHUNK)
         pixels = np.stack([x[part], y[part]], axis=-1)
         lines = pixels[:, axis]
-        rays = camera.unproject(pixels)
+        rays = all_rays[y[part], x[part]]
         ends = ideal.project(rays)
         ends[:, 0] -= sign * rig.disparity(depth[y[part], x[part]])
         tau = shutter.pixel_time(partner.lens_pixels(ends), frame, other)
@@ -694,7 +694,7 @@ def _of_side(
     column = there_camera.unproject(ends)[..., 0]
     rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), ends, column)
     disparity = np.where(known, gain * rho, np.nan)
-    return _on_sensor(camera, wide, disparity.astype(np.float32))
+    return _on_sensor(camera, wide, pixel_rays(rig, side), disparity.astype(np.float32))
 
 
 def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -767,9 +767,11 @@ def _inside(camera: PinholeCamera | AlignedCamera, pixels: FloatArray) -> FloatA
     return np.where(camera.contains(pixels)[..., None], pixels, np.nan)
 
 
-def _on_sensor(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, disparity: F32) -> F32:
+def _on_sensor(
+    camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, rays: FloatArray, disparity: F32
+) -> F32:
     """Disparity of the wide camera on the pixels of the camera with its lens."""
     if wide is camera:
         return disparity
     shift = np.array([wide.cx - camera.ideal.cx, wide.cy - camera.ideal.cy])
-    return between_pixels(disparity, camera.ideal_pixels(camera.pixel_grid()) + shift)
+    return between_pixels(disparity, camera.ideal.project(rays) + shift)

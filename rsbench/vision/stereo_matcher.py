@@ -222,7 +222,7 @@ def sensor_disparities(
     on_sensors = []
     for side, found in zip(SIDES, both, strict=True):
         ideal, other = (
-            eyes[side].ideal_pixels(eyes[side].pixel_grid()),
+            rig.camera.ideal.project(pixel_rays(rig, side)),
             eyes["right" if side == "left" else "left"],
         )
         sign = 1.0 if side == "left" else -1.0
@@ -238,19 +238,26 @@ def widened(rig: StereoRig) -> PinholeCamera:
 @lru_cache(maxsize=4)
 def _widened(rig: StereoRig) -> PinholeCamera:
     if rig.aligned:
-        return _around(rig.camera.ideal, rig.camera.ideal_pixels(rig.camera.pixel_grid()))
+        return _around(rig.camera.ideal, rig.camera.ideal.project(pixel_rays(rig, "left")))
     rims = []
     for side in SIDES:
-        grid = rig.eye(side).pixel_grid()
-        some = grid[0], grid[-1], grid[:, 0], grid[:, -1], grid[::8, ::8].reshape(-1, 2)
-        rims.append(rig.eye(side).ideal_pixels(np.concatenate(some)))
+        grid = rig.camera.project(pixel_rays(rig, side))
+        rims += [grid[0], grid[-1], grid[:, 0], grid[:, -1], grid[::8, ::8].reshape(-1, 2)]
     return _around(rig.camera, np.concatenate(rims)[None])
+
+
+@lru_cache(maxsize=2 * len(SIDES))
+def pixel_rays(rig: StereoRig, side: Side) -> FloatArray:
+    """(H, W, 3) rays of all pixels of a camera, in the body's axes; not to be written to."""
+    rays = rig.eye(side).unproject(rig.eye(side).pixel_grid())
+    rays.setflags(write=False)
+    return rays
 
 
 @lru_cache(maxsize=4)
 def own_depths(rig: StereoRig, side: Side) -> F32:
     """(H, W) ``StereoRig.own_depth`` of all pixels of a camera."""
-    return rig.own_depth(side, rig.sensor(side).pixel_grid()).astype(np.float32)
+    return np.asarray(pixel_rays(rig, side) @ rig.own(side).R[2]).astype(np.float32)
 
 
 def body_depth(depth: F32, rig: StereoRig, side: Side) -> F32:
