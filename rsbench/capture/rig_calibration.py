@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import RigCamera, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -114,7 +114,7 @@ def _row_columns(rays: FloatArray) -> FloatArray:
     return np.stack([-(1.0 + v * v), u * v, u, v], axis=-1)
 
 
-def rotation_of_rows(stereo: FloatArray, rig: StereoRig, seed: int = 0) -> tuple[FloatArray, FloatArray] | None:
+def rotation_of_rows(stereo: FloatArray, rig: StereoRig, seed: int = 0) -> tuple[FloatArray, BoolArray] | None:
     """Errors (8,) of a calibration from left-right matches (n, 4), ideal px, of whole images, with many outliers.
 
     Returns:
@@ -266,7 +266,7 @@ class _Problem:
         rays in the derivatives would pull the focal lengths to smaller values, five deviations of 1200 tracks.
         """
         k = len(self.free)
-        cost, g, H, backs = 0.0, np.zeros(k), np.zeros((k, k)), []
+        cost, g, H, backs = 0.0, np.zeros(k), np.zeros((k, k)), list[tuple[FloatArray, FloatArray]]()
         weight = self.prior[self.free] ** -2.0
         for window, theta in zip(self.windows, thetas, strict=True):
             packed, size = self._packed(window, errors), 6 + k

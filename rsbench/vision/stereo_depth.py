@@ -455,7 +455,8 @@ def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig
     other_camera = rig.eye(there_side)
     disparity = np.nan_to_num(rig.disparity(body_depth(depth, rig, side)))
     other = np.nan_to_num(rig.disparity(body_depth(other_depth, rig, there_side)))
-    ideal = rig.camera.ideal.project(pixel_rays(rig, side))
+    row, column = np.indices(depth.shape)
+    ideal = rig.eye(side).ideal_pixels(np.stack([column, row], axis=-1))
     partner = other_camera.lens_pixels(np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1))
     x, y = np.moveaxis(np.rint(np.nan_to_num(partner, nan=-1.0)).astype(np.int64), -1, 0)
     height, width = other_depth.shape

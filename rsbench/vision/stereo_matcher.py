@@ -239,7 +239,7 @@ def widened(rig: StereoRig) -> PinholeCamera:
 def _widened(rig: StereoRig) -> PinholeCamera:
     if rig.aligned:
         return _around(rig.camera.ideal, rig.camera.ideal.project(pixel_rays(rig, "left")))
-    rims = []
+    rims = list[FloatArray]()
     for side in SIDES:
         grid = rig.camera.project(pixel_rays(rig, side))
         rims += [grid[0], grid[-1], grid[:, 0], grid[:, -1], grid[::8, ::8].reshape(-1, 2)]
