@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
-MAX_REPOSITORY_MB, MAX_ARGUMENTS = 30, 9
+MAX_REPOSITORY_MB, MAX_ARGUMENTS = 32, 9
 
 in_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git checkout")
 
