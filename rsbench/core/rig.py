@@ -271,14 +271,16 @@ class StereoRig:
             return np.ones(np.shape(pixels)[:-1])
         return np.asarray(self.eye(side).unproject(pixels) @ self.own(side).R[2])
 
-    def rows_together(self, scanning: Scanning) -> bool:
+    def rows_together(self, scanning: Scanning, readout_ratio: float | None = None) -> bool:
         """Whether both ends of a match are read at one time, or nearly: an ideal row of both within a 25th.
 
-        Of an ideal rig what ``scanning`` says, for its lens bends rows of both cameras alike.
+        Of an ideal rig what ``scanning`` says, for its lens bends rows of both cameras alike. A ratio that is not
+        known may be 1: the slower the cameras read, the farther apart are two rows.
         """
         if self.left is None or not scanning.rows_together:
             return scanning.rows_together
-        shutter, camera = self.shutter_of(scanning, 1.0), self.camera
+        ratio = 1.0 if readout_ratio is None else readout_ratio
+        shutter, camera = self.shutter_of(scanning, ratio), self.camera
         x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
         ends = np.stack([x, y], axis=-1)
         first = shutter.pixel_time(self.eye("left").lens_pixels(ends), 0, "left")

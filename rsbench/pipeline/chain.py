@@ -221,7 +221,7 @@ def _solve(
         clock("motion")
         return matches, None, inputs.shutter_of(rig), None, None
     forget_features()
-    own = matches is None and rig.rows_together(inputs.scanning or Scanning())
+    own = matches is None and rig.rows_together(inputs.scanning or Scanning(), inputs.readout_ratio)
     rig_found = None
     try:
         if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
@@ -264,7 +264,7 @@ def find_depth(
         if motion is None:
             raise ValueError(f"the motion must be known where matcher {options.matcher.name!r} finds depth")
         pairs = motion_pairs(images, rig, shutter, motion, options)
-    elif pairs is None and not rig.rows_together(shutter.scanning):
+    elif pairs is None and not rig.rows_together(shutter.scanning, shutter.readout_ratio):
         if motion is None:
             raise ValueError("the motion must be known where depth is found of cameras that read rows apart")
         pairs = moving_pairs(images, rig, shutter, motion, options)

@@ -318,7 +318,7 @@ def with_found_rig(
 ) -> FoundRig | None:
     """The rig as the first frames show it; None where their rows agree with its calibration, or do not tell."""
     images = next(iter(window_images(left, right)), None)
-    if images is None or not rig.rows_together(scanning or Scanning()):
+    if images is None or not rig.rows_together(scanning or Scanning(), readout_ratio):
         return None
     inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning)
     try:

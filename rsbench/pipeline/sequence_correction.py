@@ -261,7 +261,7 @@ def _with_depth(
     first: int,
 ) -> Iterator[Window]:
     """The windows with depth from the other camera, that of each frame from ``first`` on found once."""
-    apart = not rig.rows_together(shutter.scanning) or needs_motion(options.matcher)
+    apart = not rig.rows_together(shutter.scanning, shutter.readout_ratio) or needs_motion(options.matcher)
     if apart or "depth" not in options.corrector.component.spec.needs:
         yield from windows
         return
