@@ -43,7 +43,7 @@ ERRORS = (
 )
 """Rotation of the right camera about the body's axes, rad; of both cameras against the baseline, rad; logarithms
 of the focal lengths; frame periods by which the right camera is later: added to what the calibration says."""
-_DELAY = len(ERRORS) - 1
+_CONVERGENCE, _DELAY = 1, len(ERRORS) - 1
 _STEP = 1e-6
 _SAMPLES, _ROUNDS, _REFITS = 2000, 8, 3
 _ROW_PX = 1.0
@@ -196,26 +196,14 @@ def refine_rig(
     Returns:
         None where no motion explains the tracks.
     """
-    solver, found = RefinedSolver(motion_model=motion_model, use_pairs=False), list[_Window]()
-    thetas = list[FloatArray]()
-    first, read = with_errors(rig, start), _read(shutter, start)
-    for matches in windows:
-        tracks = Correspondences(tracks=matches.tracks)
-        options = robust or RobustOptions()
-        result = estimate_motion(tracks, first, read, solver, options, np.random.default_rng(seed))
-        if not result.estimate.success:
-            continue
-        packed = pack(tracks, first, read, motion_model)
-        theta = packed.theta(result.estimate.w, result.estimate.d)
-        inliers = result.inliers["tracks"]
-        chosen = matches.tracks[inliers]
-        some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST, 1)])
-        noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
-        tailed = heavy_tailed(pack(some, first, read, motion_model), theta, noise)
-        if tailed is None:
-            continue
-        found.append(_Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale))
-        thetas.append(theta)
+    starts = [start]
+    if start[_CONVERGENCE] != 0.0:
+        starts.append(np.where(np.arange(len(ERRORS)) == _CONVERGENCE, 0.0, start))
+    options = robust or RobustOptions()
+    tried = [_moving(windows, rig, shutter, each, options, seed, motion_model) for each in starts]
+    # Rows hardly show the convergence: under a wrong one, what moves in the scene may agree on a motion.
+    best = int(np.argmax([agreeing for *_, agreeing in tried]))
+    start, (found, thetas, _) = starts[best], tried[best]
     if not found:
         return None
     problem = _Problem(found, rig, shutter, prior, motion_model)
@@ -232,6 +220,38 @@ def refine_rig(
     return FoundRig(
         rig=with_errors(rig, errors), shutter=_read(shutter, errors), errors=errors, sigma=sigma, tracks=count
     )
+
+
+def _moving(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    start: FloatArray,
+    robust: RobustOptions,
+    seed: int,
+    motion_model: str,
+) -> tuple[list[_Window], list[FloatArray], int]:
+    """Windows that have a motion under these errors, their motions, and how many tracks agree with them."""
+    solver, agreeing = RefinedSolver(motion_model=motion_model, use_pairs=False), 0
+    found, thetas = list[_Window](), list[FloatArray]()
+    first, read = with_errors(rig, start), _read(shutter, start)
+    for matches in windows:
+        tracks = Correspondences(tracks=matches.tracks)
+        result = estimate_motion(tracks, first, read, solver, robust, np.random.default_rng(seed))
+        if not result.estimate.success:
+            continue
+        packed = pack(tracks, first, read, motion_model)
+        theta = packed.theta(result.estimate.w, result.estimate.d)
+        chosen = matches.tracks[result.inliers["tracks"]]
+        some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST, 1)])
+        noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
+        tailed = heavy_tailed(pack(some, first, read, motion_model), theta, noise)
+        if tailed is None:
+            continue
+        found.append(_Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale))
+        thetas.append(theta)
+        agreeing += len(chosen)
+    return found, thetas, agreeing
 
 
 def _read(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
