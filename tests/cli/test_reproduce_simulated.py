@@ -93,7 +93,7 @@ def test_everything_makes_each_folder_of_results_once(
     reproduce(Target.everything, tmp_path / "out", tmp_path / "data")
     folders = {folder.name for folder in (Path(__file__).parents[2] / "results").iterdir() if folder.is_dir()}
     # Made by programs in benchmarks/, which their provenance names.
-    apart = {"gyro", "r6p", "solvers", "speed", "trajectory", "tuning"}
+    apart = {"gyro", "r6p", "rectify", "solvers", "speed", "trajectory", "tuning"}
     # Claims make Figure 3 too, boards write beside leaderboard.
     assert {*made, "fig3"} == folders - apart | {"image-claims", "boards"}
     # Judged from what the others have stored.
