@@ -37,7 +37,6 @@ from rsbench.interop.writers.sequence_views import (
     compare_rows,
     first_pose,
     lens_fault,
-    line_delay,
     number,
     numbers,
     one_by_one,
@@ -124,7 +123,8 @@ def _depth_text(values: FloatArray) -> bytes:
 
 
 def _write_carla_calibration(sequence: Sequence, folder: Path) -> None:
-    camera, delay_ms = sequence.rig.sensor("left"), 1e3 * line_delay(sequence, "left")
+    camera, shutter = sequence.rig.sensor("left"), sequence.shutter
+    delay_ms = 1e3 * shutter.readout_ratio * sequence.frame_period_s / shutter.lines("left")
     rows = ["#Rolling shutter camera intrinsic parameters", f"FPS: {number(1.0 / sequence.frame_period_s)}"]
     rows += [f"ROW_READOUT_TIME(ms): {number(delay_ms)}", f"RESOLUTION_H: {camera.height}"]
     write_lines(folder / "rs_calib.txt", [*rows, f"RESOLUTION_W: {camera.width}"])
