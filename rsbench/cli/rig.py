@@ -93,6 +93,8 @@ def rig(
         for line in _lines(found):
             echo(line)
     if picture is not None:
+        if picture.suffix.lower() not in (".svg", ".png", ".pdf"):
+            raise RsbenchError(f"--picture {picture}: must end in .svg, .png or .pdf")
         from rsbench.report.rig_picture import draw_rig
 
         drawn = _known_rig(found)

@@ -570,6 +570,9 @@ def test_the_command_shows_what_was_understood(tmp_path: Path) -> None:
     for words in ("Kalibr (camchain.yaml)", "119.81 mm", "25.6 us a line", "0.641 deg in all", "--fps"):
         assert words in shown.stdout
     assert picture.read_text().lstrip().startswith("<?xml")
+    refused = run_here("rig", path, "--picture", tmp_path / "rig.bmp")
+    assert refused.returncode == 2 and "must end in .svg, .png or .pdf" in refused.stderr
+    assert not (tmp_path / "rig.bmp").exists()
     record = json.loads(run_here("rig", path, "--json").stdout)
     assert record["baseline_m"] == pytest.approx(float(np.linalg.norm(T)))
     camera = rsbench.read_rig(path).rig.sensor("left")
