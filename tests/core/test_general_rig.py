@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from general_rigs import LEFT, RIGHT, RIGS, SCANS, rig_of
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
-from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.projection import back_project, rs_project, rs_project_near
@@ -18,23 +18,7 @@ from rsbench.core.se3 import transform
 from rsbench.core.shutter import Scanning
 from rsbench.solvers.engine.base import load_solver_entry
 
-LEFT = PinholeCamera(
-    width=640,
-    height=480,
-    fx=520.0,
-    fy=521.0,
-    cx=315.0,
-    cy=242.0,
-    lens=Lens(model="brown-conrady", k1=-0.2, p1=1e-3),
-)
-RIGHT = PinholeCamera(
-    width=1280, height=720, fx=905.0, fy=903.0, cx=650.0, cy=355.0, lens=Lens(model="kannala-brandt", k1=0.02)
-)
 small = st.floats(-0.2, 0.2)
-
-
-def rig_of(w: tuple[float, float, float], t: tuple[float, float, float] = (-0.25, 0.01, -0.02)) -> StereoRig:
-    return StereoRig.of_cameras(LEFT, RIGHT, so3.exp(np.array(w)), t)
 
 
 @given(st.tuples(small, small, small), st.tuples(small, small))
@@ -84,24 +68,8 @@ def test_impossible_extrinsics_are_refused(
         StereoRig.of_cameras(LEFT, RIGHT, rotation, translation)
 
 
-RIGS = {
-    "turned": rig_of((0.01, -0.03, 0.02)),
-    "vertical": StereoRig.of_cameras(LEFT, RIGHT, so3.exp(np.array([0.01, 0.0, 0.02])), (0.01, -0.25, 0.01)),
-    "toed in": rig_of((0.0, 0.06, 0.02)),
-}
-
-
 @pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
-@pytest.mark.parametrize(
-    "scanning",
-    [
-        Scanning(),
-        Scanning(right_delay=0.1),
-        Scanning(right_scan="left"),
-        Scanning(right_readout_ratio=0.0),
-    ],
-    ids=["rows", "late", "columns", "global right"],
-)
+@pytest.mark.parametrize("scanning", SCANS.values(), ids=SCANS)
 def test_projection_returns_from_where_it_went_and_solvers_find_the_motion(
     rig: StereoRig, scanning: Scanning
 ) -> None:
