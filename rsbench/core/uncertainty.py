@@ -1,0 +1,252 @@
+"""What a stated deviation means, in one place: covariances, intervals and mixtures that cover the truth.
+
+An estimate minimises a cost, the sum over measurements i of negative log-likelihoods with gradients g_i and
+curvatures H_i at the minimum. Five things make the inverse curvature too small a covariance, and each has one
+function here.
+
+1. The model of the noise is approximate. The sandwich A^-1 (sum g_i g_i^T) A^-1 holds whatever the noise is (P.
+   Huber, Proc. Fifth Berkeley Symposium, 1967; H. White, Econometrica 1980), with each g_i divided by 1 - h_i for
+   the part of its error that the fit has followed (HC3: J. MacKinnon, H. White, J. Econometrics 1985), h_i = tr
+   (H^-1 H_i) being the leverage of the measurement. By chance it is too small in some directions when measurements
+   are few, so it is replaced by the inverse information wherever that is larger (``larger``).
+2. Few measurements carry the information. With leverages that add up to p, as many equal measurements as K = p^2
+   / sum h_i^2 would have the same spread of information (L. Kish, Survey Sampling, 1965). A covariance from K
+   samples has squared errors as T^2 of H. Hotelling (Annals of Mathematical Statistics 1931), not as chi-squared;
+   ``small_sample_factor`` is the ratio of their quantiles. The ellipsoid of chi-squared then covers at that level.
+   Smaller ellipsoids (one deviation) cover slightly more than they name.
+3. Neighbouring measurements have common errors. The sandwich over tiles of the image as clusters (K.-Y. Liang, S.
+   Zeger, Biometrika 1986) has few degrees of freedom, so that it is summarised by one number: its mean variance
+   over that of independent measurements, at least 1 (``shared_error_factor``). It multiplies covariances, and it
+   divides log-likelihoods where hypotheses are compared (P. McCullagh, J. Nelder, Generalized Linear Models, 1989,
+   9.2: quasi-likelihood; R. Royall, T.-S. Tsou, J. Royal Statistical Society B 2003).
+4. The hypothesis itself is uncertain. The covariance of a mixture adds the squared distances between what the
+   hypotheses give, weighted by their probabilities (``spread_about``, ``mixture``; J. Hoeting, D. Madigan, A.
+   Raftery, C. Volinsky, Statistical Science 1999, eq. 3).
+5. The likelihood is not Gaussian: a bound, two optima, a long tail. An interval then holds all values that the
+   likelihood ratio does not reject (``likelihood_interval``; S. Wilks, Annals of Mathematical Statistics 1938).
+
+Each stated number is one standard deviation of the error against the truth, and each covariance C such that the
+error e has e^T C^-1 e below the 95 % quantile of chi-squared in 95 of 100 problems. It has no part for errors of
+what is given (calibration, shutter): where these are estimated, the caller adds what they contribute.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from rsbench.core.so3 import FloatArray
+
+LEVEL = 0.95
+"""Probability at which ellipsoids are made to cover."""
+TILES = (4, 3)
+"""Columns of the image, and rows in each, in which measurements may have common errors."""
+_LEAST_FREEDOM = 3.0
+"""Of the denominator of F: fewer have quantiles that say nothing."""
+_MOST_FOLLOWED = 0.5
+"""Largest leverage for which HC3 corrects."""
+_DOUBLINGS, _HALVINGS = 40, 30
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stated:
+    """A covariance, and what it was made from."""
+
+    covariance: FloatArray
+    """(p, p), all factors included."""
+    count: float
+    """K, the effective number of measurements."""
+    shared: float
+    """Variance that common errors of neighbours leave, over that of independent ones; at least 1."""
+
+
+def stated_covariance(
+    gradients: FloatArray,
+    inverse: FloatArray,
+    information: FloatArray,
+    leverages: FloatArray,
+    places: FloatArray,
+    parameters: int,
+) -> Stated:
+    """Points 1 to 3 above, for n measurements and an estimate of size p.
+
+    Args:
+        gradients: (n, p) g_i, of the cost at its minimum.
+        inverse: (p, p) A^-1, inverse of the cost's Hessian.
+        information: (p, p) inverse of the expected information: covariance if the model of the noise holds.
+        leverages: (n,) h_i.
+        places: (n, 2) where in the image each measurement is, in any unit.
+        parameters: that the measurements determine, p or fewer.
+    """
+    kept = 1.0 - np.minimum(leverages, _MOST_FOLLOWED)
+    shares = gradients / kept[:, None] @ inverse
+    covariance = larger(shares.T @ shares, information)
+    shared = shared_error_factor(shares, tiles(places), covariance, parameters)
+    count = effective_count(leverages)
+    return Stated(
+        covariance=covariance * shared * small_sample_factor(count, parameters), count=count, shared=shared
+    )
+
+
+def larger(covariance: FloatArray, other: FloatArray) -> FloatArray:
+    """The larger of two covariances (p, p) along each axis on which both are diagonal; ``other``: definite."""
+    size = np.sqrt(np.diagonal(other))
+    half = size[:, None] * np.linalg.cholesky(other / np.outer(size, size))
+    back = np.linalg.solve(half, np.linalg.solve(half, covariance).T)
+    values, vectors = np.linalg.eigh(0.5 * (back + back.T))
+    axes = half @ vectors * np.sqrt(np.maximum(values, 1.0))
+    return np.asarray(axes @ axes.T)
+
+
+def effective_count(leverages: FloatArray) -> float:
+    """K, as many equal measurements as have the leverages (n,); 0 for none."""
+    squares = float(np.sum(leverages**2))
+    return float(np.sum(leverages)) ** 2 / squares if squares > 0.0 else 0.0
+
+
+@functools.lru_cache(maxsize=4096)
+def _hotelling(count: float, parameters: int, level: float) -> float:
+    freedom = max(count - parameters + 1.0, _LEAST_FREEDOM)
+    quantile = float(scipy.special.fdtri(parameters, freedom, level))
+    normal = 2.0 * float(scipy.special.gammaincinv(0.5 * parameters, level))
+    return (freedom + parameters - 1.0) / freedom * parameters * quantile / normal
+
+
+def small_sample_factor(count: float, parameters: int, level: float = LEVEL) -> float:
+    """Quantile of Hotelling's T^2 for a covariance from K samples over that of chi-squared, at least 1."""
+    return _hotelling(float(count), parameters, level)
+
+
+def variance_factor(freedom: float, parameters: int, level: float = LEVEL) -> float:
+    """As ``small_sample_factor`` where one variance alone is estimated, with these degrees of freedom."""
+    quantile = float(scipy.special.fdtri(parameters, max(freedom, _LEAST_FREEDOM), level))
+    return parameters * quantile / (2.0 * float(scipy.special.gammaincinv(0.5 * parameters, level)))
+
+
+def tiles(places: FloatArray, shape: tuple[int, int] = TILES) -> NDArray[np.int64]:
+    """Number (n,) of the tile of each place (n, 2); as many places in every column, and in every row of it."""
+    columns, rows = shape
+    ranks = np.argsort(np.argsort(places[:, 0], kind="stable"), kind="stable")
+    column = ranks * columns // max(len(places), 1)
+    order = np.lexsort((places[:, 1], column))
+    start = np.searchsorted(column[order], np.arange(columns))
+    size = np.diff(np.append(start, len(places)))
+    inside = np.zeros(len(places), dtype=np.int64)
+    inside[order] = np.arange(len(places)) - start[column[order]]
+    return np.asarray(column * rows + inside * rows // np.maximum(size[column], 1), dtype=np.int64)
+
+
+def clustered(shares: FloatArray, groups: NDArray[np.int64]) -> FloatArray:
+    """Covariance (p, p) of a sum of shares (n, p), the shifts that measurements cause, of independent groups."""
+    _, places = np.unique(groups, return_inverse=True)
+    count = int(places.max(initial=-1)) + 1
+    if count < 2:
+        return np.zeros((shares.shape[1],) * 2)
+    centred = shares - np.mean(shares, axis=0)
+    sums = np.stack([np.bincount(places, column, count) for column in centred.T], axis=1)
+    return np.asarray(sums.T @ sums) * count / (count - 1)
+
+
+def shared_error_factor(
+    shares: FloatArray, groups: NDArray[np.int64], covariance: FloatArray, parameters: int
+) -> float:
+    """phi, the mean variance of groups that err together over that of a covariance (p, p), at least 1."""
+    if not shares.size:
+        return 1.0
+    size = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
+    scaled = clustered(shares / size, groups)
+    inverse = np.linalg.pinv(covariance / np.outer(size, size), hermitian=True)
+    return max(1.0, float(np.trace(inverse @ scaled)) / parameters)
+
+
+def tempered(probabilities: ArrayLike, factor: float) -> FloatArray:
+    """Probabilities of hypotheses (k,) whose log-odds count 1 / factor."""
+    powers = np.asarray(probabilities, dtype=np.float64) ** (1.0 / factor)
+    return np.asarray(powers / np.sum(powers))
+
+
+def spread_about(used: FloatArray, probabilities: ArrayLike, values: FloatArray) -> FloatArray:
+    """(p, p) mean square of the distance of hypotheses' values (k, p) from the value (p,) that is used."""
+    away = np.asarray(values) - used
+    return np.asarray((np.asarray(probabilities)[:, None] * away).T @ away)
+
+
+def mixture(probabilities: ArrayLike, values: ArrayLike, sigmas: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (...) of a mixture of parts with these means and deviations (k, ...)."""
+    weights, values = np.asarray(probabilities), np.asarray(values)
+    mean = np.asarray(np.tensordot(weights, values, 1))
+    variance = np.tensordot(weights, np.asarray(sigmas) ** 2 + (values - mean) ** 2, 1)
+    return mean, np.sqrt(variance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """Values that a likelihood does not reject."""
+
+    low: float
+    high: float
+    bounded: bool
+    """Whether both ends are the likelihood's, and neither is a limit of the values."""
+
+    @property
+    def half(self) -> float:
+        """Half of its length."""
+        return 0.5 * (self.high - self.low)
+
+    def holds(self, value: float) -> bool:
+        """Whether it contains a value."""
+        return self.low <= value <= self.high
+
+
+def likelihood_interval(
+    cost: Callable[[float], float],
+    at: float,
+    step: float,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+    level: float = LEVEL,
+    dispersion: float = 1.0,
+) -> Interval:
+    """All values about the best one whose likelihood ratio is not rejected.
+
+    Args:
+        cost: negative log-likelihood of a value, all else fitted to it.
+        at: the value of the least cost.
+        step: a first guess of its deviation.
+        limits: of the values.
+        level: probability with which the interval holds the truth.
+        dispersion: ``shared`` above, by which log-likelihoods are divided.
+    """
+    allowed = cost(at) + 0.5 * dispersion * float(scipy.special.chdtri(1, 1.0 - level))
+    (low, low_found), (high, high_found) = (
+        _crossing(cost, at, sign * step, allowed, limit) for sign, limit in zip((-1.0, 1.0), limits, strict=True)
+    )
+    return Interval(low=low, high=high, bounded=low_found and high_found)
+
+
+def _crossing(
+    cost: Callable[[float], float], at: float, step: float, allowed: float, limit: float
+) -> tuple[float, bool]:
+    """Where a cost exceeds what is allowed, in the direction of the step; the limit where it does not before."""
+    inside, reach = at, step
+    for _ in range(_DOUBLINGS):
+        outside = at + reach
+        if (outside - limit) * step >= 0.0:
+            outside = limit
+        if cost(outside) > allowed:
+            break
+        if outside == limit:
+            return limit, False
+        inside, reach = outside, 2.0 * reach
+    else:
+        return inside, False
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (inside + outside)
+        if abs(outside - inside) <= 1e-3 * abs(middle - at):
+            break
+        inside, outside = (middle, outside) if cost(middle) <= allowed else (inside, middle)
+    return 0.5 * (inside + outside), True

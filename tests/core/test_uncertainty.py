@@ -1,0 +1,115 @@
+"""Stated deviations, against closed forms and against simulated truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsbench.core import uncertainty as u
+
+
+def test_the_larger_covariance_is_the_larger_one_along_common_axes() -> None:
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    first, second = turn * [4.0, 1.0, 9.0] @ turn.T, turn * [1.0, 2.0, 9.0] @ turn.T
+    np.testing.assert_allclose(u.larger(first, second), turn * [4.0, 2.0, 9.0] @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(u.larger(np.zeros((3, 3)), second), second, atol=1e-12)
+
+
+@given(st.integers(0, 10_000))
+def test_it_is_at_least_either_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    units = np.diag(10.0 ** rng.uniform(-3.0, 3.0, 4))
+    first, second = (units @ (A @ A.T + 1e-3 * np.eye(4)) @ units for A in rng.normal(size=(2, 4, 4)))
+    out, back = u.larger(first, second), np.linalg.inv(units)
+    for each in (first, second):
+        assert np.linalg.eigvalsh(back @ (out - each) @ back)[0] > -1e-8 * np.trace(back @ out @ back)
+
+
+def test_equal_measurements_count_as_many_and_one_that_dominates_as_one() -> None:
+    assert u.effective_count(np.full(40, 6.0 / 40)) == pytest.approx(40.0)
+    assert u.effective_count(np.array([1.0, 1e-9])) == pytest.approx(1.0)
+    assert u.effective_count(np.zeros(0)) == 0.0
+
+
+def test_the_ellipsoid_of_a_sampled_covariance_covers_as_hotelling_has_it() -> None:
+    """Independent truth: 20,000 means and covariances of 20 normal samples."""
+    rng, n, p = np.random.default_rng(1), 20, 3
+    draws = rng.normal(size=(20_000, n, p))
+    mean = draws.mean(axis=1)
+    centred = draws - mean[:, None]
+    C = np.swapaxes(centred, 1, 2) @ centred / (n - 1) / n
+    squares = np.einsum("ni,nij,nj->n", mean, np.linalg.inv(C), mean)
+    factor = u.small_sample_factor(n - 1, p)
+    assert np.mean(squares <= factor * scipy.stats.chi2.ppf(0.95, p)) == pytest.approx(0.95, abs=0.005)
+    assert u.small_sample_factor(1e7, p) == pytest.approx(1.0, abs=1e-5)
+    assert u.variance_factor(1e7, p) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_tiles_are_of_equal_numbers() -> None:
+    places = np.random.default_rng(2).normal(size=(240, 2)) ** 3
+    assert np.all(np.bincount(u.tiles(places)) == 20)
+    assert len(u.tiles(np.zeros((0, 2)))) == 0
+
+
+def test_errors_that_neighbours_share_are_seen_and_independent_ones_are_not() -> None:
+    """A mean of values that have, by tile, a common error of a third of their deviation: variance 1 + 20 / 9."""
+    factors = []
+    for common in (0.0, 1.0 / 3.0):
+        found = []
+        for seed in range(200):
+            rng = np.random.default_rng(seed)
+            places = rng.uniform(size=(240, 2))
+            groups = u.tiles(places)
+            values = rng.normal(size=240) + common * rng.normal(size=12)[groups]
+            shares = (values - values.mean())[:, None] / 240
+            found.append(float(u.clustered(shares, groups)[0, 0] / (shares.T @ shares)[0, 0]))
+        factors.append(np.mean(found))
+    assert factors[0] == pytest.approx(1.0, abs=0.1)  # 200 variances of 11 degrees of freedom: +-0.03
+    assert factors[1] == pytest.approx((1.0 + 20.0 / 9.0) / (1.0 + 1.0 / 9.0), rel=0.1)
+
+
+def test_a_regression_is_covered_with_unequal_noise_and_few_measurements() -> None:
+    """Forty measurements of three parameters, noise that grows with the place: White's holds 87 %."""
+    held = {"stated": 0, "plain": 0}
+    for seed in range(600):
+        rng = np.random.default_rng(seed)
+        places = rng.uniform(-1.0, 1.0, (40, 2))
+        X = np.column_stack([np.ones(40), places])
+        e = rng.normal(size=40) * (0.3 + places[:, 0] ** 2)
+        inverse = np.asarray(np.linalg.inv(X.T @ X), dtype=np.float64)
+        error, left = inverse @ X.T @ e, e - X @ inverse @ X.T @ e
+        h = np.einsum("ni,ij,nj->n", X, inverse, X)
+        stated = u.stated_covariance(
+            X * left[:, None], inverse, float(left @ left) / 37.0 * inverse, h, places, 3
+        ).covariance
+        for name, C in (("stated", stated), ("plain", inverse @ (X * left[:, None] ** 2).T @ X @ inverse)):
+            held[name] += bool(error @ np.linalg.solve(C, error) <= scipy.stats.chi2.ppf(0.95, 3))
+    assert 0.93 < held["stated"] / 600 < 0.985 and held["plain"] / 600 < 0.9
+
+
+def test_a_mixture_has_the_variance_within_and_between() -> None:
+    mean, sigma = u.mixture([0.5, 0.5], [[0.0], [2.0]], [[1.0], [1.0]])
+    assert mean == pytest.approx([1.0]) and sigma == pytest.approx([np.sqrt(2.0)])
+    spread = u.spread_about(np.zeros(2), [0.75, 0.25], np.array([[0.0, 0.0], [2.0, 1.0]]))
+    np.testing.assert_allclose(spread, [[1.0, 0.5], [0.5, 0.25]])
+    np.testing.assert_allclose(u.tempered([0.8, 0.2], 2.0), [2.0 / 3.0, 1.0 / 3.0])
+
+
+def test_the_interval_of_a_normal_value_is_that_of_its_deviation_and_of_poisson_counts_the_exact_one() -> None:
+    found = u.likelihood_interval(lambda x: 0.5 * ((x - 3.0) / 0.2) ** 2, 3.0, 0.01)
+    assert found.bounded and found.low == pytest.approx(3.0 - 1.96 * 0.2, abs=1e-3)
+    assert found.high == pytest.approx(3.0 + 1.96 * 0.2, abs=1e-3) and found.holds(3.0)
+    counts = u.likelihood_interval(lambda m: m - 5.0 * np.log(max(m, 1e-300)), 5.0, 1.0, (0.0, np.inf))
+
+    def excess(m: float) -> float:
+        """Deviance of a Poisson rate behind 5 counts, less the quantile."""
+        return float(2.0 * (m - 5.0 - 5.0 * np.log(m / 5.0)) - scipy.stats.chi2.ppf(0.95, 1))
+
+    for found_end, ends in ((counts.low, (1e-3, 5.0)), (counts.high, (5.0, 50.0))):
+        assert found_end == pytest.approx(scipy.optimize.brentq(excess, *ends), abs=1e-2)
+    flat = u.likelihood_interval(lambda x: 0.0, 0.5, 0.1, (0.0, 1.0))
+    assert not flat.bounded and (flat.low, flat.high) == (0.0, 1.0)
