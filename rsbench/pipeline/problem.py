@@ -165,7 +165,7 @@ def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
         if path.suffix not in _LINES:
             yield _attempt(read_text(path), str(path), path.stem)
             return
-        with io.TextIOWrapper(open_regular(path), encoding="utf-8") as file:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
             yield from _parsed(file, str(path), path.stem, lines=True)
     except OSError as error:
         yield RsbenchError(f"{path}: cannot be read: {error.strerror}")

@@ -6,6 +6,7 @@ environment variable ``RSBENCH_LIMITS`` is a factor for all limits. Errors are o
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import io
@@ -140,9 +141,16 @@ def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
 
 
 def read_text(path: Path, limit: int = FILE_BYTES) -> str:
-    """The content of a file in UTF-8; errors as ``read_bytes``, and RsbenchError for another encoding."""
+    """The content of a file in UTF-8, with a byte order mark or without.
+
+    Raises:
+        RsbenchError: as ``read_bytes``, or another encoding, UTF-16 by its name.
+    """
+    data = read_bytes(path, limit)
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise RsbenchError(f"{path}: is UTF-16 text: save it as UTF-8")
     try:
-        return read_bytes(path, limit).decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RsbenchError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
 

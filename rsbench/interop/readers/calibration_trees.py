@@ -52,7 +52,7 @@ def read_tree(path: Path) -> Any:
     Raises:
         RsbenchError: it cannot be read, or is in none of the syntaxes.
     """
-    text = read_text(path, _LONGEST).lstrip("\ufeff")
+    text = read_text(path, _LONGEST)
     try:
         return _arrays(_parsed(text, path))
     except RecursionError as error:

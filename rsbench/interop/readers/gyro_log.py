@@ -8,6 +8,7 @@ backwards.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from rsbench.storage.untrusted_files import read_text
 
 _TITLES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
 _OURS = ("stamp_ns", "wx", "wy", "wz")
-_THEIRS = ("t", "gx", "gy", "gz")
+_THEIRS = ("gx", "gy", "gz")
 _CAMERA_FROM_THEIRS = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -53,57 +54,91 @@ def read_gyro_log(path: Path) -> GyroLog:
     if suffix not in (".gcsv", ".csv"):
         raise RsbenchError(f"{path}: must end in .gcsv, gyroflow's format, or .csv, with {','.join(_OURS)}")
     text = read_text(path).splitlines()
-    times, rates = _of_gcsv(text, path) if suffix == ".gcsv" else _of_csv(text, path)
-    if len(times) < 2 or np.any(np.diff(times) < 0.0):
-        raise RsbenchError(f"{path}: must have two samples and more, in the order of time")
+    read_table = _of_gcsv if suffix == ".gcsv" else _of_csv
+    line_numbers, times, rates = read_table(text, path)
+    if len(times) < 2:
+        raise RsbenchError(f"{path}: must have two samples and more")
+    if np.any(np.diff(times) < 0.0):
+        number = line_numbers[int(np.argmax(np.diff(times) < 0.0)) + 1]
+        raise RsbenchError(
+            f"{path}:{number}: its time is before that of the line above: must be in the order of time"
+        )
     later = np.concatenate([[True], np.diff(times) > 0.0])
     if np.count_nonzero(later) < 2:
         raise RsbenchError(f"{path}: all samples have one time")
     return GyroLog(times[later], rates[later])
 
 
-def _of_csv(text: Sequence[str], path: Path) -> tuple[FloatArray, FloatArray]:
-    values = _table(text, 0, _OURS, path)
-    return 1e-9 * values[:, 0], values[:, 1:]
+def _of_csv(text: Sequence[str], path: Path) -> tuple[list[int], FloatArray, FloatArray]:
+    names = _cells(text[0]) if text else []
+    if any(name not in names for name in _OURS):
+        raise RsbenchError(f"{path}: must have the columns {','.join(_OURS)}")
+    line_numbers, values = _table(text, 0, [names.index(name) for name in _OURS], path)
+    return line_numbers, 1e-9 * values[:, 0], values[:, 1:]
 
 
-def _of_gcsv(text: Sequence[str], path: Path) -> tuple[FloatArray, FloatArray]:
-    start = next((k for k, line in enumerate(text) if line.split(",")[0].strip() == "t"), None)
-    if not text or text[0].strip() not in _TITLES or start is None:
+def _of_gcsv(text: Sequence[str], path: Path) -> tuple[list[int], FloatArray, FloatArray]:
+    """Absent keys and names as gyroflow's own reader takes them: milliseconds, scale 1, xzY, columns by place."""
+    start = next((k for k, line in enumerate(text) if _cells(line)[0] in ("t", "time")), None)
+    if not text or not text[0].strip().startswith(_TITLES) or start is None:
         raise RsbenchError(f"{path}: must begin with {_TITLES[0]} and have a line t,gx,gy,gz")
-    head = dict(line.split(",", 1) for line in text[1:start] if "," in line)
+    pairs = [(number, _cells(line)) for number, line in enumerate(text[1:start], start=2)]
+    head = {cells[0]: (number, cells[1]) for number, cells in pairs if len(cells) == 2}
     scales = []
-    for key in ("tscale", "gscale"):
-        if key not in head:
-            raise RsbenchError(f"{path}: has no {key}, by which its numbers are multiplied")
-        scales.append(float(numbers(head[key], f"{path}: {key}", 1)[0]))
+    for key, usual in (("tscale", "0.001"), ("gscale", "1")):
+        number, value = head.get(key, (0, usual))
+        scales.append(float(numbers(value, f"{path}:{number}: {key}", 1)[0]))
         if not scales[-1] > 0.0:
-            raise RsbenchError(f"{path}: {key} = {scales[-1]:g}: must be positive")
-    orientation = head.get("orientation", "XYZ").strip()
+            raise RsbenchError(f"{path}:{number}: {key} = {scales[-1]:g}: must be positive")
+    number, orientation = head.get("orientation", (0, "xzY"))
     if sorted(orientation.upper()) != ["X", "Y", "Z"]:
         raise RsbenchError(
-            f"{path}: orientation = {orientation!r}: must be X, Y and Z in some order, lower case for minus"
+            f"{path}:{number}: orientation = {orientation!r}: must be X, Y and Z in some order, lower case for "
+            "minus"
         )
-    values = _table(text, start, _THEIRS, path)
+    names = _cells(text[start])
+    if len(names) < 4:
+        raise RsbenchError(f"{path}:{start + 1}: {text[start].strip()!r}: must be t,gx,gy,gz")
+    rates = [names.index(name) for name in _THEIRS] if set(_THEIRS) <= set(names) else [1, 2, 3]
+    line_numbers, values = _table(text, start, [0, *rates], path)
     theirs = [(1.0 if each.isupper() else -1.0) * values[:, 1 + "XYZ".index(each.upper())] for each in orientation]
-    return scales[0] * values[:, 0], scales[1] * np.stack(theirs, axis=-1) @ _CAMERA_FROM_THEIRS.T
+    times = scales[0] * _unrolled(values[:, 0])
+    return line_numbers, times, scales[1] * np.stack(theirs, axis=-1) @ _CAMERA_FROM_THEIRS.T
 
 
-def _table(text: Sequence[str], start: int, names: Sequence[str], path: Path) -> FloatArray:
-    """Columns (n, k) by their names in the line ``start``; an incomplete last line is ignored."""
-    columns = [each.strip() for each in text[start].split(",")] if text else []
-    if any(name not in columns for name in names):
-        raise RsbenchError(f"{path}: must have the columns {','.join(names)}")
-    rows = [line for line in text[start + 1 :] if line.strip()]
-    if rows and rows[-1].count(",") < len(columns) - 1:
-        rows.pop()
-    chosen = [columns.index(name) for name in names]
-    try:
-        values = (
-            np.loadtxt(rows, delimiter=",", usecols=chosen, ndmin=2, comments=None) if rows else np.zeros((0, 4))
-        )
-    except ValueError as error:
-        raise RsbenchError(f"{path}: not a table of numbers: {str(error)[:120]}") from None
-    if not np.all(np.isfinite(values)):
-        raise RsbenchError(f"{path}: numbers must be finite")
-    return values
+def _cells(line: str) -> list[str]:
+    return [each.strip() for each in line.split(",")]
+
+
+def _table(text: Sequence[str], start: int, columns: Sequence[int], path: Path) -> tuple[list[int], FloatArray]:
+    """Line numbers (n) and values (n, k) of some columns below the line ``start``, of lines that have all of them.
+
+    A logger that misses a reading leaves a cell empty, and one that is cut off an incomplete last line.
+    """
+    found, width = dict[int, list[str]](), len(_cells(text[start]))
+    for number, line in enumerate(text[start + 1 :], start=start + 2):
+        cells = _cells(line)
+        least = width if number == len(text) else max(columns) + 1
+        if len(cells) >= least and all(cells[k] for k in columns):
+            found[number] = [cells[k] for k in columns]
+    with contextlib.suppress(ValueError):
+        values = np.array(list(found.values()), dtype=np.float64).reshape(-1, len(columns))
+        if np.all(np.isfinite(values)):
+            return list(found), values
+    return list(found), np.array([numbers(" ".join(row), f"{path}:{n}") for n, row in found.items()])
+
+
+def _unrolled(ticks: FloatArray) -> FloatArray:
+    """Times of a counter that begins again at 0 after 2^16, 2^24 or 2^32 ticks, as one that does not.
+
+    A step back is taken for that where it leaves a step forward of at most ten usual ones; others stay.
+    """
+    steps = np.diff(ticks)
+    if not np.any(steps < 0.0):
+        return ticks
+    usual = float(np.median(np.abs(steps)))
+    for size in (2.0**16, 2.0**24, 2.0**32):
+        rolled = np.where(steps < 0.0, steps + size, steps)
+        if np.all((rolled >= 0.0) & (rolled <= np.maximum(10.0 * usual, steps))):
+            return ticks[0] + np.concatenate([[0.0], np.cumsum(rolled)])
+    return ticks
