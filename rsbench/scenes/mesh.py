@@ -1,21 +1,15 @@
 """A scene from a mesh file of the user: glTF, GLB, OBJ, OFF, PLY or STL, read by trimesh.
 
-A file may name others, such as textures, in its own folder and below. The size that a file states is checked
-before trimesh reads it, and what trimesh ignores in a glTF header is read here: extensions that it cannot decode,
-and transforms of textures. The model is then placed: its size and place, the ground below it and walls around.
+The model is placed: its size and place, the ground below it and walls around. Its surfaces are diffuse, or glossy
+where a glTF says how rough they are.
 """
 
 from __future__ import annotations
 
-import base64
-import io
-import logging
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import trimesh
@@ -23,228 +17,11 @@ from numpy.typing import NDArray
 
 from rsbench.components.imports import in_words
 from rsbench.core.errors import RsbenchError
+from rsbench.scenes.mesh_files import TEXTURE, Surface, read_mesh_file
 from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
 from rsbench.scenes.parts import Piece, assemble, box, grid
 from rsbench.scenes.surfaces import paint_palette
-from rsbench.storage.untrusted_files import (
-    FILE_BYTES,
-    check_amount,
-    check_image_size,
-    check_size,
-    parse_json,
-    read_bytes,
-)
-
-_TRANSFORM = "KHR_texture_transform"
-_HARMLESS = (_TRANSFORM, "KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-"""Beginnings of extensions that may be required: we read them, or they say what a diffuse surface has not."""
-_ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
-
-
-@dataclass(frozen=True, kw_only=True)
-class TextureTransform:
-    """Transform of texture coordinates, in glTF's own frame: u right, v down."""
-
-    offset: tuple[float, float] = (0.0, 0.0)
-    rotation: float = 0.0
-    """Radians; anticlockwise as one sees it in a picture of u and v, so from +u towards -v."""
-    scale: tuple[float, float] = (1.0, 1.0)
-
-    def __call__(self, uv: FloatArray) -> FloatArray:
-        """Coordinates (n, 2), v up, as trimesh gives them: scaled, then rotated, then moved."""
-        c, s = np.cos(self.rotation), np.sin(self.rotation)
-        u, v = uv[:, 0] * self.scale[0], (1.0 - uv[:, 1]) * self.scale[1]
-        turned = np.stack([c * u + s * v + self.offset[0], 1.0 - (c * v - s * u + self.offset[1])], axis=1)
-        return np.asarray(turned, dtype=np.float64)
-
-
-def check_extensions(header: Mapping[str, Any], where: str) -> None:
-    """Refuse what would be read as something else than it is.
-
-    Raises:
-        RsbenchError: the file requires an extension that is not read, or has materials of an old one.
-    """
-    for name in header.get("extensionsRequired", []):
-        if not str(name).startswith(_HARMLESS) or name == _ARCHIVED:
-            raise RsbenchError(f"{where}: needs the glTF extension {name}, which is not read: export it without")
-    if any(_ARCHIVED in material.get("extensions", {}) for material in header.get("materials", [])):
-        raise RsbenchError(f"{where}: has materials of {_ARCHIVED}: export it with metallic-roughness ones")
-
-
-def texture_transforms(header: Mapping[str, Any], where: str) -> dict[str, TextureTransform]:
-    """Transforms of base colour textures by the names of their materials.
-
-    Raises:
-        RsbenchError: materials of one name have several, or a texture uses other coordinates than the first.
-    """
-    found: dict[str, TextureTransform] = {}
-    for material in header.get("materials", []):
-        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-        stated = texture.get("extensions", {}).get(_TRANSFORM, {})
-        name = str(material.get("name"))
-        if stated.get("texCoord", texture.get("texCoord", 0)) != 0:
-            raise RsbenchError(
-                f"{where}: the texture of material {name!r} uses a second set of coordinates: export it with one"
-            )
-        transform = TextureTransform(
-            offset=_pair(stated.get("offset", (0.0, 0.0))),
-            rotation=float(stated.get("rotation", 0.0)),
-            scale=_pair(stated.get("scale", (1.0, 1.0))),
-        )
-        if found.setdefault(name, transform) != transform:
-            raise RsbenchError(
-                f"{where}: materials of the name {name!r} have several {_TRANSFORM}: give them names of their own"
-            )
-    return {name: transform for name, transform in found.items() if transform != TextureTransform()}
-
-
-def _pair(values: Any) -> tuple[float, float]:
-    first, second = values
-    return float(first), float(second)
-
-
-PARTS = 1 << 12
-"""Nodes, meshes, materials and so on, of each kind."""
-VALUES = 1 << 26
-"""Numbers in the arrays of a file, and in those of all its parts, which may share them."""
-_DEEPEST = 64
-_VISITS = 1 << 28
-TEXTURE = 1 << 24
-"""Pixels of a texture, 4096 x 4096."""
-SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-_TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-
-
-def check_mesh_file(path: Path) -> dict[str, TextureTransform]:
-    """Refuse a mesh file that says of itself that it unfolds to too much; returns its transforms of textures.
-
-    Raises:
-        RsbenchError: that, a format that is not read, or a header that cannot be one.
-    """
-    if path.suffix.lower() not in SUFFIXES:
-        raise RsbenchError(
-            f"mesh file {path}: cannot be read: must end in {', '.join(SUFFIXES)}; export it as GLB"
-        )
-    data, where = read_bytes(path, FILE_BYTES), f"mesh file {path}"
-    try:
-        match path.suffix.lower():
-            case ".glb":
-                return _check_gltf(_json_chunk(data), where, _binary_chunk(data))
-            case ".gltf":
-                return _check_gltf(data, where)
-            case ".ply":
-                _check_ply(data, where)
-            case ".obj":
-                _check_obj(data, where)
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise RsbenchError(f"{where}: cannot be read: {type(error).__name__} in its header: {error}") from error
-    return {}
-
-
-def _json_chunk(data: bytes) -> bytes:
-    if data[:4] != b"glTF" or data[16:20] != b"JSON":
-        raise ValueError("not binary glTF")
-    return data[20 : 20 + int.from_bytes(data[12:16], "little")]
-
-
-def _binary_chunk(data: bytes) -> bytes:
-    start = 20 + int.from_bytes(data[12:16], "little")
-    return data[start + 8 : start + 8 + int.from_bytes(data[start : start + 4], "little")]
-
-
-def _check_gltf(text: bytes, where: str, binary: bytes = b"") -> dict[str, TextureTransform]:
-    header = parse_json(text.decode("utf-8"), where)
-    for name, items in header.items():
-        if isinstance(items, list):
-            check_amount(where, name, len(items), PARTS)
-    sizes = [_size(accessor) for accessor in header.get("accessors", [])]
-    check_amount(where, "values of all accessors", sum(sizes), VALUES)
-    primitives = [primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]]
-    check_amount(where, "primitives", len(primitives), PARTS)
-    used = [index for primitive in primitives for index in _accessors(primitive)]
-    check_amount(where, "values of all primitives", sum(sizes[index] for index in used), VALUES)
-    _check_graph(header, where)
-    check_extensions(header, where)
-    if any(not {"bufferView", "sparse"} & set(header["accessors"][index]) for index in used):
-        raise RsbenchError(f"{where}: has meshes without data: export it without compression")
-    for number in _coloured_images(header):
-        _check_image(header, number, binary, f"{where}: image {number}")
-    return texture_transforms(header, where)
-
-
-def _coloured_images(header: dict[str, Any]) -> list[int]:
-    """Numbers of the images that colour a material, each once."""
-    textures = [
-        each.get("pbrMetallicRoughness", {}).get("baseColorTexture") for each in header.get("materials", [])
-    ]
-    sources = [header["textures"][each["index"]].get("source") for each in textures if each is not None]
-    return sorted({number for number in sources if number is not None})
-
-
-def _check_image(header: dict[str, Any], number: int, binary: bytes, where: str) -> None:
-    """Refuse an image inside the file that cannot be decoded, in whose place trimesh takes grey without a word.
-
-    Images in files of their own are read, and refused, as they are needed.
-    """
-    image = header["images"][number]
-    if str(image.get("uri", "")).startswith("data:"):
-        kind, _, text = image["uri"].partition(",")
-        data = base64.b64decode(text, validate=True) if kind.endswith(";base64") else unquote_to_bytes(text)
-    elif "bufferView" in image and binary:
-        view = header["bufferViews"][image["bufferView"]]
-        start = int(view.get("byteOffset", 0))
-        data = binary[start : start + int(view["byteLength"])]
-    else:
-        return
-    check_image_size(data, where, most=TEXTURE)
-
-
-def _check_graph(header: dict[str, Any], where: str) -> None:
-    """Refuse nodes that are not trees, as glTF requires, or so deep that each path takes long."""
-    children = [node.get("children", []) for node in header.get("nodes", [])]
-    parents = {child: number for number, each in enumerate(children) for child in each}
-    shown = [node for scene in header.get("scenes", []) for node in scene.get("nodes", [])]
-    check_amount(where, "nodes of all scenes", len(shown), PARTS)
-    if len(parents) < sum(map(len, children)):
-        raise RsbenchError(f"{where}: a node has two parents")
-    for node in parents:
-        depth = 0
-        while node in parents and depth <= _DEEPEST:
-            node, depth = parents[node], depth + 1
-        check_amount(where, "levels of nodes", depth, _DEEPEST)
-
-
-def _size(accessor: dict[str, Any]) -> int:
-    count, width = accessor["count"], _TYPES[accessor["type"]]
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise ValueError(f"count = {count!r}")
-    return count * width
-
-
-def _accessors(primitive: dict[str, Any]) -> Iterable[int]:
-    found = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
-    if any(isinstance(index, bool) or not isinstance(index, int) or index < 0 for index in found):
-        raise ValueError(f"accessors {found}")
-    return found
-
-
-def _check_obj(data: bytes, where: str) -> None:
-    groups = len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE))
-    check_amount(where, "groups", groups, PARTS)
-    # Its reader goes through all vertices for each group.
-    vertices = len(re.findall(rb"^\s*v\s", data, re.MULTILINE))
-    check_amount(where, "vertices times groups", vertices * groups, _VISITS)
-
-
-def _check_ply(data: bytes, where: str) -> None:
-    header, _, content = data.partition(b"end_header")
-    counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\S+)", header, re.MULTILINE)]
-    # Each vertex and each face takes a byte at least; of text, each line is one.
-    if min(counts, default=0) < 0 or sum(counts) > len(content):
-        raise ValueError(f"states {sum(counts)} elements in {len(content)} bytes")
-    if b"ascii" in header and content.count(b"\n") > 2 * sum(counts) + PARTS:
-        raise ValueError(f"states {sum(counts)} elements in {content.count(bytes([10]))} lines")
-
+from rsbench.storage.untrusted_files import check_amount, check_size
 
 _GROUND, _WALL = "cobbles", "brick"
 _SUNK = 1e-3
@@ -303,7 +80,6 @@ _SHEET = 1024  # columns of the sheet that holds colours of faces
 _TRIANGLES = 1 << 22
 _TEXTURES = 1 << 26
 """Pixels of all textures."""
-logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what it logs of a file is in our line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,7 +143,7 @@ class MeshBuilder(SceneBuilder):
             raise RsbenchError(f"mesh file {path}: cannot be read: {in_words(error)}") from error
 
     def _meshes(self, path: Path) -> tuple[SceneMesh, ...]:
-        model, transforms = _read(path)
+        model, surfaces = read_mesh_file(path)
         _check_size(model, path)
         angle = np.deg2rad(self.heading_deg)
         heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
@@ -376,7 +152,7 @@ class MeshBuilder(SceneBuilder):
             shading=self.shading,
             transparent=self.transparent,
             gloss=self.gloss,
-            transforms=transforms,
+            surfaces=surfaces,
             materials={},
         )
         meshes = []
@@ -397,9 +173,9 @@ class _Look:
     shading: str
     transparent: str
     gloss: str
-    transforms: dict[str, TextureTransform]
-    materials: dict[int, Material]
-    """Made so far, by the identity of what trimesh read."""
+    surfaces: dict[str, Surface]
+    materials: dict[tuple[int, tuple[float, ...]], Material]
+    """Made so far, by the identity of what trimesh read and the colour that multiplies it."""
 
 
 def _check_size(model: Any, path: Path) -> None:
@@ -407,75 +183,6 @@ def _check_size(model: Any, path: Path) -> None:
     nodes = [model.geometry[model.graph[node][1]] for node in model.graph.nodes_geometry]
     triangles = sum(len(part.faces) for part in nodes if isinstance(part, trimesh.Trimesh))
     check_amount(f"mesh file {path}", "triangles", triangles, _TRIANGLES)
-
-
-class _Neighbours(trimesh.resolvers.FilePathResolver):
-    """Files beside the model and below, as UTF-8; remembers what was wrong with them, which trimesh only logs."""
-
-    def __init__(self, source: str) -> None:
-        super().__init__(source)
-        self.wrong: list[str] = []
-        self.libraries: list[bytes] = []
-        """Contents of the MTL files that were read."""
-
-    def get(self, name: str) -> bytes:
-        try:
-            content: bytes = super().get(name.replace("\\", "/"))  # exporters on Windows write paths of theirs
-        except Exception as error:
-            too_large = isinstance(error, RsbenchError)
-            self.wrong.append(str(error) if too_large else f"{name}, which is missing or lies outside its folder")
-            raise
-        if name.lower().endswith(".mtl"):
-            content = _as_utf8(content)
-            self.libraries.append(content)
-        return content
-
-    def absolute(self, name: str) -> Path:
-        path: Path = super().absolute(name)  # raises where links or dots lead out of the folder
-        if path.exists():
-            if not path.is_file():
-                raise ValueError(f"{name} is no file")
-            check_amount(name, "bytes", path.stat().st_size, FILE_BYTES)
-        return path
-
-
-def _as_utf8(text: bytes) -> bytes:
-    """Text of unknown encoding: UTF-8 when it can be, else the old one of Western exporters."""
-    try:
-        text.decode("utf-8")
-    except UnicodeDecodeError:
-        return text.decode("latin-1").encode("utf-8")
-    return text
-
-
-def _read(path: Path) -> tuple[Any, dict[str, TextureTransform]]:
-    """What trimesh makes of a file, and the transforms of its textures."""
-    if not path.is_file():
-        raise RsbenchError(f"mesh file {path}: no such file (parameters.file is relative to the card)")
-    transforms = check_mesh_file(path)
-    neighbours = _Neighbours(str(path))
-    options = {"resolver": neighbours, "process": False}
-    try:
-        if path.suffix.lower() != ".obj":
-            return trimesh.load_scene(str(path), **options), transforms
-        content = path.read_bytes()
-        text = _as_utf8(content)
-        given = {"file_obj": str(path)} if text == content else {"file_obj": io.BytesIO(text), "file_type": "obj"}
-        model = trimesh.load_scene(**given, **options)
-        _check_names(text, neighbours.libraries, path)
-        return model, transforms
-    finally:
-        if neighbours.wrong:
-            raise RsbenchError(f"mesh file {path}: refers to {neighbours.wrong[0]}")
-
-
-def _check_names(text: bytes, libraries: list[bytes], path: Path) -> None:
-    """Refuse materials that no library has, where trimesh takes grey instead; an OBJ without any is grey."""
-    used = re.findall(rb"^\s*usemtl[ \t]+(.+?)\s*$", text, re.MULTILINE)
-    known = re.findall(rb"^\s*newmtl[ \t]+(.+?)\s*$", b"\n".join(libraries), re.MULTILINE)
-    missing = sorted(set(used) - set(known)) if libraries else []
-    if missing:
-        raise RsbenchError(f"mesh file {path}: usemtl {missing[0].decode()}: its .mtl has no such material")
 
 
 def _scene_mesh(
@@ -489,24 +196,55 @@ def _scene_mesh(
         raise RsbenchError(f"{where} has vertices that are not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise RsbenchError(f"{where} has faces that name vertices beyond its {len(vertices)}")
-    faces = faces.astype(np.int32)
+    # A mirror turns triangles over; shading normals stay on the side that the file has them.
+    faces = np.ascontiguousarray(faces[:, ::-1] if np.linalg.det(linear) < 0.0 else faces, dtype=np.int32)
     normals = _normals(part, linear, where) if look.shading == "smooth" else None
     if part.visual.kind in ("vertex", "face"):
         return _coloured_faces(name, vertices, faces, normals, np.asarray(part.visual.face_colors)[:, :3])
     source = getattr(part.visual, "material", None)
     uv = getattr(part.visual, "uv", None)
-    if id(source) not in look.materials:
-        _check_alpha(source, where, look.transparent)
-        material = _material(source, where, list(look.materials.values()))
+    shades = _shades(part, where)
+    plain = bool(np.all(shades == shades[:1]))
+    key = id(source), tuple(shades[0].tolist()) if plain else ()
+    surface = look.surfaces.get(str(getattr(source, "name", None)))
+    if key not in look.materials:
+        _check_alpha(source, part, where, look.transparent)
+        factor = shades[0] if plain else np.ones(3)
+        material = _material(source, surface, factor, where, list(look.materials.values()))
         roughness = _roughness(source, where) if look.gloss == "file" else None
-        look.materials[id(source)] = replace(material, roughness=roughness)
-    material = look.materials[id(source)]
+        look.materials[key] = replace(material, roughness=roughness)
+    material = look.materials[key]
+    if not plain:
+        if material.texture is not None:
+            raise RsbenchError(
+                f"{where} has vertex colours over a texture: bake them into it, or remove them on export"
+            )
+        colours = np.rint(255 * _to_srgb(_to_linear(np.array(material.colour)) * shades)).astype(np.uint8)
+        made = _coloured_faces(name, vertices, faces, normals, colours)
+        return replace(made, material=replace(made.material, roughness=material.roughness))
     if material.texture is not None and (uv is None or not np.isfinite(uv).all()):
         raise RsbenchError(f"{where} has a texture but no finite texture coordinates")
     uv = None if uv is None else np.asarray(uv, dtype=np.float64)
-    if uv is not None and (transform_of := look.transforms.get(material.name)) is not None:
-        uv = transform_of(uv)
+    if uv is not None and surface is not None and material.texture is not None:
+        uv = surface.coordinates(uv, _image(source).size, where)
     return SceneMesh(name=name, vertices=vertices, faces=faces, material=material, uv=uv, normals=normals)
+
+
+def _image(source: Any) -> Any:
+    """The picture that colours a material of trimesh; None: none."""
+    pbr = isinstance(source, trimesh.visual.material.PBRMaterial)
+    return source.baseColorTexture if pbr else getattr(source, "image", None)
+
+
+def _shades(part: Any, where: str) -> FloatArray:
+    """Linear reflectance (m, 3) by which the vertex colours of a glTF multiply each triangle; (1, 3) of none."""
+    colours = getattr(part.visual, "vertex_attributes", {}).get("color")
+    if colours is None:
+        return np.ones((1, 3))
+    shades = _unit(colours)[:, :3][part.faces].mean(axis=1)
+    if not (np.isfinite(shades).all() and shades.min() >= 0.0 and shades.max() <= 1.0):
+        raise RsbenchError(f"{where} has vertex colours that are not between 0 and 1")
+    return shades
 
 
 def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
@@ -521,7 +259,13 @@ def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
     return normals
 
 
-def _check_alpha(source: Any, where: str, transparent: str) -> None:
+def _unit(colours: NDArray[Any]) -> FloatArray:
+    """Colours between 0 and 1, of integers that stand for such, or floats."""
+    most = np.iinfo(colours.dtype).max if np.issubdtype(colours.dtype, np.integer) else 1.0
+    return np.asarray(colours, dtype=np.float64) / most
+
+
+def _check_alpha(source: Any, part: Any, where: str, transparent: str) -> None:
     """Refuse a material that is anywhere less than opaque, unless that is to be passed over.
 
     Raises:
@@ -534,6 +278,8 @@ def _check_alpha(source: Any, where: str, transparent: str) -> None:
         if source.alphaMode in ("MASK", "BLEND"):
             image = source.baseColorTexture
             least = 1.0 if source.baseColorFactor is None else float(source.baseColorFactor[3]) / 255
+            colours = part.visual.vertex_attributes.get("color")
+            least *= 1.0 if colours is None else float(_unit(colours)[:, 3:].min(initial=1.0))
     else:
         stated = getattr(source, "kwargs", {})
         least = 0.0 if "map_d" in stated else float(stated.get("d", [1.0])[-1])
@@ -546,25 +292,29 @@ def _check_alpha(source: Any, where: str, transparent: str) -> None:
         )
 
 
-def _material(source: Any, where: str, others: list[Material]) -> Material:
-    """Diffuse part of a glTF or MTL material; all else that it may say is left out, or ``_roughness``."""
+def _material(
+    source: Any, surface: Surface | None, shade: FloatArray, where: str, others: list[Material]
+) -> Material:
+    """Diffuse part of a glTF or MTL material, multiplied by ``shade``; all else that it may say is left out."""
     if source is None:
         return Material(name="plain")
     if isinstance(source, trimesh.visual.material.MultiMaterial):
         raise RsbenchError(f"{where} has several materials in one part: export it as glTF instead")
-    name = str(getattr(source, "name", None) or "unnamed")
+    name = str(getattr(source, "name", None) or "unnamed") if surface is None else surface.name
+    image = _image(source)
     if isinstance(source, trimesh.visual.material.PBRMaterial):
-        image, factor = source.baseColorTexture, source.baseColorFactor
-        # glTF factors are linear reflectances; trimesh keeps them as bytes.
-        linear = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255
+        linear = np.ones(3) if surface is None or surface.factor is None else surface.factor
     else:
-        image = getattr(source, "image", None)
+        # A texture is multiplied by Kd where the file has one, and Kd is sRGB as textures are.
+        stated = "kd" in getattr(source, "kwargs", {})
         diffuse = np.asarray(getattr(source, "diffuse", (204, 204, 204)), dtype=np.float64)[:3] / 255
-        linear = np.ones(3) if image is not None else _to_linear(diffuse)
+        linear = _to_linear(diffuse) if image is None or stated else np.ones(3)
+    linear = linear * shade
     if image is None:
         r, g, b = (float(value) for value in _to_srgb(linear))
         return Material(name=name, colour=(r, g, b))
-    return Material(name=name, texture=_texture(image, linear, where, others))
+    texture = _texture(image, linear, where, others)
+    return Material(name=name, texture=texture if surface is None else surface.wrapped(texture))
 
 
 def _roughness(source: Any, where: str) -> float | None:

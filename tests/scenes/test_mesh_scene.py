@@ -22,7 +22,11 @@ from rsbench.scenes.load import _packed, _unpacked
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
 def test_colours_sit_at_their_corners(tmp_path: Path, suffix: str) -> None:
-    textured_quad().export(tmp_path / f"quad.{suffix}")
+    quad = textured_quad()
+    if suffix == "obj":  # trimesh writes Kd 0.4 of other materials, which would dim the texture
+        image = quad.visual.material.baseColorTexture
+        quad.visual.material = trimesh.visual.material.SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
+    quad.export(tmp_path / f"quad.{suffix}")
     (mesh,) = load(tmp_path, f'file = "quad.{suffix}"').meshes
     middle = np.array([0.5, 0.5])
     # y up in the file is z up in the scene; a step of a quarter towards the middle stays in the corner's texel.
@@ -371,15 +375,184 @@ def test_a_turn_of_a_texture_is_anticlockwise_in_its_own_picture(tmp_path: Path)
     np.testing.assert_allclose([u, 1.0 - v], [np.cos(0.1), -np.sin(0.1)], atol=1e-6)
 
 
-def test_transforms_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
-    def twice(header: dict[str, Any]) -> None:
+def test_transforms_belong_to_materials_by_number(tmp_path: Path) -> None:
+    """Materials may have one name or none; three.js#15486."""
+
+    def second(header: dict[str, Any]) -> None:
         header["materials"].append(json.loads(json.dumps(header["materials"][0])))
         _transformed(scale=[2.0, 2.0])(header)
+        for material in header["materials"]:
+            material.pop("name")
+        header["meshes"].append(json.loads(json.dumps(header["meshes"][0])))
+        header["meshes"][1]["primitives"][0]["material"] = 1
+        header["nodes"].append({"mesh": 1})
+        header["nodes"][0].setdefault("children", []).append(len(header["nodes"]) - 1)
 
-    with pytest.raises(RsbenchError, match="materials of the name 'four' have several KHR_texture_transform"):
-        load(tmp_path, _edited(tmp_path, twice))
+    meshes = load(tmp_path, _edited(tmp_path, second)).meshes
+    assert sorted(float(np.max(mesh.uv)) for mesh in meshes if mesh.uv is not None) == [1.0, 2.0]
     with pytest.raises(RsbenchError, match="'four' uses a second set of coordinates"):
         load(tmp_path, _edited(tmp_path, _transformed(texCoord=1)))
+
+
+def _wrapped(s: int, t: int, scale: float) -> Callable[[dict[str, Any]], None]:
+    def edit(header: dict[str, Any]) -> None:
+        header["samplers"] = [{"wrapS": s, "wrapT": t}]
+        header["textures"][0]["sampler"] = 0
+        _transformed(scale=[scale, scale])(header)
+
+    return edit
+
+
+def bilinear(texture: np.ndarray, uv: np.ndarray, index: Callable[[np.ndarray, int], np.ndarray]) -> np.ndarray:
+    """Colours (n, 3) at uv (n, 2), v up, with a rule that gives the texel of an index beyond the texture."""
+    height, width = texture.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
+    found = np.zeros((len(uv), 3))
+    for dx in (0, 1):
+        for dy in (0, 1):
+            weight = np.abs(1 - dx - (x - np.floor(x))) * np.abs(1 - dy - (y - np.floor(y)))
+            i, j = index(np.floor(x).astype(int) + dx, width), index(np.floor(y).astype(int) + dy, height)
+            found += weight[:, None] * texture[j, i]
+    return found
+
+
+def repeated(index: np.ndarray, size: int) -> np.ndarray:
+    return index % size
+
+
+def mirrored(index: np.ndarray, size: int) -> np.ndarray:
+    return np.where(index % (2 * size) < size, index % size, size - 1 - index % size)
+
+
+def clamped(index: np.ndarray, size: int) -> np.ndarray:
+    return np.clip(index, 0, size - 1)
+
+
+@pytest.mark.parametrize(("code", "rule", "scale"), [(33648, mirrored, 2.5), (33071, clamped, 1.0)])
+def test_wraps_of_textures(tmp_path: Path, code: int, rule: Any, scale: float) -> None:
+    """What the renderer looks up, a repeated texture, against the rule of glTF's samplers between corners."""
+    plain = load(tmp_path, _edited(tmp_path, _transformed(scale=[scale, scale]))).meshes[0]
+    found = load(tmp_path, _edited(tmp_path, _wrapped(code, code, scale))).meshes[0]
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), 200)
+    texture, expected = found.material.texture, plain.material.texture
+    assert texture is not None and expected is not None and plain.uv is not None and found.uv is not None
+    there, truth = weights @ found.uv[found.faces[0]], weights @ plain.uv[plain.faces[0]]
+    np.testing.assert_allclose(bilinear(texture, there, repeated), bilinear(expected, truth, rule), atol=1e-9)
+
+
+def test_coordinates_that_leave_a_clamped_texture_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RsbenchError, match="its texture is clamped, and its coordinates u leave 0 to 1"):
+        load(tmp_path, _edited(tmp_path, _wrapped(33071, 10497, 2.0)))
+
+
+@pytest.mark.parametrize(("mode", "faces"), [(5, 2), (6, None)])
+def test_strips_are_drawn_and_fans_refused(tmp_path: Path, mode: int, faces: int | None) -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
+    header = TRIANGLE | {
+        "buffers": [{"byteLength": 48}],
+        "bufferViews": [{"buffer": 0, "byteLength": 48}],
+        "accessors": [TRIANGLE["accessors"][0] | {"count": 4}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": mode}]}],
+    }
+    (tmp_path / "x.glb").write_bytes(glb(header, corners.tobytes()))
+    if faces is None:
+        assert "triangle fans (mode 6)" in refusal(tmp_path, 'file = "x.glb"')
+    else:
+        (mesh,) = load(tmp_path, 'file = "x.glb"').meshes
+        found = mesh.vertices[mesh.faces]
+        normals = np.cross(found[:, 1] - found[:, 0], found[:, 2] - found[:, 0])
+        # A square of area 1, both triangles turning one way (glTF 2.0, 3.7.2.1).
+        assert len(found) == faces and np.linalg.norm(normals.sum(axis=0)) == pytest.approx(2.0)
+
+
+def _with_colours(colours: np.ndarray, material: dict[str, Any] | None, image: bytes = b"") -> bytes:
+    """The triangle with COLOR_0, float, and a material, whose texture is ``image``."""
+    data, uv = colours.astype(np.float32).tobytes(), np.array([[0, 0], [1, 0], [0, 1]], np.float32).tobytes()
+    binary, views = CORNERS, list(TRIANGLE["bufferViews"])
+    for part in (data, uv, image):
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)})
+        binary += part + b"\0" * (-len(part) % 4)
+    width = f"VEC{colours.shape[1]}"
+    accessors = [
+        *TRIANGLE["accessors"],
+        {"bufferView": 1, "componentType": 5126, "count": 3, "type": width},
+        {"bufferView": 2, "componentType": 5126, "count": 3, "type": "VEC2"},
+    ]
+    attributes = {"POSITION": 0, "COLOR_0": 1, "TEXCOORD_0": 2}
+    primitive: dict[str, Any] = {"attributes": attributes}
+    if material is not None:
+        primitive["material"] = 0
+    header = TRIANGLE | {
+        "buffers": [{"byteLength": len(binary)}],
+        "bufferViews": views,
+        "accessors": accessors,
+        "meshes": [{"primitives": [primitive]}],
+    }
+    if material is not None:
+        header |= {"materials": [material]}
+    if image:
+        header |= {"images": [{"bufferView": 3, "mimeType": "image/png"}], "textures": [{"source": 0}]}
+    return glb(header, binary)
+
+
+def test_vertex_colours_of_a_gltf_are_linear_and_multiply(tmp_path: Path) -> None:
+    """0.5 linear is 188 in sRGB, 0.25 is 137 (IEC 61966-2-1); glTF#1224, #1225."""
+    half = np.full((3, 3), 0.5)
+    Image.new("RGB", (2, 2), (255, 255, 255)).save(tmp_path / "white.png")
+    white = (tmp_path / "white.png").read_bytes()
+    factor = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.5, 0.5, 1.0]}}
+    textured = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    for material, image, level in ((None, b"", 188), (factor, b"", 137), (textured, white, 188)):
+        (tmp_path / "x.glb").write_bytes(_with_colours(half, material, image))
+        (mesh,) = load(tmp_path, 'file = "x.glb"').meshes
+        texture = mesh.material.texture
+        found = 255.0 * np.asarray(mesh.material.colour) if texture is None else texture[0, 0]
+        np.testing.assert_allclose(found, level, atol=1.0)
+    mixed = np.array([[1.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    (tmp_path / "x.glb").write_bytes(_with_colours(mixed, None))
+    (mesh,) = load(tmp_path, 'file = "x.glb"').meshes  # one triangle, the mean of its corners
+    np.testing.assert_allclose(255.0 * np.asarray(mesh.material.colour), [188.0, 0.0, 0.0], atol=1.0)
+
+
+def test_vertex_colours_that_cannot_be_drawn_are_refused(tmp_path: Path) -> None:
+    for colours, material, words in (
+        (np.full((3, 3), 2.0), None, "between 0 and 1"),
+        (np.full((3, 4), 0.5), {"alphaMode": "BLEND"}, "is transparent"),
+    ):
+        (tmp_path / "x.glb").write_bytes(_with_colours(colours, material))
+        assert words in refusal(tmp_path, 'file = "x.glb"')
+
+
+def test_factors_of_a_gltf_are_exact(tmp_path: Path) -> None:
+    """Trimesh keeps them as bytes, where 0.001 is 0; it is 12.92 times that in sRGB."""
+
+    def dark(header: dict[str, Any]) -> None:
+        header["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [0.001, 0.001, 0.001, 1.0]}
+
+    (mesh,) = load(tmp_path, _edited(tmp_path, dark)).meshes
+    np.testing.assert_allclose(mesh.material.colour, 0.01292, rtol=1e-9)
+
+
+def test_files_beside_a_gltf_are_named_by_uris(tmp_path: Path) -> None:
+    """Blanks as %20 (glTF#1449)."""
+    Image.new("RGB", (2, 2), RED).save(tmp_path / "my tex.png")
+    mesh = load(
+        tmp_path, _edited(tmp_path, lambda header: header.update(images=[{"uri": "my%20tex.png"}]))
+    ).meshes[0]
+    assert mesh.material.texture is not None and tuple(mesh.material.texture[0, 0]) == RED
+
+
+@pytest.mark.parametrize("scale", [[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [-2.0, -1.0, -3.0]])
+def test_smooth_normals_of_a_mirror_are_on_the_side_of_the_face(tmp_path: Path, scale: list[float]) -> None:
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.icosphere(1), transform=np.diag([*scale, 1.0]))
+    scene.export(tmp_path / "ball.glb")
+    (mesh,) = load(tmp_path, 'file = "ball.glb"\nshading = "smooth"').meshes
+    assert mesh.normals is not None
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    facing = np.cross(b - a, c - a)
+    assert np.all(np.sum(facing * a, axis=1) > 0.0)  # outward
+    assert np.all(np.sum(facing * mesh.normals[mesh.faces[:, 0]], axis=1) > 0.0)
 
 
 @pytest.mark.parametrize("mode", ["MASK", "BLEND"])
@@ -489,3 +662,57 @@ def test_the_cache_keeps_roughness(tmp_path: Path) -> None:
     meshes = load(tmp_path, SHINY).meshes
     (again,) = _unpacked(_packed(meshes))
     assert again.material == meshes[0].material
+
+
+def test_texture_coordinates_of_faces_in_a_ply(tmp_path: Path) -> None:
+    """As MeshLab writes them; one corner has two coordinates, at a seam."""
+    Image.fromarray(np.array([[RED, GREEN], [WHITE, BLUE]], dtype=np.uint8)).save(tmp_path / "t.png")
+    (tmp_path / "m.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile t.png\nelement vertex 4\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
+        "property list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+        "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 .25 .75 .25 .75 .25 .75\n"
+    )
+    (mesh,) = load(tmp_path, 'file = "m.ply"').meshes
+    assert mesh.uv is not None
+    np.testing.assert_allclose(mesh.uv[mesh.faces[0]], [[0, 0], [1, 0], [1, 1]], atol=1e-6)
+    np.testing.assert_allclose(mesh.uv[mesh.faces[1]], [[0.25, 0.75]] * 3, atol=1e-6)
+    assert colour_at(mesh, mesh.uv[mesh.faces[1]][0]) == RED
+
+
+U_SHAPE = [(0, 0), (4, 0), (4, 4), (3, 4), (3, 1), (1, 1), (1, 4), (0, 4)]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("tilt", [0.0, 1.2])
+def test_polygons_that_are_not_convex_keep_their_area(tmp_path: Path, order: int, tilt: float) -> None:
+    """A U of area 10, of which a fan covers 19 (trimesh#2519); and an arrowhead of four corners, area 1."""
+    text, arrow = "", [(0, 0), (2, 1), (0, 2), (1, 1)]
+    for outline in (U_SHAPE, arrow):
+        turned = [(x * np.cos(tilt), y, x * np.sin(tilt)) for x, y in outline]
+        text += "".join(f"v {x} {y} {z}\n" for x, y, z in turned)
+        text += "f " + " ".join(str(-k) for k in range(1, len(outline) + 1)[::order]) + "\n"
+    (tmp_path / "u.obj").write_text(text)
+    (mesh,) = load(tmp_path, 'file = "u.obj"\nup_axis = "z"').meshes
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normals = 0.5 * np.cross(b - a, c - a)
+    assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(11.0)
+    # All triangles turn as their polygons do.
+    assert abs(normals.sum(axis=0) @ [-np.sin(tilt), 0.0, np.cos(tilt)]) in (
+        pytest.approx(11.0),
+        pytest.approx(9.0),
+    )
+
+
+def test_textures_of_an_mtl_are_dimmed_scaled_and_clamped(tmp_path: Path) -> None:
+    """Kd under map_Kd multiplies (Online3DViewer#371); -s, -o and -clamp on are read; names may have blanks."""
+    Image.new("RGB", (4, 4), (255, 255, 255)).save(tmp_path / "a b.png")
+    library = "newmtl m\nKd 0.5 0.5 0.5\nmap_Kd -s 10 20 1 -o 0.5 -bm 1 a b.png\n"
+    (mesh,) = load(tmp_path, _obj(tmp_path, "usemtl m\n", library)).meshes
+    assert mesh.material.texture is not None and mesh.uv is not None
+    np.testing.assert_allclose(mesh.material.texture, 128, atol=1)
+    np.testing.assert_allclose(np.sort(mesh.uv, axis=0), [[0.5, 0], [10.5, 0], [10.5, 20]], atol=1e-9)
+    with pytest.raises(RsbenchError, match="its texture is clamped"):
+        load(tmp_path, _obj(tmp_path, "usemtl m\n", "newmtl m\nmap_Kd -clamp on -s 10 10 10 a b.png\n"))
+    with pytest.raises(RsbenchError, match=r"a\.mtl:2: -mm changes the colours"):
+        load(tmp_path, _obj(tmp_path, "usemtl m\n", "newmtl m\nmap_Kd -mm 0 2 a b.png\n"))

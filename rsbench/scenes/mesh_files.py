@@ -1,0 +1,505 @@
+"""Mesh files of a user as trimesh reads them, and what it leaves out.
+
+A file may name others, such as textures, in its own folder and below. The size that a file states is checked
+before trimesh reads it. Trimesh leaves out, and this module reads: transforms and wraps of the textures of a glTF,
+exact factors of its colours, its triangle fans (refused), options of ``map_Kd`` of an MTL, and in an OBJ numbers
+that count back from where they stand, and the shape of polygons that are not convex.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import logging
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import unquote, unquote_to_bytes
+
+import mapbox_earcut
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from rsbench.core.errors import RsbenchError
+from rsbench.scenes.model import FloatArray
+from rsbench.storage.untrusted_files import (
+    FILE_BYTES,
+    check_amount,
+    check_image_size,
+    parse_json,
+    read_bytes,
+)
+
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what it logs of a file is in our line
+Wrap = Literal["repeat", "mirror", "clamp"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surface:
+    """What a file says of the colour of a material and trimesh leaves out."""
+
+    name: str
+    linear: FloatArray
+    """(2, 2) and"""
+    offset: FloatArray
+    """(2,) of the texture's coordinates: ``linear @ uv + offset`` of those of the mesh, v up in both."""
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    """Beyond 0 to 1, along u and along v."""
+    factor: FloatArray | None = None
+    """(3,) linear reflectance that multiplies texture and vertex colours; None: as trimesh has it."""
+
+    def coordinates(self, uv: FloatArray, size: tuple[int, int], where: str) -> FloatArray:
+        """Coordinates (n, 2) in ``wrapped`` of coordinates of the mesh, v up; ``size``: of the texture, w and h.
+
+        Raises:
+            RsbenchError: the texture is clamped, and coordinates lead out of it.
+        """
+        found = uv @ self.linear.T + self.offset
+        for axis, (wrap, texels) in enumerate(zip(self.wrap, size, strict=True)):
+            if wrap == "mirror":
+                found[:, axis] /= 2.0
+            elif wrap == "clamp":
+                if np.any(np.abs(found[:, axis] - 0.5) > 0.5 + 0.5 / texels):
+                    raise RsbenchError(
+                        f"{where}: its texture is clamped, and its coordinates {'uv'[axis]} leave 0 to 1, which "
+                        "is not drawn: make the texture repeat, or the coordinates stay inside"
+                    )
+                found[:, axis] = (found[:, axis] * texels + 1.0) / (texels + 2.0)
+        return found
+
+    def wrapped(self, texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A texture (h, w, 3) that, repeated, continues as this one does: mirrored, or with its border doubled."""
+        for axis, wrap in ((1, self.wrap[0]), (0, self.wrap[1])):
+            if wrap == "mirror":
+                pair = (texture, np.flip(texture, axis))
+                texture = np.concatenate(pair if axis else pair[::-1], axis=axis)
+            elif wrap == "clamp":
+                border = [(0, 0), (0, 0), (0, 0)]
+                border[axis] = (1, 1)
+                texture = np.pad(texture, border, mode="edge")
+        return texture
+
+
+_TRANSFORM = "KHR_texture_transform"
+_HARMLESS = (_TRANSFORM, "KHR_materials_", "KHR_lights_", "EXT_texture_webp")
+"""Beginnings of extensions that may be required: we read them, or they say what a diffuse surface has not."""
+_ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
+
+
+def check_extensions(header: Mapping[str, Any], where: str) -> None:
+    """Refuse what would be read as something else than it is.
+
+    Raises:
+        RsbenchError: the file requires an extension that is not read, or has materials of an old one.
+    """
+    for name in header.get("extensionsRequired", []):
+        if not str(name).startswith(_HARMLESS) or name == _ARCHIVED:
+            raise RsbenchError(f"{where}: needs the glTF extension {name}, which is not read: export it without")
+    if any(_ARCHIVED in material.get("extensions", {}) for material in header.get("materials", [])):
+        raise RsbenchError(f"{where}: has materials of {_ARCHIVED}: export it with metallic-roughness ones")
+
+
+def _surfaces(header: Mapping[str, Any], where: str) -> dict[str, Surface]:
+    """Surfaces by the numbers of their materials, which ``_numbered`` makes their names.
+
+    The transform is that of KHR_texture_transform: scaled, then turned, anticlockwise as one sees it in a picture
+    of u and v, then moved, with v down.
+
+    Raises:
+        RsbenchError: a texture uses other coordinates than the first.
+    """
+    found = {}
+    for number, material in enumerate(header.get("materials", [])):
+        colour = material.get("pbrMetallicRoughness", {})
+        texture = colour.get("baseColorTexture", {})
+        stated = texture.get("extensions", {}).get(_TRANSFORM, {})
+        name = str(material.get("name", "unnamed"))
+        if stated.get("texCoord", texture.get("texCoord", 0)) != 0:
+            raise RsbenchError(
+                f"{where}: the texture of material {name!r} uses a second set of coordinates: export it with one"
+            )
+        angle, (su, sv) = float(stated.get("rotation", 0.0)), _pair(stated.get("scale", (1.0, 1.0)))
+        (ou, ov), c, s = _pair(stated.get("offset", (0.0, 0.0))), np.cos(angle), np.sin(angle)
+        sampler = header["textures"][texture["index"]].get("sampler") if texture else None
+        wraps = {} if sampler is None else header["samplers"][sampler]
+        found[str(number)] = Surface(
+            name=name,
+            linear=np.array([[c * su, -s * sv], [s * su, c * sv]]),
+            offset=np.array([s * sv + ou, 1.0 - c * sv - ov]),
+            wrap=(_WRAPS[wraps.get("wrapS", 10497)], _WRAPS[wraps.get("wrapT", 10497)]),
+            factor=np.array([float(each) for each in colour.get("baseColorFactor", (1.0, 1.0, 1.0))[:3]]),
+        )
+    return found
+
+
+def _numbered(header: dict[str, Any]) -> dict[str, Any]:
+    """A header whose materials are named by their numbers, and where vertex colours always have a material.
+
+    Trimesh makes bytes of the vertex colours of a primitive without one, too coarse for linear light.
+    """
+    materials = [each | {"name": str(number)} for number, each in enumerate(header.get("materials", []))]
+    bare = False
+    for mesh in header.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            if "COLOR_0" in primitive["attributes"] and "material" not in primitive:
+                primitive["material"], bare = len(materials), True
+    if bare:
+        materials.append({"name": str(len(materials))})
+    return header | ({"materials": materials} if materials else {})
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    first, second = values
+    return float(first), float(second)
+
+
+PARTS = 1 << 12
+"""Nodes, meshes, materials and so on, of each kind."""
+VALUES = 1 << 26
+"""Numbers in the arrays of a file, and in those of all its parts, which may share them."""
+_DEEPEST = 64
+_VISITS = 1 << 28
+TEXTURE = 1 << 24
+"""Pixels of a texture, 4096 x 4096."""
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+_WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
+_FAN = 6
+_TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+def check_mesh_file(path: Path) -> tuple[bytes | None, dict[str, Surface]]:
+    """Refuse a mesh file that says of itself that it unfolds to too much, or would be read as something else.
+
+    Returns:
+        What trimesh should read in place of the file, None: the file itself; and surfaces by the names that its
+        materials have there.
+
+    Raises:
+        RsbenchError: that, a format that is not read, or a header that cannot be one.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise RsbenchError(
+            f"mesh file {path}: cannot be read: must end in {', '.join(SUFFIXES)}; export it as GLB"
+        )
+    data, where = read_bytes(path, FILE_BYTES), f"mesh file {path}"
+    try:
+        match suffix:
+            case ".glb" | ".gltf":
+                binary = suffix == ".glb"
+                text = _json_chunk(data) if binary else data
+                header = parse_json(text.decode("utf-8-sig"), where)
+                _check_gltf(header, where, _binary_chunk(data) if binary else b"")
+                surfaces = _surfaces(header, where)
+                text = json.dumps(_numbered(header)).encode()
+                return _with_json_chunk(data, text) if binary else text, surfaces
+            case ".ply":
+                _check_ply(data, where)
+            case ".obj":
+                _check_obj(data, where)
+                text = _plain_polygons(_as_utf8(data))
+                return None if text == data else text, {}
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise RsbenchError(f"{where}: cannot be read: {type(error).__name__} in its header: {error}") from error
+    return None, {}
+
+
+def _json_chunk(data: bytes) -> bytes:
+    if data[:4] != b"glTF" or data[16:20] != b"JSON":
+        raise ValueError("not binary glTF")
+    return data[20 : 20 + int.from_bytes(data[12:16], "little")]
+
+
+def _binary_chunk(data: bytes) -> bytes:
+    start = 20 + int.from_bytes(data[12:16], "little")
+    return data[start + 8 : start + 8 + int.from_bytes(data[start : start + 4], "little")]
+
+
+def _with_json_chunk(data: bytes, text: bytes) -> bytes:
+    """The same binary glTF with another JSON chunk."""
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + int.from_bytes(data[12:16], "little") :]
+    size = (20 + len(text) + len(rest)).to_bytes(4, "little")
+    return data[:8] + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
+
+
+def _check_gltf(header: dict[str, Any], where: str, binary: bytes) -> None:
+    for name, items in header.items():
+        if isinstance(items, list):
+            check_amount(where, name, len(items), PARTS)
+    sizes = [_size(accessor) for accessor in header.get("accessors", [])]
+    check_amount(where, "values of all accessors", sum(sizes), VALUES)
+    primitives = [primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]]
+    check_amount(where, "primitives", len(primitives), PARTS)
+    used = [index for primitive in primitives for index in _accessors(primitive)]
+    check_amount(where, "values of all primitives", sum(sizes[index] for index in used), VALUES)
+    _check_graph(header, where)
+    check_extensions(header, where)
+    if any(not {"bufferView", "sparse"} & set(header["accessors"][index]) for index in used):
+        raise RsbenchError(f"{where}: has meshes without data: export it without compression")
+    if any(primitive.get("mode") == _FAN for primitive in primitives):
+        raise RsbenchError(f"{where}: has triangle fans (mode {_FAN}), which are not read: export it as triangles")
+    for number in _coloured_images(header):
+        _check_image(header, number, binary, f"{where}: image {number}")
+
+
+def _coloured_images(header: dict[str, Any]) -> list[int]:
+    """Numbers of the images that colour a material, each once."""
+    textures = [
+        each.get("pbrMetallicRoughness", {}).get("baseColorTexture") for each in header.get("materials", [])
+    ]
+    sources = [header["textures"][each["index"]].get("source") for each in textures if each is not None]
+    return sorted({number for number in sources if number is not None})
+
+
+def _check_image(header: dict[str, Any], number: int, binary: bytes, where: str) -> None:
+    """Refuse an image inside the file that cannot be decoded, in whose place trimesh takes grey without a word.
+
+    Images in files of their own are read, and refused, as they are needed.
+    """
+    image = header["images"][number]
+    if str(image.get("uri", "")).startswith("data:"):
+        kind, _, text = image["uri"].partition(",")
+        data = base64.b64decode(text, validate=True) if kind.endswith(";base64") else unquote_to_bytes(text)
+    elif "bufferView" in image and binary:
+        view = header["bufferViews"][image["bufferView"]]
+        start = int(view.get("byteOffset", 0))
+        data = binary[start : start + int(view["byteLength"])]
+    else:
+        return
+    check_image_size(data, where, most=TEXTURE)
+
+
+def _check_graph(header: dict[str, Any], where: str) -> None:
+    """Refuse nodes that are not trees, as glTF requires, or so deep that each path takes long."""
+    children = [node.get("children", []) for node in header.get("nodes", [])]
+    parents = {child: number for number, each in enumerate(children) for child in each}
+    shown = [node for scene in header.get("scenes", []) for node in scene.get("nodes", [])]
+    check_amount(where, "nodes of all scenes", len(shown), PARTS)
+    if len(parents) < sum(map(len, children)):
+        raise RsbenchError(f"{where}: a node has two parents")
+    for node in parents:
+        depth = 0
+        while node in parents and depth <= _DEEPEST:
+            node, depth = parents[node], depth + 1
+        check_amount(where, "levels of nodes", depth, _DEEPEST)
+
+
+def _size(accessor: dict[str, Any]) -> int:
+    count, width = accessor["count"], _TYPES[accessor["type"]]
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise ValueError(f"count = {count!r}")
+    return count * width
+
+
+def _accessors(primitive: dict[str, Any]) -> Iterable[int]:
+    found = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+    if any(isinstance(index, bool) or not isinstance(index, int) or index < 0 for index in found):
+        raise ValueError(f"accessors {found}")
+    return found
+
+
+def _check_obj(data: bytes, where: str) -> None:
+    groups = len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE))
+    check_amount(where, "groups", groups, PARTS)
+    # Its reader goes through all vertices for each group.
+    vertices = len(re.findall(rb"^\s*v\s", data, re.MULTILINE))
+    check_amount(where, "vertices times groups", vertices * groups, _VISITS)
+
+
+def _check_ply(data: bytes, where: str) -> None:
+    header, _, content = data.partition(b"end_header")
+    counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\S+)", header, re.MULTILINE)]
+    # Each vertex and each face takes a byte at least; of text, each line is one.
+    if min(counts, default=0) < 0 or sum(counts) > len(content):
+        raise ValueError(f"states {sum(counts)} elements in {len(content)} bytes")
+    if b"ascii" in header and content.count(b"\n") > 2 * sum(counts) + PARTS:
+        raise ValueError(f"states {sum(counts)} elements in {content.count(bytes([10]))} lines")
+
+
+class _Neighbours(trimesh.resolvers.FilePathResolver):
+    """Files beside the model and below, as UTF-8; remembers what was wrong with them, which trimesh only logs."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(source)
+        self.wrong: list[str] = []
+        self.materials: dict[str, Surface] = {}
+        """Those of the MTL files that were read."""
+
+    def get(self, name: str) -> bytes:
+        try:
+            content: bytes = super().get(self._written(name))
+        except Exception as error:
+            too_large = isinstance(error, RsbenchError)
+            self.wrong.append(str(error) if too_large else f"{name}, which is missing or lies outside its folder")
+            raise
+        if name.lower().endswith(".mtl"):
+            try:
+                content, found = _library(_as_utf8(content), name)
+            except RsbenchError as error:
+                self.wrong.append(str(error))
+                raise
+            self.materials |= found
+        return content
+
+    def _written(self, name: str) -> str:
+        """The name of a file: exporters on Windows write paths of theirs, and glTF encodes blanks as URIs do."""
+        name = name.replace("\\", "/")
+        return name if self.absolute(name).exists() else unquote(name)
+
+    def absolute(self, name: str) -> Path:
+        path: Path = super().absolute(name)  # raises where links or dots lead out of the folder
+        if path.exists():
+            if not path.is_file():
+                raise ValueError(f"{name} is no file")
+            check_amount(name, "bytes", path.stat().st_size, FILE_BYTES)
+        return path
+
+
+def _as_utf8(text: bytes) -> bytes:
+    """Text of unknown encoding: UTF-8 when it can be, else the old one of Western exporters."""
+    try:
+        return text.decode("utf-8-sig").encode("utf-8")
+    except UnicodeDecodeError:
+        return text.decode("latin-1").encode("utf-8")
+
+
+def read_mesh_file(path: Path) -> tuple[Any, dict[str, Surface]]:
+    """What trimesh makes of a file, and the surfaces by the names of their materials.
+
+    Raises:
+        RsbenchError: the file or one that it refers to is missing or wrong; errors of trimesh pass.
+    """
+    if not path.is_file():
+        raise RsbenchError(f"mesh file {path}: no such file (parameters.file is relative to the card)")
+    content, surfaces = check_mesh_file(path)
+    neighbours = _Neighbours(str(path))
+    options = {"resolver": neighbours, "process": False}
+    try:
+        if content is None:
+            model = trimesh.load_scene(str(path), **options)
+        else:
+            model = trimesh.load_scene(io.BytesIO(content), file_type=path.suffix.lower()[1:], **options)
+    finally:
+        if neighbours.wrong:
+            raise RsbenchError(f"mesh file {path}: refers to {neighbours.wrong[0]}")
+    if path.suffix.lower() == ".obj" and neighbours.materials:
+        _check_names(content or path.read_bytes(), neighbours.materials, path)
+    return model, surfaces | neighbours.materials
+
+
+def _check_names(text: bytes, known: Mapping[str, Surface], path: Path) -> None:
+    """Refuse materials that no library has, where trimesh takes grey instead; an OBJ without any is grey."""
+    used = re.findall(rb"^\s*usemtl[ \t]+(.+?)\s*$", text, re.MULTILINE)
+    missing = sorted({name.decode() for name in used} - set(known))
+    if missing:
+        raise RsbenchError(f"mesh file {path}: usemtl {missing[0]}: its .mtl has no such material")
+
+
+_OPTIONS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
+"""Most numbers after an option of ``map_Kd``; the others have one word."""
+
+
+def _library(text: bytes, where: str) -> tuple[bytes, dict[str, Surface]]:
+    """An MTL file without the options of its textures, and its surfaces by name.
+
+    ``-s`` scales coordinates, ``-o`` moves them, ``-clamp on`` ends the texture at its border.
+
+    Raises:
+        RsbenchError: an option changes the colours of a texture.
+    """
+    lines, surfaces, name = list[str](), dict[str, Surface](), ""
+    for number, line in enumerate(text.decode("utf-8").splitlines(), start=1):
+        words = line.split()
+        key = words[0].lower() if words else ""
+        if key == "newmtl":
+            name = " ".join(words[1:])
+            surfaces[name] = Surface(name=name, linear=np.eye(2), offset=np.zeros(2))
+        elif key == "map_kd":
+            options, file = _map_options(line.split(maxsplit=1)[1:])
+            if [float(each) for each in options.get("-mm", [])] not in ([], [0.0, 1.0]):
+                raise RsbenchError(f"{where}:{number}: -mm changes the colours of a texture, which is not read")
+            scale, offset = (
+                np.array([float(each) for each in options.get(key, [])] or [usual] * 2)
+                for key, usual in (("-s", 1.0), ("-o", 0.0))
+            )
+            wrap: Wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
+            surfaces[name] = Surface(
+                name=name,
+                linear=np.diag(np.append(scale, 1.0)[:2]),
+                offset=np.append(offset, 0.0)[:2],
+                wrap=(wrap, wrap),
+            )
+            line = f"map_Kd {file}"
+        lines.append(line)
+    return "\n".join(lines).encode(), surfaces
+
+
+def _map_options(value: Sequence[str]) -> tuple[dict[str, list[str]], str]:
+    """Options of a texture, and the name of its file, which may have blanks."""
+    options, rest = dict[str, list[str]](), value[0].strip() if value else ""
+    while rest.startswith("-") and len(words := rest.split()) > 2:
+        count = 1
+        while count < _OPTIONS.get(words[0], 1) and len(words) > count + 2 and _NUMBER.fullmatch(words[count + 1]):
+            count += 1
+        options[words[0]] = words[1 : 1 + count]
+        rest = rest.split(maxsplit=1 + count)[1 + count]
+    return options, rest
+
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+
+def _plain_polygons(text: bytes) -> bytes:
+    """An OBJ whose faces have numbers from 1, and whose polygons that are not convex are cut into triangles.
+
+    Trimesh counts negative numbers back from the end of the file, and makes fans of all polygons.
+    """
+    lines, counts = text.split(b"\n"), {b"v": 0, b"vt": 0, b"vn": 0}
+    vertices, polygons = list[list[bytes]](), dict[int, list[tuple[int, list[int]]]]()
+    for number, line in enumerate(lines):
+        words = line.split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+            if words[0] == b"v":
+                vertices.append(words[1:4])
+        elif words and words[0] == b"f":
+            if b"-" in line:
+                words = [b"f", *(_from_one(word, counts) for word in words[1:])]
+                lines[number] = b" ".join(words)
+            if len(words) > 4:
+                corners = [int(word.split(b"/")[0]) - 1 for word in words[1:]]
+                polygons.setdefault(len(corners), []).append((number, corners))
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3) if polygons else np.zeros((0, 3))
+    for same in polygons.values():
+        found = points[np.array([corners for _, corners in same])]
+        following = np.roll(found, -1, axis=1)
+        normal = np.sum(np.cross(found, following), axis=1)  # Newell
+        turns = np.cross(found - np.roll(found, 1, axis=1), following - found) @ normal[..., None]
+        size = np.sum(normal**2, axis=-1)
+        for k in np.flatnonzero(np.any(turns[..., 0] < -1e-9 * size[:, None], axis=1)):
+            words = lines[same[k][0]].split()[1:]
+            lines[same[k][0]] = b"\n".join(
+                b"f " + b" ".join(words[each] for each in triangle) for triangle in _cut(found[k], normal[k])
+            )
+    return b"\n".join(lines)
+
+
+def _from_one(word: bytes, counts: Mapping[bytes, int]) -> bytes:
+    """A corner ``v/vt/vn`` of a face whose negative numbers count back from the last one so far."""
+    kinds = zip(word.split(b"/"), counts.values(), strict=False)
+    return b"/".join(b"%d" % (count + 1 + int(n)) if n.startswith(b"-") else n for n, count in kinds)
+
+
+def _cut(polygon: FloatArray, normal: FloatArray) -> NDArray[np.intp]:
+    """Triangles (m, 3) of a polygon (n, 3), turning as it does about its normal (3,)."""
+    kept = np.delete(np.arange(3), np.argmax(np.abs(normal)))
+    flat = np.ascontiguousarray(polygon[:, kept] - polygon[0, kept])
+    found = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], dtype=np.uint32)).reshape(-1, 3)
+    corners = polygon[found.astype(np.intp)]
+    side = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ normal
+    return np.where(side[:, None] < 0.0, found[:, ::-1], found).astype(np.intp)
