@@ -292,6 +292,48 @@ def test_euroc(tmp_path: Path) -> None:
     assert run_here("verify", tmp_path, "--from", "euroc").returncode == 0
 
 
+def test_stamps_that_differ_by_less_than_half_a_row_are_one_time(tmp_path: Path) -> None:
+    """ORB_SLAM3#20: clocks of their own, or stamps that went through floats."""
+    root = write_euroc(tmp_path)
+    path = root / "mav0" / "cam1" / "data.csv"
+    half = PERIOD / 48 / 2  # of the rows of a frame that takes the whole period
+    for shift, frames in ((-200, 2), (int(0.9 * half), 2), (int(1.1 * half), None)):
+        stamps = [START + k * PERIOD for k in (1, 2, 3)]
+        write(path, "".join(f"{stamp + shift},{stamp}.png\n" for stamp in stamps))
+        if frames is None:
+            with pytest.raises(RsbenchError, match="0 times in common"):
+                read_euroc(root)
+        else:
+            (recording,) = read_euroc(root)
+            assert recording.frames == frames and recording.images["right", 0].name == f"{stamps[0]}.png"
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_a_camchain_stands_in_for_the_sensors_files(tmp_path: Path, chained: bool) -> None:
+    """As TUM VI and TUM RS-VI are distributed (open_vins#152)."""
+    root = write_euroc(tmp_path)
+    (expected,) = read_euroc(root)
+    text = ""
+    for k, T in BODY_FROM.items():
+        (root / "mav0" / f"cam{k}" / "sensor.yaml").unlink()
+        key, matrix = "T_cam_imu", np.linalg.inv(T)
+        if k and chained:
+            key, matrix = "T_cn_cnm1", np.linalg.inv(T) @ BODY_FROM[0]
+        text += (
+            f"cam{k}:\n  camera_model: pinhole\n  distortion_model: radtan\n  resolution: [64, 48]\n"
+            "  intrinsics: [46.0, 45.5, 31.2, 24.1]\n  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+            f"  {key}: {matrix.tolist()}\n" + ("  line_delay: 0.0001\n" if chained else "")
+        )
+    write(root / "dso" / "camchain.yaml", text)
+    (found,) = read_euroc(root)
+    assert found.cameras == expected.cameras and found.images == expected.images
+    tau = np.array([0.25, 0.5])
+    for side in ("left", "right"):
+        for a, b in zip(found.poses[side](tau), expected.poses[side](tau), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-12)
+        assert (found.shutters[side].readout_ratio if chained else 0.096) == pytest.approx(1e-4 * 48 * 20)
+
+
 def test_tum_rsvi_has_its_line_delay(tmp_path: Path) -> None:
     (recording,) = read_others(write_euroc(tmp_path), "tum-rsvi")
     assert recording.shutters["left"].readout_ratio == 0.0
@@ -645,3 +687,32 @@ def test_bad_recordings_are_refused_in_one_line(tmp_path: Path) -> None:
     run = run_here("evaluate", folder, "--from", "fastec-rs", "--out", tmp_path / "b")
     assert run.returncode == 2
     assert "001_global_middle.png: is 160 x 119" in run.stderr
+
+
+@pytest.mark.parametrize("empty", ["\n", "", "\n\n"])
+def test_colmap_images_without_lines_of_points(tmp_path: Path, empty: str) -> None:
+    """Some programs leave out the second lines (colmap#965), which are empty where nothing was matched."""
+    write_points(tmp_path)
+    images = "".join(f"{k + 1} 1 0 0 0 {0.1 * k} 0 0 1 {k} 7.png\n{empty}" for k in range(4))
+    write(tmp_path / "images.txt", images)
+    (recording,) = read_colmap(tmp_path)
+    assert [path.name for path in recording.images.values()] == [f"{k} 7.png" for k in range(4)]
+    found = recording.poses["left"](np.arange(4.0)).t[:, 0]
+    np.testing.assert_allclose(found, 0.1 * np.arange(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["disp0.pfm", "disp0GT.pfm"])
+def test_disparities_of_middlebury_by_each_of_their_names(tmp_path: Path, name: str) -> None:
+    """MiddEval3 and ETH3D write disp0GT.pfm (IGEV#20)."""
+    K = "[100 0 7.5; 0 100 5.5; 0 0 1]"
+    write(tmp_path / "calib.txt", f"cam0={K}\ncam1={K}\ndoffs=0\nbaseline=100\nwidth=16\nheight=12\nndisp=8\n")
+    for k in range(2):
+        write_image(tmp_path / f"im{k}.png", np.zeros((12, 16), dtype=np.uint8))
+    assert len(read_middlebury(tmp_path)[0].notes) == 1
+    values = np.full((12, 16), 3.0, dtype="<f4")
+    values[0] = np.inf  # the lowest row
+    (tmp_path / name).write_bytes(b"Pf\n16 12\n-1.0\n" + values.tobytes())
+    (recording,) = read_middlebury(tmp_path)
+    assert not recording.notes
+    found = recording.disparities["left", 0]()
+    assert np.all(np.isnan(found[-1])) and np.all(found[:-1] == 3.0)

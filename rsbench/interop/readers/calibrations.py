@@ -198,18 +198,37 @@ def _kalibr_apart(first: Fields, second: Fields) -> Pose:
     """The second camera's transform from the first one's."""
     if "T_cn_cnm1" in second:
         return pose_of(second, "T_cn_cnm1")
-    from_imu = []
-    for camera in (first, second):
-        if "T_cam_imu" in camera:
-            from_imu.append(pose_of(camera, "T_cam_imu"))
-        elif "T_imu_cam" in camera:
-            from_imu.append(inverse(pose_of(camera, "T_imu_cam")))
+    return compose(_kalibr_from_imu(second), inverse(_kalibr_from_imu(first)))
+
+
+def _kalibr_from_imu(camera: Fields) -> Pose:
+    """``camera_from_imu``."""
+    if "T_cam_imu" in camera:
+        return pose_of(camera, "T_cam_imu")
+    if "T_imu_cam" in camera:
+        return inverse(pose_of(camera, "T_imu_cam"))
+    raise RsbenchError(
+        f"{camera.where}: T_cn_cnm1: is missing, as are T_cam_imu and T_imu_cam: nothing says how the cameras "
+        "stand; calibrate them together"
+    )
+
+
+def kalibr_in_body(path: Path) -> list[tuple[Table, Pose]]:
+    """Table and ``body_from_camera`` of each camera of a camchain that has the IMU, whose axes are the body's.
+
+    Raises:
+        RsbenchError: the file is none, or does not say how a camera stands.
+    """
+    top, found = Fields(read_tree(path), str(path)), list[tuple[Table, Pose]]()
+    if not _is_kalibr(top.tree):
+        raise RsbenchError(f"{path}: is no camchain of Kalibr")
+    for camera in map(top.inner, sorted(key for key in top.tree if re.fullmatch(r"cam\d", key))):
+        if found and not {"T_cam_imu", "T_imu_cam"} & camera.tree.keys():
+            in_body = compose(found[-1][1], inverse(pose_of(camera, "T_cn_cnm1")))
         else:
-            raise RsbenchError(
-                f"{camera.where}: T_cn_cnm1: is missing, as are T_cam_imu and T_imu_cam: nothing says how the "
-                "cameras stand; calibrate them together"
-            )
-    return compose(from_imu[1], inverse(from_imu[0]))
+            in_body = inverse(_kalibr_from_imu(camera))
+        found.append((_kalibr_camera(camera)[0], in_body))
+    return found
 
 
 def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:

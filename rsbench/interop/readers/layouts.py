@@ -7,8 +7,8 @@ a pose ``cam_from_world``, as ours. The layout has no times: images are ordered 
 shutter. A rig of two cameras is one recording; any other camera is one of its own.
 
 **EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the
-sensor's coordinates to the body's, ``data.csv`` times in nanoseconds and file names; poses are those of the body,
-p and q = (w, x, y, z), in ``mocap0`` or ``state_groundtruth_estimate0``. Times are whole numbers: as floats they
+sensor's coordinates to the body's (where it is absent, a camchain of Kalibr nearby has them), ``data.csv`` times in
+nanoseconds and file names; poses are those of the body, p and q = (w, x, y, z), in ``mocap0`` or ``state_groundtruth_estimate0``. Times are whole numbers: as floats they
 would lose 256 ns. The layout does not describe a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1;
 camera 0 is global) is published beside it, and its times are taken as those of the first row.
 
@@ -29,7 +29,8 @@ same authors, Python/capture_rolling_shutter.py):
 at the time of the first row, and ``%03d_global_middle.png``, of row ``height // 2``. Rows are those of successive
 frames of a high-speed camera, so the readout ratio is 1. There is no calibration, depth or motion.
 
-**Middlebury** (2014 and 2021): a scene is a folder with ``im0.png``, ``im1.png``, ``calib.txt`` and ``disp0.pfm``.
+**Middlebury** (2014 and 2021): a scene is a folder with ``im0.png``, ``im1.png``, ``calib.txt`` and ``disp0.pfm``
+(``disp0GT.pfm`` in MiddEval3 and ETH3D).
 Its principal points may differ by ``doffs``: z = baseline f / (d + doffs); lengths are millimetres; a PFM begins
 with its lowest row, and unknown disparities are infinite.
 
@@ -65,9 +66,15 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, from_quaternion
 from rsbench.dataset.recording import PoseAt, Recording
-from rsbench.interop.readers.calibration_parts import brown, camera_of, rotation_of, table_of
+from rsbench.interop.readers.calibration_parts import Table, brown, camera_of, rotation_of, table_of
 from rsbench.interop.readers.calibration_trees import Fields, read_tree
-from rsbench.interop.readers.calibrations import asl_camera, asl_pose, colmap_camera, colmap_poses
+from rsbench.interop.readers.calibrations import (
+    asl_camera,
+    asl_pose,
+    colmap_camera,
+    colmap_poses,
+    kalibr_in_body,
+)
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.mono_camera import DEFAULT_FOCAL
 from rsbench.storage.files import read_grey_png
@@ -156,15 +163,12 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     shots: dict[str, Shot] = {}
     points = folder / "points3D.txt"
     path = only_file(folder, "images.txt")
-    rows = [line for line in read_text(path).splitlines() if not line.lstrip().startswith("#")]
-    while rows and not rows[-1].strip():
-        rows.pop()
-    for number, line in enumerate(rows[::2]):  # every second line lists points, and may be empty
-        where = f"{path}, image {number + 1}"
+    for number, (line, seen_points) in enumerate(_colmap_image_lines(path), start=1):
+        where = f"{path}, image {number}"
         identifier, name, camera, pose = _colmap_image(where, line)
         if camera not in cameras:
             raise RsbenchError(f"{path}: {name} is of camera {camera}, which cameras.txt lacks")
-        seen = partial(_colmap_points_seen, points, "".join(rows[2 * number + 1 : 2 * number + 2]), where)
+        seen = partial(_colmap_points_seen, points, seen_points, where)
         shots[identifier] = Shot(camera, name, pose, seen if points.is_file() else None)
     found = list[Recording]()
     rigs = _colmap_rigs(folder, cameras)
@@ -230,6 +234,24 @@ def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
         raise RsbenchError(f"{where}: must be a number, a camera model, a size and parameters")
     table, _ = colmap_camera(words[1], words[4:], numbers(" ".join(words[2:4]), where, 2), where)
     return words[0], camera_of(table, where)
+
+
+def _colmap_image_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Line of each image, and the line of its points below: empty without any, or absent, as some write it."""
+    image = ""
+    for line in read_text(path).splitlines():
+        if line.lstrip().startswith("#"):
+            continue
+        words = line.split()
+        of_points = len(words) != 10 and all(_NUMBER.fullmatch(word) for word in words)
+        if image:
+            yield image, line if of_points else ""
+        image = "" if of_points else line
+    if image:
+        yield image, ""
+
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
@@ -314,21 +336,21 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
     sensors = {side: root / f"cam{k}" for k, side in enumerate(SIDES) if (root / f"cam{k}").is_dir()}
     if "left" not in sensors:
         raise RsbenchError(f"{root}: holds no folder cam0")
-    files = {side: path / "sensor.yaml" for side, path in sensors.items()}
-    yamls = {side: Fields(read_tree(path), str(path)) for side, path in files.items()}
-    cameras = {side: camera_of(asl_camera(each), each.where) for side, each in yamls.items()}
-    body_from = {side: asl_pose(each) for side, each in yamls.items()}
+    known = _asl_cameras(root, sensors)
+    cameras = {side: camera_of(table, str(root)) for side, (table, _) in known.items()}
+    body_from = {side: pose for side, (_, pose) in known.items()}
     times = {side: _euroc_times(path) for side, path in sensors.items()}
-    stamps = [stamp for stamp in times["left"] if all(stamp in times[side] for side in sensors)]
-    if len(stamps) < 2:
-        raise RsbenchError(f"{root}: the cameras have {len(stamps)} times in common; two are needed")
+    together = _together(times, cameras["left"].height)
+    if len(together) < 2:
+        raise RsbenchError(f"{root}: the cameras have {len(together)} times in common; two are needed")
+    stamps = [each["left"] for each in together]
     period = float(np.median(np.diff(stamps))) * 1e-9
-    images: dict[View, Path] = {(s, k): times[s][stamp] for s in sensors for k, stamp in enumerate(stamps)}
+    images: dict[View, Path] = {(s, k): times[s][each[s]] for s in sensors for k, each in enumerate(together)}
     apart = None if "right" not in sensors else compose(inverse(body_from["right"]), body_from["left"])
     world = _trajectory(root, stamps[0], period)
     shutters = {
         side: _euroc_shutter(cameras[side].height, delay, period, root)
-        for side, delay in (line_delays_s or {}).items()
+        for side, delay in (line_delays_s or _line_delays(known)).items()
     }
     return [
         Recording(
@@ -342,6 +364,44 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
             notes=() if shutters else ("the layout does not say how rows are read",),
         )
     ]
+
+
+def _asl_cameras(root: Path, sensors: Mapping[Side, Path]) -> dict[Side, tuple[Table, Pose]]:
+    """Table and ``body_from_camera`` of each camera: of its sensor.yaml, or of a camchain of Kalibr beside.
+
+    TUM VI and TUM RS-VI are distributed with ``dso/camchain.yaml`` in place of the first.
+    """
+    files = {side: path / "sensor.yaml" for side, path in sensors.items()}
+    chains = sorted({each for folder in (root, root.parent) for each in folder.glob("**/*camchain*.yaml")})
+    if not any(path.is_file() for path in files.values()) and chains:
+        found = kalibr_in_body(chains[0])
+        if len(found) < len(sensors):
+            raise RsbenchError(f"{chains[0]}: has {len(found)} cameras, and {root} {len(sensors)}")
+        return dict(zip(sensors, found, strict=False))
+    yamls = {side: Fields(read_tree(path), str(path)) for side, path in files.items()}
+    return {side: (asl_camera(each), asl_pose(each)) for side, each in yamls.items()}
+
+
+def _line_delays(known: Mapping[Side, tuple[Table, Pose]]) -> dict[Side, float]:
+    """Seconds between rows where all cameras have them."""
+    found = {side: table["line_delay_s"] for side, (table, _) in known.items() if "line_delay_s" in table}
+    return found if len(found) == len(known) else {}
+
+
+def _together(times: Mapping[Side, Mapping[int, Path]], height: int) -> list[dict[Side, int]]:
+    """Stamps of the cameras that are one time: the nearest to that of the left camera, within half a row.
+
+    Cameras with clocks of their own, or stamps that went through floats, differ by some nanoseconds.
+    """
+    left = np.array(sorted(times["left"]), dtype=np.int64)
+    most = np.median(np.diff(left)) / height / 2.0 if len(left) > 1 else 0.0
+    near = {side: np.array(sorted(of_side), dtype=np.int64) for side, of_side in times.items() if of_side}
+    found = list[dict[Side, int]]()
+    for stamp in left if len(near) == len(times) else ():
+        each = {side: int(stamps[np.argmin(np.abs(stamps - stamp))]) for side, stamps in near.items()}
+        if all(abs(value - int(stamp)) <= most for value in each.values()):
+            found.append(each)
+    return found
 
 
 def _euroc_times(folder: Path) -> dict[int, Path]:
@@ -545,15 +605,17 @@ def _middlebury(folder: Path) -> Recording:
     images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
     disparities: dict[View, Callable[[], FloatArray]] = {}
     views: tuple[View, ...] = (("left", 0), ("right", 0))
-    for view, name in zip(views, ("disp0.pfm", "disp1.pfm"), strict=True):
-        if (folder / name).is_file():
-            disparities[view] = partial(_middlebury_disparities, folder / name, offset)
+    for k, view in enumerate(views):
+        named = [folder / f"disp{k}.pfm", folder / f"disp{k}GT.pfm"]  # the second in MiddEval3 and ETH3D
+        for path in [each for each in named if each.is_file()][:1]:
+            disparities[view] = partial(_middlebury_disparities, path, offset)
     return Recording(
         name=folder.name,
         cameras={"left": left, "right": right},
         images={view: image for view, image in images.items() if image.is_file()},
         right_from_left=_apart(_MM * baseline),
         disparities=disparities,
+        notes=() if disparities else ("there is no disp0.pfm or disp0GT.pfm: disparities are not compared",),
     )
 
 
