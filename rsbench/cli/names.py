@@ -254,6 +254,8 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
         return [kind]
     if name.endswith(".toml"):
         raise RsbenchError(f"{name}: give its kind: --kind {'|'.join(kinds)}")
+    if Path(name).is_dir():
+        raise RsbenchError(f"{name}: is a folder, and show takes names and cards; a dataset: rsbench view {name}")
     names = {each: names_of(each) for each in kinds}
     found = [each for each in kinds if current_name(each, name) in names[each]]
     if not found:

@@ -7,10 +7,11 @@ a pose ``cam_from_world``, as ours. The layout has no times: images are ordered 
 shutter. A rig of two cameras is one recording; any other camera is one of its own.
 
 **EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the
-sensor's coordinates to the body's (where it is absent, a camchain of Kalibr nearby has them), ``data.csv`` times in
-nanoseconds and file names; poses are those of the body, p and q = (w, x, y, z), in ``mocap0`` or ``state_groundtruth_estimate0``. Times are whole numbers: as floats they
-would lose 256 ns. The layout does not describe a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1;
-camera 0 is global) is published beside it, and its times are taken as those of the first row.
+sensor's coordinates to the body's (where it is absent, a camchain of Kalibr nearby has them), ``data.csv`` times
+in nanoseconds and file names; poses are those of the body, p and q = (w, x, y, z), in ``mocap0`` or
+``state_groundtruth_estimate0``. Times are whole numbers: as floats they would lose 256 ns. The layout does not
+describe a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1; camera 0 is global) is published beside
+it, and its times are taken as those of the first row.
 
 **Carla-RS** (Liu et al., Deep Shutter Unrolling Network, CVPR 2020): a sequence is a folder with ``gt_vel.log``
 (wx, wy, wz in rad/s and x, y, z per second), ``%04d_rs.png``, and where depth was rendered ``%04d_rs.depth`` or
