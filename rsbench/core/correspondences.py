@@ -44,6 +44,9 @@ class Correspondences:
     """(n, 4) xl, yl, xr, yr: left to right in frame 1."""
     tracks: FloatArray = field(default_factory=lambda: _none(8))
     """(n, 8) xl0, yl0, xr0, yr0, xl1, yl1, xr1, yr1: one point in all four images."""
+    covariance: FloatArray = field(default_factory=lambda: _none(3))
+    """(n, 3) xx, xy, yy, px^2, of each row of ``tracks``: how well its ends agree with each other, as the images
+    predict it, up to a scale that all share. Empty where it is not known."""
     lines: FloatArray = field(default_factory=lambda: _none(16))
     """(n, 16) two ends xa, ya, xb, yb in left 0, right 0, left 1, right 1: one straight line in all four images.
     The ends of one image are no points of another: the line alone is the same."""
@@ -60,10 +63,14 @@ class Correspondences:
     def __post_init__(self) -> None:
         for name, columns in SET_COLUMNS.items():
             object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
-        for name in ("affine", "gyro", "gravity"):
-            object.__setattr__(self, name, _matches(getattr(self, name), name, 4))
+        for name, columns in {"affine": 4, "gyro": 4, "gravity": 4, "covariance": 3}.items():
+            object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
         if len(self.affine) not in (0, len(self.left)):
             raise ValueError(f"affine has {len(self.affine)} rows and left {len(self.left)}: one each, or none")
+        if len(self.covariance) not in (0, len(self.tracks)):
+            raise ValueError(
+                f"covariance has {len(self.covariance)} rows and tracks {len(self.tracks)}: one each, or none"
+            )
         flat = np.flatnonzero(~np.any(self.gravity[:, 1:], axis=1))
         if len(flat):
             raise ValueError(f"gravity[{flat[0]}] has no direction: gx, gy, gz are 0")
@@ -112,7 +119,9 @@ def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspond
         lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
         if len(lost):
             raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
-    return replace(correspondences, **sets, affine=_ideal_affine(correspondences, rig.eye("left")))
+    left = rig.eye("left")
+    covariance = _turned(correspondences.covariance, left.ideal_by_pixel(correspondences.tracks[:, :2]))
+    return replace(correspondences, **sets, affine=_ideal_affine(correspondences, left), covariance=covariance)
 
 
 def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | AlignedCamera) -> FloatArray:
@@ -125,6 +134,25 @@ def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | Al
         return affine
     by_0, by_1 = _ideal_by_pixels(left, camera)
     return (inverse_2x2(by_1) @ affine.reshape(-1, 2, 2) @ by_0).reshape(-1, 4)
+
+
+def lens_covariance(
+    covariance: FloatArray, tracks: FloatArray, camera: PinholeCamera | AlignedCamera
+) -> FloatArray:
+    """Covariances (n, 3) in pixels of the left image from those in ideal pixels; none of none.
+
+    Args:
+        tracks: (n, 8) whose they are, in pixels of the images.
+    """
+    return _turned(covariance, inverse_2x2(camera.ideal_by_pixel(tracks[:, :2])))
+
+
+def _turned(covariance: FloatArray, J: FloatArray) -> FloatArray:
+    """Covariances (n, 3) after linear maps (n, 2, 2)."""
+    if len(covariance) == 0:
+        return covariance
+    full = J @ covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2) @ np.swapaxes(J, 1, 2)
+    return full.reshape(-1, 4)[:, [0, 1, 3]]
 
 
 def _ideal_affine(correspondences: Correspondences, camera: PinholeCamera | AlignedCamera) -> FloatArray:
@@ -201,7 +229,9 @@ def join_stereo(correspondences: Correspondences) -> Joined:
     c = correspondences
     for side in SIDES:
         if len(c.stereo_0) and len(c.stereo_1):
-            c = replace(c, tracks=np.concatenate([c.tracks, _joined_tracks(c, side)]))
+            joined = _joined_tracks(c, side)
+            known = c.covariance if len(joined) == 0 else _none(3)  # those of joined tracks are not known
+            c = replace(c, tracks=np.concatenate([c.tracks, joined]), covariance=known)
     alone = {
         name: int(np.count_nonzero(~repeated(getattr(c, name), c.tracks[:, half])))
         for name, half in _STEREO_HALF.items()

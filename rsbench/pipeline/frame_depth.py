@@ -22,7 +22,6 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.corrector import CorrectorEntry, load_corrector
 from rsbench.vision.epipolar_search import depth_from_motion
 from rsbench.vision.feature_matcher import FeatureEntry, load_features
-from rsbench.vision.features import SiftMatcher
 from rsbench.vision.images import eight_bit
 from rsbench.vision.stereo_depth import SgmMatcher, fill_holes, moving_disparities, sky_mask, timed_depth
 from rsbench.vision.stereo_matcher import (
@@ -67,11 +66,15 @@ class CorrectionOptions:
             RsbenchError: features or matcher are not ours, which know no other size.
         """
         entries: dict[str, Any] = {"features": self.features, "matcher": self.matcher}
-        for option, kind in (("features", SiftMatcher), ("matcher", SgmMatcher)):
+        sgm = self.matcher.component
+        faster = {
+            "features": self.features.component.faster(),
+            "matcher": replace(sgm, half=True) if isinstance(sgm, SgmMatcher) else None,
+        }
+        for option, component in faster.items():
             entry = entries[option]
-            if not isinstance(entry.component, kind):
+            if component is None:
                 raise RsbenchError(f"--fast: {option} {entry.name!r} cannot work at half the size; leave one out")
-            component = replace(entry.component, half=True)
             entries[option] = replace(entry, component=component, key=component_key(component, {}))
         return replace(self, depth_from_motion=False, **entries)
 

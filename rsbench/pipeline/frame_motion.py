@@ -38,7 +38,7 @@ from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.feature_matcher import find_correspondences
-from rsbench.vision.features import ROW_TOLERANCE_PX, SiftMatcher
+from rsbench.vision.features import ROW_TOLERANCE_PX
 from rsbench.vision.images import eight_bit
 
 _FEWEST_MATCHES = 12
@@ -74,12 +74,11 @@ def find_matches_of_rig(
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
     """
-    component, together = options.features.component, rig.rows_together(scanning)
-    if not together and isinstance(component, SiftMatcher):
-        apart = replace(options.features, component=replace(component, row_tolerance=None))
-        options = replace(options, features=apart)
+    together, apart = rig.rows_together(scanning), options.features.component.apart()
+    if not together and apart is not None:
+        options = replace(options, features=replace(options.features, component=apart))
     matches = find_matches(images, options, rig=rig)
-    if together or isinstance(component, SiftMatcher):
+    if together or apart is not None:
         return matches
     return Correspondences(left=matches.left, right=matches.right)
 
@@ -108,11 +107,9 @@ def match_frames(
 
 
 def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
-    """The same options, but for rsbench's own matcher giving tracks alone where there are as many as that."""
-    component = options.features.component
-    if not isinstance(component, SiftMatcher):
-        return options
-    return replace(options, features=replace(options.features, component=replace(component, enough_tracks=tracks)))
+    """The same options, whose feature matcher may give tracks alone where there are as many as that."""
+    component = options.features.component.with_enough(tracks)
+    return replace(options, features=replace(options.features, component=component))
 
 
 def find_rig(
@@ -191,8 +188,7 @@ def match_unknown(
             check_rig(images["left", 0], images["right", 0], rig)
     except RefusedFramesError as error:
         doubt = error
-    anyhow = isinstance(options.features.component, SiftMatcher)
-    scanning = Scanning(scan="left") if anyhow else Scanning()
+    scanning = Scanning() if options.features.component.apart() is None else Scanning(scan="left")
     return _enough(find_matches_of_rig(images, rig, scanning, options)), doubt
 
 
@@ -200,7 +196,10 @@ def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
     """Without tracks whose left-right ends are not on one row, of cameras that read rows together."""
     tracks = without_lens(Correspondences(tracks=matches.tracks), rig).tracks
     off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
-    return replace(matches, tracks=matches.tracks[off <= ROW_TOLERANCE_PX])
+    near = off <= ROW_TOLERANCE_PX
+    return replace(
+        matches, tracks=matches.tracks[near], covariance=matches.covariance[near[: len(matches.covariance)]]
+    )
 
 
 def _enough(matches: Correspondences) -> Correspondences:

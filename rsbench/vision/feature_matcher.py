@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.correspondences import SET_SIDES, Correspondences, lens_affine
+from rsbench.core.correspondences import SET_SIDES, Correspondences, lens_affine, lens_covariance
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, AlignedCamera, StereoRig, View
 from rsbench.core.so3 import FloatArray
@@ -42,6 +42,21 @@ class FeatureMatcher(ABC):
         """``match`` of images of any cameras, in their pixels: of their images without lens and rotation."""
         straight = {view: undistorted(image, rig.eye(view[0])) for view, image in images.items()}
         return of_sensors(self.match(straight), rig)
+
+    def apart(self) -> Self | None:
+        """The same for cameras that do not read rows together, whose left-right matches may lie anywhere.
+
+        None: it may look along the row.
+        """
+        return None
+
+    def with_enough(self, tracks: int) -> Self:
+        """The same, which may give tracks alone where there are as many as that."""
+        return self
+
+    def faster(self) -> Self | None:
+        """The same at half the size; None: it knows no other size."""
+        return None
 
 
 FeatureEntry = Entry[FeatureMatcher, RunOptions]
@@ -108,8 +123,8 @@ def undistorted(image: NDArray[Any], camera: PinholeCamera | AlignedCamera) -> N
     )
 
 
-def of_sensors(matches: Correspondences, rig: StereoRig) -> Correspondences:
-    """Matches in ideal pixels as pixels of the images; those with an end outside are dropped."""
+def of_sensors(matches: Correspondences, rig: StereoRig, border_px: float = 0.0) -> Correspondences:
+    """Matches in ideal pixels as pixels of the images; those outside or near the border are dropped."""
     if rig.rectified:
         return matches
     sets, kept = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
@@ -117,8 +132,20 @@ def of_sensors(matches: Correspondences, rig: StereoRig) -> Correspondences:
         rows = getattr(matches, name)
         ideal = rows.reshape(len(rows), len(sides), 2)
         ends = np.stack([rig.eye(side).lens_pixels(ideal[:, k]) for k, side in enumerate(sides)], axis=1)
-        inside = [rig.sensor(side).contains(ends[:, k]) for k, side in enumerate(sides)]
+        inside = [_inside(ends[:, k], rig.sensor(side), border_px) for k, side in enumerate(sides)]
         kept[name] = np.all(inside, axis=0)
         sets[name] = ends[kept[name]].reshape(-1, rows.shape[1])
     affine = matches.affine[kept["left"][: len(matches.affine)]]
-    return replace(matches, **sets, affine=lens_affine(affine, sets["left"], rig.eye("left")))
+    covariance = matches.covariance[kept["tracks"][: len(matches.covariance)]]
+    return replace(
+        matches,
+        **sets,
+        affine=lens_affine(affine, sets["left"], rig.eye("left")),
+        covariance=lens_covariance(covariance, sets["tracks"], rig.eye("left")),
+    )
+
+
+def _inside(points: FloatArray, camera: PinholeCamera, border_px: float) -> NDArray[np.bool_]:
+    """Mask (n,) of points (n, 2), px, that the image holds with so much around them."""
+    shifts = [np.array([x, y]) for x in (-border_px, border_px) for y in (-border_px, border_px)]
+    return np.all([camera.contains(points + shift) for shift in shifts], axis=0)

@@ -24,7 +24,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar, final
+from typing import Any, Generic, NamedTuple, Self, TypeVar, final
 
 import cv2
 import numpy as np
@@ -128,7 +128,7 @@ def _scan(
                 back_nearest[j], back[j] = distance, i
 
 
-_BLUR_PX = 0.8
+BLUR_PX = 0.8
 """Standard deviation of the smoothing before: the cubic kernel interpolates what is left without a bias."""
 _HALF = 7
 """Patches are 2 _HALF + 1 px wide, with Gaussian weights."""
@@ -199,7 +199,19 @@ def _not_of_tracks(matches: Correspondences, frame: int) -> FloatArray:
 
 def smoothed(image: NDArray[Any]) -> F32:
     """Grey levels (H, W) as patches are cut from them."""
-    return np.asarray(cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _BLUR_PX))
+    return np.asarray(cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), BLUR_PX))
+
+
+class Aligned(NamedTuple):
+    """Where patches of one image lie in another."""
+
+    places: FloatArray
+    """(n, 2) px; of a patch that cannot be aligned the given one."""
+    done: BoolArray
+    """(n,) which were aligned."""
+    covariance: FloatArray
+    """(n, 3) xx, xy, yy, px^2, by the patch's gradients and what the fit leaves; of those that were aligned.
+    Smoothing correlates what is left: a scale that all share is not in them."""
 
 
 def aligned(
@@ -212,11 +224,30 @@ def aligned(
         points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
         start: (2, 2) affine map from the pixels around a point of a to those of b, about; None: the identity.
     """
+    return align(a, b, points_a, points_b, start)[:2]
+
+
+def align(
+    a: F32,
+    b: F32,
+    points_a: FloatArray,
+    points_b: FloatArray,
+    start: FloatArray | None = None,
+    most_px: float = _MOST_PX,
+    most_sigma: float = _MOST_SIGMA_PX,
+) -> Aligned:
+    """``aligned`` with the covariances.
+
+    Args:
+        most_px: change of a place, at most.
+        most_sigma: standard deviation, px, of a place that is taken, at most.
+    """
     out = np.array(points_b, dtype=np.float64)
-    done = np.zeros(len(out), dtype=np.bool_)
+    done, covariance = np.zeros(len(out), dtype=np.bool_), np.zeros((len(out), 3))
     start = np.eye(2) if start is None else np.ascontiguousarray(start)
-    _align_all(a, b, np.ascontiguousarray(points_a, dtype=np.float64), start, out, done)
-    return out, done
+    source = np.ascontiguousarray(points_a, dtype=np.float64)
+    _align_all(a, b, source, start, (most_px, most_sigma), out, done, covariance)
+    return Aligned(out, done, covariance)
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
@@ -249,7 +280,16 @@ def _template(image: F32, x: float, y: float, grid: F32, J: F32) -> None:
 
 
 @compiled(error_model="numpy")
-def _align_all(a: F32, b: F32, points: FloatArray, start: FloatArray, places: FloatArray, done: BoolArray) -> None:
+def _align_all(
+    a: F32,
+    b: F32,
+    points: FloatArray,
+    start: FloatArray,
+    most: tuple[float, float],
+    places: FloatArray,
+    done: BoolArray,
+    covariance: FloatArray,
+) -> None:
     size = 2 * _HALF + 1
     grid, J = (
         np.zeros((size + 2, size + 2), dtype=np.float32),
@@ -264,11 +304,19 @@ def _align_all(a: F32, b: F32, points: FloatArray, start: FloatArray, places: Fl
         if not (margin <= x < a.shape[1] - margin and margin <= y < a.shape[0] - margin):
             continue
         _template(a, x, y, grid, J)
-        done[n] = _align(b, J, weights, start, places[n])
+        done[n] = _align(b, J, weights, start, most, places[n], covariance[n])
 
 
 @compiled(error_model="numpy")
-def _align(b: F32, J: F32, weights: FloatArray, start: FloatArray, place: FloatArray) -> bool:
+def _align(
+    b: F32,
+    J: F32,
+    weights: FloatArray,
+    start: FloatArray,
+    most: tuple[float, float],
+    place: FloatArray,
+    covariance: FloatArray,
+) -> bool:
     """Move one place (2,) to where the patch fits; False, and no move, where it cannot be."""
     count = len(J)
     H = np.zeros((_PARAMETERS, _PARAMETERS))
@@ -294,13 +342,15 @@ def _align(b: F32, J: F32, weights: FloatArray, start: FloatArray, place: FloatA
         A = A @ M
         dx, dy = A[0, 0] * step[0] + A[0, 1] * step[1], A[1, 0] * step[0] + A[1, 1] * step[1]
         x, y, bias, gain = x - dx, y - dy, bias + step[6], gain + step[7]
-        if not (abs(x - place[0]) < _MOST_PX and abs(y - place[1]) < _MOST_PX):
+        if not (abs(x - place[0]) < most[0] and abs(y - place[1]) < most[0]):
             return False
         if dx * dx + dy * dy < _CONVERGED_PX**2:
             break
     shear = np.max(np.abs(A - start))
-    variance = np.sum(weights * residuals**2) / np.sum(weights) * max(inverse[0, 0], inverse[1, 1])
-    if not (shear < _MOST_SHEAR and abs(gain - 1.0) < _MOST_GAIN and variance < _MOST_SIGMA_PX**2):
+    left = np.sum(weights * residuals**2) / np.sum(weights)
+    covariance[0], covariance[1], covariance[2] = left * inverse[0, 0], left * inverse[0, 1], left * inverse[1, 1]
+    variance = left * max(inverse[0, 0], inverse[1, 1])
+    if not (shear < _MOST_SHEAR and abs(gain - 1.0) < _MOST_GAIN and variance < most[1] ** 2):
         return False
     place[0], place[1] = x, y
     return True
@@ -438,13 +488,22 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
         """Features are found in the images as they are: interpolating them would add a tenth to the noise."""
         return self._matched(images, rig)
 
+    def apart(self) -> Self:
+        return replace(self, row_tolerance=None)
+
+    def with_enough(self, tracks: int) -> Self:
+        return replace(self, enough_tracks=tracks)
+
+    def faster(self) -> Self:
+        return replace(self, half=True)
+
     def _matched(self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig | None) -> Correspondences:
         four = (images["left", 0], images["right", 0], images["left", 1], images["right", 1])
         matches = match_stereo_frames(*four, self, rig)
         alone = 0 < self.enough_tracks <= len(matches.tracks)
         if alone:
             matches = Correspondences(tracks=matches.tracks)
-        if self.refine and not _still(matches):
+        if self.refine and not still(matches):
             matches = refine_matches(images, matches, None if rig is None or rig.aligned else rig)
         return Correspondences(tracks=matches.tracks) if alone else matches
 
@@ -608,7 +667,7 @@ def match_stereo_frames(
     )
 
 
-def _still(matches: Correspondences) -> bool:
+def still(matches: Correspondences) -> bool:
     """Whether nothing moves over time: errors that are all alike would leave solvers no noise to judge by."""
     pairs = matches.left, matches.right, matches.tracks[:, [0, 1, 4, 5]]
     moved = np.concatenate([each[:, 2:] - each[:, :2] for each in pairs])

@@ -364,7 +364,8 @@ def followed(greys: tuple[F32, F32], labelled: Labelled) -> Followed:
     """
     places, labels, seen = labelled.places, labelled.labels[0], labelled.seen[0]
     aligned = np.where(seen, resample(greys[1], places), greys[0])
-    left = dense_flow(*(np.clip(np.rint(grey), 0, 255).astype(np.uint8) for grey in (greys[0], aligned)))
+    first, second = (np.clip(np.rint(grey), 0, 255).astype(np.uint8) for grey in (greys[0], aligned))
+    left = dense_flow(first, second)
     inner = _inner(labelled)
     y, x = (_GRID * axis + _GRID // 2 for axis in np.indices([n // _GRID for n in labels.shape]).reshape(2, -1))
     y, x = y[inner[y, x]], x[inner[y, x]]

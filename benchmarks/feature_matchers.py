@@ -1,0 +1,132 @@
+"""Feature matchers on rendered frames: pose-2's score of the motion that their matches give, and their time.
+
+Of each sequence of a dataset with two stereo frames: tracks, the share of their later ends that the truth
+contradicts by more than 1 px, errors of the motion under the law that the matches choose (``rs-stereo-refined``,
+``auto``), pose-2's score (mean of the areas under the curves of e_R to 0.1 deg and of e_T to 1 deg), and processor
+seconds of matching and of solving. Matchers take turns on each sequence, so that what else runs on the machine
+slows them alike. A table of each sequence is written beside the summary by sensor and by law.
+
+    rsbench generate laws --out data/laws --only castle-twist-moderate-real-1 ...
+    python benchmarks/feature_matchers.py --data data/laws --features sift sift-refined dense --out matchers.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.motion_tracks import match_scores
+from rsbench.benchmark.scoring import pose_errors
+from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.pipeline.answer import solve_problem
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import find_matches_of_rig
+from rsbench.pipeline.isolated_components import SolverRunner
+from rsbench.pipeline.problem import Problem
+from rsbench.solvers.engine.base import load_solver_entry
+from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.vision.feature_matcher import load_features
+from rsbench.vision.features import forget_features
+
+
+def row_of(sequence: Sequence, features: str, model: str | None, most: int, seed: int) -> dict[str, float | str]:
+    """Figures of one matcher on one sequence."""
+    images = {view: sequence.image("rs", *view) for view in VIEWS}
+    options = CorrectionOptions(features=load_features(features))
+    forget_features()
+    begin = time.process_time()
+    matches = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, options)
+    matched = time.process_time()
+    if 0 < most < len(matches.tracks):
+        kept = np.sort(np.random.default_rng(seed).permutation(len(matches.tracks))[:most])
+        matches = Correspondences(tracks=matches.tracks[kept])
+    problem = Problem(
+        name=sequence.name, correspondences=matches, rig=sequence.rig, known_shutter=sequence.shutter
+    )
+    solving = time.process_time()
+    with SolverRunner() as runner:
+        entry = load_solver_entry("rs-stereo-refined")
+        found = solve_problem(problem, entry, RobustOptions(), runner, seed, (), model or sequence.motion.name)
+    solved = time.process_time()
+    w, d = (np.full(3, np.nan) if found[key] is None else np.array(found[key]) for key in ("w", "d"))
+    errors = pose_errors(
+        w,
+        d,
+        true_w=sequence.motion.w,
+        true_d=sequence.motion.d,
+        rig=sequence.rig,
+        success=bool(found["success"]),
+        metric=bool(found["metric"]),
+        reference_point=found["reference_point"],
+    )
+    e_R, e_T = float(errors["e_R_deg"]), float(errors["e_T_deg"])
+    score = 0.5 * (max(0.0, 1.0 - e_R / 0.1) + max(0.0, 1.0 - e_T))
+    right = match_scores(sequence, Correspondences(tracks=matches.tracks))["matches_1px"]
+    return {
+        "sequence": sequence.name,
+        "law": sequence.motion.name,
+        "sensor": "ideal" if sequence.sensor is None else "real",
+        "features": features,
+        "tracks": len(matches.tracks),
+        "wrong": 1.0 - right,
+        "e_R": e_R,
+        "e_T": e_T,
+        "score": score,
+        "model": str(found["motion_model"]),
+        "matching_s": matched - begin,
+        "solving_s": solved - solving,
+    }
+
+
+def summary(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Means of score, share of wrong ends and seconds; medians of tracks; geometric means of the errors."""
+    groups = table.groupby([*by, "features"], sort=False)
+    found = groups[["score", "wrong", "matching_s", "solving_s"]].mean()
+    found["tracks"] = groups["tracks"].median()
+    for name in ("e_R", "e_T"):
+        found[name] = groups[name].agg(lambda each: float(np.exp(np.mean(np.log(np.maximum(each, 1e-9))))))
+    found["sequences"] = groups.size()
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="dataset of two frames with their truth")
+    parser.add_argument("--features", nargs="+", default=["sift", "sift-refined", "dense"], help="names or cards")
+    parser.add_argument("--only", default="", help="sequences whose name holds this")
+    parser.add_argument("--true-law", action="store_true", help="solve under the law that the rig follows")
+    parser.add_argument("--most", type=int, default=0, help="tracks that are solved with, at most; 0: all")
+    parser.add_argument("--seed", type=int, default=0, help="of the solver's samples")
+    parser.add_argument("--out", type=Path, help="table of each sequence and matcher")
+    arguments = parser.parse_args()
+    rows = list[dict[str, float | str]]()
+    for sequence in read_dataset(arguments.data):
+        if arguments.only not in sequence.name:
+            continue
+        for features in arguments.features:
+            model = None if arguments.true_law else "auto"
+            rows.append(row_of(sequence, features, model, arguments.most, arguments.seed))
+            row = rows[-1]
+            sys.stdout.write(
+                f"{row['sequence']:40} {Path(features).stem:14} {row['tracks']:5d} tracks, "
+                f"{row['wrong']:6.1%} wrong, e_R {row['e_R']:.4f}, e_T {row['e_T']:.3f}, "
+                f"score {row['score']:.3f}, {row['model']}, "
+                f"{row['matching_s']:.2f} + {row['solving_s']:.2f} s\n"
+            )
+            sys.stdout.flush()
+    table = pd.DataFrame(rows)
+    if arguments.out:
+        table.to_csv(arguments.out, index=False)
+    for by in (["sensor"], ["law", "sensor"]):
+        sys.stdout.write(summary(table, by).round(4).to_string() + "\n")
+
+
+if __name__ == "__main__":
+    main()
