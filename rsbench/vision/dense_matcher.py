@@ -299,7 +299,7 @@ def start_of_flow(first: U8, second: U8, along_rows: bool = False) -> FloatArray
 
 
 def _inverse(affine: FloatArray) -> FloatArray:
-    back: FloatArray = np.linalg.inv(affine[:, :2])
+    back = np.asarray(np.linalg.inv(affine[:, :2]), dtype=np.float64)
     return np.column_stack([back, -back @ affine[:, 2]])
 
 
