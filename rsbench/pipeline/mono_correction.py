@@ -339,6 +339,8 @@ class SeenPair:
     """None where they show none at all."""
     matches: FloatArray
     """(n, 4) x0, y0, x1, y1, px, see ``trajectory_matches``."""
+    even: bool = True
+    """Whether one frame period lies between them."""
 
     @property
     def motion(self) -> Motion | None:
@@ -386,7 +388,7 @@ def _group_motions(pending: dict[int, SeenPair], first: int) -> list[FoundOwnMot
 
 
 def _shows(pair: SeenPair) -> bool:
-    return pair.motion is not None and len(pair.matches) >= _LEAST
+    return pair.even and pair.motion is not None and len(pair.matches) >= _LEAST
 
 
 def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
@@ -426,6 +428,13 @@ class Turned:
         """A frame (H, W[, 3]) as this camera has it."""
         lines_first = np.swapaxes(image, 0, 1) if self.exchanged else image
         return np.ascontiguousarray(lines_first[::-1] if self.flipped else lines_first)
+
+    def paced(self, period: float) -> Turned:
+        """The same where so many frame periods lie between two frames."""
+        if period == 1.0:
+            return self
+        ratio = min(self.shutter.readout_ratio / period, 1.0)
+        return replace(self, shutter=replace(self.shutter, readout_ratio=ratio))
 
     def line(self, row: float) -> float:
         """The number of lines read at the time of so many rows; of columns, a like share of the width."""

@@ -88,12 +88,14 @@ def pair_rates(
     robust: RobustOptions,
     seed: int = 0,
     advance: Callable[[str], None] = lambda word: None,
+    begins: FloatArray | None = None,
 ) -> PairRates:
     """Of some pairs of frames (H, W[, 3]), in the axes of the camera whose lines are rows from the top.
 
     Args:
         frames, count: in order, gone through once, and how many there are, about.
         advance: called for each pair that is looked at.
+        begins: (n,) times of the frames' first rows, frame periods; pairs that are not one apart show nothing here.
     """
     turn = turned(camera, shutter)
     rig = StereoRig(camera=turn.camera, baseline=1.0)
@@ -101,13 +103,15 @@ def pair_rates(
     every = max((count - 1) // PAIRS, 1)
     for number, images in islice(enumerate(pairwise(frames)), 0, every * PAIRS, every):
         advance(f"frame {number}")
+        if begins is not None and begins[number + 1] - begins[number] != 1.0:
+            continue
         pair = [turn.image(image) for image in images]
         flows = find_flows(pair)
         if refusal(pair, flows):
             continue
         motion = find_own_motion(flows, rig, turn.shutter, "left", robust, seed).own.motion
         if motion is not None:
-            starts.append(float(number))
+            starts.append(float(number) if begins is None else float(begins[number]))
             rates.append(motion.w)
     return PairRates(np.array(starts), np.reshape(rates, (-1, 3)))
 

@@ -20,7 +20,7 @@ from rsbench.capture.sequence_shutter import LONGEST
 from rsbench.components.motion_models import AcceleratedMotion, InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import CameraCard, Progress, check_alike, no_progress
@@ -124,12 +124,14 @@ def know_camera(
     options: MonoOptions,
     gyro: Gyroscope | None = None,
     progress: Progress = no_progress,
+    starts: FloatArray | None = None,
 ) -> KnownCamera:
     """Estimates from frames (H, W[, 3]) what the card leaves open: shutter, focal length, gyroscope's clock.
 
     Args:
         frames: in order; gone through once for each quantity that is estimated.
         count: of the frames, about; 0 where it is unknown.
+        starts: as of ``correct_frames``, for the gyroscope's clock.
 
     Raises:
         NoMotionError: the frames do not show how their lines are read.
@@ -150,7 +152,7 @@ def know_camera(
     samples, clock = None if gyro is None else gyro.samples, None
     if gyro is not None and gyro.clock_error > 0.0:
         with progress("looking at the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
-            rates = pair_rates(frames, count, camera, shutter, robust, seed, advance)
+            rates = pair_rates(frames, count, camera, shutter, robust, seed, advance, starts)
         samples, clock = in_time(rates, gyro.samples, camera, shutter, gyro.clock_error)
     return KnownCamera(camera=camera, focal=focal, readout=readout, gyro=samples, clock=clock)
 
@@ -187,6 +189,7 @@ def correct_frames(
     options: MonoOptions | None = None,
     done: int = 0,
     gyro: FloatArray | None = None,
+    starts: FloatArray | None = None,
 ) -> Iterator[MonoMoment]:
     """Every frame (H, W[, 3]), uint8 or uint16, of one camera at the time of its target row, in order.
 
@@ -198,6 +201,8 @@ def correct_frames(
         options: how they are corrected.
         done: so many first frames are left out.
         gyro: (n, 4) tau, w of a gyroscope, as of ``Correspondences``: tau 0 is the first row of the first frame.
+        starts: (n,) increasing times of the frames' first rows, frame periods; 0, 1, 2, ... if absent. The readout
+            takes a smaller share of a longer interval, and a trajectory goes through intervals of 1 alone.
 
     Raises:
         RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
@@ -207,7 +212,7 @@ def correct_frames(
     turn = turned(camera, shutter)
     pending: MonoMoment | None = None
     each: _Frame | None = None
-    for each in _with_neighbours(_pairs(frames, turn, options, done, gyro)):
+    for each in _with_neighbours(_pairs(frames, turn, options, done, gyro, starts)):
         if each.number < done:
             continue
         if each.number == 1 and each.after is None and each.before and not each.before.fusion:
@@ -248,7 +253,12 @@ def _with_neighbours(
 
 
 def _pairs(
-    frames: Iterable[NDArray[Any]], turn: Turned, options: MonoOptions, done: int, gyro: FloatArray | None
+    frames: Iterable[NDArray[Any]],
+    turn: Turned,
+    options: MonoOptions,
+    done: int,
+    gyro: FloatArray | None,
+    starts: FloatArray | None,
 ) -> Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]]:
     """Number of the second frame, both frames, and what is known of them, of all pairs in order; None: done."""
     first = max(done - 1, 0)
@@ -256,12 +266,12 @@ def _pairs(
     turned_gyro, waiting = None if gyro is None else turn.gyro(gyro), deque[_Seen]()
 
     def look(at: tuple[int, tuple[NDArray[Any], NDArray[Any]]]) -> _Seen:
-        return _seen(*at, turn, options, turned_gyro)
+        return _seen(*at, turn, options, turned_gyro, *_span(at[0], starts))
 
     def kept(seen: Iterable[_Seen]) -> Iterator[SeenPair]:
         for each in seen:
             waiting.append(each)
-            yield SeenPair(found=each.found, matches=each.matches)
+            yield SeenPair(found=each.found, matches=each.matches, even=_span(each.number, starts)[1] == 1.0)
 
     def ready(at: tuple[_Seen, FoundOwnMotion | None]) -> tuple[_Seen, _Pair | None]:
         seen, found = at
@@ -282,6 +292,13 @@ def _pairs(
     motions = (each.found for each in seen) if gyro is not None else with_shared_trajectory(seen, begin, first)
     for each, pair in map_ahead(ready, found_in_order(motions), _AT_ONCE, _AT_ONCE):
         yield each.number + 1, *each.images, pair
+
+
+def _span(number: int, starts: FloatArray | None) -> tuple[float, float]:
+    """When a pair begins and how long it is, frame periods."""
+    if starts is None or number + 1 >= len(starts):
+        return float(number), 1.0
+    return float(starts[number]), float(starts[number + 1] - starts[number])
 
 
 def correct_all(
@@ -316,15 +333,18 @@ def _seen(
     turn: Turned,
     options: MonoOptions,
     gyro: FloatArray | None,
+    start: float,
+    period: float,
 ) -> _Seen:
-    """``gyro``: samples (n, 4) of the sequence, as this camera turns."""
+    """``gyro``: samples (n, 4) of the sequence, as this camera turns; ``start``, ``period``: frame periods."""
+    turn = turn.paced(period)
     check_alike({f"frame {number + place}": image for place, image in enumerate(images)})
     given = [turn.image(image) for image in images]
     flows, corrector = find_flows(given), options.corrector
     samples = None
     if gyro is not None:
-        samples = around(gyro, number, number + 1.0 + turn.shutter.readout_ratio)
-    local = None if samples is None else samples - [number, 0.0, 0.0, 0.0]
+        samples = around(gyro, start, start + period * (1.0 + turn.shutter.readout_ratio))
+    local = None if samples is None else (samples - [start, 0.0, 0.0, 0.0]) * [1.0 / period, *3 * [period]]
     found, reason = _found(given, flows, turn, corrector, local)
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
@@ -373,7 +393,6 @@ def _unmoved(number: int, image: NDArray[Any], reason: str) -> MonoMoment:
 def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
     """A frame corrected with one neighbour, filled from both; or as it was read, with the reason."""
     line = (turn.camera.height - 1) / 2 if options.target_row is None else turn.line(options.target_row)
-    times = [float(turn.shutter.time_after(line, place, "left")) for place in FRAMES]
     sources = [(each.before, 1), (each.after, 0)]
     if line > (turn.camera.height - 1) / 2:
         sources.reverse()
@@ -386,10 +405,15 @@ def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
     if stays or not good:
         return _unmoved(each.number, each.image, why or (each.after.reason if each.after else ""))
     fusion, place, found = good[0]
-    beyond = Beyond(good[1][0], good[1][1], times[good[1][1]]) if len(good) > 1 else None
-    fused = fusion.corrected(place, times[place], beyond)
+    beyond = Beyond(*good[1][:2], _target(*good[1][:2], line)) if len(good) > 1 else None
+    fused = fusion.corrected(place, _target(fusion, place, line), beyond)
     fused = turn.back(finished(fused) if options.close else fused)
     return MonoMoment(number=each.number, image=each.image, fused=fused, found=turn.found(found), skipped=why)
+
+
+def _target(fusion: MonoFusion, place: int, line: float) -> float:
+    """The time of a line of one of a pair's frames, in that pair's periods."""
+    return float(fusion.own.shutter.time_after(line, place, "left"))
 
 
 def translation_record(found: FoundOwnMotion) -> dict[str, Any]:
