@@ -14,6 +14,9 @@ from rsbench.cli.correct_input import (
     EPILOG,
     GyroscopeOptions,
     ReadoutOptions,
+    arranged,
+    check_out,
+    default_out,
     given_frames,
     sized,
     target_row,
@@ -41,6 +44,12 @@ if TYPE_CHECKING:
 
     Finish: TypeAlias = Callable[[Fused], Fused]
 
+_OUT = "Folder or .mp4, .mov, .mkv, .avi. Default: NAME-corrected, of one camera's video .mp4."
+_SIDES = "Both cameras of the rig are in each frame, the left one left."
+_FOV = "Horizontal field of view of one camera's frames as they are stored, degrees."
+_TARGET = (
+    "Time of a corrected frame: first, middle, last or a row. Default: first; middle where one camera is guessed"
+)
 _INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
 _FAST = "Of a rig: features and depth at half the size, which takes less time and loses little."
 _ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
@@ -48,7 +57,7 @@ _RECTIFY = "Write rectified pairs too, with P1, P2, Q: rectified/."
 _SOLVER = "rs-stereo-refined"
 _RIG_ONLY = (
     *("rig", "left", "right", "sky", "fill", "solver", "motion_model", "matcher", "features", "corrector", "fast"),
-    *("row_poses", "rectify"),
+    *("row_poses", "rectify", "side_by_side"),
 )
 """Parameters that the correction of one camera's frames does not have."""
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
@@ -59,19 +68,19 @@ def correct(
     frames: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="LEFT_0 RIGHT_0 LEFT_1 RIGHT_1", help="Four images; or the folder of a rendered sequence."
+            metavar="VIDEO|DIR|IMAGES",
+            help="Of one camera; with --rig two videos or folders, or LEFT_0 RIGHT_0 LEFT_1 RIGHT_1; or a folder "
+            "of a rendered sequence.",
         ),
     ] = None,
     rig: Annotated[
         Path | None,
         typer.Option(metavar="RIG|NAME", help="Calibration of both cameras: rig.toml, or another tool's."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR|VIDEO", help=_OUT)] = None,
     left: Annotated[Path | None, typer.Option(help="Folder of images or video of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="The same for the right camera.")] = None,
-    target: Annotated[
-        str, typer.Option(help="Time of the corrected frame: first, middle or last row, or a row's number.")
-    ] = "first",
+    target: Annotated[str | None, typer.Option(metavar="ROW", help=_TARGET)] = None,
     inpaint: Annotated[bool | None, typer.Option(help=_INPAINT)] = None,
     sky: Annotated[bool, typer.Option(help="Detect sky, which moves by rotation alone.")] = True,
     fill: Annotated[bool, typer.Option(help="Fill pixels a frame lacks from other frames.")] = True,
@@ -84,6 +93,8 @@ def correct(
     fast: Annotated[bool, typer.Option("--fast", help=_FAST)] = False,
     row_poses: Annotated[bool, typer.Option("--row-poses", help=_ROW_POSES)] = False,
     rectify: Annotated[bool, typer.Option("--rectify", help=_RECTIFY)] = False,
+    side_by_side: Annotated[bool, typer.Option("--side-by-side", help=_SIDES)] = False,
+    fov: Annotated[float | None, typer.Option(metavar="DEG", help=_FOV)] = None,
     camera: CameraFile = None,
     footage: Footage = None,
     gyro: GyroFile = None,
@@ -95,15 +106,26 @@ def correct(
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
     log = GyroscopeOptions(file=gyro, fps=fps, offset_s=gyro_offset)
     readout = ReadoutOptions(readout_ratio=readout_ratio, shutter=shutter, fps=fps)
-    if camera is not None or footage is not None:
+    given = arranged(frames, rig, camera, footage, left, right, side_by_side)
+    if out is None and given.one_camera and given.left is not None:
+        out = default_out(given.left)
+    if out is None:
+        raise RsbenchError("--out: is required: a folder for the results")
+    check_out(out)
+    if given.one_camera:
         _refuse_rig_options(ctx)
-        correct_one_camera(frames, footage, camera, out, target, inpaint, seed, log, readout)
+        # Of what was an error before positional inputs were guessed, the time from which rows are moved least.
+        row = target or ("middle" if given.words else "first")
+        correct_one_camera(given, camera, fov, out, row, inpaint, seed, log, readout)
         return
-    given = replace(given_frames(frames, rig, out, left, right, log, readout, row_poses), rectify=rectify)
+    if fov is not None:
+        raise RsbenchError("--fov: is of one camera; a rig's is in its calibration, --rig")
+    both = given_frames(given.frames, rig, out, given.left, given.right, log, readout, row_poses, side_by_side)
+    given_rig = replace(both, rectify=rectify)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}
     others |= {"one_time": rectify}
     options = _options(features, solver, matcher, corrector, fill, **others)
-    _correct_given(given, target, options.faster() if fast else options, inpaint is None)
+    _correct_given(given_rig, target or "first", options.faster() if fast else options, inpaint is None)
 
 
 def _refuse_rig_options(ctx: typer.Context) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,15 @@ if TYPE_CHECKING:
     from rsbench.core.rig import StereoRig
     from rsbench.core.so3 import FloatArray
     from rsbench.interop.readers.rig_files import Readout
-    from rsbench.pipeline.footage import FrameSource, RigCard
+    from rsbench.pipeline.footage import FrameSource, Part, RigCard
 
 _MOST = 1e9
 
 EPILOG = """[bold]Examples[/bold]
+
+  rsbench correct video.mp4     [dim](of one camera; writes video-corrected.mp4 and a report)[/dim]
+
+  rsbench correct a.png b.png c.png --shutter gopro-hero6-4k30 --out corrected
 
   rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected
 
@@ -62,8 +67,8 @@ class GyroscopeOptions:
         if self.file is None and self.offset_s is not None:
             raise RsbenchError("--gyro-offset: needs --gyro, a gyroscope's log")
 
-    def samples(self, source: FrameSource) -> FloatArray | None:
-        """(n, 4) tau, w; None without a log.
+    def samples(self, source: FrameSource, rate: float | None = None) -> FloatArray | None:
+        """(n, 4) tau, w; None without a log. ``rate``: frames per second by the frames' own times.
 
         Raises:
             RsbenchError: a log that cannot be read, is of another time, or frames without a known rate.
@@ -73,7 +78,7 @@ class GyroscopeOptions:
 
         if self.file is None:
             return None
-        fps, offset_s = self._fps(source), self.offset_s or 0.0
+        fps, offset_s = self._fps(source, rate), self.offset_s or 0.0
         if not abs(offset_s) < _MOST:
             raise RsbenchError(f"--gyro-offset {offset_s:g}: must lie within {_MOST:g} seconds")
         samples = read_gyro_log(self.file).samples(fps, offset_s)
@@ -85,18 +90,18 @@ class GyroscopeOptions:
             )
         return samples
 
-    def farthest(self, source: FrameSource) -> float:
+    def farthest(self, source: FrameSource, rate: float | None = None) -> float:
         """Frame periods within which its clock may be off; 0 where the offset is given."""
         from rsbench.pipeline.mono_gyro import FARTHEST_S
 
-        return FARTHEST_S * self._fps(source) if self.offset_s is None else 0.0
+        return FARTHEST_S * self._fps(source, rate) if self.offset_s is None else 0.0
 
-    def _fps(self, source: FrameSource) -> float:
+    def _fps(self, source: FrameSource, rate: float | None = None) -> float:
         """Raises RsbenchError where neither `--fps` nor the video gives it."""
         from rsbench.core.errors import RsbenchError
         from rsbench.dataset.corrected_frames import said_fps
 
-        fps = said_fps(source.path) if self.fps is None else self.fps
+        fps = (rate or said_fps(source.path)) if self.fps is None else self.fps
         if fps is None:
             raise RsbenchError("--fps: is required with --gyro and images, which have no frame rate")
         if not 0.0 < fps < _MOST:
@@ -136,13 +141,13 @@ class ReadoutOptions:
         return Readout(readout_ratio=self.readout_ratio, shutter=self.shutter, fps=fps)
 
 
-def size_of(frames: list[Path] | Path) -> Callable[[], tuple[int, int]]:
+def size_of(frames: list[Path] | Path, part: Part = "whole") -> Callable[[], tuple[int, int]]:
     """A function that gives the (width, height) of the first of some frames, a folder's or a video's."""
 
     def size() -> tuple[int, int]:
         from rsbench.pipeline.footage import FrameSource
 
-        source = FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames)
+        source = FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames, part)
         height, width = next(iter(source)).shape[:2]
         return width, height
 
@@ -158,6 +163,149 @@ def say_notes(option: str, notes: tuple[str, ...]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Arranged:
+    """What the files of a command line are: of one camera, or of a rig."""
+
+    one_camera: bool
+    frames: list[Path] | None
+    """Images, or the folder of a rendered sequence."""
+    left: Path | None
+    """Folder or video; of one camera its own."""
+    right: Path | None
+    words: str = ""
+    """What was assumed, and the option that says otherwise; empty where nothing was."""
+
+
+def is_rendered(folder: Path) -> bool:
+    """Whether a folder is of a dataset or one of its sequences."""
+    return any((folder / name).is_file() for name in ("dataset.json", "sequence.json"))
+
+
+def arranged(
+    frames: list[Path] | None,
+    rig: Path | None,
+    camera: Path | None,
+    footage: Path | None,
+    left: Path | None,
+    right: Path | None,
+    side_by_side: bool,
+) -> Arranged:
+    """Whose frames are given: those of one camera, unless there is a rig.
+
+    Raises:
+        RsbenchError: files that do not exist or do not go together.
+    """
+    from rsbench.core.errors import RsbenchError
+
+    files = frames or []
+    for path in files:
+        if not path.exists():
+            raise RsbenchError(f"{path}: does not exist{_nearest(path)}")
+    films = [path for path in files if path.is_dir() or not _is_image(path)]
+    if camera is not None or footage is not None:
+        if (footage is None) == (not files):
+            raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
+        if films and len(files) > 1:
+            raise RsbenchError(f"{films[0]}: one camera has one video or folder; give it alone")
+        return Arranged(
+            one_camera=True, frames=None if films else frames, left=films[0] if films else footage, right=None
+        )
+    if left is not None or right is not None or (len(files) == 1 and is_rendered(files[0])):
+        return Arranged(one_camera=False, frames=frames, left=left, right=right)
+    if not files:
+        raise RsbenchError("frames: give a video, a folder or images of one camera; or those of a rig, with --rig")
+    if films:
+        return _arranged_films(films, files, rig, side_by_side)
+    return _arranged_images(files, rig)
+
+
+def _arranged_films(films: list[Path], files: list[Path], rig: Path | None, side_by_side: bool) -> Arranged:
+    from rsbench.core.errors import RsbenchError
+
+    kind, rigged = "folder" if films[0].is_dir() else "video", rig is not None
+    if len(films) < len(files) or len(films) > 2 or (side_by_side and len(films) == 2):
+        raise RsbenchError(
+            f"frames: {len(files)} inputs; give one {kind} of one camera, or two of a rig with --rig"
+        )
+    if side_by_side and not rigged:
+        raise RsbenchError("--rig: is required with --side-by-side: the calibration of both cameras")
+    if len(films) == 1 and rigged and not side_by_side:
+        raise RsbenchError(
+            f"{films[0]}: one {kind}, and --rig is of two cameras: add --side-by-side if both are in each frame, "
+            "or give two; of one camera leave --rig out"
+        )
+    if len(films) == 2 and not rigged:
+        raise RsbenchError(
+            f"--rig: is required with two {kind}s, which are taken as the left and the right camera of a rig; "
+            "correct those of one camera one by one"
+        )
+    if rigged:
+        right = None if side_by_side else films[1]
+        return Arranged(one_camera=False, frames=None, left=films[0], right=right)
+    words = f"one {kind}: taken as one camera's (a rig: give two and --rig, or --side-by-side and --rig)"
+    return Arranged(one_camera=True, frames=None, left=films[0], right=None, words=words)
+
+
+def _arranged_images(files: list[Path], rig: Path | None) -> Arranged:
+    from rsbench.core.errors import RsbenchError
+
+    if len(files) == 1:
+        raise RsbenchError(
+            f"{files[0]}: one image does not show how its camera moved; give two, a folder or a video"
+        )
+    if rig is not None:
+        return Arranged(one_camera=False, frames=files, left=None, right=None)
+    if len(files) == 4:
+        raise RsbenchError(
+            "--rig: is required with four images, which are taken as LEFT_0 RIGHT_0 LEFT_1 RIGHT_1 of a rig; "
+            "of one camera give their folder by --frames, or --camera"
+        )
+    words = f"{len(files)} images: taken as one camera's, in this order (four of a rig: give --rig)"
+    return Arranged(one_camera=True, frames=files, left=None, right=None, words=words)
+
+
+def _is_image(path: Path) -> bool:
+    from rsbench.pipeline.footage import IMAGE_SUFFIXES
+
+    return path.suffix.lower() in IMAGE_SUFFIXES
+
+
+def _nearest(path: Path) -> str:
+    """The names beside a path that are like it, for a message."""
+    import difflib
+
+    folder = path.parent
+    names = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
+    near = difflib.get_close_matches(path.name, names, 3)
+    return f"; nearest here: {', '.join(near)}" if near else ""
+
+
+def default_out(path: Path) -> Path:
+    """Where results go unless it is given: a video beside where the command runs, or a folder."""
+    return Path(f"{path.stem}-corrected.mp4" if path.is_file() else f"{path.resolve().name}-corrected")
+
+
+def check_out(out: Path) -> None:
+    """Refuse a place for results that cannot be one, before work begins.
+
+    Raises:
+        RsbenchError: the ending of an image or of a video that is not written, or a file where a folder has to be.
+    """
+    from rsbench.core.errors import RsbenchError
+    from rsbench.dataset.corrected_frames import is_video
+
+    video = is_video(out)
+    if _is_image(out):
+        raise RsbenchError(f"--out {out}: several frames are no image; give a folder, or a video (.mp4)")
+    place = out.resolve().parent if video else out.resolve()
+    there = next(folder for folder in (place, *place.parents) if folder.exists())
+    if not there.is_dir():
+        raise RsbenchError(f"--out {out}: {there} is a file, not a folder; choose another place")
+    if not os.access(there, os.W_OK):
+        raise RsbenchError(f"--out {out}: {there} cannot be written; choose another place")
+
+
+@dataclass(frozen=True, kw_only=True)
 class RigInput:
     """What is to be corrected, and where to."""
 
@@ -169,6 +317,8 @@ class RigInput:
     """Its images, or a folder or video."""
     right: list[Path] | Path
     gyro: GyroscopeOptions
+    side_by_side: bool = False
+    """Whether both cameras are halves of the frames of one video or folder."""
     row_poses: bool = False
     """Whether the pose at every row of a sequence is wanted."""
     rectify: bool = False
@@ -178,6 +328,8 @@ class RigInput:
         """Of the left and the right camera."""
         from rsbench.pipeline.footage import FrameSource
 
+        if self.side_by_side and isinstance(self.left, Path):
+            return FrameSource(self.left, "left"), FrameSource(self.left, "right")
         left, right = (
             FrameSource.of_files(each) if isinstance(each, list) else FrameSource(each)
             for each in (self.left, self.right)
@@ -194,12 +346,13 @@ def given_frames(
     gyro: GyroscopeOptions,
     readout: ReadoutOptions,
     row_poses: bool = False,
+    side_by_side: bool = False,
 ) -> RigInput:
     """Raises RsbenchError for another combination of arguments."""
     from rsbench.core.errors import RsbenchError
     from rsbench.interop.readers.rig_files import read_rig_file
 
-    rendered = frames is not None and len(frames) == 1 and frames[0].is_dir()
+    rendered = frames is not None and len(frames) == 1 and is_rendered(frames[0])
     if out is None or (rig is None and not rendered):
         raise RsbenchError(f"--{'out' if rig is not None or rendered else 'rig'}: is required")
     if frames and rendered:
@@ -211,10 +364,14 @@ def given_frames(
         if wanted and frames:
             raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
     said = readout.beside(rig, gyro.file is not None, left)
-    card, notes = read_rig_file(rig, said, size_of(frames or left or []))
+    card, notes = read_rig_file(rig, said, size_of(frames or left or [], "left" if side_by_side else "whole"))
     say_notes("--rig", notes)
     if frames is not None and len(frames) == 4 and not (left or right):
         return RigInput(card=card, out=out, four=frames, left=[], right=[], gyro=gyro)
+    if side_by_side and left and not (frames or right):
+        return RigInput(
+            card=card, out=out, four=[], left=left, right=left, gyro=gyro, row_poses=row_poses, side_by_side=True
+        )
     if frames or not (left and right):
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(

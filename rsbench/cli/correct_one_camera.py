@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsbench.cli.console import echo
-from rsbench.cli.correct_input import GyroscopeOptions, ReadoutOptions, say_notes, size_of, target_row
+from rsbench.cli.correct_input import (
+    Arranged,
+    GyroscopeOptions,
+    ReadoutOptions,
+    say_notes,
+    size_of,
+    target_row,
+)
 from rsbench.cli.correct_output import listed
 
 if TYPE_CHECKING:
@@ -53,10 +60,10 @@ _UNIT = "length of the translation over one frame period"
 
 
 def correct_one_camera(
-    frames: list[Path] | None,
-    footage: Path | None,
+    given: Arranged,
     camera: Path | None,
-    out: Path | None,
+    fov: float | None,
+    out: Path,
     target: str,
     inpaint: bool | None,
     seed: int,
@@ -68,24 +75,63 @@ def correct_one_camera(
     Raises:
         RsbenchError: arguments that do not go together, or what ``correct_frames`` refuses.
     """
-    from rsbench.core.errors import RsbenchError
     from rsbench.interop.readers.rig_files import read_camera_file
     from rsbench.pipeline.footage import FrameSource
     from rsbench.pipeline.mono_sequence import Gyroscope
 
-    if out is None:
-        raise RsbenchError("--out: is required")
-    if (frames is None) == (footage is None):
-        raise RsbenchError("frames: with --camera give FRAME_0 FRAME_1 and so on, or --frames DIR|VIDEO")
-    source = FrameSource.of_files(frames) if frames is not None else FrameSource(footage or Path())
-    said = readout.beside(camera, gyro.file is not None, source.path)
-    card, notes = read_camera_file(camera, said, size_of(frames or source.path))
+    source = FrameSource.of_files(given.frames) if given.frames is not None else FrameSource(given.left or Path())
+    stated = readout.beside(camera, gyro.file is not None, source.path)
+    card, notes = read_camera_file(camera, stated, size_of(given.frames or source.path))
     say_notes("--camera", notes)
+    card = _with_fov(card, fov)
     _warn_of_other_rate(card, source, gyro.fps)
-    samples = gyro.samples(source)
-    log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro.farthest(source))
-    record = _correct(source, card, out, _options(source, target, inpaint, seed), log)
-    _say(record, out)
+    options = _options(source, target, inpaint, seed)
+    _say_input(given, source, options, out)
+    period = source.timeline.period_s
+    rate = None if period is None else 1.0 / period
+    samples = gyro.samples(source, rate)
+    log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro.farthest(source, rate))
+    record, lines = _correct(source, card, out, options, log)
+    _say(record, out, lines)
+
+
+def _with_fov(card: OneCameraCard, fov: float | None) -> OneCameraCard:
+    """The card with the field of view of ``--fov``."""
+    from dataclasses import replace
+
+    from rsbench.core.errors import RsbenchError
+
+    if fov is None:
+        return card
+    if not card.focal_unknown:
+        raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
+    try:
+        return replace(card, fov_deg=fov)
+    except ValueError as error:
+        raise RsbenchError(f"--fov: {error}") from error
+
+
+def _say_input(given: Arranged, source: FrameSource, options: MonoOptions, out: Path) -> None:
+    """What was assumed of the frames, a line each."""
+    from rsbench.pipeline.footage import FORECAST
+    from rsbench.storage.videos import ORIENTATIONS, UPRIGHT
+
+    height, width = next(iter(source)).shape[:2]
+    timeline = source.timeline
+    if given.words:
+        echo(given.words)
+    if source.orientation != UPRIGHT:
+        echo(
+            f"shown {ORIENTATIONS[source.orientation]}: rows, --target, --fov and scan are of frames as they are "
+            "stored, and the result is shown alike"
+        )
+    for line in timeline.words:
+        echo(line)
+    rate = "" if timeline.period_s is None else f" at {1.0 / timeline.period_s:.4g} frames/s"
+    forecast = FORECAST.words(len(timeline.starts), width * height)
+    echo(f"{len(timeline.twins)} frames of {width} x {height}{rate}: {forecast}")
+    row = "the middle row" if options.target_row is None else f"row {options.target_row:g}"
+    echo(f"output: {out}, each frame at the time of {row} (--target)")
 
 
 def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: float | None) -> None:
@@ -109,35 +155,86 @@ def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: fl
 
 def _correct(
     source: FrameSource, card: OneCameraCard, out: Path, options: MonoOptions, gyro: Gyroscope | None
-) -> dict[str, Any]:
-    """What motion.json holds, once all is written, as a folder or a video."""
+) -> tuple[dict[str, Any], list[str]]:
+    """What motion.json holds, once all is written, as a folder or a video; and lines about what was written."""
     from rsbench.dataset.corrected_frames import (
+        comparison_of_video,
         fps_of,
         fresh_folder,
         is_video,
+        page_of_video,
         read_corrected,
         video_place,
         write_record,
         write_video,
     )
-    from rsbench.report.corrected_page import write_page
 
     run = _run_key(source, card, options, is_video(out), gyro)
     if is_video(out):
         with video_place(out, run) as folder:
             record = _correct_into(folder, source, card, options, gyro, whole=False)
+            changed = _compare(folder, source, record, comparison_of_video(out).name)
+            _write_page(folder, out, source, record, changed, page_of_video(out).name)
             images = (read_corrected(folder, f"{each['number']:06d}") for each in record["frames"])
-            write_video(out, folder, images, fps_of(source.path), record)
-        return record
+            others = [folder / each(out).name for each in (comparison_of_video, page_of_video)]
+            lines = write_video(out, folder, images, fps_of(source.path), record, source, others)
+        return record, lines
     with fresh_folder(out, run=run) as folder:
         record = _correct_into(folder, source, card, options, gyro, whole=True)
         write_record(folder, record)
-        facts = [("readout ratio", _readout(record)), ("focal length", _focal(record))]
-        facts += [("gyroscope's clock", _clock(record))] if "gyro_clock" in record else []
-        facts += [("unit of depth", _UNIT)]
-        cards = _cards(folder, source, len(record["frames"]))
-        write_page(folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards)
-    return record
+        _write_page(folder, out, source, record, _compare(folder, source, record, ""), "report.html")
+    return record, []
+
+
+def _compare(folder: Path, source: FrameSource, record: dict[str, Any], video: str) -> list[float]:
+    """How much each frame changed, grey levels; writes a video of this name of frames before and after."""
+    from collections import deque
+
+    from rsbench.dataset.corrected_frames import DEFAULT_FPS, read_corrected
+    from rsbench.report.corrected_page import comparison
+    from rsbench.storage.videos import write_frames
+
+    changed = list[float]()
+    numbers = (each["number"] for each in record["frames"])
+    pairs = (
+        (before, read_corrected(folder, f"{number:06d}")) for number, before in zip(numbers, source, strict=True)
+    )
+    shown = comparison(pairs, source.orientation, changed)
+    if video:
+        write_frames(folder / video, shown, fps=DEFAULT_FPS, times=source.times)
+    else:
+        deque(shown, maxlen=0)
+    return changed
+
+
+def _write_page(
+    folder: Path, out: Path, source: FrameSource, record: dict[str, Any], changed: list[float], page: str
+) -> None:
+    from rsbench.dataset.corrected_frames import comparison_of_video, read_fused
+    from rsbench.report.corrected_page import card_of, most_changed, write_page
+
+    facts = [("readout ratio", _readout(record)), ("focal length", _focal(record))]
+    facts += [("gyroscope's clock", _clock(record))] if "gyro_clock" in record else []
+    alone = sum("reason" in each for each in record["frames"])
+    facts += [("frames corrected", f"{len(changed) - alone} of {len(changed)}")]
+    facts += [("change of a frame", f"{max(changed):.1f} grey levels at most, mean over its pixels")]
+    facts += [("unit of depth", _UNIT)]
+    chosen = most_changed(changed, _PAGE_FRAMES)
+    before = dict(zip(chosen, source.only(chosen), strict=True))
+    cards = [
+        card_of(f"frame {n}", before[n], read_fused(folder, f"{n:06d}"), unit="", orientation=source.orientation)
+        for n in chosen
+    ]
+    write_page(
+        folder,
+        f"rsbench correct: {out.name}",
+        "Rolling shutter to global shutter; the frames that changed most",
+        facts,
+        cards,
+        page=folder / page,
+        record=record,
+        video=comparison_of_video(out).name if (folder / comparison_of_video(out).name).is_file() else "",
+    )
 
 
 def _run_key(
@@ -172,8 +269,14 @@ def _correct_into(
     from rsbench.dataset.corrected_frames import written_entries
     from rsbench.pipeline.mono_sequence import correct_frames, know_camera
 
+    timeline = source.timeline
+    originals, run = timeline.originals, timeline.even_run()
+    taken = source if len(originals) == len(timeline.twins) else source.only(originals)
+    looked = taken if timeline.even else source.only(originals[run])
+    starts = None if timeline.even else timeline.starts
     try:
-        known = know_camera(source, source.count, card, options, gyro, progress_bar)
+        begins = None if starts is None else starts[run]
+        known = know_camera(looked, looked.count, card, options, gyro, progress_bar, begins)
     except NoMotionError as error:
         echo(f"rsbench: not corrected: {error}", err=True)
         raise typer.Exit(1) from None
@@ -182,8 +285,9 @@ def _correct_into(
     with progress_bar("correcting", max(source.count, 1)) as advance:
         for entry in entries:
             advance(f"frame {entry['number']}")
-        moments = correct_frames(source, known.camera, known.readout.shutter, options, len(entries), known.gyro)
-        record["frames"] = entries + _write(folder, moments, advance, whole=whole)
+        done, shutter = sum("copy_of" not in each for each in entries), known.readout.shutter
+        moments = correct_frames(taken, known.camera, shutter, options, done, known.gyro, starts)
+        record["frames"] = _write(folder, moments, entries, timeline.twins.tolist(), advance, whole=whole)
     return record
 
 
@@ -248,22 +352,32 @@ def _clock(record: dict[str, Any]) -> str:
     return f"{seen}, and set right" if clock["used"] else f"{seen}, and left as it is"
 
 
-def _say(record: dict[str, Any], out: Path) -> None:
+def _say(record: dict[str, Any], out: Path, lines: list[str]) -> None:
     """Exit 1 where some frames are not corrected."""
+    from rsbench.dataset.corrected_frames import page_of_video
+
     frames = {
         key: listed((each["number"], each[key]) for each in record["frames"] if key in each)
         for key in ("skipped", "reason")
     }
+    reasons = {each.get("reason") for each in record["frames"]}
+    if len(reasons) == 1 and None not in reasons:
+        frames["reason"] = f"all {len(record['frames'])} frames: {reasons.pop()}"
     motions = ((each["number"], each.get("motion", {})) for each in record["frames"])
     frames["gyro"] = listed((number, motion["gyro"]) for number, motion in motions if "gyro" in motion)
     corrected = sum("reason" not in each for each in record["frames"])
-    echo(f"readout ratio {_readout(record)}")
-    echo(f"focal length {_focal(record)}")
+    improve = "" if not record["readout_ratio_estimated"] else ": --readout-ratio or --shutter gives it"
+    echo(f"readout ratio {_readout(record)}{improve}")
+    improve = "" if record["focal_length_sigma"] is None else ": --fov or --camera gives it"
+    echo(f"focal length {_focal(record)}{improve}")
     if "gyro_clock" in record:
         echo(f"gyroscope's clock: {_clock(record)}")
+    for line in lines:
+        echo(line)
     echo(f"{corrected} of {len(record['frames'])} frames corrected")
-    place = out if out.is_file() else out / "report.html"
-    echo(f"{'video' if out.is_file() else 'report'}: {place.resolve()}")
+    if out.is_file():
+        echo(f"video: {out.resolve()}")
+    echo(f"report: {(page_of_video(out) if out.is_file() else out / 'report.html').resolve()}")
     if frames["gyro"]:
         echo(f"rsbench: corrected without the gyroscope: {frames['gyro']}", err=True)
     if frames["skipped"]:
@@ -273,17 +387,33 @@ def _say(record: dict[str, Any], out: Path) -> None:
         raise typer.Exit(1)
 
 
-def _write(folder: Path, moments: Any, advance: Any, *, whole: bool) -> list[dict[str, Any]]:
-    """Write every frame, and then what motion.json says of it: a frame that has that is complete."""
-    from rsbench.dataset.corrected_frames import write_entry, write_frame
+def _write(
+    folder: Path, moments: Any, entries: list[dict[str, Any]], twins: list[int], advance: Any, *, whole: bool
+) -> list[dict[str, Any]]:
+    """Write every frame, and then what motion.json says of it: a frame that has that is complete.
+
+    Args:
+        moments: of frames that are no copies, from those of ``entries`` on.
+        entries: of frames that are complete.
+        twins: for each frame the number of the one that it repeats, or its own.
+    """
+    from rsbench.dataset.corrected_frames import copy_frame, write_entry, write_frame
     from rsbench.pipeline.mono_sequence import translation_record
 
-    entries: list[dict[str, Any]] = []
+    def copies() -> None:
+        while len(entries) < len(twins) and twins[len(entries)] < len(entries):
+            number, twin = len(entries), twins[len(entries)]
+            copy_frame(folder, f"{number:06d}", f"{twin:06d}")
+            entries.append({**entries[twin], "number": number, "copy_of": twin})
+            write_entry(folder, entries[-1])
+            advance(f"frame {number}")
+
     moment: MonoMoment
+    copies()
     for moment in moments:
-        name = f"{moment.number:06d}"
-        write_frame(folder, name, moment.fused, whole=whole)
-        entry: dict[str, Any] = {"number": moment.number, **moment.fused.shares()}
+        number = len(entries)
+        write_frame(folder, f"{number:06d}", moment.fused, whole=whole)
+        entry: dict[str, Any] = {"number": number, **moment.fused.shares()}
         for key, words in (("reason", moment.fused.reason), ("skipped", moment.skipped)):
             if words:
                 entry[key] = words
@@ -291,15 +421,6 @@ def _write(folder: Path, moments: Any, advance: Any, *, whole: bool) -> list[dic
             entry["motion"] = translation_record(moment.found)
         write_entry(folder, entry)
         entries.append(entry)
-        advance(f"frame {moment.number}")
+        advance(f"frame {number}")
+        copies()
     return entries
-
-
-def _cards(folder: Path, source: FrameSource, count: int) -> list[dict[str, Any]]:
-    """Some frames for the page, from what was written."""
-    from rsbench.dataset.corrected_frames import read_fused
-    from rsbench.report.corrected_page import card_of
-
-    chosen = range(0, count, max(count // _PAGE_FRAMES, 1))[:_PAGE_FRAMES]
-    before = {number: image for number, image in enumerate(source) if number in chosen}
-    return [card_of(f"frame {n}", before[n], read_fused(folder, f"{n:06d}"), unit="") for n in chosen]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterable, Iterator
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -26,11 +26,12 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import cameras_record
-from rsbench.pipeline.footage import read_frame
+from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.mono_gyro import CONTRADICTED
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
+from rsbench.storage.videos import UPRIGHT, VideoFile, write_frames, written_as_video
 from rsbench.storage.work_folder import (
     HIDDEN,
     WORK,
@@ -42,7 +43,6 @@ from rsbench.storage.work_folder import (
     work_folder,
 )
 from rsbench.vision.fusion import Fused, Origin
-from rsbench.vision.images import eight_bit
 
 _TUM = "# frame periods, metres: the body in the world, which is the body at the start of the first frame\n"
 MASK_VALUES = {
@@ -145,14 +145,25 @@ def _exchange(fresh: Path, place: Path, old: Path) -> None:
         raise
 
 
+_PARTS = {"corrected": ".png", "mask": ".png", "depth": ".exr"}
+"""What is written of a frame, and as which files."""
+
+
+def copy_frame(folder: Path, name: str, twin: str) -> None:
+    """What ``write_frame`` wrote of one frame as that of another."""
+    for part, suffix in _PARTS.items():
+        if (written := folder / part / f"{twin}{suffix}").is_file():
+            shutil.copyfile(written, folder / part / f"{name}{suffix}")
+
+
 def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True) -> None:
-    """corrected/NAME.png and, of a ``whole`` frame, mask/NAME.png and depth/NAME.exr below ``folder``."""
-    for part in ("corrected", "mask", "depth") if whole else ("corrected",):
+    """corrected/NAME.png, mask/NAME.png and, of a ``whole`` frame, depth/NAME.exr below ``folder``."""
+    for part in _PARTS if whole else list(_PARTS)[:2]:
         (folder / part).mkdir(parents=True, exist_ok=True)
     write_png(folder / "corrected" / f"{name}.png", fused.image)
+    write_origin(folder / "mask" / f"{name}.png", fused.origin)
     if not whole:
         return
-    write_origin(folder / "mask" / f"{name}.png", fused.origin)
     depth = np.where(np.isfinite(fused.depth), fused.depth, np.float32(0.0))
     write_depth(folder / "depth" / f"{name}.exr", depth)
 
@@ -163,10 +174,11 @@ def read_corrected(folder: Path, name: str) -> NDArray[Any]:
 
 
 def read_fused(folder: Path, name: str) -> Fused:
-    """A whole frame that ``write_frame`` wrote; where it has no finite depth that is NaN."""
-    depth = read_depth(folder / "depth" / f"{name}.exr")
+    """A frame that ``write_frame`` wrote; where it has no finite depth that is NaN."""
+    image, file = read_corrected(folder, name), folder / "depth" / f"{name}.exr"
+    depth = read_depth(file) if file.is_file() else np.zeros(image.shape[:2], np.float32)
     return Fused(
-        image=read_corrected(folder, name),
+        image=image,
         origin=read_origin(folder / "mask" / f"{name}.png"),
         depth=np.where(depth > 0.0, depth, np.float32(np.nan)),
     )
@@ -312,15 +324,13 @@ def write_record(folder: Path, record: dict[str, Any]) -> None:
     write_json(folder / MARKER, record)
 
 
-_CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
-"""By the file's ending; FFV1 loses nothing."""
 DEFAULT_FPS = 30.0
 """Of frames that do not say it."""
 
 
 def is_video(out: Path) -> bool:
-    """Whether the ending of a name is that of a video."""
-    return out.suffix.lower() in _CODECS
+    """Whether the ending of a name is that of a video that is written; RsbenchError of another video."""
+    return written_as_video(out)
 
 
 def refuse_video(out: Path) -> None:
@@ -362,43 +372,56 @@ def _refuse_other_video(out: Path) -> None:
         raise RsbenchError(f"{out}: exists and was not written by 'rsbench correct'; choose another --out")
 
 
+def page_of_video(out: Path) -> Path:
+    """The report beside a video."""
+    return out.with_suffix(".html")
+
+
+def comparison_of_video(out: Path) -> Path:
+    """The video beside a video that shows frames as they were read and as they are written."""
+    return out.with_name(f"{out.stem}-compare.mp4")
+
+
 def record_of_video(out: Path) -> Path:
     """The file beside a video that says what ``motion.json`` says of frames."""
     return out.with_suffix(".json")
 
 
-def write_video(out: Path, half: Path, frames: Iterable[NDArray[Any]], fps: float, record: dict[str, Any]) -> None:
-    """Write frames (H, W[, 3]) RGB or grey, uint8 or uint16, and their record beside them.
+def write_video(
+    out: Path,
+    half: Path,
+    frames: Iterable[NDArray[Any]],
+    fps: float,
+    record: dict[str, Any],
+    source: FrameSource | None = None,
+    others: Sequence[Path] = (),
+) -> list[str]:
+    """Write frames (H, W[, 3]) RGB or grey, uint8 or uint16, and their record beside them; returns notes.
 
     Args:
         out: the video.
         half: a folder on the same disk, for what is not complete.
         frames: all of one size.
-        fps: frames per second.
+        fps: frames per second of images.
         record: what was found, for JSON.
+        source: the frames read: what is written has their times, orientation, colours and sound.
+        others: files that are ready in ``half`` and go beside the video, with the video's name in theirs.
 
     Raises:
-        RsbenchError: OpenCV has no such encoder here, or the file cannot be written.
+        RsbenchError: there is no such encoder here, or the file cannot be written.
     """
     part = half.parent / f"part{out.suffix.lower()}"
-    writer, count = None, 0
-    for frame in frames:
-        count += 1
-        (level,) = eight_bit([frame])
-        height, width = level.shape[:2]
-        if writer is None:
-            code = cv2.VideoWriter.fourcc(*_CODECS[out.suffix.lower()])
-            writer = cv2.VideoWriter(str(part), code, fps, (width, height))
-            if not writer.isOpened():
-                raise RsbenchError(f"--out {out}: OpenCV cannot write such a video here; give a folder, for PNG")
-        writer.write(cv2.cvtColor(level, cv2.COLOR_RGB2BGR if level.ndim == 3 else cv2.COLOR_GRAY2BGR))
-    if writer is None:
-        raise RsbenchError(f"--out {out}: there are no frames to write")
-    writer.release()
-    if not part.is_file() or cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT) != count:
+    like, times = (None, None) if source is None else (source.video, source.times)
+    orientation = UPRIGHT if source is None else source.orientation
+    count, notes = write_frames(part, frames, fps=fps, times=times, like=like, orientation=orientation, named=out)
+    written = VideoFile.open(part).count
+    if written not in (0, count):
         raise RsbenchError(f"--out {out}: the video could not be written; is the disk full?")
     write_json(record_of_video(out), {"video": out.name, **record})
+    for each in others:
+        os.replace(each, out.with_name(each.name))
     os.replace(part, out)
+    return notes
 
 
 def fps_of(path: Path) -> float:
@@ -408,9 +431,4 @@ def fps_of(path: Path) -> float:
 
 def said_fps(path: Path) -> float | None:
     """Frames per second of a video file; None for a folder or where the file does not say."""
-    if not path.is_file():
-        return None
-    video = cv2.VideoCapture(str(path))
-    fps = float(video.get(cv2.CAP_PROP_FPS))
-    video.release()
-    return fps if np.isfinite(fps) and 1.0 <= fps <= 1000.0 else None
+    return VideoFile.open(path).rate if path.is_file() else None

@@ -6,12 +6,17 @@ into columns, and rows are what a rolling shutter reads.
 
 from __future__ import annotations
 
+import copy
+import hashlib
+import itertools
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -25,15 +30,16 @@ from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
-from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes
+from rsbench.core.so3 import FloatArray
+from rsbench.storage.untrusted_files import check_image_size, read_bytes
+from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, Times, VideoFile
 
 _SMALLEST = 32
 """Pixels of the shorter side; below that there is nothing to match."""
 _LARGEST_OFFSET_PX = 10.0
-_MOST_FRAMES = 1e9
 _LONGEST_S = 1e4
 """Of a frame period."""
-_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -227,13 +233,18 @@ def _checked(pixels: NDArray[Any], where: str) -> NDArray[Any]:
     """RGB or grey image from OpenCV's BGR or grey."""
     if pixels.dtype not in (np.uint8, np.uint16):
         raise RsbenchError(f"{where}: has {pixels.dtype} pixels; 8 and 16 bit are allowed")
+    _checked_size(pixels, where)
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., 0])
+
+
+def _checked_size(pixels: NDArray[Any], where: str) -> NDArray[Any]:
     if min(pixels.shape[:2]) < _SMALLEST:
         raise RsbenchError(
             f"{where}: is {pixels.shape[1]} x {pixels.shape[0]} pixels; at least {_SMALLEST} x {_SMALLEST} needed"
         )
-    if pixels.ndim == 3 and pixels.shape[2] == 3:
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
-    return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., 0])
+    return pixels
 
 
 def read_four(paths: dict[View, Path]) -> dict[View, NDArray[Any]]:
@@ -270,27 +281,159 @@ def _kind(frame: NDArray[Any]) -> str:
     return f"{width} x {height} {8 * frame.dtype.itemsize}-bit {colour}"
 
 
+_ABOUT = 0.15
+
+
+def about_one(periods: Any) -> Any:
+    """Which intervals (...) are so near one frame period that a trajectory may take them as one."""
+    return np.abs(np.asarray(periods) - 1.0) <= _ABOUT
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Timeline:
+    """When the frames of a camera were taken, and which of them are copies."""
+
+    twins: NDArray[np.intp]
+    """(n,) for each frame the number of the one that it repeats; its own where it is none."""
+    starts: FloatArray
+    """(m,) of those that are no copies: first rows, frame periods since that of the first."""
+    period_s: float | None
+    """Median time from one of those to the next, seconds; None of images."""
+    first_s: float
+    """Time of the first frame as the container has it, seconds."""
+
+    @property
+    def originals(self) -> NDArray[np.intp]:
+        """(m,) numbers of the frames that are no copies."""
+        return np.flatnonzero(self.twins == np.arange(len(self.twins)))
+
+    @property
+    def even(self) -> bool:
+        """Whether all of those are one frame period apart."""
+        return bool(np.all(np.diff(self.starts) == 1.0))
+
+    def even_run(self) -> slice:
+        """Of those, the longest run of frames about one period apart, or all where none has ``_LEAST_RUN``."""
+        breaks = np.flatnonzero(~about_one(np.diff(self.starts))) + 1
+        edges = np.concatenate([[0], breaks, [len(self.starts)]])
+        longest = int(np.argmax(np.diff(edges)))
+        low, high = int(edges[longest]), int(edges[longest + 1])
+        return slice(low, high) if high - low >= _LEAST_RUN else slice(0, len(self.starts))
+
+    @property
+    def words(self) -> list[str]:
+        """What is not as of most videos, a line each."""
+        lines, copies = list[str](), len(self.twins) - len(self.starts)
+        if copies:
+            lines.append(f"{copies} of {len(self.twins)} frames repeat the one before: they get its result")
+        uneven = np.diff(self.starts)
+        if not self.even:
+            lines.append(
+                f"{np.count_nonzero(uneven != 1.0)} of {len(uneven)} intervals between frames are not the usual "
+                f"{1000.0 * (self.period_s or 0.0):.1f} ms ({uneven.min():.2g} to {uneven.max():.3g} times that): "
+                "taken as their time stamps say"
+            )
+        return lines
+
+
+_LEAST_RUN = 12
+"""Frames by which a shutter is found as well as by more, or nearly."""
+_NEARLY, _SHARE, _NEIGHBOURS = 0.5, 0.1, 3
+"""Grey levels, and share of the difference of neighbouring frames, below which a frame is a copy."""
+_COPIES, _EVENLY, _SPREAD = 4, 1.05, 1.0
+"""Copies at like distances, and periods per original, from which on these were taken evenly, within so many."""
+_JITTER = 0.01
+"""Frame periods by which time stamps err, beside their rounding."""
+
+
+def _copies(nearly: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Twins (n,) of frames by the grey levels that each differs by from the one before."""
+    count = len(nearly)
+    finite = np.where(np.isfinite(nearly), nearly, 0.0)
+    padded = np.pad(finite, _NEIGHBOURS)
+    around = np.max(np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1), axis=1)
+    copies = (nearly == 0.0) | ((nearly < _NEARLY) & (nearly < _SHARE * around))
+    if np.count_nonzero(~copies) < 2:  # nothing moves at all
+        return np.arange(count)
+    return np.maximum.accumulate(np.where(copies, 0, np.arange(count)))
+
+
+def _spread(originals: NDArray[np.intp], count: int) -> float | None:
+    """Periods between frames that were taken evenly, where copies at like distances make up another rate."""
+    copies = np.setdiff1d(np.arange(count), originals)
+    if len(copies) < _COPIES or len(originals) < 2 or np.ptp(np.diff(copies)) > 1:
+        return None
+    slope, start = np.polyfit(np.arange(len(originals)), originals, 1)
+    off = np.abs(originals - (start + slope * np.arange(len(originals))))
+    return float(slope) if slope > _EVENLY and np.max(off) < _SPREAD else None
+
+
+def _timeline(twins: NDArray[np.intp], times: Times | None) -> Timeline:
+    count = len(twins)
+    originals = np.flatnonzero(twins == np.arange(count))
+    seconds = None if times is None else times.seconds
+    if len(originals) < 2:
+        return Timeline(twins=twins, starts=np.arange(float(len(originals))), period_s=None, first_s=0.0)
+    spread = _spread(originals, count)
+    if seconds is None or times is None:
+        starts = np.arange(float(len(originals))) if spread else originals - float(originals[0])
+        return Timeline(twins=twins, starts=starts.astype(np.float64), period_s=None, first_s=0.0)
+    period = float(np.median(np.diff(seconds[originals])))
+    first = float(seconds[0])
+    if spread:
+        period = spread * float(np.median(np.diff(seconds)))
+        return Timeline(twins=twins, starts=np.arange(float(len(originals))), period_s=period, first_s=first)
+    steps = np.diff(seconds[originals]) / period
+    rounded = np.maximum(np.rint(steps), 1.0)
+    exact = np.abs(steps - rounded) <= 2.0 * float(times.base) / period + _JITTER
+    starts = np.concatenate([[0.0], np.cumsum(np.where(exact, rounded, steps))])
+    if bool(np.all(exact)):
+        period = float((seconds[originals][-1] - seconds[originals][0]) / starts[-1])
+    return Timeline(twins=twins, starts=starts, period_s=period, first_s=first)
+
+
+def _natural(file: Path) -> tuple[list[tuple[int, str]], str]:
+    """Key of an order in which 2 comes before 10."""
+    parts = re.split(r"(\d+)", file.stem)
+    return [(int(each), "") if k % 2 else (0, each) for k, each in enumerate(parts)], file.name
+
+
+def _tag_of(file: Path) -> int:
+    """EXIF's orientation of an image; that of an upright one where it says none."""
+    from PIL import Image
+
+    with suppress(Exception), Image.open(file) as image:  # Pillow raises various exceptions for a damaged file
+        number = int(image.getexif().get(_EXIF_ORIENTATION, UPRIGHT))
+        return number if number in ORIENTATIONS else UPRIGHT
+    return UPRIGHT
+
+
+_EXIF_ORIENTATION = 0x0112
+Part: TypeAlias = Literal["whole", "left", "right"]
+
+
 class FrameSource:
     """Frames of one camera, in order, from a folder of images (by name) or a video; can be read repeatedly."""
 
-    def __init__(self, path: Path) -> None:
-        """Open a folder or video.
+    def __init__(self, path: Path, part: Part = "whole") -> None:
+        """Open a folder or video; ``part``: half of each frame, of two cameras side by side.
 
         Raises:
-            RsbenchError: missing, no frames, or not a video that OpenCV can read.
+            RsbenchError: missing, no frames, or not a video that can be read.
         """
-        self.path = path
+        self.path, self._part = path, part
         self._files: list[Path] = []
+        self._video: VideoFile | None = None
+        self._kept: frozenset[int] | None = None
         if path.is_dir():
-            self._files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
+            images = (file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+            self._files = sorted((file for file in images if not file.name.startswith(".")), key=_natural)
             if not self._files:
-                raise RsbenchError(f"{path}: no images; files may end in {', '.join(sorted(_IMAGE_SUFFIXES))}")
+                raise RsbenchError(f"{path}: no images; files may end in {', '.join(sorted(IMAGE_SUFFIXES))}")
             self.count = len(self._files)
         elif path.is_file():
-            video = self._open()
-            count = video.get(cv2.CAP_PROP_FRAME_COUNT)  # as the file says: progress alone believes it
-            self.count = int(count) if 0.0 <= count < _MOST_FRAMES else 0
-            video.release()
+            self._video = VideoFile.open(path)
+            self.count = self._video.count  # as the file says: progress alone believes it
         else:
             raise RsbenchError(f"{path}: no such folder or video")
 
@@ -301,35 +444,88 @@ class FrameSource:
             raise RsbenchError("no frames")
         source = cls.__new__(cls)
         source.path, source._files, source.count = files[0].parent, files, len(files)
+        source._part, source._video, source._kept = "whole", None, None
+        return source
+
+    @property
+    def video(self) -> VideoFile | None:
+        """The file; None of images."""
+        return self._video
+
+    @property
+    def orientation(self) -> int:
+        """EXIF's number: how frames, which are read as they are stored, are to be turned for a person."""
+        return self._video.orientation if self._video is not None else _tag_of(self._files[0])
+
+    @cached_property
+    def times(self) -> Times | None:
+        """Of a video's frames; None of images."""
+        return None if self._video is None else self._video.times()
+
+    @cached_property
+    def timeline(self) -> Timeline:
+        """When each frame was taken, and which of them are copies; reads all of them."""
+        if self.times is not None:
+            self.count = len(self.times.seconds)
+            return _timeline(_copies(self.times.nearly), self.times)
+        digests = [hashlib.sha256(read_bytes(file)).digest() for file in self._files]
+        same = [0.0 if a == b else np.inf for a, b in itertools.pairwise(digests)]
+        return _timeline(_copies(np.array([np.inf, *same], dtype=np.float32)), None)
+
+    def only(self, numbers: Iterable[int]) -> FrameSource:
+        """The frames of these numbers."""
+        source = copy.copy(self)
+        source._kept = frozenset(int(each) for each in numbers)
+        source.count = len(source._kept)
         return source
 
     def identity(self) -> list[str]:
-        """Of its files: paths, sizes and times of change."""
+        """Of its files: paths, sizes and times of change; and which part of them is taken."""
         files = [(path.resolve(), path.stat()) for path in self._files or [self.path]]
-        return [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in files]
-
-    def _open(self) -> Any:
-        video = cv2.VideoCapture(str(self.path))
-        if not video.isOpened():
-            raise RsbenchError(f"{self.path}: cannot be read as a video")
-        width, height = (video.get(what) for what in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        check_size(self.path, (int(width), int(height)))
-        # Turning frames would turn rows into columns.
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        return video
+        part = [] if self._part == "whole" else [self._part]
+        return part + [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in files]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
+        kept = self._kept
         if self._files:
-            yield from map(read_frame, self._files)
-            return
-        video = self._open()
-        try:
-            number = 0
-            while True:
-                ok, pixels = video.read()
-                if not ok:
-                    return
-                yield _checked(pixels, f"{self.path}, frame {number}")
-                number += 1
-        finally:
-            video.release()
+            files = enumerate(self._files)
+            frames = (read_frame(file) for number, file in files if kept is None or number in kept)
+        else:
+            assert self._video is not None
+            decoded = enumerate(self._video.frames())
+            last = None if kept is None else max(kept) + 1
+            frames = (
+                _checked_size(frame, f"{self.path}, frame {number}")
+                for number, frame in itertools.islice(decoded, last)
+                if kept is None or number in kept
+            )
+        for frame in frames:
+            yield self._taken(frame)
+
+    def _taken(self, frame: NDArray[Any]) -> NDArray[Any]:
+        if self._part == "whole":
+            return frame
+        half = frame.shape[1] // 2
+        return np.ascontiguousarray(frame[:, :half] if self._part == "left" else frame[:, half : 2 * half])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forecast:
+    """What correcting frames of one camera takes, measured on two cores (``benchmarks/footage_sizes.py``)."""
+
+    seconds: float
+    """For a million pixels of a frame."""
+    bytes: float
+    """For a pixel."""
+    start_s: float
+    start_bytes: float
+
+    def words(self, frames: int, pixels: int) -> str:
+        """In words, for so many frames of so many pixels."""
+        seconds = self.start_s + self.seconds * frames * pixels / 1e6
+        gigabytes = (self.start_bytes + self.bytes * pixels) / 1e9
+        time = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
+        return f"about {time} on two cores, {gigabytes:.1f} GB of memory"
+
+
+FORECAST = Forecast(seconds=2.5, bytes=1000.0, start_s=10.0, start_bytes=4e8)

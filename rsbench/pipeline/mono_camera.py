@@ -33,7 +33,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import CameraCard, check_alike
-from rsbench.pipeline.mono_correction import flow_matches, refusal, trajectory_matches
+from rsbench.pipeline.mono_correction import STILL, flow_matches, refusal, trajectory_matches
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
 
@@ -199,6 +199,8 @@ def _found(
             windows.append(examine_alone(matches, camera, known, options, seed))
             advance(f"pair {len(windows)}")
     assert camera is not None
+    if not windows and why == STILL:
+        raise NoMotionError(why)
     if not windows:
         raise NoMotionError(f"cannot tell the readout ratio: {why}. Give readout_ratio in the camera's card")
     return _settled(conclude_alone(windows), camera, card)

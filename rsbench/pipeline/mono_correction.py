@@ -340,7 +340,7 @@ class SeenPair:
     matches: FloatArray
     """(n, 4) x0, y0, x1, y1, px, see ``trajectory_matches``."""
     even: bool = True
-    """Whether one frame period lies between them."""
+    """Whether about one frame period lies between them."""
 
     @property
     def motion(self) -> Motion | None:

@@ -23,6 +23,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.footage import about_one
 from rsbench.pipeline.mono_correction import (
     FoundOwnMotion,
     error_px,
@@ -95,7 +96,7 @@ def pair_rates(
     Args:
         frames, count: in order, gone through once, and how many there are, about.
         advance: called for each pair that is looked at.
-        begins: (n,) times of the frames' first rows, frame periods; pairs that are not one apart show nothing here.
+        begins: (n,) times of the frames' first rows, frame periods; pairs not about 1 apart are left out.
     """
     turn = turned(camera, shutter)
     rig = StereoRig(camera=turn.camera, baseline=1.0)
@@ -103,7 +104,7 @@ def pair_rates(
     every = max((count - 1) // PAIRS, 1)
     for number, images in islice(enumerate(pairwise(frames)), 0, every * PAIRS, every):
         advance(f"frame {number}")
-        if begins is not None and begins[number + 1] - begins[number] != 1.0:
+        if begins is not None and not about_one(begins[number + 1] - begins[number]):
             continue
         pair = [turn.image(image) for image in images]
         flows = find_flows(pair)

@@ -23,7 +23,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.footage import CameraCard, Progress, check_alike, no_progress
+from rsbench.pipeline.footage import CameraCard, Progress, about_one, check_alike, no_progress
 from rsbench.pipeline.mono_camera import (
     IN_ORDER,
     PAIRS,
@@ -202,7 +202,7 @@ def correct_frames(
         done: so many first frames are left out.
         gyro: (n, 4) tau, w of a gyroscope, as of ``Correspondences``: tau 0 is the first row of the first frame.
         starts: (n,) increasing times of the frames' first rows, frame periods; 0, 1, 2, ... if absent. The readout
-            takes a smaller share of a longer interval, and a trajectory goes through intervals of 1 alone.
+            takes a smaller share of a longer interval, and a trajectory goes through intervals of about 1 alone.
 
     Raises:
         RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
@@ -271,7 +271,9 @@ def _pairs(
     def kept(seen: Iterable[_Seen]) -> Iterator[SeenPair]:
         for each in seen:
             waiting.append(each)
-            yield SeenPair(found=each.found, matches=each.matches, even=_span(each.number, starts)[1] == 1.0)
+            yield SeenPair(
+                found=each.found, matches=each.matches, even=bool(about_one(_span(each.number, starts)[1]))
+            )
 
     def ready(at: tuple[_Seen, FoundOwnMotion | None]) -> tuple[_Seen, _Pair | None]:
         seen, found = at

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from rsbench.dataset.corrected_frames import MARKER
 from rsbench.report import pictures
 from rsbench.report.pictures import Image
 from rsbench.storage.files import read_json, write_bytes
+from rsbench.storage.videos import UPRIGHT, upright
 from rsbench.vision.fusion import Fused, Origin
 
 _WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
@@ -137,21 +138,28 @@ _LEGEND = {
 _LONGEST = 900
 
 
-def card_of(title: str, before: NDArray[Any], fused: Fused, unit: str = " m") -> dict[str, Any]:
+_KNOWN = 0.5
+"""Share of the pixels whose depth is known, from which on depth is shown."""
+
+
+def card_of(
+    title: str, before: NDArray[Any], fused: Fused, unit: str = " m", orientation: int = UPRIGHT
+) -> dict[str, Any]:
     """One frame of the page: its pictures as URIs, small enough to carry many; ``unit`` of depth."""
     finite = np.isfinite(fused.depth) & (fused.depth > 0)
+    known = float(np.mean(finite))
     inverse = np.where(finite, 1.0 / np.where(finite, fused.depth, 1.0), np.nan)
-    low, high = np.nanpercentile(inverse, [1, 99]) if np.any(finite) else (0.0, 1.0)
+    low, high = np.nanpercentile(inverse, [1, 99]) if known else (0.0, 1.0)
     origin_picture = np.zeros((*fused.origin.shape, 3), dtype=np.uint8)
     for origin, colour in _COLOURS.items():
         origin_picture[fused.origin == origin] = colour
     shares = fused.shares()
     return {
         "title": title,
-        "before": _uri(_eight_bit(before)),
-        "after": _uri(_eight_bit(fused.image)),
-        "origin": _uri(origin_picture),
-        "depth": _uri(pictures.colour_map(inverse, low, high)),
+        "before": _uri(upright(_eight_bit(before), orientation)),
+        "after": _uri(upright(_eight_bit(fused.image), orientation)),
+        "origin": _uri(upright(origin_picture, orientation)),
+        "depth": _uri(upright(pictures.colour_map(inverse, low, high), orientation)) if known >= _KNOWN else None,
         "near": f"{1.0 / high:.3g}{unit}",
         "far": f"{1.0 / low:.3g}{unit}" if low > 0 else "infinity",
         "shares": [
@@ -172,27 +180,90 @@ def write_page(
     facts: list[tuple[str, str]],
     cards: list[Any],
     trajectory: dict[str, Any] | None = None,
+    *,
+    page: Path | None = None,
+    record: Mapping[str, Any] | None = None,
+    video: str = "",
 ) -> None:
-    """report.html: opens from disk, needs no other file; ``trajectory`` is of ``draw_trajectory``."""
+    """report.html: opens from disk, needs no other file; ``trajectory`` is of ``draw_trajectory``.
+
+    Args:
+        page: another place for it.
+        record: what motion.json says, where it is not in ``folder``.
+        video: name of a video beside it that shows the frames before and after.
+    """
     environment = Environment(
         loader=PackageLoader("rsbench.report"),
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
     )
-    record = read_json(folder / MARKER)
-    page = environment.get_template("correct.html.j2").render(
+    record = read_json(folder / MARKER) if record is None else record
+    html = environment.get_template("correct.html.j2").render(
         title=title,
         subtitle=subtitle,
         facts=facts,
         cards=cards,
         trajectory=trajectory,
+        video=video,
+        left=_left_alone(record.get("frames", [])),
         record=json.dumps(record, indent=1)[:20000],
     )
-    write_bytes(folder / "report.html", page.encode())
+    write_bytes(page or folder / "report.html", html.encode())
+
+
+def _left_alone(frames: Any) -> list[tuple[str, str]]:
+    """Numbers of frames that are as they were read, and why, of each reason."""
+    reasons = dict[str, list[int]]()
+    for each in frames if isinstance(frames, list) else []:
+        if "reason" in each:
+            reasons.setdefault(each["reason"], []).append(each["number"])
+    return [(ranges(numbers), why) for why, numbers in reasons.items()]
+
+
+def ranges(numbers: Sequence[int]) -> str:
+    """Increasing numbers in words, such as "0 to 4, 7"."""
+    runs = list[list[int]]()
+    for number in numbers:
+        if runs and runs[-1][-1] == number - 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return ", ".join(" to ".join(map(str, run)) for run in runs)
+
+
+_WIDEST = 1920
+"""Columns of a comparison."""
+_COARSE = 4
+"""Pixels for one by which changes are measured."""
+
+
+def comparison(
+    pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]], orientation: int, changed: list[float]
+) -> Iterator[Image]:
+    """Frames before and after, side by side as they are shown; ``changed`` gets the grey levels between both."""
+    for before, after in pairs:
+        both = _eight_bit(np.stack([before, after]) if before.ndim == 3 else np.stack([before, after])[..., None])
+        old, new = both if before.ndim == 3 else np.repeat(both, 3, axis=-1)
+        small = [each[::_COARSE, ::_COARSE].astype(np.float32) for each in (old, new)]
+        changed.append(float(np.mean(np.abs(small[0] - small[1]))))
+        both = np.hstack([upright(each, orientation) for each in (old, new)])
+        scale = min(_WIDEST / both.shape[1], 1.0)
+        size = [2 * max(int(side * scale) // 2, 1) for side in both.shape[1::-1]]
+        yield both if scale == 1.0 else np.asarray(cv2.resize(both, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def most_changed(changed: Sequence[float], count: int) -> list[int]:
+    """Numbers of at most so many frames that changed most, in order, some frames apart."""
+    chosen = list[int]()
+    apart = max(len(changed) // (4 * count), 1)
+    for number in np.argsort(changed)[::-1].tolist():
+        if len(chosen) < count and all(abs(number - other) >= apart for other in chosen):
+            chosen.append(number)
+    return sorted(chosen)
 
 
 def _eight_bit(image: NDArray[Any]) -> Image:
-    """RGB uint8; 16-bit images are stretched to their brightest pixels, which may use few of the 16 bits."""
+    """RGB uint8, grey of more than two axes as it is; 16 bits, which may be used in part, up to the brightest."""
     if image.dtype != np.uint8:
         top = max(float(np.percentile(image, 99.9)), 1.0)
         image = np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)

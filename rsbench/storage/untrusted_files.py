@@ -31,8 +31,8 @@ CARD_BYTES = MB
 """Limit for a TOML card: its reader takes seconds for a MB."""
 FILE_BYTES = 256 * MB
 """Limit for any other file that is read at once, and for the arrays of an npz file."""
-PIXELS = 1 << 21
-"""Limit for one frame, slightly more than 1920 x 1080: correcting four takes 0.5 to 0.7 kB for each pixel."""
+PIXELS = 1 << 23
+"""Limit for one frame, slightly more than 3840 x 2160: correcting four takes 0.5 to 0.7 kB for each pixel."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
 """Names of sequences, which become folders."""
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)

@@ -27,6 +27,7 @@ OTHER = {
     "fast": ["--fast"],
     "row_poses": ["--row-poses"],
     "rectify": ["--rectify"],
+    "side_by_side": ["--side-by-side"],
     "rig": ["--rig", "rig.toml"],
     "left": ["--left", "left"],
     "right": ["--right", "right"],
@@ -35,11 +36,12 @@ OTHER = {
     "gyro_offset": ["--gyro-offset", "0.1"],
     "readout_ratio": ["--readout-ratio", "0.5"],
     "shutter": ["--shutter", "gopro-hero6-4k30"],
+    "fov": ["--fov", "60"],
 }
 """A value of each option that is not its default."""
 OF_INPUT = {"frames", "out", "camera", "footage"}
 """What every run, or one of its two kinds, has to give."""
-ONE_CAMERA = {"target", "inpaint", "seed", "gyro", "fps", "gyro_offset", "readout_ratio", "shutter"}
+ONE_CAMERA = {"target", "inpaint", "seed", "gyro", "fps", "gyro_offset", "readout_ratio", "shutter", "fov"}
 
 
 def _parameters() -> set[str]:
@@ -72,16 +74,17 @@ def test_options_of_one_camera_reach_its_correction(
     assert default != other
 
 
-@pytest.mark.parametrize("option", sorted(OTHER.keys() - {"rig", "left", "right", "row_poses", "gyro"}))
+@pytest.mark.parametrize("option", sorted(OTHER.keys() - {"rig", "left", "right", "row_poses", "gyro", "fov"}))
 def test_options_of_a_rig_reach_its_correction(
     option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[Any] = []
     monkeypatch.setattr(command, "_correct_given", lambda *known: calls.append(known))
     (tmp_path / "rig.toml").write_text(RIG)
-    given = ["--left", "left", "--right", "right", "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out"]
+    sides = ["--left", "left"] if option == "side_by_side" else ["--left", "left", "--right", "right"]
+    given = [*sides, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out"]
     with_log = [*given, *OTHER["gyro"]]
-    run_here("correct", *with_log)
+    run_here("correct", *with_log, *(["--right", "right"] if option == "side_by_side" else []))
     run_here("correct", *with_log, *OTHER[option])
     default, other = calls
     assert repr(default) != repr(other)
@@ -91,5 +94,7 @@ def test_options_of_a_rig_reach_its_correction(
 def test_options_of_a_sequence_are_refused_for_two_times(option: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(RIG)
     four = [tmp_path / f"{name}.png" for name in ("l0", "r0", "l1", "r1")]
+    for each in four:
+        each.touch()
     result = run_here("correct", *four, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out", *OTHER[option])
     assert_refused(result, OTHER[option][0])

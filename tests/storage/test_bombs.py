@@ -90,7 +90,7 @@ def tiff(path: Path) -> None:
 
 
 def webp(path: Path) -> None:
-    Image.new("RGB", (16_000, 200)).save(path, lossless=True, method=0)
+    Image.new("RGB", (16_000, 600)).save(path, lossless=True, method=0)
 
 
 def pgm(path: Path) -> None:
@@ -144,8 +144,8 @@ def text(content: str) -> Callable[[Path], object]:
 
 def avi(path: Path) -> None:
     """A real video, of frames that are too large."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (2000, 1500))
-    writer.write(np.zeros((1500, 2000, 3), np.uint8))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (4000, 2200))
+    writer.write(np.zeros((2200, 4000, 3), np.uint8))
     writer.release()
 
 
@@ -164,10 +164,10 @@ def ply(path: Path) -> None:
 
 GB = 1 << 30
 BOMBS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "a.png": (png, r"20000 x 20000 pixels: 400000000 is more than \d+; if meant, set RSBENCH_LIMITS=191"),
+    "a.png": (png, r"20000 x 20000 pixels: 400000000 is more than \d+; if meant, set RSBENCH_LIMITS=48"),
     "a.jpg": (jpeg, r"60000 x 60000 pixels"),
     "a.tif": (tiff, r"100000 x 100000 pixels"),
-    "a.webp": (webp, r"16000 x 200 pixels"),
+    "a.webp": (webp, r"16000 x 600 pixels"),
     "a.pgm": (pgm, r"90000 x 90000 pixels"),
     "a.exr": (exr, r"100000 x 100000 pixels|damaged or not an EXR"),
     "a.npz": (npz, r"bytes of all arrays: \d+ is more than"),
@@ -178,7 +178,7 @@ BOMBS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a.toml": (sparse(GB), r"bytes: 1073741824 is more than"),
     "b.toml": (text("x = " + "[" * 2000), r"nested too deeply"),
     "a.problem": (sparse(GB), r"bytes: 1073741824 is more than"),
-    "a.avi": (avi, r"2000 x 1500 pixels"),
+    "a.avi": (avi, r"4000 x 2200 pixels"),
     "a.glb": (glb, r"values of all accessors: 3000000000 is more than"),
     "a.ply": (ply, r"states 4000000000 elements"),
 }
