@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import bdtr, betaincinv  # scipy.stats takes a second to load
+from scipy.special import bdtr, betaincinv, stdtrit  # scipy.stats takes a second to load
 
 from rsbench.benchmark.seeds import generator
 from rsbench.core.so3 import FloatArray
@@ -62,6 +62,43 @@ def share_interval(successes: int, trials: int, coverage: float = COVERAGE) -> I
     low = betaincinv(successes, failures + 1, tail) if successes > 0 else 0.0
     high = betaincinv(successes + 1, failures, 1.0 - tail) if failures > 0 else 1.0
     return Interval(float(low), float(high))
+
+
+def scene_means(values: FloatArray, scenes: Sequence[str]) -> FloatArray:
+    """Means (..., scenes), in the order of their names, of values (..., n)."""
+    names, labels = np.unique(np.asarray(scenes), return_inverse=True)
+    weights = np.zeros((len(names), len(labels)))
+    weights[labels, np.arange(len(labels))] = 1.0
+    return values @ (weights / weights.sum(axis=1, keepdims=True)).T
+
+
+def mean_interval(means: FloatArray) -> Interval:
+    """Interval of the mean of independent means (k,) of scenes; without bounds for a single scene."""
+    k = len(means)
+    if k < 2:
+        return Interval(-np.inf, np.inf)
+    half = float(stdtrit(k - 1, 0.5 + 0.5 * COVERAGE) * np.std(means, ddof=1) / np.sqrt(k))
+    middle = float(np.mean(means))
+    return Interval(middle - half, middle + half)
+
+
+def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True) -> tuple[float, float, float]:
+    """The mean over scenes of values (n,), and the ends of its interval.
+
+    A ``share`` lies in [0, 1], and so does its interval. Of yes or no of problems that are independent the
+    interval is exact; of those that share scenes it has that one inside: scenes that all say no do not bound the
+    share to 0.
+    """
+    means = scene_means(values, scenes)
+    low, high = mean_interval(means)
+    if not share:
+        return float(np.mean(means)), low, high
+    if np.all((values == 0.0) | (values == 1.0)):
+        exact = share_interval(int(np.sum(values)), len(values))
+        if len(means) == len(values):
+            return float(np.mean(means)), exact.low, exact.high
+        low, high = min(low, exact.low), max(high, exact.high)
+    return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 
 
 def bootstrap_interval(

@@ -526,8 +526,9 @@ def _show(
         echo(table(lines).to_csv(index=False, lineterminator="\n"), nl=False)
         return
     lines = [line for line in lines if method in (None, line.scored.header.method)]
+    stated = any(line.calibration for line in lines)
     for uses in dict.fromkeys(line.uses for line in lines):
-        rows = [_cells(line) for line in lines if line.uses == uses]
+        rows = [_cells(line) | (line.stated_words if stated else {}) for line in lines if line.uses == uses]
         print_rows(
             f"{protocol}, split {split}, uses {uses}",
             list(rows[0]),

@@ -13,7 +13,7 @@ import pandas as pd
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.standings import LEVELS, Triple
+from rsbench.benchmark.leaderboard.deviations import LEVELS, Triple
 from rsbench.benchmark.statistics import Interval, median_interval, typical_interval
 from rsbench.core.so3 import FloatArray
 

@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.board import Scored, about_split, entries_of, place, splits_of
+from rsbench.benchmark.leaderboard.deviations import LEVELS, named_numbers
 from rsbench.benchmark.leaderboard.picture_track import PictureTrack
 from rsbench.benchmark.leaderboard.pictures import (
     PARTINGS,
@@ -27,17 +28,10 @@ from rsbench.benchmark.leaderboard.pictures import (
     read_answer_depth,
     read_answer_frame,
 )
-from rsbench.benchmark.leaderboard.standings import (
-    LEVELS,
-    Standing,
-    named_numbers,
-    score_interval,
-    standings,
-    table,
-)
+from rsbench.benchmark.leaderboard.standings import Standing, standings, table
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score, Split, Track, Truth
 from rsbench.benchmark.leaderboard.tracks import track_of_id
-from rsbench.benchmark.statistics import in_words
+from rsbench.benchmark.statistics import in_words, score_interval
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import read_pairs
@@ -215,17 +209,17 @@ def _brief(lines: Sequence[Standing]) -> list[list[str]]:
     track = lines[0].track
     assumes = ["assumes"] if track.parting else []
     titles = {score.key: score.title for score in track.scores}
-    stated = ["in 95 %"] if any(line.calibration for line in lines) else []
+    stated = any(line.calibration for line in lines)
     head = ["method", *assumes, "uses", "rank", track.primary.title, *lines[0].parts]
-    rows = [[*head, *(titles[key] for key in track.beside), *brief_medians(track), *stated]]
+    rows = [[*head, *(titles[key] for key in track.beside), *brief_medians(track)]]
+    rows[0] += list(lines[0].stated_words) if stated else []
     for line in lines:
         primary, *beside = [in_words(*line.means[key]) for key in (track.primary.key, *track.beside)]
         parts = [f"{triple[0]:.2f}" for triple in line.parts.values()]
         medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
         assumed = [line.assumes] if track.parting else []
-        covers = [in_words(*line.calibration.covers[-1]) if line.calibration else "-"] if stated else []
-        cells = [line.name, *assumed, line.uses, line.rank_words, primary, *parts, *beside, *medians, *covers]
-        rows.append(cells)
+        rows.append([line.name, *assumed, line.uses, line.rank_words, primary, *parts, *beside, *medians])
+        rows[-1] += list(line.stated_words.values()) if stated else []
     return rows
 
 
@@ -527,6 +521,8 @@ def _calibration(line: Standing) -> dict[str, Any] | None:
         "spread": in_words(*found.spread),
         "mean": f"{found.mean:.3g}",
         "unknowns": line.track.unknowns,
+        "log_score": in_words(*found.log_score) if found.log_score else "",
+        "log_rank": line.stated_words["log rank"] if line.log_rank else "",
         "rows": rows,
         "figure": reliability(found.covers),
     }
@@ -679,11 +675,20 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         column("nees_ratio", "NEES", "up", "squared error by the stated covariance: 1 where that is right"),
         *(
             column(
-                key, f"in {100.0 * level:.0f} %", "down", "share of truths in the stated ellipsoid of that level"
+                f"covers_{100.0 * level:.0f}",
+                f"in {100.0 * level:.0f} %",
+                "down",
+                "share of truths in the stated ellipsoid of that level",
             )
-            for level, key in zip(LEVELS, list(named_numbers(None))[1:], strict=True)
+            for level in LEVELS
         ),
     ]
+    if _log_scored(each):
+        words = "ln of the stated density at the truth over that of a vague guess, nats, mean over scenes"
+        stated += [column("log_score", "log score", "down", f"{words}; 0 where nothing is stated")]
+        stated += [
+            column("log_rank", "log rank", "up", "by the log score, among those that have one and use no more")
+        ]
     return [
         column("method", "method", "up", "name of the entry", text=True),
         column("uses", "uses", "up", "what it works on", text=True),
@@ -706,6 +711,10 @@ def _stated(each: Board) -> bool:
     return any(line.calibration for line in each.lines)
 
 
+def _log_scored(each: Board) -> bool:
+    return any("log_score" in line.scored.scores for line in each.lines)
+
+
 def _row(each: Board, line: Standing) -> dict[str, Any]:
     header, rank, primary = line.scored.header, line.rank, line.track.primary.key
     cells: list[dict[str, Any]] = [
@@ -716,9 +725,13 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
         cells.append({"value": _value(triple[0]), "text": in_words(*triple), "bar": drawn})
     for value in line.medians.values():
         cells.append({"value": _value(value), "text": "–" if np.isnan(value) else f"{value:.3g}", "bar": None})
-    for triple in named_numbers(line.calibration).values() if _stated(each) else ():
-        text = "–" if np.isnan(triple[0]) else in_words(*triple)
-        cells.append({"value": _value(triple[0]), "text": text, "bar": None})
+    if _stated(each):
+        for triple in named_numbers(line.calibration, _log_scored(each)).values():
+            text = "–" if np.isnan(triple[0]) else in_words(*triple)
+            cells.append({"value": _value(triple[0]), "text": text, "bar": None})
+        if _log_scored(each):
+            place = "" if line.log_rank is None else line.log_rank.place
+            cells.append({"value": place, "text": line.stated_words.get("log rank", "–"), "bar": None})
     for triple in line.parts.values():
         cells.append({"value": _value(triple[0]), "text": in_words(*triple), "bar": None})
     return {

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
+from rsbench.benchmark.leaderboard.deviations import NOT_STATED, log_score, stated, vague_log_densities
 from rsbench.benchmark.leaderboard.inputs import read_frames, read_inputs, write_inputs
 from rsbench.benchmark.leaderboard.pictures import check_own
 from rsbench.benchmark.leaderboard.splits import POINTS_1, POINTS_2, Draws, Frames, SimulatedPoints, exact_problem
@@ -299,6 +300,15 @@ class MotionTrack(SolverTrack):
     def row(self, truth: Truth, answer: Answer | None) -> Row:
         return motion_row(truth, answer)
 
+    def rows(self, submission: Submission, split: Split) -> list[Row]:
+        rows, vague = (
+            super().rows(submission, split),
+            vague_log_densities([truth.motion for truth in split.truths]),
+        )
+        for row, at_truth in zip(rows, vague, strict=True):
+            row["log_score"] = log_score(row.pop("log_density"), float(at_truth))
+        return rows
+
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
         if not isinstance(self.inputs, SimulatedPoints):
             return {}
@@ -341,6 +351,10 @@ def motion_row(truth: Truth, answer: Answer | None) -> Row:
     metres = math.nan if success else math.inf
     if success and metric:
         metres = float(np.linalg.norm(d - _true_d(truth, point)))
+    nees, log_density = NOT_STATED
+    if answer is not None and answer.covariance is not None and success and metric:
+        error = np.concatenate([w - truth.motion.w, d - _true_d(truth, point)])
+        nees, log_density = stated(error, np.array(answer.covariance))
     scores = {
         **found,
         "metres": metres,
@@ -349,7 +363,8 @@ def motion_row(truth: Truth, answer: Answer | None) -> Row:
         **{f"auc_{limit}": max(0.0, 1.0 - worst / limit) for limit in AUC_DEG},
         "within": float(found["e_R_deg"] < SUCCESS_DEG[0] and not found["e_T_deg"] >= SUCCESS_DEG[1]),
         "flip": float(success and found["e_T_deg"] > FLIP_DEG),
-        "nees": _nees(answer, w, d, truth) if answer is not None and success and metric else math.nan,
+        "nees": nees,
+        "log_density": log_density,
     }
     return score_row(truth, answer, success, scores)
 
@@ -372,17 +387,6 @@ def _row_angle(w: FloatArray, truth: Truth) -> float:
     estimated = so3.exp(times[:, None] * w)
     true = truth.motion.body_from_world(times).R
     return float(np.rad2deg(np.max(so3.angle(estimated @ np.swapaxes(true, -1, -2)))))
-
-
-def _nees(answer: Answer, w: FloatArray, d: FloatArray, truth: Truth) -> float:
-    """Squared error of (w, d) by the covariance that was stated: on average 6 where that is right."""
-    if answer.covariance is None:
-        return math.nan
-    error = np.concatenate([w - truth.motion.w, d - _true_d(truth, answer.reference_point)])
-    values, vectors = np.linalg.eigh(np.array(answer.covariance))
-    if not values[0] > 0.0:
-        return math.inf
-    return float(np.sum((vectors.T @ error) ** 2 / values))
 
 
 # The bound

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, stdtr, stdtrit  # Student's distribution and its inverse
+from scipy.special import stdtr
 
 from rsbench.benchmark.leaderboard.board import Scored
+from rsbench.benchmark.leaderboard.deviations import Calibration, calibration, named_numbers
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Track
 from rsbench.benchmark.leaderboard.tracks import track_of_id
-from rsbench.benchmark.statistics import COVERAGE, Interval, median_interval, share_interval, typical_interval
+from rsbench.benchmark.statistics import COVERAGE, in_words, scene_means, score_interval
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 
@@ -36,43 +37,6 @@ class Rank(NamedTuple):
     place: int
     low: int
     high: int
-
-
-def scene_means(values: FloatArray, scenes: Sequence[str]) -> FloatArray:
-    """Means (..., scenes), in the order of their names, of values (..., n)."""
-    names, labels = np.unique(np.asarray(scenes), return_inverse=True)
-    weights = np.zeros((len(names), len(labels)))
-    weights[labels, np.arange(len(labels))] = 1.0
-    return values @ (weights / weights.sum(axis=1, keepdims=True)).T
-
-
-def mean_interval(means: FloatArray) -> Interval:
-    """Interval of the mean of independent means (k,) of scenes; without bounds for a single scene."""
-    k = len(means)
-    if k < 2:
-        return Interval(-np.inf, np.inf)
-    half = float(stdtrit(k - 1, 0.5 + 0.5 * COVERAGE) * np.std(means, ddof=1) / np.sqrt(k))
-    middle = float(np.mean(means))
-    return Interval(middle - half, middle + half)
-
-
-def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True) -> tuple[float, float, float]:
-    """The mean over scenes of values (n,), and the ends of its interval.
-
-    A ``share`` lies in [0, 1], and so does its interval. Of yes or no of problems that are independent the
-    interval is exact; of those that share scenes it has that one inside: scenes that all say no do not bound the
-    share to 0.
-    """
-    means = scene_means(values, scenes)
-    low, high = mean_interval(means)
-    if not share:
-        return float(np.mean(means)), low, high
-    if np.all((values == 0.0) | (values == 1.0)):
-        exact = share_interval(int(np.sum(values)), len(values))
-        if len(means) == len(values):
-            return float(np.mean(means)), exact.low, exact.high
-        low, high = min(low, exact.low), max(high, exact.high)
-    return float(np.mean(means)), max(low, 0.0), min(high, 1.0)
 
 
 def better(means: FloatArray) -> NDArray[np.bool_]:
@@ -132,68 +96,6 @@ def ties(beats: NDArray[np.bool_], i: int) -> list[Any]:
     return [j for j in range(len(beats)) if j != i and not beats[i, j] and not beats[j, i]]
 
 
-# Calibration of the covariances that methods state (NEES): shown beside scores, and never ranked.
-#
-# The squared error by the stated covariance (NEES) is chi-squared where that is right, with six degrees of freedom
-# for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-# and Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that share of problems. A
-# single wild error can dominate a mean, so the interval is that of the median.
-
-LEVELS = (0.5, 0.9, 0.95)
-_SEED = 0
-Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
-    """How well stated covariances fit the errors; each triple is a value with the ends of its interval."""
-
-    stated: int
-    """Number of answers with a covariance."""
-    spread: Triple
-    """Median of NEES over that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
-    covers: tuple[Triple, ...]
-    """For each of ``LEVELS``, the share of truths within the ellipsoid of that level."""
-    mean: float
-    """NEES over its degrees of freedom, without an interval."""
-
-
-def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
-    """Calibration of an entry's scores, whose answers have ``unknowns`` numbers; None without covariances."""
-    if "nees" not in scores:
-        return None
-    stated = scores[scores["nees"].notna()]
-    if stated.empty:
-        return None
-    nees, scenes = stated["nees"].to_numpy(dtype=np.float64), list(stated["scene"])
-    ratio = nees / _chi_squared(0.5, unknowns)
-    alone = len(set(scenes)) == len(scenes)
-    low, high = median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)
-    return Calibration(
-        stated=len(stated),
-        spread=(float(np.median(ratio)), low, high),
-        covers=tuple(
-            score_interval((nees <= _chi_squared(level, unknowns)).astype(np.float64), scenes) for level in LEVELS
-        ),
-        mean=float(np.mean(nees)) / unknowns,
-    )
-
-
-def _chi_squared(level: float, unknowns: int) -> float:
-    """Quantile ``level`` of the chi-squared distribution with ``unknowns`` degrees of freedom."""
-    return 2.0 * float(gammaincinv(0.5 * unknowns, level))
-
-
-def named_numbers(found: Calibration | None) -> dict[str, Triple]:
-    """The triples by the names of their columns; NaN where nothing was stated."""
-    nothing = (np.nan, np.nan, np.nan)
-    covers = found.covers if found else (nothing,) * len(LEVELS)
-    return {
-        "nees_ratio": found.spread if found else nothing,
-        **{f"covers_{100.0 * level:.0f}": triple for level, triple in zip(LEVELS, covers, strict=True)},
-    }
-
-
 # Tables of splits
 
 
@@ -214,6 +116,10 @@ class Standing:
     """For each other score, the median over problems; NaN where the entry has none."""
     calibration: Calibration | None
     """Calibration of the covariances that it states."""
+    log_rank: Rank | None
+    """Rank by the log score among the entries that have one and use no more; None without one."""
+    log_peers: int
+    """Number of these entries."""
     parts: dict[str, tuple[float, float, float]]
     """The primary score in each part into which its track divides the problems, by name."""
     worst: dict[str, tuple[str, float]]
@@ -229,9 +135,17 @@ class Standing:
         """Such as ``2 [1, 4] of 9``, ``alone``, ``oracle`` or ``in doubt``."""
         if self.rank is None:
             return "in doubt" if self.scored.doubt else "oracle"
-        if self.peers == 1:
-            return "alone"
-        return f"{self.rank.place} [{self.rank.low}, {self.rank.high}] of {self.peers}"
+        return _rank_words(self.rank, self.peers)
+
+    @property
+    def stated_words(self) -> dict[str, str]:
+        """By column: how often its ellipsoids of 95 % hold the truth, its log score, and its rank by that."""
+        found = self.calibration
+        words = {"in 95 %": in_words(*found.covers[-1]) if found else "-"}
+        if "log_score" in self.scored.scores:
+            words["log score"] = in_words(*found.log_score) if found and found.log_score else "-"
+            words["log rank"] = _rank_words(self.log_rank, self.log_peers) if self.log_rank else "-"
+        return words
 
     @property
     def assumes(self) -> str:
@@ -247,6 +161,10 @@ class Standing:
     def uses(self) -> str:
         """In the order of ``KNOWLEDGE``."""
         return " + ".join(name for name in KNOWLEDGE if name in self.scored.header.uses)
+
+
+def _rank_words(rank: Rank, peers: int) -> str:
+    return "alone" if peers == 1 else f"{rank.place} [{rank.low}, {rank.high}] of {peers}"
 
 
 def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None) -> list[Standing]:
@@ -270,20 +188,37 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
             )
     ranked = [each for each in kept if ORACLE not in each.header.uses and not each.doubt]
     scenes = list(problems["scene"])
-    uses = [frozenset(each.header.uses) for each in ranked]
-    found: list[Standing] = []
-    if ranked:
-        primary = track_of_id(ranked[0].header.protocol).primary
-        values = np.stack([each.scores[primary.key].to_numpy() for each in ranked])
-        means = scene_means(primary.sign * values, scenes)
-        beats = better(means)
-        for i, rank in enumerate(ranks(means.mean(axis=1), beats, uses)):
-            peers = [j for j in range(len(ranked)) if uses[j] <= uses[i]]
-            tied = tuple(ranked[j].header.method for j in ties(beats, i) if j in peers)
-            found.append(_standing(ranked[i], scenes, rank, len(peers), tied))
-    found.sort(key=_order)
-    oracles = [_standing(each, scenes, None, 0, ()) for each in kept if each not in ranked]
-    return found + sorted(oracles, key=_order)
+    primary = track_of_id(kept[0].header.protocol).primary
+    by_log_score = _ranked([each for each in ranked if _states_deviations(each)], "log_score", 1.0, scenes)
+    log_ranks = {each.header.method: (rank, peers) for each, rank, peers, _ in by_log_score}
+    found = [
+        _standing(each, scenes, rank, peers, tied, log_ranks.get(each.header.method, (None, 0)))
+        for each, rank, peers, tied in _ranked(ranked, primary.key, primary.sign, scenes)
+    ]
+    oracles = [_standing(each, scenes, None, 0, (), (None, 0)) for each in kept if each not in ranked]
+    return sorted(found, key=_order) + sorted(oracles, key=_order)
+
+
+def _states_deviations(scored: Scored) -> bool:
+    """Whether an entry has a log score: it states a covariance somewhere."""
+    return "log_score" in scored.scores and bool(scored.scores["nees"].notna().any())
+
+
+def _ranked(
+    entries: Sequence[Scored], column: str, sign: float, scenes: Sequence[str]
+) -> list[tuple[Scored, Rank, int, tuple[str, ...]]]:
+    """Entries with their ranks by a column, the number of those that they are ranked among, and their ties."""
+    if not entries:
+        return []
+    uses = [frozenset(each.header.uses) for each in entries]
+    means = scene_means(sign * np.stack([each.scores[column].to_numpy() for each in entries]), scenes)
+    beats = better(means)
+    found = list[tuple[Scored, Rank, int, tuple[str, ...]]]()
+    for i, rank in enumerate(ranks(means.mean(axis=1), beats, uses)):
+        peers = [j for j in range(len(entries)) if uses[j] <= uses[i]]
+        tied = tuple(entries[j].header.method for j in ties(beats, i) if j in peers)
+        found.append((entries[i], rank, len(peers), tied))
+    return found
 
 
 def _order(standing: Standing) -> tuple[int, str, float, str]:
@@ -294,7 +229,12 @@ def _order(standing: Standing) -> tuple[int, str, float, str]:
 
 
 def _standing(
-    scored: Scored, scenes: Sequence[str], rank: Rank | None, peers: int, tied: tuple[str, ...]
+    scored: Scored,
+    scenes: Sequence[str],
+    rank: Rank | None,
+    peers: int,
+    tied: tuple[str, ...],
+    by_log_score: tuple[Rank | None, int],
 ) -> Standing:
     scores, track = scored.scores, track_of_id(scored.header.protocol)
     return Standing(
@@ -309,6 +249,8 @@ def _standing(
         },
         medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
         calibration=calibration(scores, track.unknowns),
+        log_rank=by_log_score[0],
+        log_peers=by_log_score[1],
         parts={} if not track.parting else _parts(scores, track),
         worst=_worst(scores, track),
     )
@@ -346,17 +288,23 @@ def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
         header = line.scored.header
         row: dict[str, object] = {"method": header.method, "uses": line.uses, "peers": line.peers or None}
         row |= {"handed_in": line.scored.handed_in, "doubt": line.scored.doubt or None}
-        row |= dict(zip(("rank", "rank_low", "rank_high"), line.rank or (None, None, None), strict=True))
+        row |= _rank_columns("rank", line.rank)
         row |= {"assumes": line.assumes or None} if line.parts else {}
         row |= _ends(line.means) | line.medians
         row |= _ends({f"{line.track.primary.key}_{name}": triple for name, triple in line.parts.items()})
         for name, (problem, error) in line.worst.items() if worst else ():
             row |= {f"worst_{name}": error, f"worst_{name}_problem": problem}
         if "nees" in line.scored.scores:
-            row |= _ends(named_numbers(line.calibration))
+            row |= _ends(named_numbers(line.calibration, "log_score" in line.scored.scores))
+        row |= _rank_columns("log_rank", line.log_rank) if "log_score" in line.scored.scores else {}
         rows.append(row | {"ties": " ".join(line.ties)})
-    integers = ["peers", "rank", "rank_low", "rank_high"]
-    return pd.DataFrame(rows).astype(dict.fromkeys(integers, "Int64")) if rows else pd.DataFrame()
+    found = pd.DataFrame(rows)
+    integers = [name for name in found if name == "peers" or "rank" in name]
+    return found.astype(dict.fromkeys(integers, "Int64"))
+
+
+def _rank_columns(name: str, rank: Rank | None) -> dict[str, object]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), rank or (None, None, None), strict=True))
 
 
 def _ends(triples: Mapping[str, tuple[float, float, float]]) -> dict[str, object]:

@@ -1,0 +1,134 @@
+"""What stated deviations are worth: how often their ellipsoids hold the truth, and a log score of them.
+
+**Coverage.** The squared error by the stated covariance (NEES) is chi-squared where the covariance is right, with
+six degrees of freedom for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that
+share of problems. A single large error can dominate a mean, so the interval is that of the median.
+
+**Log score.** Coverage alone is reached by large deviations too; a proper score also rewards small ones. It is the
+logarithm of the density that an answer states at the true motion x = (w, d), over that of a vague guess v:
+
+    log score = ln((1 - e) N(x; answer, covariance) + e v(x)) - ln v(x),    e = 0.01.
+
+v knows of a split only how large its motions are: a Cauchy density in three dimensions about 0 for w, and one for
+d, whose scales are the median lengths of the true w and d. So units cancel, and the score counts nats (1.44 bits)
+that an answer tells beyond v. A failure, or an answer without a covariance, states v and has 0. The share e makes
+the score robust: a truth that the Gaussian excludes costs ln e = -4.6, however far away it is. It is proper within
+0.01: nobody gains more than -ln(1 - e) on average by stating another density than the one that he believes. (By
+Gibbs' inequality no mixture beats the true density p, and (1 - e) p + e v is at least (1 - e) p.) See Gneiting and
+Raftery, Strictly proper scoring rules, JASA 2007, section 4.1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.special import gammaincinv
+
+from rsbench.benchmark.statistics import median_interval, score_interval, typical_interval
+from rsbench.core.motion import Motion
+from rsbench.core.so3 import FloatArray
+
+LEVELS = (0.5, 0.9, 0.95)
+VAGUE = 0.01
+"""Share of the vague density in what an answer states, e above."""
+NOT_STATED = math.nan, math.nan
+_SEED = 0
+Triple = tuple[float, float, float]
+
+
+# Of one answer
+
+
+def stated(error: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+    """NEES and the logarithm of the Gaussian density of an error (n,) under a stated covariance (n, n).
+
+    inf and -inf where the covariance is not positive definite.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    if not values[0] > 0.0:
+        return math.inf, -math.inf
+    nees = float(np.sum((vectors.T @ error) ** 2 / values))
+    return nees, -0.5 * (nees + float(np.sum(np.log(2.0 * np.pi * values))))
+
+
+def vague_log_densities(motions: Sequence[Motion]) -> FloatArray:
+    """ln v (n,) of the true motions of a split, in radians and metres to the power of -3 each."""
+    found = np.zeros(len(motions))
+    for vectors in (np.array([motion.w for motion in motions]), np.array([motion.d for motion in motions])):
+        lengths = np.linalg.norm(vectors, axis=1)
+        scale = float(np.median(lengths)) or 1.0
+        found -= 2.0 * np.log(np.pi) + 3.0 * np.log(scale) + 2.0 * np.log1p((lengths / scale) ** 2)
+    return found
+
+
+def log_score(log_density: float, vague: float) -> float:
+    """The log score by the logarithms of both densities at the truth; 0 where no density is stated (NaN)."""
+    if math.isnan(log_density):
+        return 0.0
+    return float(np.logaddexp(math.log1p(-VAGUE) + log_density - vague, math.log(VAGUE)))
+
+
+# Of an entry
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """How well stated covariances fit the errors; each triple is a value with the ends of its interval."""
+
+    stated: int
+    """Number of answers with a covariance."""
+    spread: Triple
+    """Median of NEES over that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
+    covers: tuple[Triple, ...]
+    """For each of ``LEVELS``, the share of truths within the ellipsoid of that level."""
+    mean: float
+    """NEES over its degrees of freedom, without an interval."""
+    log_score: Triple | None
+    """Mean over scenes, nats; None on tracks that have none."""
+
+
+def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
+    """Calibration of an entry's scores, whose answers have ``unknowns`` numbers; None without covariances."""
+    if "nees" not in scores:
+        return None
+    known = scores[scores["nees"].notna()]
+    if known.empty:
+        return None
+    nees, scenes = known["nees"].to_numpy(dtype=np.float64), list(known["scene"])
+    ratio = nees / _chi_squared(0.5, unknowns)
+    alone = len(set(scenes)) == len(scenes)
+    low, high = median_interval(ratio) if alone else typical_interval(ratio, _SEED, scenes)
+    gains = scores["log_score"].to_numpy(dtype=np.float64) if "log_score" in scores else None
+    return Calibration(
+        stated=len(known),
+        spread=(float(np.median(ratio)), low, high),
+        covers=tuple(
+            score_interval((nees <= _chi_squared(level, unknowns)).astype(np.float64), scenes) for level in LEVELS
+        ),
+        mean=float(np.mean(nees)) / unknowns,
+        log_score=None if gains is None else score_interval(gains, list(scores["scene"]), share=False),
+    )
+
+
+def _chi_squared(level: float, unknowns: int) -> float:
+    """Quantile ``level`` of the chi-squared distribution with ``unknowns`` degrees of freedom."""
+    return 2.0 * float(gammaincinv(0.5 * unknowns, level))
+
+
+def named_numbers(found: Calibration | None, scored: bool) -> dict[str, Triple]:
+    """The triples by the names of their columns; NaN where nothing was stated.
+
+    ``scored``: with the log score.
+    """
+    nothing = (np.nan, np.nan, np.nan)
+    covers = found.covers if found else (nothing,) * len(LEVELS)
+    return {
+        "nees_ratio": found.spread if found else nothing,
+        **{f"covers_{100.0 * level:.0f}": triple for level, triple in zip(LEVELS, covers, strict=True)},
+        **({"log_score": (found and found.log_score) or nothing} if scored else {}),
+    }
