@@ -255,7 +255,9 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
     echo(first)
     say_calibration(record)
     if motion is not None:
-        echo(f"motion {motion['rotation_deg']:.4f} deg, {motion['translation']:.4f} m per frame period")
+        from rsbench.report.motion_figures import sizes
+
+        echo(f"motion in a frame period: {', '.join(sizes(motion))} (+-: one standard deviation)")
         if motion["model_choice"]:
             echo(f"motion model: {motion['model_choice']['text']}")
         if motion["note"]:

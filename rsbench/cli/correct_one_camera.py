@@ -328,8 +328,8 @@ def _readout(record: dict[str, Any]) -> str:
     text = f"{record['readout_ratio']:.3f}"
     if not record["readout_ratio_estimated"]:
         return f"{text} (given)"
-    sure = f"{100.0 * record['capture']['probability']:.0f} % sure"
-    return f"{text} +- {record['readout_ratio_sigma']:.3f}, from the {record['scan']} (found, {sure})"
+    odds = f"probability that the camera reads so {record['capture']['probability']:.0%}"
+    return f"{text} +- {record['readout_ratio_sigma']:.3f}, from the {record['scan']} (found, {odds})"
 
 
 def _focal(record: dict[str, Any]) -> str:

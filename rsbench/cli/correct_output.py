@@ -25,11 +25,12 @@ def write_page_of(
     trajectory: dict[str, Any] | None = None,
 ) -> None:
     from rsbench.report.corrected_page import write_page
+    from rsbench.report.motion_figures import sizes
 
     facts = [("readout ratio", readout_words(shutter, capture))]
     if motion is not None:
-        facts += [("rotation", f"{motion['rotation_deg']:.4f} deg per frame period")]
-        facts += [("translation", f"{motion['translation']:.4f} m per frame period")]
+        names = "rotation in a frame period", "translation in a frame period"
+        facts += zip(names, sizes(motion), strict=True)
         if motion["model_choice"]:
             facts += [("motion model", motion["model_choice"]["text"])]
         facts += [("matches that agree", _agreeing(motion))]
@@ -49,8 +50,9 @@ def readout_words(shutter: RollingShutter, capture: Capture | None) -> str:
     best = None if capture is None else capture.likeliest
     if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
-    sure = f"{100.0 * best.probability:.0f} % sure" + "".join(f"; else {c.scans}" for c in capture.candidates[1:2])
-    text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {sure})"
+    odds = f"probability that the cameras read so {best.probability:.0%}"
+    odds += "".join(f"; else {each.scans}" for each in capture.candidates[1:2])
+    text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {odds})"
     if not capture.determined and capture.moved_px < 1.0:
         text += f"; matches move by {capture.moved_px:.1f} px, so that it hardly matters"
     if shutter.right_delay:

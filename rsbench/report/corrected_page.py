@@ -18,6 +18,7 @@ from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import MARKER
 from rsbench.report import pictures
+from rsbench.report.motion_figures import draw_certainty
 from rsbench.report.pictures import Image
 from rsbench.storage.files import read_json, write_bytes
 from rsbench.storage.videos import UPRIGHT, upright
@@ -206,6 +207,7 @@ def write_page(
         trajectory=trajectory,
         video=video,
         left=_left_alone(record.get("frames", [])),
+        certainty=draw_certainty(_one_motion(record)),
         record=json.dumps(record, indent=1)[:20000],
     )
     write_bytes(page or folder / "report.html", html.encode())
@@ -260,6 +262,14 @@ def most_changed(changed: Sequence[float], count: int) -> list[int]:
         if len(chosen) < count and all(abs(number - other) >= apart for other in chosen):
             chosen.append(number)
     return sorted(chosen)
+
+
+def _one_motion(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The motion of four frames; of a sequence that of its only window, and None where it has several."""
+    if (motion := record.get("motion")) is not None:
+        return motion
+    found = [each["motion"] for each in record.get("frames", ()) if isinstance(each, dict) and each.get("motion")]
+    return found[0] if found and all(each == found[0] for each in found) else None
 
 
 def _eight_bit(image: NDArray[Any]) -> Image:
