@@ -127,8 +127,9 @@ def named_numbers(found: Calibration | None, scored: bool) -> dict[str, Triple]:
     """
     nothing = (np.nan, np.nan, np.nan)
     covers = found.covers if found else (nothing,) * len(LEVELS)
+    gain = nothing if found is None or found.log_score is None else found.log_score
     return {
         "nees_ratio": found.spread if found else nothing,
         **{f"covers_{100.0 * level:.0f}": triple for level, triple in zip(LEVELS, covers, strict=True)},
-        **({"log_score": (found and found.log_score) or nothing} if scored else {}),
+        **({"log_score": gain} if scored else {}),
     }

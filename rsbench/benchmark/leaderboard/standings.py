@@ -299,7 +299,7 @@ def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
         row |= _rank_columns("log_rank", line.log_rank) if "log_score" in line.scored.scores else {}
         rows.append(row | {"ties": " ".join(line.ties)})
     found = pd.DataFrame(rows)
-    integers = [name for name in found if name == "peers" or "rank" in name]
+    integers = [name for name in map(str, found.columns) if name == "peers" or "rank" in name]
     return found.astype(dict.fromkeys(integers, "Int64"))
 
 
