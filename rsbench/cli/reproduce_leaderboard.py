@@ -135,23 +135,32 @@ def entries_of_frames() -> dict[str, list[str]]:
 
 
 def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboard") -> None:
-    """Write a board's site, and by what command and code each entry was made."""
+    """Write a board's site, and by what command and code each entry was made.
+
+    What is there of protocols that the board does not have stays: their tables do too.
+    """
     from rsbench.benchmark.leaderboard.board import entries_of, splits_of
     from rsbench.benchmark.provenance import provenance
     from rsbench.report.board_page import build_site
     from rsbench.storage.files import write_json
     from rsbench.storage.untrusted_files import read_json
 
-    page = build_site(board, out / "site", problem_pages=False)
+    page, path, splits = (
+        build_site(board, out / "site", problem_pages=False),
+        out / "provenance.json",
+        splits_of(board),
+    )
     made = {
         f"{protocol}/{split}/{entry.header.method}": read_json(entry.folder / "entry.json").get("made")
-        for protocol, split in splits_of(board)
+        for protocol, split in splits
         for entry in entries_of(board, protocol, split)
     }
+    former = read_json(path).get("entries", {}) if path.is_file() else {}
+    kept = {name: each for name, each in former.items() if tuple(name.split("/")[:2]) not in splits}
     brief = {
         name: {key: record[key] for key in ("command", "commit", "source", "date") if key in record}
         for name, record in made.items()
         if isinstance(record, dict)
     }
-    write_json(out / "provenance.json", {**provenance(command), "entries": brief})
+    write_json(path, {**provenance(command), "entries": dict(sorted((kept | brief).items()))})
     echo(f"page: {page}")
