@@ -7,19 +7,25 @@
 # make sample     the release's sample of data, build/rsbench-sample.zip
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  docs/reference/commands.md and cards.md from the code
-# make lock       renew constraints.txt from pyproject.toml (needs uv)
+# make lock       renew both files of constraints from pyproject.toml (needs uv)
 # make clean      remove .venv and caches
 # Needs Python >= 3.11 with pip and venv. `make demo PYTHON=/path/to/python` chooses one.
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TOOLS := $(VENV)/.tools-installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES = $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 COMPILE := from rsbench.solvers.refined import warm_up; warm_up(["linear", "twist"])
+OURS := import os, sys; from importlib.util import find_spec; \
+  found = getattr(find_spec("rsbench"), "origin", None); \
+  ours = os.path.samefile(os.path.dirname(found), "rsbench") if found else not os.path.exists("$(STAMP)"); \
+  whose = f"imports rsbench from {os.path.dirname(found)}" if found else "was made for a checkout that moved"; \
+  sys.exit(None if ours else f"make: $(VENV) {whose}: remove $(VENV) (make clean), and make again")
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: help demo test test-extras test-gpu attack sample docs reference lock clean
+.PHONY: help demo test test-extras test-gpu attack sample docs reference lock clean here
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
 
@@ -31,7 +37,7 @@ demo: $(STAMP)
 
 # Types are checked while kernels are compiled and the first tests run, in two processes, the longest tests first.
 # Bytecode is kept whatever the environment says, since each process that a test starts would compile it again.
-test: $(STAMP)
+test: $(TOOLS)
 	@echo "== format"; $(BIN)/ruff format --check .
 	@echo "== lint";   $(BIN)/ruff check .
 	@echo "== layers"; $(BIN)/lint-imports
@@ -42,32 +48,37 @@ test: $(STAMP)
 	wait $$types || { echo "types: failed, see above" >&2; exit 1; }; exit $$tests
 
 # Not locked: the newest versions that pyproject.toml allows.
-test-extras: $(STAMP)
+test-extras: $(TOOLS)
 	@$(PIP) install --quiet -e '.[view,torch]' datasets --no-build-isolation
 	@NO_SKIPS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/interop/test_view.py \
 	  tests/interop/test_export_training.py tests/interop/test_export_layouts.py tests/test_learn_flow.py \
 	  tests/jobs/test_dask_jobs.py tests/storage/test_s3.py
 
-test-gpu: $(STAMP)
+test-gpu: $(TOOLS)
 	@$(BIN)/python -c 'import sys; from rsbench.renderers.backend import probe_cuda; found = probe_cuda(); \
 	  sys.exit(None if found.ok else f"make: no GPU to test: {found.reason}")'
 	@RSBENCH_VARIANT=cuda OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -k "not moving" tests/renderers tests/dataset
 
-attack: $(STAMP)
+attack: $(TOOLS)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md
 
 sample: $(STAMP)
 	@$(BIN)/python benchmarks/release_sample.py build/rsbench-sample.zip
 
-docs: $(STAMP)
+docs: $(TOOLS)
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
 	@echo "site: $(CURDIR)/build/docs/index.html"
 
 reference: $(STAMP)
 	@$(BIN)/python docs/make_reference.py
 
-# A killed `python -m venv` leaves a venv without a working pip: it is made again.
-$(STAMP): constraints.txt pyproject.toml
+# Refuse a .venv whose rsbench is that of another checkout, or that was moved with its checkout: installing would
+# change what the other one runs.
+here:
+	@if [ -x $(BIN)/python ]; then $(BIN)/python -I -c '$(OURS)'; fi
+
+# What users need; a killed `python -m venv` leaves a venv without a working pip: it is made again.
+$(STAMP): constraints.txt pyproject.toml | here
 	@if ! $(PIP) --version >/dev/null 2>&1; then \
 	  for python in $(CANDIDATES); do \
 	    if "$$python" -c '$(SUITABLE)' 2>/dev/null; then found=$$python; break; fi; \
@@ -78,15 +89,24 @@ $(STAMP): constraints.txt pyproject.toml
 	  echo "Creating $(VENV) with $$("$$found" --version)"; \
 	  "$$found" -m venv --clear $(VENV); \
 	fi
-	@echo "Installing the locked dependencies into $(VENV) (a few minutes the first time)"
+	@echo "Installing the locked dependencies into $(VENV) (a minute or two the first time)"
 	@$(PIP) install --quiet --require-hashes -r constraints.txt
 	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
+# What tests, checks and the documentation need besides.
+$(TOOLS): constraints-dev.txt $(STAMP)
+	@echo "Installing what tests and documentation need (a minute or two the first time)"
+	@$(PIP) install --quiet --require-hashes -r constraints-dev.txt
+	@touch $@
+
+# The tools' versions come first, since those of users are among them.
+LOCK = uv pip compile pyproject.toml --extra install --universal --python-version 3.11 \
+	  --generate-hashes --no-annotate --no-header --quiet
 lock:
 	@command -v uv >/dev/null || { echo "make: 'make lock' needs uv, which is not installed" >&2; exit 1; }
-	uv pip compile pyproject.toml --extra dev --extra docs --universal --python-version 3.11 \
-	  --generate-hashes --no-annotate --no-header --quiet --output-file constraints.txt
+	$(LOCK) --extra dev --extra docs --output-file constraints-dev.txt
+	$(LOCK) --constraints constraints-dev.txt --output-file constraints.txt
 
 clean:
 	rm -rf $(VENV) .ruff_cache .pytest_cache .hypothesis .import_linter_cache dist build

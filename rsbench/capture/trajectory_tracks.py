@@ -21,7 +21,7 @@ from rsbench.capture.trajectory_gyro import GyroSteps
 from rsbench.capture.trajectory_spline import Curve, Views, blank_views, fill_view
 from rsbench.components.compiled import compiled
 from rsbench.components.motion_kernels import Vector, apply, apply_transposed, cross, plus, times
-from rsbench.core.correspondences import BEYOND_PX, BoolArray, Correspondences, unlinked_pairs
+from rsbench.core.correspondences import BoolArray, Correspondences, nearest_within, unlinked_pairs
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -533,12 +533,7 @@ def _numbered(pixels: Sequence[FloatArray], right: Sequence[BoolArray], first: i
 def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
     """For each place (n, c) the nearest of others (m, c) within the tolerance, each once; -1 for none."""
     out = -np.ones(len(begins), dtype=np.int64)
-    if len(begins) == 0 or len(ends) == 0:
-        return out
-    from scipy.spatial import cKDTree  # takes as long to load as all else that a solver needs
-
-    found = cKDTree(ends).query(begins, p=np.inf, distance_upper_bound=BEYOND_PX)
-    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+    distance, nearest = (part[:, 0] for part in nearest_within(begins, ends))
     order = np.argsort(distance, kind="stable")
     order = order[np.isfinite(distance[order]) & known[order]]
     _, firsts = np.unique(nearest[order], return_index=True)

@@ -23,6 +23,7 @@ from typing import Any, TypeVar, overload
 
 from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.runtime import rtsys
 
 from rsbench.storage.work_folder import temporary, user_cache
 
@@ -96,6 +97,12 @@ class _KernelCache(FunctionCache):
             return None
         signature = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
         return IndexDataCacheFile(str(folder), f"{self._impl.filename_base}-{signature}", source_version())
+
+    def load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
+        """Without loading what Numba compiles with, which takes as long as a solve; compiling loads it itself."""
+        rtsys.initialize(target_context)  # memory of arrays
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
     def _load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
         key = self._index_key(sig, target_context.codegen())

@@ -186,12 +186,39 @@ def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
 
 def repeated(rows: FloatArray, others: FloatArray) -> BoolArray:
     """Mask (n,) of the matches (n, c) that are also among ``others`` (m, c), within ``JOIN_TOLERANCE_PX``."""
-    if len(rows) == 0 or len(others) == 0:
-        return np.zeros(len(rows), dtype=np.bool_)
-    from scipy.spatial import cKDTree  # takes as long to load as all else that a solver needs
+    return np.isfinite(nearest_within(rows, others)[0][:, 0])
 
-    distance, _ = cKDTree(others).query(rows, p=np.inf, distance_upper_bound=BEYOND_PX)
-    return np.isfinite(distance)
+
+def nearest_within(points: FloatArray, others: FloatArray, count: int = 1) -> tuple[FloatArray, NDArray[np.int64]]:
+    """The nearest others (m, c) of points (n, c) in which no coordinate differs by more than the tolerance.
+
+    SciPy's trees do the same; loading them takes longer than a solve.
+
+    Returns:
+        Largest difference of a coordinate (n, count) in growing order, infinite where there is none; indices (n,
+        count), of equals the first, 0 where there is none.
+    """
+    by_first = np.argsort(others[:, 0], kind="stable")
+    others = others[by_first]
+    begin, end = (
+        np.searchsorted(others[:, 0], points[:, 0] + sign * 2.0 * JOIN_TOLERANCE_PX, side)
+        for sign, side in ((-1.0, "left"), (1.0, "right"))
+    )
+    found = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
+    for step in range(int(np.max(end - begin, initial=0))):
+        point = np.nonzero(begin + step < end)[0]
+        other = begin[point] + step
+        apart = np.abs(points[point] - others[other]).max(axis=1)
+        near = apart < BEYOND_PX
+        found.append((apart[near], point[near], by_first[other[near]]))
+    apart, point, other = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.lexsort((other, apart, point))
+    apart, point, other = apart[order], point[order], other[order]
+    place = np.arange(len(point)) - np.searchsorted(point, point)
+    kept = place < count
+    distance, index = np.full((len(points), count), np.inf), np.zeros((len(points), count), dtype=np.int64)
+    distance[point[kept], place[kept]], index[point[kept], place[kept]] = apart[kept], other[kept]
+    return distance, index
 
 
 _STEREO_HALF = {"stereo_0": slice(0, 4), "stereo_1": slice(4, 8)}
@@ -259,10 +286,8 @@ def _joined_tracks(c: Correspondences, side: Side) -> FloatArray:
 
 def _assign(pairs: FloatArray, stereo_0: FloatArray, stereo_1: FloatArray) -> NDArray[np.int64]:
     """Indices (k, 3) of the pairs (n, 4) and of the matches (m, 4) with the same first ends, each used once."""
-    if not (len(pairs) and len(stereo_0) and len(stereo_1)):
-        return np.zeros((0, 3), dtype=np.int64)
-    distance_0, nearest_0 = _nearest(pairs[:, :2], stereo_0[:, :2])
-    distance_1, nearest_1 = _nearest(pairs[:, 2:], stereo_1[:, :2])
+    distance_0, nearest_0 = nearest_within(pairs[:, :2], stereo_0[:, :2], _RIVALS)
+    distance_1, nearest_1 = nearest_within(pairs[:, 2:], stereo_1[:, :2], _RIVALS)
     distance = distance_0[:, :, None] + distance_1[:, None, :]
     pair, j, k = np.nonzero(np.isfinite(distance))
     found = np.stack([pair, nearest_0[pair, j], nearest_1[pair, k]], axis=1)
@@ -276,15 +301,6 @@ def _assign(pairs: FloatArray, stereo_0: FloatArray, stereo_1: FloatArray) -> ND
             for index, taken in zip(row, used, strict=True):
                 taken.add(index)
     return np.array(sorted(kept), dtype=np.int64).reshape(-1, 3)
-
-
-def _nearest(points: FloatArray, ends: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Distances and indices (n, k) of the ends (m, 2) within the tolerance of points (n, 2); infinite for none."""
-    from scipy.spatial import cKDTree  # see ``repeated``
-
-    rivals = np.arange(1, min(_RIVALS, len(ends)) + 1)
-    distance, index = cKDTree(ends).query(points, k=rivals, p=np.inf, distance_upper_bound=BEYOND_PX)
-    return np.asarray(distance), np.asarray(index, dtype=np.int64)
 
 
 def gyro_samples(samples: ArrayLike | None) -> FloatArray | None:

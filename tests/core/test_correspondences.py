@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import (
+    BEYOND_PX,
     JOIN_TOLERANCE_PX,
     Correspondences,
     join_stereo,
     lens_affine,
+    nearest_within,
     repeated,
     temporal_pairs,
     unlinked_pairs,
@@ -215,3 +218,20 @@ def test_the_same_match_many_times_is_one_measurement() -> None:
     joined = join_stereo(as_sets(tracks, 0.0, np.random.default_rng(0)))
     assert joined.alone == {"stereo_0": 0, "stereo_1": 0}
     assert not np.any(unlinked_pairs(joined.correspondences, "left"))
+
+
+@given(seed=st.integers(0, 10_000), columns=st.sampled_from([2, 4, 8]), count=st.sampled_from([1, 3]))
+def test_nearest_within_finds_what_a_tree_finds(seed: int, columns: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    others = rng.integers(0, 4, (rng.integers(0, 40), columns)) + rng.uniform(-0.008, 0.008, columns)
+    others += rng.uniform(-0.004, 0.004, others.shape)
+    points = rng.integers(0, 4, (rng.integers(0, 40), columns)) + rng.uniform(-0.008, 0.008, columns)
+    distance, index = nearest_within(points, others, count)
+    assert distance.shape == index.shape == (len(points), count)
+    if len(others):
+        which = np.arange(1, count + 1)
+        expected, place = cKDTree(others).query(points, k=which, p=np.inf, distance_upper_bound=BEYOND_PX)
+        assert np.array_equal(distance, expected)
+        assert np.array_equal(index[np.isfinite(distance)], np.asarray(place)[np.isfinite(expected)])
+    else:
+        assert np.isinf(distance).all()
