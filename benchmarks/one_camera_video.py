@@ -25,7 +25,8 @@ from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.arrays import options_of
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
+from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
+from rsbench.pipeline.sequence_capture import CorrectedMoment, KnownCapture
 from rsbench.pipeline.sequence_correction import correct_sequence
 from rsbench.vision.fusion import finished
 
@@ -41,23 +42,23 @@ def scores(sequence: Sequence, most: int) -> Iterator[list[float]]:
     count = min(sequence.frames, most)
     row = sequence.rig.camera.height // 2
     frames = [sequence.image("rs", "left", frame) for frame in range(count)]
-    options = MonoOptions(target_row=float(row))
+    options = options_of_camera(None, 0, float(row))
 
-    def alone(some: list[NDArray[np.uint8]]) -> list[MonoMoment]:
+    def alone(some: list[NDArray[np.uint8]]) -> list[CorrectedMoment]:
         return list(correct_frames(some, sequence.rig.camera, sequence.shutter, options))
 
     video = alone(frames)
     files = [[sequence.folder / picture_file("rs", side, frame) for frame in range(count)] for side in SIDES]
     chosen = options_of("rs-stereo-refined", "auto", "sgm", "sift-refined", "fusion", target_row=float(row))
-    ratio = sequence.shutter.readout_ratio
-    rig = correct_sequence(*map(FrameSource.of_files, files), sequence.rig, ratio, chosen)
+    known = KnownCapture(rig=sequence.rig, shutter=sequence.shutter)
+    rig = correct_sequence([FrameSource.of_files(each) for each in files], known, chosen)
     for k, moment in enumerate(rig):
         if k == 0:
             continue
-        two = alone(frames[k - 1 : k + 1])[1].fused.image
+        two = alone(frames[k - 1 : k + 1])[1].shown["left"].image
         both = finished(moment.frames["left"]).image if "left" in moment.frames else frames[k]
         truth = sequence.image("gs", "left", k, row)
-        yield [psnr(image, truth) for image in (frames[k], two, video[k].fused.image, both)]
+        yield [psnr(image, truth) for image in (frames[k], two, video[k].shown["left"].image, both)]
 
 
 def main() -> int:

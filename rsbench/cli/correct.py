@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
@@ -17,19 +18,9 @@ from rsbench.cli.correct_input import (
     arranged,
     check_out,
     default_out,
+    given_camera,
     given_frames,
-    sized,
     target_row,
-)
-from rsbench.cli.correct_one_camera import (
-    CameraFile,
-    Footage,
-    Fps,
-    GyroFile,
-    GyroOffset,
-    ReadoutRatio,
-    ShutterName,
-    correct_one_camera,
 )
 from rsbench.cli.correct_output import readout_words, say_calibration, write_page_of
 from rsbench.cli.correct_sequence import correct_sequence_given
@@ -37,7 +28,7 @@ from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from rsbench.cli.correct_input import RigInput
+    from rsbench.cli.correct_input import CorrectInput
     from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.vision.corrector import CorrectorEntry
     from rsbench.vision.fusion import Fused
@@ -61,6 +52,38 @@ _RIG_ONLY = (
 )
 """Parameters that the correction of one camera's frames does not have."""
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
+
+
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(metavar="CAMERA", help="Of one camera, in place of --rig: camera.toml or a calibration."),
+]
+Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
+GyroFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="LOG.gcsv|LOG.csv",
+        help="What a gyroscope measured; of a rig, over four frames and more. Needs --fps or a video.",
+    ),
+]
+Fps = Annotated[
+    float | None,
+    typer.Option(help="Frames a second, for --gyro, --shutter and a line delay. Default: what the video says."),
+]
+ReadoutRatio = Annotated[
+    float | None, typer.Option(help="Readout time over frame period, in place of what the calibration says.")
+]
+ShutterName = Annotated[
+    str | None, typer.Option("--shutter", metavar="NAME", help="The same from a mode: rsbench list shutters.")
+]
+GyroOffset = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="What --gyro's clock shows at the first row of the first frame. Default: 0; of one camera what the "
+        "frames show, within half a second.",
+    ),
+]
 
 
 def correct(
@@ -116,7 +139,10 @@ def correct(
         _refuse_rig_options(ctx)
         # Of what was an error before positional inputs were guessed, the time from which rows are moved least.
         row = target or ("middle" if given.words else "first")
-        correct_one_camera(given, camera, fov, out, row, inpaint, seed, log, readout)
+        from rsbench.pipeline.mono_sequence import options_of_camera
+
+        alone = given_camera(given, camera, fov, out, log, readout)
+        _correct_given(alone, row, options_of_camera(inpaint, seed, 0.0), inpaint is None)
         return
     if fov is not None:
         raise RsbenchError("--fov: is of one camera; a rig's is in its calibration, --rig")
@@ -137,7 +163,7 @@ def _refuse_rig_options(ctx: typer.Context) -> None:
             raise RsbenchError(f"{options}: has no effect on frames of one camera; leave it out")
 
 
-def _correct_given(given: RigInput, target: str, options: CorrectionOptions, close: bool) -> None:
+def _correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
     """Exit 1 where no motion or no correction is found; ``close``: narrow holes of corrected frames."""
     from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.compile_ahead import compiling_ahead
@@ -147,7 +173,7 @@ def _correct_given(given: RigInput, target: str, options: CorrectionOptions, clo
 
     finish: Finish = finished if close else lambda fused: fused
     try:
-        with compiling_ahead(), Isolation() as isolation:
+        with nullcontext() if given.one_camera else compiling_ahead(), Isolation() as isolation:
             options = isolation.chain(options)
             if given.four:
                 _correct_four(given, target, options, finish)
@@ -192,7 +218,7 @@ def _corrector(name: str, fill: bool) -> CorrectorEntry:
     return replace(entry, component=component, key=component_key(component, {}))
 
 
-def _correct_four(given: RigInput, target: str, options: CorrectionOptions, finish: Finish) -> None:
+def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, finish: Finish) -> None:
     from rsbench.capture.calibration import NO_ERRORS
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.corrected_frames import (
@@ -205,16 +231,17 @@ def _correct_four(given: RigInput, target: str, options: CorrectionOptions, fini
     )
     from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
     from rsbench.pipeline.chain import correct_four
-    from rsbench.pipeline.footage import read_four
+    from rsbench.pipeline.footage import RigCard, read_four
     from rsbench.pipeline.sequence_capture import with_found_camera
     from rsbench.report.corrected_page import card_of
     from rsbench.vision.corrector import demand_corrected
 
     card, out, order = given.card, given.out, (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    assert isinstance(card, RigCard)
     refuse_video(out)
     images = read_four(dict(zip(order, given.four, strict=True)))  # pyrefly: ignore[bad-argument-type]
-    rig = sized(card, images["left", 0], images["right", 0])
-    options = replace(options, target_row=target_row(target, rig.camera.height))
+    rig = card.rig_of(images["left", 0], images["right", 0])
+    options = replace(options, target_row=target_row(target, images["left", 0].shape[0]))
     with fresh_folder(out) as folder:
         rig, focal = with_found_camera(
             rig, card.sigma, [images], options, card.readout_ratio, card.scanning, progress_bar
@@ -246,8 +273,9 @@ def _correct_four(given: RigInput, target: str, options: CorrectionOptions, fini
         record["seconds"] = result.seconds
         write_record(folder, record)
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
-        write_page_of(folder, out, result.shutter, result.capture, record["motion"], cards)
-    _say(out, f"readout ratio {readout_words(result.shutter, result.capture)}", record)
+        read = readout_words(result.shutter, result.capture, rig)
+        write_page_of(folder, out, [("readout ratio", read)], record["motion"], cards)
+    _say(out, f"readout ratio {read}", record)
 
 
 def _say(out: Path, first: str, record: dict[str, Any]) -> None:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rsbench.core.rig import StereoRig
     from rsbench.core.so3 import FloatArray
     from rsbench.interop.readers.rig_files import Readout
     from rsbench.pipeline.footage import FrameSource, Part, RigCard
+    from rsbench.pipeline.mono_camera import OneCameraCard
 
 _MOST = 1e9
+_SAME_RATE = 0.01
+"""Relative difference of frame rates, up to which they are one, as 29.97 and 30."""
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -145,13 +147,16 @@ def size_of(frames: list[Path] | Path, part: Part = "whole") -> Callable[[], tup
     """A function that gives the (width, height) of the first of some frames, a folder's or a video's."""
 
     def size() -> tuple[int, int]:
-        from rsbench.pipeline.footage import FrameSource
-
-        source = FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames, part)
-        height, width = next(iter(source)).shape[:2]
+        height, width = next(iter(_source(frames, part))).shape[:2]
         return width, height
 
     return size
+
+
+def _source(frames: list[Path] | Path, part: Part = "whole") -> FrameSource:
+    from rsbench.pipeline.footage import FrameSource
+
+    return FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames, part)
 
 
 def say_notes(option: str, notes: tuple[str, ...]) -> None:
@@ -306,16 +311,17 @@ def check_out(out: Path) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigInput:
+class CorrectInput:
     """What is to be corrected, and where to."""
 
-    card: RigCard
+    card: RigCard | OneCameraCard
     out: Path
-    four: list[Path]
+    four: list[Path] = field(default_factory=list)
     """Left 0, right 0, left 1, right 1; or, of footage, nothing."""
-    left: list[Path] | Path
-    """Its images, or a folder or video."""
-    right: list[Path] | Path
+    footage: list[list[Path] | Path] = field(default_factory=list)
+    """Images, or the folder or video, of the left and the right camera, or of one."""
+    words: str = ""
+    """What was assumed of the files; empty where nothing was."""
     gyro: GyroscopeOptions
     side_by_side: bool = False
     """Whether both cameras are halves of the frames of one video or folder."""
@@ -324,17 +330,74 @@ class RigInput:
     rectify: bool = False
     """Whether rectified pairs are wanted too."""
 
-    def footage(self) -> tuple[FrameSource, FrameSource]:
-        """Of the left and the right camera."""
-        from rsbench.pipeline.footage import FrameSource
+    @property
+    def one_camera(self) -> bool:
+        """Whether frames are of one camera."""
+        return len(self.footage) == 1
 
-        if self.side_by_side and isinstance(self.left, Path):
-            return FrameSource(self.left, "left"), FrameSource(self.left, "right")
-        left, right = (
-            FrameSource.of_files(each) if isinstance(each, list) else FrameSource(each)
-            for each in (self.left, self.right)
-        )
-        return left, right
+    def sources(self) -> list[FrameSource]:
+        """The frames of each camera."""
+        from rsbench.core.rig import SIDES
+
+        parts: tuple[Part, ...] = SIDES if self.side_by_side else ("whole",) * len(self.footage)
+        return [_source(each, part) for each, part in zip(self.footage, parts, strict=True)]
+
+
+def given_camera(
+    given: Arranged,
+    camera: Path | None,
+    fov: float | None,
+    out: Path,
+    gyro: GyroscopeOptions,
+    readout: ReadoutOptions,
+) -> CorrectInput:
+    """The frames of one camera; RsbenchError for options that do not go together."""
+    from rsbench.interop.readers.rig_files import read_camera_file
+
+    files: list[Path] | Path = given.frames if given.frames is not None else given.left or Path()
+    source = _source(files)
+    stated = readout.beside(camera, gyro.file is not None, source.path)
+    card, notes = read_camera_file(camera, stated, size_of(files))
+    say_notes("--camera", notes)
+    card = _with_fov(card, fov)
+    _warn_of_other_rate(card, source, gyro.fps)
+    return CorrectInput(card=card, out=out, footage=[files], words=given.words, gyro=gyro)
+
+
+def _with_fov(card: OneCameraCard, fov: float | None) -> OneCameraCard:
+    """The card with the field of view of ``--fov``."""
+    from dataclasses import replace
+
+    from rsbench.core.errors import RsbenchError
+
+    if fov is None:
+        return card
+    if not card.focal_unknown:
+        raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
+    try:
+        return replace(card, fov_deg=fov)
+    except ValueError as error:
+        raise RsbenchError(f"--fov: {error}") from error
+
+
+def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: float | None) -> None:
+    """Warn if the card's readout ratio assumes another frame rate than the frames have."""
+    from rsbench.cli.console import echo
+    from rsbench.dataset.corrected_frames import said_fps
+
+    fps = said_fps(source.path) if fps_option is None else fps_option
+    if card.frame_period_s is None or card.readout_ratio is None or fps is None or not fps > 0.0:
+        return
+    share = card.frame_period_s * fps
+    if abs(share - 1.0) <= _SAME_RATE:
+        return
+    ratio, other = card.readout_ratio, card.readout_ratio * share
+    there = f"at that rate the ratio is {other:.3g}" if other <= 1.0 else "a frame is shorter than that readout"
+    echo(
+        f"rsbench: camera: readout ratio {ratio:.3g} assumes {1.0 / card.frame_period_s:.4g} frames/s, but the "
+        f"frames have {fps:.4g} ({there}): set `frame_period_s = {1.0 / fps:.4g}` beside `shutter`",
+        err=True,
+    )
 
 
 def given_frames(
@@ -347,7 +410,7 @@ def given_frames(
     readout: ReadoutOptions,
     row_poses: bool = False,
     side_by_side: bool = False,
-) -> RigInput:
+) -> CorrectInput:
     """Raises RsbenchError for another combination of arguments."""
     from rsbench.core.errors import RsbenchError
     from rsbench.interop.readers.rig_files import read_rig_file
@@ -363,24 +426,24 @@ def given_frames(
     for option, wanted in (("--row-poses", row_poses), ("--gyro", gyro.file is not None)):
         if wanted and frames:
             raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
-    said = readout.beside(rig, gyro.file is not None, left)
-    card, notes = read_rig_file(rig, said, size_of(frames or left or [], "left" if side_by_side else "whole"))
+    stated = readout.beside(rig, gyro.file is not None, left)
+    card, notes = read_rig_file(rig, stated, size_of(frames or left or [], "left" if side_by_side else "whole"))
     say_notes("--rig", notes)
     if frames is not None and len(frames) == 4 and not (left or right):
-        return RigInput(card=card, out=out, four=frames, left=[], right=[], gyro=gyro)
+        return CorrectInput(card=card, out=out, four=frames, gyro=gyro)
     if side_by_side and left and not (frames or right):
-        return RigInput(
-            card=card, out=out, four=[], left=left, right=left, gyro=gyro, row_poses=row_poses, side_by_side=True
+        return CorrectInput(
+            card=card, out=out, footage=[left, left], gyro=gyro, row_poses=row_poses, side_by_side=True
         )
     if frames or not (left and right):
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(
             f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
         )
-    return RigInput(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
+    return CorrectInput(card=card, out=out, footage=[left, right], gyro=gyro, row_poses=row_poses)
 
 
-def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> RigInput:
+def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> CorrectInput:
     """The rolling-shutter frames of a sequence of a dataset."""
     from rsbench.core.errors import RsbenchError
     from rsbench.core.rig import SIDES
@@ -394,13 +457,13 @@ def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: boo
             raise RsbenchError(f"{folder}: is a dataset; give one of its sequences: {', '.join(names)}")
         folder = folder / names[0]
     sequence = read_sequence(folder)
-    left, right = (
+    footage: list[list[Path] | Path] = [
         [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
-    )
+    ]
     card = rig_card_of(sequence.rig, sequence.shutter)
     if gyro.file is not None and gyro.fps is None:
         gyro = replace(gyro, fps=1.0 / sequence.frame_period_s)
-    return RigInput(card=card, out=out, four=[], left=left, right=right, gyro=gyro, row_poses=row_poses)
+    return CorrectInput(card=card, out=out, footage=footage, gyro=gyro, row_poses=row_poses)
 
 
 def target_row(target: str, height: int) -> float:
@@ -417,15 +480,3 @@ def target_row(target: str, height: int) -> float:
     if not 0.0 <= row <= height - 1:
         raise RsbenchError(f"--target {target}: must be first, middle, last or a row from 0 to {height - 1}")
     return row
-
-
-def sized(card: RigCard, left: Any, right: Any) -> StereoRig:
-    """The rig with images like these two; RsbenchError where its cameras cannot be of such images."""
-    from rsbench.core.errors import RsbenchError
-
-    sizes = [(image.shape[1], image.shape[0]) for image in (left, right)]
-    try:
-        return card.rig(*sizes)
-    except ValueError as error:
-        words = " and ".join(dict.fromkeys(f"{width} x {height}" for width, height in sizes))
-        raise RsbenchError(f"--rig: of images of {words} pixels: {error}") from error

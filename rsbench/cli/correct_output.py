@@ -10,24 +10,30 @@ from rsbench.cli.console import echo
 
 if TYPE_CHECKING:
     from rsbench.capture.two_frame_estimate import Capture
+    from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
 
 _MOST_LISTED = 8
+UNIT = "length of the translation over one frame period"
+"""Unit of the depth of one camera's frames."""
 
 
 def write_page_of(
     folder: Path,
     out: Path,
-    shutter: RollingShutter,
-    capture: Capture | None,
+    facts: list[tuple[str, str]],
     motion: dict[str, Any] | None,
     cards: list[Any],
     trajectory: dict[str, Any] | None = None,
+    *,
+    page: Path | None = None,
+    record: dict[str, Any] | None = None,
+    video: Path | None = None,
 ) -> None:
+    """The page; arguments as of ``write_page``, ``motion``: of four frames."""
     from rsbench.report.corrected_page import write_page
     from rsbench.report.motion_figures import sizes
 
-    facts = [("readout ratio", readout_words(shutter, capture))]
     if motion is not None:
         names = "rotation in a frame period", "translation in a frame period"
         facts += zip(names, sizes(motion), strict=True)
@@ -35,9 +41,9 @@ def write_page_of(
             facts += [("motion model", motion["model_choice"]["text"])]
         facts += [("matches that agree", _agreeing(motion))]
         facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
-    write_page(
-        folder, f"rsbench correct: {out.name}", "Rolling shutter to global shutter", facts, cards, trajectory
-    )
+    title, shown = f"rsbench correct: {out.name}", video.name if video is not None and video.is_file() else ""
+    subtitle = "Rolling shutter to global shutter" + ("" if record is None else "; the frames that changed most")
+    write_page(folder, title, subtitle, facts, cards, trajectory, page=page, record=record, video=shown)
 
 
 def _agreeing(motion: dict[str, Any]) -> str:
@@ -46,11 +52,31 @@ def _agreeing(motion: dict[str, Any]) -> str:
     return ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
 
 
-def readout_words(shutter: RollingShutter, capture: Capture | None) -> str:
+def camera_facts(record: dict[str, Any]) -> dict[str, str]:
+    """Of the record of one camera: its focal length, and the clock of its gyroscope."""
+    focal, sigma = f"{record['camera']['fx']:.1f}", record["focal_length_sigma"]
+    how = "found"
+    if record["focal_length_assumed"]:
+        how = "assumed: the width of the image; the frames do not determine it"
+    facts = {"focal length": f"{focal} px (given)" if sigma is None else f"{focal} +- {sigma:.1f} px ({how})"}
+    clock = record.get("gyro_clock")
+    if clock is None:
+        return facts
+    words = f"{clock['shift']:+.3f} +- {clock['sigma']:.3f} frame periods off, and "
+    words += "set right" if clock["used"] else "left as it is"
+    if not clock["told"]:
+        words = "the frames do not show its offset; give `--gyro-offset`"
+    return {**facts, "gyroscope's clock": words}
+
+
+def readout_words(shutter: RollingShutter, capture: Capture | None, rig: StereoRig) -> str:
     best = None if capture is None else capture.likeliest
     if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
     odds = f"probability that the cameras read so {best.probability:.0%}"
+    if not rig.metric:
+        odds = odds.replace("cameras read", "camera reads")
+        return f"{best.ratio:.3f} +- {best.sigma:.3f}, from the {shutter.scan_of('left')} (found, {odds})"
     odds += "".join(f"; else {each.scans}" for each in capture.candidates[1:2])
     text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {odds})"
     if not capture.determined and capture.moved_px < 1.0:

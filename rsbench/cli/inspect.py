@@ -157,14 +157,14 @@ def _of_footage(left: Path | None, right: Path | None, card: Path, options: _Opt
 
 def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, options: _Options) -> _Case:
     """Frames of a user, whose card says the rig."""
-    from rsbench.cli.correct_input import ReadoutOptions, say_notes, sized
+    from rsbench.cli.correct_input import ReadoutOptions, say_notes
     from rsbench.interop.readers.rig_files import read_rig_file
 
     first, second = next(iter(left)), next(iter(right))
     readout = ReadoutOptions(readout_ratio=None, shutter=None, fps=options.fps).beside(card, False, left.path)
     given, notes = read_rig_file(card, readout, lambda: (first.shape[1], first.shape[0]))
     say_notes("--rig", notes)
-    rig = sized(given, first, second)
+    rig = given.rig_of(first, second)
     ratio, scanning = given.readout_ratio, given.scanning
     try:
         shutter = None if ratio is None or scanning is None else rig.shutter_of(scanning, ratio)

@@ -14,7 +14,7 @@ centre; solvers, matching and disparities use them. In an ideal rig both are the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import Literal
@@ -140,7 +140,7 @@ class StereoRig:
     """A stereo pair that moves about the centre of its baseline.
 
     ``StereoRig(camera=, baseline=)`` is the ideal rig, two equal cameras in perfect alignment; ``of_cameras``
-    makes any other from what a calibration gives.
+    makes any other from what a calibration gives, and ``of_one`` that of one camera.
     """
 
     camera: PinholeCamera
@@ -152,6 +152,8 @@ class StereoRig:
     left: RigCamera | None = None
     """None in the ideal rig, as is ``right``."""
     right: RigCamera | None = None
+    sides: tuple[Side, ...] = field(default=SIDES, repr=False)
+    """The cameras that there are: both, or in a rig ``of_one`` the left one."""
 
     def __post_init__(self) -> None:
         arguments.check_type("camera", self.camera, PinholeCamera)
@@ -165,6 +167,11 @@ class StereoRig:
         if self.left is not None and self.camera.lens is not None:
             raise ValueError("camera must have no lens where left and right are given: theirs are their own")
         arguments.keep_plain(self)
+
+    @classmethod
+    def of_one(cls, camera: PinholeCamera) -> StereoRig:
+        """One camera, whose centre is the body's: lengths have no unit, so the baseline stands for any."""
+        return cls(camera=camera, baseline=1.0, origin="left", sides=("left",))
 
     @classmethod
     def of_cameras(
@@ -209,6 +216,11 @@ class StereoRig:
         if left.camera == right.camera and turned < _ALIGNED_RAD:
             return cls(camera=left.camera, baseline=baseline)
         return cls(camera=_ideal_camera(left, right), baseline=baseline, left=left, right=right)
+
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are metres; one camera does not show them."""
+        return len(self.sides) > 1
 
     @property
     def aligned(self) -> bool:

@@ -18,6 +18,7 @@ from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.shutter_decision import record_of
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.two_frame_estimate import Capture
+from rsbench.components.motion_models import AcceleratedMotion
 from rsbench.components.rig_tables import camera_record
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
@@ -29,7 +30,9 @@ from rsbench.dataset.sequence import cameras_record
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion
+from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import CONTRADICTED
+from rsbench.pipeline.sequence_capture import KnownCapture
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
 from rsbench.storage.videos import UPRIGHT, VideoFile, write_frames, written_as_video
 from rsbench.storage.work_folder import (
@@ -202,8 +205,10 @@ def read_origin(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.u
     return origins[read_png(path, size)[..., 0]]
 
 
-def motion_record(found: FoundMotion) -> dict[str, Any]:
-    """The body's motion of one window, metres, ready for JSON."""
+def motion_record(found: FoundMotion | FoundOwnMotion) -> dict[str, Any]:
+    """The body's motion of one window, metres, or one camera's, of length 1, ready for JSON."""
+    if isinstance(found, FoundOwnMotion):
+        return _own_motion_record(found)
     estimate, motion = found.robust.estimate, found.motion
     # A covariance holds about the point that the solver solved for.
     known = estimate.covariance is not None and found.reference_point == "body"
@@ -228,6 +233,27 @@ def motion_record(found: FoundMotion) -> dict[str, Any]:
         "matches": {str(name): count.matches for name, count in found.robust.counts.items()},
         **gyro,
     }
+
+
+def _own_motion_record(found: FoundOwnMotion) -> dict[str, Any]:
+    motion = found.own.motion
+    unused = {"gyro": found.unused} if found.unused else {}
+    if motion is None:
+        return {"reason": found.reason, **unused}
+    record = {
+        "model": motion.name,
+        **({"acceleration": motion.acceleration} if isinstance(motion, AcceleratedMotion) else {}),
+        "w": motion.w.tolist(),
+        "d": motion.d.tolist(),
+        "rotation_deg": float(np.rad2deg(np.linalg.norm(motion.w))),
+    }
+    if found.robust is not None:
+        record |= {
+            "noise_px": found.robust.estimate.noise_px,
+            "inliers": found.robust.inlier_count,
+            "matches": found.robust.match_count,
+        }
+    return {**record, **unused}
 
 
 def _gyro_record(gyro: GyroFound) -> Any:
@@ -272,6 +298,28 @@ def rig_record(
         "target_row": options.target_row,
         "components": components,
         "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
+    }
+
+
+def camera_alone_record(known: KnownCapture, options: CorrectionOptions, unit: str) -> dict[str, Any]:
+    """What the correction of one camera's frames assumed or found, ready for JSON; ``unit``: of length."""
+    focal, best = known.focal, None if known.capture is None else known.capture.likeliest
+    return {
+        "units": {"length": unit, "angle": "rad", "time": "frame period", "depth": f"{unit}, 0 = unknown"},
+        **_ideal_record(known.rig.camera),
+        "focal_length_assumed": focal is not None and not focal.determined,
+        "focal_length_estimated": focal is not None and focal.determined,
+        "focal_length_sigma": None if focal is None else focal.sigma,
+        "scan": known.shutter.scan_of("left"),
+        "readout_ratio": known.shutter.readout_ratio,
+        "readout_ratio_sigma": None if best is None else best.sigma,
+        "readout_ratio_estimated": known.capture is not None,
+        "capture": None if known.capture is None else record_of(known.capture),
+        "corrector": options.corrector.name,
+        "target_row": options.target_row,
+        "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
+        "gyro": known.gyro is not None,
+        **({} if known.clock is None else {"gyro_clock": known.clock._asdict()}),
     }
 
 

@@ -23,11 +23,14 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
+from rsbench.pipeline.footage import ImageSource
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches, model_to_use
 from rsbench.pipeline.isolated_components import Isolation
-from rsbench.pipeline.mono_sequence import Gyroscope, correct_all
-from rsbench.pipeline.sequence_capture import with_found_camera
+from rsbench.pipeline.mono_camera import OneCameraCard
+from rsbench.pipeline.mono_sequence import options_of_camera
+from rsbench.pipeline.sequence_capture import Gyroscope, know_capture, with_found_camera
+from rsbench.pipeline.sequence_correction import correct_sequence
 from rsbench.solvers.engine.base import Solver, entry_of
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
@@ -97,7 +100,7 @@ def of_one_camera(
     gyro_clock_error: float = 0.0,
 ) -> list[Fused]:
     """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
-    known = StereoRig(camera=camera, baseline=1.0) if isinstance(camera, PinholeCamera) else None
+    known = StereoRig.of_one(camera) if isinstance(camera, PinholeCamera) else None
     for number, image in enumerate(arguments.items("images", images)):
         check_image(f"frame {number}", image, known)
     if len(images) > 0:
@@ -109,7 +112,10 @@ def of_one_camera(
         arguments.check_number("camera", camera)  # degrees, whose range the card of a camera checks
     samples = gyro_samples(gyro)
     log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro_clock_error)
-    return correct_all(images, camera, readout_ratio, target_row, inpaint=inpaint, seed=seed, gyro=log)
+    options, sources = options_of_camera(inpaint, seed, target_row), [ImageSource(images)]
+    found = know_capture(sources, OneCameraCard.of(camera, readout_ratio), options, log)
+    frames = [moment.shown["left"] for moment in correct_sequence(sources, found, options)]
+    return [finished(fused) for fused in frames] if inpaint is None else frames
 
 
 # The trajectory of arrays, as ``rsbench.estimate_trajectory`` finds it.

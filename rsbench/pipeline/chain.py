@@ -348,12 +348,13 @@ def correct_known_rows(
         one_time=options.one_time,
     )
     return [
-        {view: _finish(fused, options) for view, fused in corrected.items()}
+        {view: inpainted(fused, options) for view, fused in corrected.items()}
         for corrected in find_corrected_rows(options.corrector, problem, views, rows)
     ]
 
 
-def _finish(fused: Fused, options: CorrectionOptions) -> Fused:
+def inpainted(fused: Fused, options: CorrectionOptions) -> Fused:
+    """A frame without holes, if the options ask for that."""
     if not (options.inpaint and fused.success):
         return fused
     return replace(fused, image=inpaint(fused.image, fused.origin == Origin.NOBODY))

@@ -176,6 +176,15 @@ class RigCard(StatedShutter):
         apart = self.right_from_left or RightFromLeft(translation=(-(self.baseline or 0.0), 0.0, 0.0))
         return rig_of_tables(self.left, self.right, apart, {"left": left, "right": right})
 
+    def rig_of(self, left: NDArray[Any], right: NDArray[Any]) -> StereoRig:
+        """The rig with images like these two; RsbenchError where its cameras cannot be of such images."""
+        sizes = [(image.shape[1], image.shape[0]) for image in (left, right)]
+        try:
+            return self.rig(*sizes)
+        except ValueError as error:
+            words = " and ".join(dict.fromkeys(f"{width} x {height}" for width, height in sizes))
+            raise RsbenchError(f"--rig: of images of {words} pixels: {error}") from error
+
 
 def _within(centre: float) -> int:
     """Columns or rows that an image surely has whose principal point lies at this one."""
@@ -507,6 +516,23 @@ class FrameSource:
             return frame
         half = frame.shape[1] // 2
         return np.ascontiguousarray(frame[:, :half] if self._part == "left" else frame[:, half : 2 * half])
+
+
+class ImageSource(FrameSource):
+    """Frames that are in memory, one a frame period."""
+
+    def __init__(self, images: Iterable[NDArray[Any]]) -> None:
+        """Images (H, W[, 3]) in order."""
+        self.path, self._images, self._kept = Path("images"), list(images), None
+        self.count = len(self._images)
+
+    @cached_property
+    def timeline(self) -> Timeline:
+        """Without copies."""
+        return _timeline(np.arange(self.count), None)
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        return iter([each for k, each in enumerate(self._images) if self._kept is None or k in self._kept])
 
 
 @dataclass(frozen=True, kw_only=True)

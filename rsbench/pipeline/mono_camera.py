@@ -76,6 +76,18 @@ class OneCameraCard:
         if self.camera is not None and self.camera.sigma:
             raise ValueError("camera.focal_sigma, k1_sigma: leave them out; of one camera neither is found")
 
+    @classmethod
+    def of(cls, camera: PinholeCamera | float | None, readout_ratio: float | None) -> OneCameraCard:
+        """Of known intrinsics, of a horizontal field of view in degrees, or of neither; RsbenchError of others."""
+        known: dict[str, Any] = {} if camera is None else {"fov_deg": camera}
+        if isinstance(camera, PinholeCamera):
+            c = camera
+            known = {"camera": CameraCard(fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)}
+        try:
+            return cls(readout_ratio=readout_ratio, **known)
+        except ValueError as error:
+            raise RsbenchError(str(error)) from error
+
     @property
     def focal_unknown(self) -> bool:
         """Whether no focal length is given."""
@@ -269,7 +281,7 @@ PAIRS = 5
 """Of frames, at most, by which the focal length is found; they lie evenly over the video."""
 
 
-def find_camera(
+def find_camera_alone(
     frames: Iterable[NDArray[Any]],
     count: int,
     card: OneCameraCard,

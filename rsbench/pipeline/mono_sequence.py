@@ -9,29 +9,21 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.self_calibration import FoundFocal
-from rsbench.capture.sequence_shutter import LONGEST
-from rsbench.components.motion_models import AcceleratedMotion, InertialMotion
+from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.footage import CameraCard, Progress, about_one, check_alike, no_progress
-from rsbench.pipeline.mono_camera import (
-    IN_ORDER,
-    PAIRS,
-    FoundShutter,
-    OneCameraCard,
-    find_camera,
-    find_shutter,
-)
+from rsbench.pipeline.chain import inpainted
+from rsbench.pipeline.footage import about_one, check_alike
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.mono_correction import (
     CUT,
     PIXELS,
@@ -49,9 +41,9 @@ from rsbench.pipeline.mono_correction import (
     with_selected_model,
     with_shared_trajectory,
 )
-from rsbench.pipeline.mono_gyro import NOT_COVERED, Clock, around, in_time, pair_rates, rotation_alone, with_gyro
-from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
-from rsbench.vision.fusion import Fused, finished
+from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
+from rsbench.pipeline.sequence_capture import CorrectedMoment
+from rsbench.vision.corrector import load_corrector
 from rsbench.vision.images import map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
@@ -59,102 +51,6 @@ _AT_ONCE = 2
 """Pairs that are worked on at once: the rest of a pair's work fills the second of two cores."""
 _HELD, _HELD_BYTES = 14, 4e8
 """Pairs that wait for those after them, and what their flow may take."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MonoMoment:
-    """One frame of a camera, corrected."""
-
-    number: int
-    image: NDArray[Any]
-    """As it was read."""
-    fused: Fused
-    """``fused.reason`` says why it is not corrected; it is then as it was read."""
-    found: FoundOwnMotion | None
-    """The motion, of length 1, over the frame and the one before, or else after; None without one."""
-    skipped: str = ""
-    """Why it was corrected with the frame after it in place of the one before; empty for the first frame."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MonoOptions:
-    """How frames of one camera are corrected."""
-
-    corrector: MonoFusionCorrector = field(default_factory=MonoFusionCorrector)
-    target_row: float | None = None
-    """The time of this row of a frame is that of its corrected image; None: of the middle one."""
-    close: bool = True
-    """Whether frames are ``finished`` for a person: narrow holes closed, seams even."""
-
-    @classmethod
-    def of(cls, inpaint: bool | None, seed: int, target_row: float | None) -> MonoOptions:
-        """``inpaint``: whether all that no frame shows is invented, or nothing; None: what is narrow."""
-        corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=bool(inpaint)), seed=seed)
-        return cls(corrector=corrector, target_row=target_row, close=inpaint is None)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Gyroscope:
-    """A gyroscope's log beside the frames of one camera."""
-
-    samples: FloatArray
-    """(n, 4) tau, w, as of ``Correspondences.gyro``; tau 0 is the first row of the first frame."""
-    clock_error: float = 0.0
-    """Frame periods by which its clock may be off; 0: the times are exact."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class KnownCamera:
-    """How one camera's frames were taken: given, or estimated from them. The correction needs nothing more."""
-
-    camera: PinholeCamera
-    focal: FoundFocal | None
-    """How the focal length was estimated; None where it is given."""
-    readout: FoundShutter
-    gyro: FloatArray | None
-    """(n, 4) samples at the times of the frames; None without a gyroscope."""
-    clock: Clock | None
-    """Error of the gyroscope's clock; None where its times are exact."""
-
-
-def know_camera(
-    frames: Iterable[NDArray[Any]],
-    count: int,
-    card: OneCameraCard,
-    options: MonoOptions,
-    gyro: Gyroscope | None = None,
-    progress: Progress = no_progress,
-    starts: FloatArray | None = None,
-) -> KnownCamera:
-    """Estimates from frames (H, W[, 3]) what the card leaves open: shutter, focal length, gyroscope's clock.
-
-    Args:
-        frames: in order; gone through once for each quantity that is estimated.
-        count: of the frames, about; 0 where it is unknown.
-        starts: as of ``correct_frames``, for the gyroscope's clock.
-
-    Raises:
-        NoMotionError: the frames do not show how their lines are read.
-        RsbenchError: as of ``find_shutter``.
-    """
-    robust, seed, pairs = options.corrector.robust, options.corrector.seed, max(count - 1, 1)
-    unknown = card.readout_ratio is None
-    with progress("looking at the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
-        readout = find_shutter(frames, count, card, robust, seed, advance)
-        if unknown:
-            advance("all pairs together")
-    shutter = readout.shutter
-    if card.focal_unknown:
-        with progress("looking at the focal length", min(pairs, PAIRS)) as advance:
-            camera, focal = find_camera(frames, count, card, shutter, robust, seed, advance)
-    else:
-        camera, focal = find_camera(frames, count, card, shutter, robust, seed)
-    samples, clock = None if gyro is None else gyro.samples, None
-    if gyro is not None and gyro.clock_error > 0.0:
-        with progress("looking at the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
-            rates = pair_rates(frames, count, camera, shutter, robust, seed, advance, starts)
-        samples, clock = in_time(rates, gyro.samples, camera, shutter, gyro.clock_error)
-    return KnownCamera(camera=camera, focal=focal, readout=readout, gyro=samples, clock=clock)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,15 +78,22 @@ class _Seen(NamedTuple):
     """See ``trajectory_matches``."""
 
 
+def options_of_camera(inpaint: bool | None, seed: int, target_row: float) -> CorrectionOptions:
+    """Options of the correction of one camera's frames; those of a rig's components have no effect on it."""
+    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=False), seed=seed)
+    entry = replace(load_corrector("mono-fusion"), component=corrector)
+    return CorrectionOptions(corrector=entry, target_row=target_row, seed=seed, inpaint=bool(inpaint))
+
+
 def correct_frames(
     frames: Iterable[NDArray[Any]],
     camera: PinholeCamera,
     shutter: RollingShutter,
-    options: MonoOptions | None = None,
+    options: CorrectionOptions | None = None,
     done: int = 0,
     gyro: FloatArray | None = None,
     starts: FloatArray | None = None,
-) -> Iterator[MonoMoment]:
+) -> Iterator[CorrectedMoment]:
     """Every frame (H, W[, 3]), uint8 or uint16, of one camera at the time of its target row, in order.
 
     Memory does not grow with the number of frames: a few pairs are worked on at once.
@@ -198,7 +101,7 @@ def correct_frames(
     Args:
         frames: in order; they are gone through once.
         camera, shutter: of the frames.
-        options: how they are corrected.
+        options: as of ``options_of_camera``; None: at the time of the middle row.
         done: so many first frames are left out.
         gyro: (n, 4) tau, w of a gyroscope, as of ``Correspondences``: tau 0 is the first row of the first frame.
         starts: (n,) increasing times of the frames' first rows, frame periods; 0, 1, 2, ... if absent. The readout
@@ -208,9 +111,9 @@ def correct_frames(
         RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
             more frames such a pair is a failure by value.
     """
-    options = options or MonoOptions()
+    options = options or options_of_camera(None, 0, (camera.height - 1) / 2)
     turn = turned(camera, shutter)
-    pending: MonoMoment | None = None
+    pending: CorrectedMoment | None = None
     each: _Frame | None = None
     for each in _with_neighbours(_pairs(frames, turn, options, done, gyro, starts)):
         if each.number < done:
@@ -255,7 +158,7 @@ def _with_neighbours(
 def _pairs(
     frames: Iterable[NDArray[Any]],
     turn: Turned,
-    options: MonoOptions,
+    options: CorrectionOptions,
     done: int,
     gyro: FloatArray | None,
     starts: FloatArray | None,
@@ -303,37 +206,11 @@ def _span(number: int, starts: FloatArray | None) -> tuple[float, float]:
     return float(starts[number]), float(starts[number + 1] - starts[number])
 
 
-def correct_all(
-    frames: Sequence[NDArray[Any]],
-    camera: PinholeCamera | float | None,
-    readout_ratio: float | None,
-    target_row: float | None = None,
-    *,
-    inpaint: bool | None = None,
-    seed: int = 0,
-    gyro: Gyroscope | None = None,
-) -> list[Fused]:
-    """``correct_frames`` of a camera, a horizontal field of view in degrees, or None; its errors."""
-    known: dict[str, Any] = {}
-    if isinstance(camera, PinholeCamera):
-        known["camera"] = CameraCard(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, lens=camera.lens)
-    elif camera is not None:
-        known["fov_deg"] = camera
-    try:
-        card = OneCameraCard(readout_ratio=readout_ratio, **known)
-    except ValueError as error:
-        raise RsbenchError(str(error)) from error
-    options = MonoOptions.of(inpaint, seed, target_row)
-    found = know_camera(frames, len(frames), card, options, gyro)
-    moments = correct_frames(frames, found.camera, found.readout.shutter, options, gyro=found.gyro)
-    return [moment.fused for moment in moments]
-
-
 def _seen(
     number: int,
     images: tuple[NDArray[Any], NDArray[Any]],
     turn: Turned,
-    options: MonoOptions,
+    options: CorrectionOptions,
     gyro: FloatArray | None,
     start: float,
     period: float,
@@ -342,15 +219,15 @@ def _seen(
     turn = turn.paced(period)
     check_alike({f"frame {number + place}": image for place, image in enumerate(images)})
     given = [turn.image(image) for image in images]
-    flows, corrector = find_flows(given), options.corrector
+    flows = find_flows(given)
     samples = None
     if gyro is not None:
         samples = around(gyro, start, start + period * (1.0 + turn.shutter.readout_ratio))
     local = None if samples is None else (samples - [start, 0.0, 0.0, 0.0]) * [1.0 / period, *3 * [period]]
-    found, reason = _found(given, flows, turn, corrector, local)
+    found, reason = _found(given, flows, turn, options, local)
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
-    matches = trajectory_matches(flows, corrector.seed, PIXELS) if gyro is None else np.zeros((0, 4))
+    matches = trajectory_matches(flows, options.seed, PIXELS) if gyro is None else np.zeros((0, 4))
     small = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _HELD_BYTES
     return _Seen(number, images, flows if small else None, found, reason, matches)
 
@@ -359,42 +236,36 @@ def _found(
     images: Sequence[NDArray[Any]],
     flows: Flows,
     turn: Turned,
-    corrector: MonoFusionCorrector,
+    options: CorrectionOptions,
     gyro: FloatArray | None,
 ) -> tuple[FoundOwnMotion | None, str]:
     """The motion over two frames, or why they cannot be corrected."""
-    rig, shutter = StereoRig(camera=turn.camera, baseline=1.0), turn.shutter
+    rig, shutter = StereoRig.of_one(turn.camera), turn.shutter
     if reason := refusal(images, flows):
         if gyro is None or reason in (STILL, CUT):
             return None, reason
         return rotation_alone(rig, shutter, "left", gyro), ""
-    known = rig, shutter, "left", corrector.robust, corrector.seed
-    found = find_steady_motion(flows, *known)
+    search = options.robust, options.seed
+    found = find_steady_motion(flows, rig, shutter, "left", *search)
     if gyro is None:
         return found, ""
-    options = corrector.robust, corrector.seed
-    return with_gyro(with_selected_model(found, flows, *options), flows, gyro, *options), ""
+    return with_gyro(with_selected_model(found, flows, *search), flows, gyro, *search), ""
 
 
-def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: MonoOptions) -> _Pair:
+def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: CorrectionOptions) -> _Pair:
     if found is None:
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
-    flows, corrector = seen.flows or find_flows(images), options.corrector
+    flows, corrector = seen.flows or find_flows(images), options.corrector.component
+    assert isinstance(corrector, MonoFusionCorrector)
     if isinstance(found.own.motion, InertialMotion):  # on no trajectory
-        found = with_best_motion(found, flows, corrector.robust, corrector.seed)
+        found = with_best_motion(found, flows, options.robust, options.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 
-def _unmoved(number: int, image: NDArray[Any], reason: str) -> MonoMoment:
-    """A frame as it was read."""
-    fused = replace(Fused.failed(image, reason), image=image.copy())
-    return MonoMoment(number=number, image=image, fused=fused, found=None)
-
-
-def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
-    """A frame corrected with one neighbour, filled from both; or as it was read, with the reason."""
-    line = (turn.camera.height - 1) / 2 if options.target_row is None else turn.line(options.target_row)
+def _moment(each: _Frame, turn: Turned, options: CorrectionOptions) -> CorrectedMoment:
+    """A frame corrected with one neighbour, filled from both; or none, with the reason."""
+    line = turn.line(options.target_row)
     sources = [(each.before, 1), (each.after, 0)]
     if line > (turn.camera.height - 1) / 2:
         sources.reverse()
@@ -402,39 +273,17 @@ def _moment(each: _Frame, turn: Turned, options: MonoOptions) -> MonoMoment:
         (pair.fusion, place, pair.found) for pair, place in sources if pair is not None and pair.fusion is not None
     ]
     why = "" if each.before is None else each.before.reason
+    moment = CorrectedMoment(number=each.number, images={"left": each.image}, frames={}, found=None, reason=why)
     # A camera that stood still is in place; the same frame twice stands for one that was not taken.
     stays = why == STILL and each.previous is not None and not np.array_equal(each.previous, each.image)
     if stays or not good:
-        return _unmoved(each.number, each.image, why or (each.after.reason if each.after else ""))
+        return replace(moment, reason=why or (each.after.reason if each.after else ""))
     fusion, place, found = good[0]
     beyond = Beyond(*good[1][:2], _target(*good[1][:2], line)) if len(good) > 1 else None
-    fused = fusion.corrected(place, _target(fusion, place, line), beyond)
-    fused = turn.back(finished(fused) if options.close else fused)
-    return MonoMoment(number=each.number, image=each.image, fused=fused, found=turn.found(found), skipped=why)
+    fused = inpainted(turn.back(fusion.corrected(place, _target(fusion, place, line), beyond)), options)
+    return replace(moment, frames={"left": fused}, found=turn.found(found))
 
 
 def _target(fusion: MonoFusion, place: int, line: float) -> float:
     """The time of a line of one of a pair's frames, in that pair's periods."""
     return float(fusion.own.shutter.time_after(line, place, "left"))
-
-
-def translation_record(found: FoundOwnMotion) -> dict[str, Any]:
-    """The motion of a camera over one frame period, ready for JSON; its unit of length is the translation's."""
-    motion = found.own.motion
-    unused = {"gyro": found.unused} if found.unused else {}
-    if motion is None:
-        return {"reason": found.reason, **unused}
-    record = {
-        "model": motion.name,
-        **({"acceleration": motion.acceleration} if isinstance(motion, AcceleratedMotion) else {}),
-        "w": motion.w.tolist(),
-        "d": motion.d.tolist(),
-        "rotation_deg": float(np.rad2deg(np.linalg.norm(motion.w))),
-    }
-    if found.robust is not None:
-        record |= {
-            "noise_px": found.robust.estimate.noise_px,
-            "inliers": found.robust.inlier_count,
-            "matches": found.robust.match_count,
-        }
-    return {**record, **unused}

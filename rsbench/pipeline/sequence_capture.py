@@ -1,19 +1,22 @@
-"""The windows of a sequence: both images of two successive times, and what is refused of them."""
+"""How the frames of a sequence were taken, by a rig or by one camera: given, or estimated from some of them.
+
+``know_capture`` ends in one ``KnownCapture``; with that, a correction needs nothing but the frames and options.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import CardSigma, RefusedFramesError, check_rig
+from rsbench.capture.calibration import NO_ERRORS, CardSigma, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
 from rsbench.capture.rig_calibration import FoundRig
-from rsbench.capture.self_calibration import FoundCamera, find_camera
+from rsbench.capture.self_calibration import FoundCamera, FoundFocal, find_camera
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_tracks import ENOUGH
@@ -22,10 +25,13 @@ from rsbench.capture.two_frame_estimate import Window as Examined
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.pipeline.footage import FrameSource, Progress, check_alike, no_progress
+from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.footage import FrameSource, Progress, RigCard, check_alike, no_progress
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.frame_motion import (
+    FoundMotion,
     find_rig,
     match_frames,
     match_unknown,
@@ -33,6 +39,167 @@ from rsbench.pipeline.frame_motion import (
     rig_of_matches,
     with_enough,
 )
+from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, OneCameraCard, find_camera_alone, find_shutter
+from rsbench.pipeline.mono_correction import FoundOwnMotion
+from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
+from rsbench.pipeline.mono_gyro import Clock, in_time, pair_rates
+from rsbench.vision.fusion import Fused
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gyroscope:
+    """A gyroscope's log beside frames."""
+
+    samples: FloatArray
+    """(n, 4) tau, w, as of ``Correspondences.gyro``; tau 0 is the first row of the first frame."""
+    clock_error: float = 0.0
+    """Frame periods by which its clock may be off; 0: the times are exact."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownCapture:
+    """How frames were taken, given or estimated, and where each estimate comes from."""
+
+    rig: StereoRig
+    """The cameras; of one camera ``StereoRig.of_one``."""
+    shutter: RollingShutter
+    capture: Capture | None = None
+    """How the shutter was estimated; None where it is given."""
+    calibration: tuple[float, ...] = NO_ERRORS
+    """Errors of the calibration, see ``calibration.TERMS``."""
+    rig_found: FoundRig | None = None
+    """How rotation, focal lengths and delay of the right camera were estimated; None where they are as given."""
+    focal: FoundFocal | None = None
+    """How one camera's focal length was estimated; None where it is given."""
+    camera_note: str = ""
+    """What was estimated of a rig's focal length and k1."""
+    gyro: FloatArray | None = None
+    """(n, 4) samples of a gyroscope at the times of the frames; None without one."""
+    clock: Clock | None = None
+    """Error of the gyroscope's clock; None where its times are exact."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CorrectedMoment:
+    """The images of one time of a sequence."""
+
+    number: int
+    images: dict[Side, NDArray[Any]]
+    """As they were read."""
+    frames: dict[Side, Fused]
+    """Corrected; empty when a motion was needed and not found, or the corrector found no correction."""
+    found: FoundMotion | FoundOwnMotion | None
+    """The motion that they were corrected with."""
+    reason: str
+    """With frames, why they were corrected with the motion between two other times than usual; without, why there
+    are none. Empty for the last time of a rig, whose motion comes from the one before."""
+    pose: Pose | None = None
+    """Body from world at the start of the frame, where a trajectory was found; the world is the first body."""
+    line_poses: Pose | None = None
+    """(lines, 3, 3), (lines, 3) likewise, at the time of each line of the left camera, in order of time."""
+
+    @property
+    def shown(self) -> dict[Side, Fused]:
+        """The corrected frames; without them the images as they were read, with the reason."""
+        images = {side: image.copy() for side, image in self.images.items()}
+        return self.frames or {
+            side: replace(Fused.failed(image, self.reason), image=image) for side, image in images.items()
+        }
+
+
+def know_capture(
+    sources: Sequence[FrameSource],
+    card: RigCard | OneCameraCard,
+    options: CorrectionOptions,
+    gyro: Gyroscope | None = None,
+    progress: Progress = no_progress,
+) -> KnownCapture:
+    """Estimates from the frames of a rig or of one camera what their card leaves open.
+
+    Args:
+        sources: frames of the left and the right camera, or of one; read once for each quantity that is estimated.
+
+    Raises:
+        NoMotionError: the frames do not show how their lines are read.
+        RefusedFramesError: the frames contradict the card.
+        RsbenchError: too few frames, frames of two sizes, or cameras that cannot be of such images.
+    """
+    if isinstance(card, OneCameraCard):
+        return _know_camera(sources[0], card, options, gyro, progress)
+    left, right = sources
+    rig = card.rig_of(next(iter(left)), next(iter(right)))
+    ratio, scanning, calibration = card.readout_ratio, card.scanning, card.calibration
+    shown = spread_windows(left, right)
+    rig, note = with_found_camera(rig, card.sigma, shown, options, ratio, scanning, progress)
+    turned = with_found_rig(rig, left, right, options, ratio, scanning)
+    rig = rig if turned is None else turned.rig
+    calibration = calibration if rig.aligned else calibration or NO_ERRORS  # found as errors of the rig
+    capture, shutter = None, None
+    if ratio is None or calibration is None:
+        with progress("looking at the shutter", min(max(left.count - 1, 1), WINDOWS)) as advance:
+            capture, shutter = estimate_sequence_capture(
+                left, right, rig, options, ratio, scanning, calibration, advance
+            )
+        nothing = capture is None or not rig.rows_together(shutter.scanning)
+        calibration = NO_ERRORS if nothing else capture.calibration
+    return KnownCapture(
+        rig=rig,
+        shutter=shutter or rig.shutter_of(scanning or Scanning(), ratio or 0.0),
+        capture=capture,
+        calibration=calibration,
+        rig_found=turned,
+        camera_note=note,
+        gyro=None if gyro is None else gyro.samples,
+    )
+
+
+def frames_with_times(source: FrameSource) -> tuple[FrameSource, FloatArray | None]:
+    """The frames of one camera without copies, and the times of their first rows, frame periods; None: even."""
+    timeline = source.timeline
+    frames = source if len(timeline.starts) == len(timeline.twins) else source.only(timeline.originals)
+    return frames, None if timeline.even else timeline.starts
+
+
+def _know_camera(
+    source: FrameSource,
+    card: OneCameraCard,
+    options: CorrectionOptions,
+    gyro: Gyroscope | None,
+    progress: Progress,
+) -> KnownCapture:
+    frames, starts = frames_with_times(source)
+    if starts is not None:  # the longest run of even intervals, which most of this assumes
+        run = source.timeline.even_run()
+        frames, starts = source.only(source.timeline.originals[run]), starts[run]
+    robust, seed, pairs = options.robust, options.seed, max(frames.count - 1, 1)
+    unknown = card.readout_ratio is None
+    with progress("looking at the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
+        found = find_shutter(frames, frames.count, card, robust, seed, advance)
+        if unknown:
+            advance("all pairs together")
+    shutter = found.shutter
+    opened = (
+        progress("looking at the focal length", min(pairs, PAIRS)) if card.focal_unknown else no_progress("", 0)
+    )
+    with opened as advance:
+        camera, focal = find_camera_alone(frames, frames.count, card, shutter, robust, seed, advance)
+    samples, clock = None if gyro is None else gyro.samples, None
+    if gyro is not None and gyro.clock_error > 0.0:
+        with progress("looking at the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
+            rates = pair_rates(frames, frames.count, camera, shutter, robust, seed, advance, starts)
+        samples, clock = in_time(rates, gyro.samples, camera, shutter, gyro.clock_error)
+    return KnownCapture(
+        rig=StereoRig.of_one(camera),
+        shutter=shutter,
+        capture=found.capture,
+        focal=focal,
+        gyro=samples,
+        clock=clock,
+    )
+
+
+# Windows of a sequence of a rig, and what is refused of them.
+
 
 JUDGED = 3
 """First windows whose rig is looked at; when all of them are refused, so is the sequence."""

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
+from rsbench.capture.calibration import OFFSET, RefusedFramesError, recalibrated
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.model_choice import AUTO
 from rsbench.capture.shutter_decision import NoMotionError
@@ -23,18 +21,26 @@ from rsbench.capture.trajectory_estimate import StreamedWindow, stream_trajector
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.trajectory_tracks import ENOUGH
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
+from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.se3 import Pose, compose
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images, Pairs, frame_pair
 from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, with_enough
-from rsbench.pipeline.sequence_capture import FEWEST_FRAMES, JUDGED, Refusals, window_images
+from rsbench.pipeline.mono_sequence import correct_frames
+from rsbench.pipeline.sequence_capture import (
+    FEWEST_FRAMES,
+    JUDGED,
+    CorrectedMoment,
+    KnownCapture,
+    Refusals,
+    frames_with_times,
+    window_images,
+)
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate
-from rsbench.vision.fusion import Fused
 from rsbench.vision.images import ahead, map_ahead
 from rsbench.vision.stereo_matcher import needs_motion
 
@@ -140,59 +146,38 @@ _AHEAD = 4
 """Windows that are matched, and frames that are corrected, ahead: as many as leave a trajectory together."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CorrectedMoment:
-    """Both images of one time of a sequence."""
-
-    number: int
-    images: dict[Side, NDArray[Any]]
-    """As they were read."""
-    frames: dict[Side, Fused]
-    """Corrected; empty when a motion was needed and not found, or the corrector found no correction."""
-    found: FoundMotion | None
-    reason: str
-    """Why no motion leads from here to the next frame, or why there is no correction; empty when neither is so, or
-    when this is the last frame."""
-    pose: Pose | None = None
-    """Body from world at the start of the frame, where a trajectory was found; the world is the first body."""
-    line_poses: Pose | None = None
-    """(lines, 3, 3), (lines, 3) likewise, at the time of each line of the left camera, in order of time."""
-
-
 def correct_sequence(
-    left: FrameSource,
-    right: FrameSource,
-    rig: StereoRig,
-    readout_ratio: float,
-    options: CorrectionOptions,
-    calibration: tuple[float, ...] = NO_ERRORS,
-    scanning: Scanning | None = None,
-    *,
-    first: int = 0,
-    gyro: FloatArray | None = None,
+    sources: Sequence[FrameSource], known: KnownCapture, options: CorrectionOptions, first: int = 0
 ) -> Iterator[CorrectedMoment]:
-    """Every frame of a sequence corrected, in order; the last one with the motion from the one before.
+    """Every time of a sequence of a rig or of one camera corrected, in order.
 
-    A frame from which no motion leads to the next uses the motion that led to it; without either it is given
-    back uncorrected. Both say why.
+    A rig's frames are corrected with the motion to the next time; the last ones, and those from which no motion
+    leads to the next, with the motion from the one before. For one camera see ``correct_frames``; copies of frames
+    are left out.
 
     Args:
-        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
-        scanning: how the cameras read their lines; None: rows from the top, both at once.
+        sources: frames of the left and the right camera, or of one.
+        known: how they were taken; with a gyroscope a sequence that ``takes_gyro``.
         first: number of the first frame that is wanted.
-        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; of one that ``takes_gyro``.
 
     Raises:
         RefusedFramesError: the first three windows, or all, contradict the given rig.
         RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
     """
-    scanning = scanning or Scanning()
-    check_cameras(rig, scanning, options, calibration[OFFSET])
-    shutter = rig.shutter_of(scanning, readout_ratio)
+    rig, shutter, calibration = known.rig, known.shutter, known.calibration
+    if not rig.metric:
+        frames, starts = frames_with_times(sources[0])
+        numbers = sources[0].timeline.originals
+        done = int(np.count_nonzero(numbers < first))
+        for moment in correct_frames(frames, rig.camera, shutter, options, done, known.gyro, starts):
+            yield replace(moment, number=int(numbers[moment.number]))
+        return
+    left, right = sources
+    check_cameras(rig, shutter.scanning, options, calibration[OFFSET])
     along = _has_trajectory(left, shutter, options)
     windows = ahead(_windows(left, right, rig, shutter, options, calibration, not along), _AHEAD)
     if along:
-        windows = on_one_trajectory(windows, rig, shutter, options, calibration, gyro)
+        windows = on_one_trajectory(windows, rig, shutter, options, calibration, known.gyro)
     deep = _with_depth(windows, rig, shutter, options, calibration[OFFSET], first)
     places = (each for each in _places(deep) if each[0] >= first)
     # Nothing is known of whether another package's may run twice at a time.

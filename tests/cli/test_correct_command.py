@@ -380,6 +380,6 @@ def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
     matches = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
     known = Known(scans=(Scans("top", "top"),), delay=0.0, models=("linear",))
     window = examine(matches, rig, replace(known, calibration_sigma=of_offset(0.5)))
-    assert "may err" in readout_words(shutter, conclude([window]))
-    assert "may err" not in readout_words(shutter, conclude([window, window]))
-    assert "may err" not in readout_words(shutter, conclude([examine(matches, rig, known)]))
+    assert "may err" in readout_words(shutter, conclude([window]), rig)
+    assert "may err" not in readout_words(shutter, conclude([window, window]), rig)
+    assert "may err" not in readout_words(shutter, conclude([examine(matches, rig, known)]), rig)

@@ -17,11 +17,10 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.dataset import corrected_frames
-from rsbench.pipeline.mono_correction import MonoFusionCorrector
-from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
+from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
+from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.storage.files import read_png, write_png
 from rsbench.vision.fusion import Fused, Origin
-from rsbench.vision.mono_fusion import MonoFusionOptions
 
 SPEED, SIZE = 12.0, (120, 160)
 """px to the right per frame period, of a texture that reaches far beyond the frames; rows, columns."""
@@ -57,7 +56,7 @@ def _correct(folder: Path, *arguments: Any) -> Any:
     return run_here("correct", *arguments, "--camera", camera, "--out", folder / "out", "--target", 60)
 
 
-def _moments(frames: list[np.ndarray], scan: Scan = "top") -> list[MonoMoment]:
+def _moments(frames: list[np.ndarray], scan: Scan = "top") -> list[CorrectedMoment]:
     height, width = frames[0].shape[:2]
     shutter = RollingShutter(height=height, width=width, readout_ratio=1.0, scan=scan)
     return list(correct_frames(frames, PinholeCamera.centred(width, height, 160.0), shutter))
@@ -207,8 +206,8 @@ def test_a_still_pair_among_others_is_a_mark_on_its_frame() -> None:
     frames = [_rolling(0), _rolling(1), _rolling(1)]
     moments = _moments(frames)
     assert [moment.number for moment in moments] == [0, 1, 2]
-    assert [bool(moment.fused.reason) for moment in moments] == [False, False, True]
-    np.testing.assert_array_equal(moments[2].fused.image, frames[2])
+    assert [bool(moment.shown["left"].reason) for moment in moments] == [False, False, True]
+    np.testing.assert_array_equal(moments[2].shown["left"].image, frames[2])
 
 
 def test_a_still_camera_is_known_by_its_clear_texture() -> None:
@@ -219,10 +218,10 @@ def test_a_still_camera_is_known_by_its_clear_texture() -> None:
     coded = [cv2.imdecode(cv2.imencode(".jpg", each, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], 1) for each in noisy]
     for frames in (noisy, coded):
         moments = _moments(frames)
-        assert ["still camera" in moment.fused.reason for moment in moments] == [True] * 3
+        assert ["still camera" in moment.shown["left"].reason for moment in moments] == [True] * 3
         with pytest.raises(RsbenchError, match="still camera"):
             _moments(frames[:2])
-        np.testing.assert_array_equal(moments[1].fused.image, frames[1])
+        np.testing.assert_array_equal(moments[1].shown["left"].image, frames[1])
 
 
 @pytest.mark.slow
@@ -245,15 +244,15 @@ def test_a_frame_after_a_cut_is_corrected_with_the_one_after_it() -> None:
     other = [np.ascontiguousarray(_rolling(frame)[::-1, :, ::-1]) for frame in (5, 6)]
     moments = _moments([_rolling(0), _rolling(1), *other])
     assert [moment.number for moment in moments] == [0, 1, 2, 3]
-    assert not any(moment.fused.reason for moment in moments)
-    assert [bool(moment.skipped) for moment in moments] == [False, False, True, False]
-    assert "cut" in moments[2].skipped
+    assert not any(moment.shown["left"].reason for moment in moments)
+    assert [bool(moment.reason) for moment in moments] == [False, False, True, False]
+    assert "cut" in moments[2].reason
     alone = _moments(other)
-    np.testing.assert_array_equal(moments[2].fused.image, alone[0].fused.image)
+    np.testing.assert_array_equal(moments[2].shown["left"].image, alone[0].shown["left"].image)
     # A last frame that nothing follows stays as it is, and says why.
     last = _moments([_rolling(0), _rolling(1), other[0]])[2]
-    assert "cut" in last.fused.reason
-    np.testing.assert_array_equal(last.fused.image, other[0])
+    assert "cut" in last.shown["left"].reason
+    np.testing.assert_array_equal(last.shown["left"].image, other[0])
 
 
 @pytest.mark.slow
@@ -267,8 +266,8 @@ def test_lines_may_be_read_from_any_side(scan: Scan) -> None:
     moments = _moments([turn(_rolling(frame)) for frame in (0, 1)], scan)
     for frame, moment in enumerate(moments):
         truth, inner = turn(_seen(np.full(SIZE[0], frame + 0.5))).astype(float), np.s_[20:-20, 20:-20]
-        before = np.sqrt(np.mean((moment.image - truth)[inner] ** 2))
-        assert np.sqrt(np.mean((moment.fused.image - truth)[inner] ** 2)) < 0.25 * before
+        before = np.sqrt(np.mean((moment.images["left"] - truth)[inner] ** 2))
+        assert np.sqrt(np.mean((moment.shown["left"].image - truth)[inner] ** 2)) < 0.25 * before
 
 
 def _place(tau: np.ndarray) -> np.ndarray:
@@ -278,11 +277,10 @@ def _place(tau: np.ndarray) -> np.ndarray:
 
 def _second(frames: list[np.ndarray], place: int, row: float) -> Fused:
     """One of the frames at the time of a row, bare."""
-    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=False))
-    options = MonoOptions(corrector=corrector, target_row=row, close=False)
+    options = options_of_camera(False, 0, row)
     shutter = RollingShutter(height=SIZE[0], width=SIZE[1], readout_ratio=1.0)
     camera = PinholeCamera.centred(SIZE[1], SIZE[0], 160.0)
-    return list(correct_frames(frames, camera, shutter, options))[place].fused
+    return list(correct_frames(frames, camera, shutter, options))[place].shown["left"]
 
 
 def _accelerated(row: float) -> tuple[list[np.ndarray], np.ndarray]:

@@ -17,7 +17,7 @@ from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_capture import estimate_sequence_capture
+from rsbench.pipeline.sequence_capture import KnownCapture, estimate_sequence_capture
 from rsbench.pipeline.sequence_correction import correct_sequence
 
 Folders = tuple[FrameSource, FrameSource]
@@ -99,9 +99,13 @@ def folders(tmp_path: Path, castle: Sequence) -> Folders:
     return sources[0], sources[1]
 
 
+def _known(castle: Sequence) -> KnownCapture:
+    return KnownCapture(rig=castle.rig, shutter=castle.shutter)
+
+
 def test_a_sequence_of_two_equals_four_frames(folders: Folders, castle: Sequence) -> None:
     options, ratio = CorrectionOptions(), castle.shutter.readout_ratio
-    moments = list(correct_sequence(*folders, castle.rig, ratio, options))
+    moments = list(correct_sequence(folders, _known(castle), options))
     four = correct_four({view: castle.image("rs", *view) for view in VIEWS}, castle.rig, ratio, options).frames
     assert [moment.number for moment in moments] == [0, 1]
     for moment in moments:
@@ -116,7 +120,9 @@ def test_a_sequence_without_texture_is_refused(folders: Folders, castle: Sequenc
         _write(source.path, "1.png", flat)
     with pytest.raises(RsbenchError, match="no texture"):
         list(
-            correct_sequence(FrameSource(left.path), FrameSource(right.path), castle.rig, 0.8, CorrectionOptions())
+            correct_sequence(
+                [FrameSource(left.path), FrameSource(right.path)], _known(castle), CorrectionOptions()
+            )
         )
 
 
@@ -136,7 +142,7 @@ def test_a_frame_without_motion_to_the_next_uses_the_motion_that_led_to_it(
 
     monkeypatch.setattr("rsbench.pipeline.sequence_correction.solve_frames", solve)
     sources = FrameSource(left.path), FrameSource(right.path)
-    moments = list(correct_sequence(*sources, castle.rig, castle.shutter.readout_ratio, CorrectionOptions()))
+    moments = list(correct_sequence(sources, _known(castle), CorrectionOptions()))
     assert [bool(moment.frames) for moment in moments] == [True, True, False]
     assert moments[2].reason == "nothing there"
     four = correct_four(
@@ -152,7 +158,7 @@ def test_sequences_of_different_lengths_are_refused(folders: Folders, castle: Se
     left, right = folders
     (right.path / "1.png").unlink()
     with pytest.raises(RsbenchError, match="has 1 frames, fewer than"):
-        list(correct_sequence(left, FrameSource(right.path), castle.rig, 0.8, CorrectionOptions()))
+        list(correct_sequence([left, FrameSource(right.path)], _known(castle), CorrectionOptions()))
 
 
 @pytest.mark.slow

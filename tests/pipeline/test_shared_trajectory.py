@@ -15,7 +15,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_correction as mono_ways
 from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, with_shared_trajectory
-from rsbench.pipeline.mono_sequence import MonoMoment, correct_frames
+from rsbench.pipeline.mono_sequence import correct_frames
+from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.vision.mono_fusion import OwnMotion
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 160.0
@@ -40,7 +41,7 @@ def frames(count: int) -> Iterator[NDArray[np.uint8]]:
         yield picture(frame + np.arange(HEIGHT) / HEIGHT)
 
 
-def moments(count: int, done: int = 0) -> list[MonoMoment]:
+def moments(count: int, done: int = 0) -> list[CorrectedMoment]:
     shutter = RollingShutter(height=HEIGHT, width=WIDTH, readout_ratio=1.0)
     return list(correct_frames(frames(count), PinholeCamera.centred(WIDTH, HEIGHT, FOCAL), shutter, done=done))
 
@@ -54,17 +55,17 @@ OWN = OwnMotion(
 
 
 @pytest.fixture(scope="module")
-def whole() -> list[MonoMoment]:
+def whole() -> list[CorrectedMoment]:
     return moments(COUNT)
 
 
 @pytest.mark.slow
-def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[MonoMoment]) -> None:
+def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[CorrectedMoment]) -> None:
     """Much better than two frames at a time, which do not show what both shake alike."""
 
-    def error(moment: MonoMoment, number: int) -> float:
+    def error(moment: CorrectedMoment, number: int) -> float:
         truth = picture(np.full(HEIGHT, number + (HEIGHT - 1) / (2 * HEIGHT))).astype(float)
-        return float(np.sqrt(np.mean((moment.fused.image - truth)[12:-12, 12:-12] ** 2)))
+        return float(np.sqrt(np.mean((moment.shown["left"].image - truth)[12:-12, 12:-12] ** 2)))
 
     shutter = RollingShutter(height=HEIGHT, width=WIDTH, readout_ratio=1.0)
     camera, video = PinholeCamera.centred(WIDTH, HEIGHT, FOCAL), list(frames(COUNT))
@@ -76,12 +77,12 @@ def test_frames_of_a_shaken_video_stand_where_they_should(whole: list[MonoMoment
 
 @pytest.mark.slow
 @pytest.mark.parametrize("done", [1, 9, 11, COUNT - 1, COUNT])
-def test_a_run_that_goes_on_writes_the_same_frames(whole: list[MonoMoment], done: int) -> None:
+def test_a_run_that_goes_on_writes_the_same_frames(whole: list[CorrectedMoment], done: int) -> None:
     later = moments(COUNT, done)
     assert [moment.number for moment in later] == list(range(done, COUNT))
     for ours, theirs in zip(later, whole[done:], strict=True):
-        np.testing.assert_array_equal(ours.fused.image, theirs.fused.image)
-        np.testing.assert_array_equal(ours.fused.depth, theirs.fused.depth)
+        np.testing.assert_array_equal(ours.shown["left"].image, theirs.shown["left"].image)
+        np.testing.assert_array_equal(ours.shown["left"].depth, theirs.shown["left"].depth)
 
 
 def test_pairs_are_told_in_order_with_those_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,9 +26,16 @@ from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.interop.readers.gyro_log import read_gyro_log
-from rsbench.pipeline.mono_correction import MonoFusionCorrector, find_own_motion, refusal, select_motion_model
+from rsbench.pipeline.mono_correction import (
+    FoundOwnMotion,
+    MonoFusionCorrector,
+    find_own_motion,
+    refusal,
+    select_motion_model,
+)
 from rsbench.pipeline.mono_gyro import CONTRADICTED, NOT_COVERED
-from rsbench.pipeline.mono_sequence import MonoMoment, MonoOptions, correct_frames
+from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
+from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.storage.files import read_json, read_png, write_png
@@ -269,19 +276,19 @@ def measured(scene: Any, seed: int = 0) -> Array:
     return np.column_stack([TAU, scene.motion.velocity(TAU)[0] + bias + noise])
 
 
-def corrected(scene: Any, u8: Any, gyro: Array | None) -> MonoMoment:
+def corrected(scene: Any, u8: Any, gyro: Array | None) -> CorrectedMoment:
     """Its second frame at the time of its middle line."""
     frames = [u8(scene.rolling("left", frame)[0]) for frame in (0, 1)]
-    options = MonoOptions.of(None, 0, None)
+    options = options_of_camera(None, 0, (scene.rig.camera.height - 1) / 2)
     return list(correct_frames(frames, scene.rig.camera, scene.shutter, options, gyro=gyro))[1]
 
 
-def psnr(moment: MonoMoment, scene: Any, truth: Any) -> float:
+def psnr(moment: CorrectedMoment, scene: Any, truth: Any) -> float:
     """dB of what the frame saw, 4 px away from what it did not."""
     lines = scene.shutter.lines("left")
     true = truth(scene, "left", 1, float(scene.shutter.time_after((lines - 1) / 2, 1, "left")))
     seen = cv2.erode(true.visible.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
-    error = (moment.fused.image.astype(float) - 255.0 * true.image)[seen]
+    error = (moment.shown["left"].image.astype(float) - 255.0 * true.image)[seen]
     return float(10.0 * np.log10(255.0**2 / np.mean(error**2)))
 
 
@@ -302,7 +309,7 @@ def test_a_gyroscope_tells_what_two_frames_do_not(
 ) -> None:
     scene = shaken(world, shapes, preset, seed, scan)
     without, given = corrected(scene, u8, None), corrected(scene, u8, measured(scene))
-    assert given.found is not None and not given.found.unused
+    assert isinstance(given.found, FoundOwnMotion) and not given.found.unused
     assert psnr(given, scene, truth) > psnr(without, scene, truth) + gain
     motion = given.found.own.motion
     assert motion is not None and motion.name == "gyro"
@@ -318,14 +325,14 @@ def test_a_gyroscope_of_another_sign_or_unit_is_not_believed(
     scene = shaken(world, shapes, "handheld")
     wrong = measured(scene) * [1.0, factor, factor, factor]
     without, given = corrected(scene, u8, None), corrected(scene, u8, wrong)
-    assert given.found is not None and given.found.unused == CONTRADICTED
-    np.testing.assert_array_equal(given.fused.image, without.fused.image)
+    assert isinstance(given.found, FoundOwnMotion) and given.found.unused == CONTRADICTED
+    np.testing.assert_array_equal(given.shown["left"].image, without.shown["left"].image)
 
 
 def test_samples_of_another_time_are_not_used(world: Any, shapes: Any, u8: Any) -> None:
     scene = shaken(world, shapes, "steady")
     given = corrected(scene, u8, measured(scene)[:20])
-    assert given.found is not None and given.found.unused == NOT_COVERED
+    assert isinstance(given.found, FoundOwnMotion) and given.found.unused == NOT_COVERED
 
 
 def test_frames_without_texture_are_corrected_by_rotation_alone(world: Any, shapes: Any, u8: Any) -> None:
@@ -472,7 +479,9 @@ def test_the_command_takes_a_log(tmp_path: Path, world: Any, shapes: Any, u8: An
     record = read_json(tmp_path / "out" / "motion.json")
     assert [each["motion"]["model"] for each in record["frames"]] == ["gyro", "gyro"]
     image = read_png(tmp_path / "out" / "corrected" / "000001.png").astype(int)
-    assert np.max(np.abs(image - corrected(scene, u8, samples).fused.image)) <= 1  # times in whole nanoseconds
+    assert (
+        np.max(np.abs(image - corrected(scene, u8, samples).shown["left"].image)) <= 1
+    )  # times in whole nanoseconds
     early = [f"{int(row.split(',')[0]) - 1_500_000_000},{row.partition(',')[2]}" for row in rows]
     (tmp_path / "early.csv").write_text("stamp_ns,wx,wy,wz\n" + "\n".join(early), encoding="utf-8")
     shown = run("--gyro", tmp_path / "early.csv", "--fps", 20)
