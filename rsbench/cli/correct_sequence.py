@@ -251,11 +251,11 @@ def _write_page(
         facts += [("change of a frame", f"{max(changed):.1f} grey levels at most, mean over its pixels")]
     facts += [("unit of depth", UNIT)] if one else []
     chosen = most_changed(changed, _PAGE_FRAMES) if changed else []
-    before = zip(chosen, source.only(numbers[k] for k in chosen), strict=True) if chosen else []
+    shown_frames = source.only(numbers[k] for k in chosen) if chosen else ()
     title, unit = ("frame {}", "") if one else ("left, frame {}", " m")
     cards = [
         card_of(title.format(numbers[k]), image, read_fused(folder, names[k]), unit, source.orientation)
-        for k, image in before
+        for k, image in zip(chosen, shown_frames, strict=True)
     ]
     trajectory = folder / "trajectory.csv"
     poses = np.loadtxt(trajectory, ndmin=2) if trajectory.is_file() else np.zeros((0, 8))
