@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.board import Scored, about_split, entries_of, place, splits_of
@@ -36,6 +35,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import read_pairs
 from rsbench.report.board_figures import ErrorLine, bar, curves, drawable, legend, reliability, short
+from rsbench.report.markup import rendered, table_lines
 from rsbench.report.pictures import Image, colour_map, encode_jpeg, shrink
 from rsbench.storage.files import write_bytes
 
@@ -188,8 +188,8 @@ def as_csv(lines: Sequence[Standing], secret: bool) -> str:
 
 def as_markdown(lines: Sequence[Standing]) -> str:
     """The most telling columns; names of methods hold nothing that Markdown reads, but underscores."""
-    head, *rows = ["| " + " | ".join(row) + " |" for row in _brief(lines)]
-    return "\n".join([head, "|" + "---|" * len(_brief(lines)[0]), *rows]).replace("_", r"\_") + "\n"
+    head, *rows = _brief(lines)
+    return "\n".join(table_lines(head, rows)).replace("_", r"\_") + "\n"
 
 
 def as_latex(lines: Sequence[Standing]) -> str:
@@ -615,17 +615,11 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
     Raises:
         RsbenchError: it is no board, an entry or a dataset is damaged, or the folder cannot be written.
     """
-    environment = Environment(
-        loader=PackageLoader("rsbench.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
 
     def write(name: str, template: str, context: dict[str, Any]) -> None:
         path = out / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, environment.get_template(f"{template}.html.j2").render(**context).encode())
+        write_bytes(path, rendered(f"{template}.html.j2", trim=True, **context).encode())
 
     boards = [read_split(board, protocol, split) for protocol, split in splits_of(board)]
     boards = [replace(each, problem_pages=problem_pages) for each in boards if each.lines]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -11,6 +11,7 @@ from rsbench.benchmark.simulated.sweep_card import SweepCard
 from rsbench.benchmark.statistics import in_words
 from rsbench.benchmark.studies.claims import CLAIMS, GLOBAL, GRID_NOISE_PX, GRID_TRIALS, OURS, SETTINGS, Claim
 from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
+from rsbench.report.markup import table_lines
 
 _CLAIMS = f"""# What became of the paper's claims
 
@@ -46,25 +47,24 @@ def claims_page(table: pd.DataFrame, best: pd.DataFrame) -> str:
 
 def summary(best: pd.DataFrame) -> list[str]:
     """The verdicts on the paper's solver, both readings of the noise side by side."""
-    lines = [
-        "| claim | matches | 10^-3 px: literal | best reading | 0.81 px: literal | best reading |",
-        f"|{'---|' * 6}",
-    ]
+    lines = []
     for (claim, matches), rows in best.groupby(["claim", "matches"], sort=False):
         verdicts = [row[name] for row in rows.to_dict("records") for name in ("literal", "best")]
-        verdicts += ["-"] * (4 - len(verdicts))
-        lines.append(f"| {claim} | {matches} | {' | '.join(verdicts)} |")
-    return [*lines, ""]
+        lines.append([claim, matches, *verdicts, *["-"] * (4 - len(verdicts))])
+    head = ["claim", "matches", "10^-3 px: literal", "best reading", "0.81 px: literal", "best reading"]
+    return [*table_lines(head, lines), ""]
 
 
 def _overview(best: pd.DataFrame) -> list[str]:
     """The same with the share of the readings that hold, and ours."""
-    lines = ["| claim | matches | noise | literal | best reading | of the readings | ours |", f"|{'---|' * 7}"]
+    lines = []
     for row in best.to_dict("records"):
         holding = f"{row['holding']} of {row['readings']} hold"
-        cells = (row["claim"], row["matches"], row["noise"], row["literal"], row["best"], holding, row["ours"])
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return [*lines, ""]
+        lines.append(
+            (row["claim"], row["matches"], row["noise"], row["literal"], row["best"], holding, row["ours"])
+        )
+    head = ["claim", "matches", "noise", "literal", "best reading", "of the readings", "ours"]
+    return [*table_lines(head, lines), ""]
 
 
 def _claim(claim: Claim, table: pd.DataFrame, best: pd.DataFrame) -> list[str]:
@@ -72,22 +72,22 @@ def _claim(claim: Claim, table: pd.DataFrame, best: pd.DataFrame) -> list[str]:
     where, there = f"at the first and last {claim.axis}", "with 27 unknowns" if claim.against_complete else "GS"
     if claim.beside:
         there = "bound of one camera"
-    lines += [f"| matches | noise | statistic | solver | verdict | {where} | {there} there |", f"|{'---|' * 7}"]
-    own = table[table.claim == claim.key]
+    cells, own = list[tuple[str, ...]](), table[table.claim == claim.key]
     for case in best[best.claim == claim.key].to_dict("records"):
         rows = own[(own.matches == case["matches"]) & (own.noise == case["noise"])]
         chosen = rows.solver.isin(["literal", "ours"])
         chosen |= (rows.solver == case["best_reading"]) & (rows.statistic == case["best_statistic"])
-        lines += [_claim_row(row, claim) for row in rows[chosen].to_dict("records")]
-    return [*lines, ""]
+        cells += [_claim_row(row, claim) for row in rows[chosen].to_dict("records")]
+    head = ("matches", "noise", "statistic", "solver", "verdict", where, f"{there} there")
+    return [*lines, *table_lines(head, cells), ""]
 
 
-def _claim_row(row: dict[str, str], claim: Claim) -> str:
+def _claim_row(row: dict[str, str], claim: Claim) -> tuple[str, ...]:
     figures, other = f"{row['first']}<br>{row['last']}", f"{row['other_first']}<br>{row['other_last']}"
     if row["first"] == row["last"]:
         figures, other = row["first"], row["other_first"]
     cells = (row["matches"], row["noise"], row["statistic"], row["solver"], row["verdict"], figures)
-    return f"| {' | '.join(map(str, (*cells, '-' if claim.exact else other)))} |"
+    return (*cells, "-" if claim.exact else other)
 
 
 _IMAGES = """# What became of the paper's claims about images
@@ -103,10 +103,8 @@ def image_claims_page(table: pd.DataFrame) -> str:
     for claim in IMAGE_CLAIMS:
         lines += [f"## {claim.key[0].upper()}{claim.key[1:]}", "", f"{claim.text}.", ""]
         lines += [f"Rule: {claim.rule}. From [{claim.table}](../{claim.table}).", ""]
-        lines += ["| who | verdict | figures |", "|---|---|---|"]
-        for row in table[table.claim == claim.key].to_dict("records"):
-            lines.append(f"| {row['who']} | {row['verdict']} | {row['figures']} |")
-        lines.append("")
+        names = ["who", "verdict", "figures"]
+        lines += [*table_lines(names, table.loc[table.claim == claim.key, names].to_numpy()), ""]
     return "\n".join(lines)
 
 
@@ -132,13 +130,13 @@ def readings_page(settings: pd.DataFrame) -> str:
     """Markdown from the table of ``claims.holding_settings``."""
     grid = [f"- {name}{_UNITS.get(name, '')}: {low} or {high}" for name, (low, high) in SETTINGS.items()]
     names = list(dict.fromkeys(settings.reading))
-    head = " | ".join(f"{name}: holds | fails" for name in names)
-    lines = [_SETTINGS, *grid, "", f"| claim | settings | {head} |", f"|---|---|{'---|---|' * len(names)}"]
+    head = ["claim", "settings", *(word for name in names for word in (f"{name}: holds", "fails"))]
+    lines = []
     for claim, rows in settings.groupby("claim", sort=False):
         by_reading = rows.set_index("reading")
         counts = [str(by_reading.loc[name, key]) for name in names for key in ("holding", "failing")]
-        lines.append(f"| {claim} | {rows.settings.iloc[0]} | {' | '.join(counts)} |")
-    return "\n".join([*lines, ""])
+        lines.append([claim, rows.settings.iloc[0], *counts])
+    return "\n".join([_SETTINGS, *grid, "", *table_lines(head, lines), ""])
 
 
 _INTRODUCTION = """# Simulations beyond the paper
@@ -181,40 +179,34 @@ def _solvers(table: pd.DataFrame) -> list[str]:
         "",
         f"2 deg, 0.3 m, 100 matches per camera, {rows.trials.iloc[0]} trials; medians with 95 % intervals.",
         "",
-        "| solver | sees | e_R (deg) | e_T (deg) | RMS e_T over bound |",
-        "|---|---|---|---|---|",
     ]
-    for row in rows.to_dict("records"):
-        cells = [_words(row, name) for name in ("e_R_median", "e_T_median", "e_T_over_bound")]
-        lines.append(f"| {row['solver']} | {row['information']} | {' | '.join(cells)} |")
-    return lines
+    head = ("solver", "sees", "e_R (deg)", "e_T (deg)", "RMS e_T over bound")
+    return lines + _figures(rows, head, ("e_R_median", "e_T_median", "e_T_over_bound"), ("solver", "information"))
+
+
+def _figures(table: pd.DataFrame, head: Sequence[str], figures: Sequence[str], names: Sequence[str]) -> list[str]:
+    """A line for each row: what it is of, and figures with their intervals."""
+    rows = table.to_dict("records")
+    named = [[f"{row[name]:g}" if name == "value" else row[name] for name in names] for row in rows]
+    return table_lines(
+        head,
+        ([*cells, *(_words(row, figure) for figure in figures)] for cells, row in zip(named, rows, strict=True)),
+    )
 
 
 def _bound(table: pd.DataFrame) -> list[str]:
     """Errors over the bound."""
     lines = ["## Errors over the Cramer-Rao bound", "", "Root mean squares.", ""]
-    lines += ["| solver | noise | matches per camera | e_R over bound | e_T over bound |", "|---|---|---|---|---|"]
-    for row in table.to_dict("records"):
-        cells = [_words(row, name) for name in ("e_R_over_bound", "e_T_over_bound")]
-        lines.append(f"| {row['solver']} | {row['variant']} | {row['value']:g} | {' | '.join(cells)} |")
-    return lines
+    head = ("solver", "noise", "matches per camera", "e_R over bound", "e_T over bound")
+    return lines + _figures(table, head, ("e_R_over_bound", "e_T_over_bound"), ("solver", "variant", "value"))
 
 
 def _wrong(table: pd.DataFrame) -> list[str]:
-    """Errors when the solver is told a wrong readout ratio."""
+    """Errors when the solver is given a wrong readout ratio."""
     noise = "0.1 px, 2 deg, 0.3 m, 100 matches per camera, or tracks; medians."
-    lines = [
-        "## Told a wrong readout ratio",
-        "",
-        noise,
-        "",
-        "| solver | sees | told minus true | e_R (deg) | e_T (deg) |",
-    ]
-    lines.append("|---|---|---|---|---|")
-    for row in table.to_dict("records"):
-        cells = [_words(row, name) for name in ("e_R_median", "e_T_median")]
-        lines.append(f"| {row['solver']} | {row['information']} | {row['value']:g} | {' | '.join(cells)} |")
-    return lines
+    head = ("solver", "sees", "given minus true", "e_R (deg)", "e_T (deg)")
+    figures = _figures(table, head, ("e_R_median", "e_T_median"), ("solver", "information", "value"))
+    return ["## A wrong readout ratio", "", noise, "", *figures]
 
 
 def _wrong_motion(table: pd.DataFrame) -> list[str]:
@@ -225,13 +217,12 @@ def _wrong_motion(table: pd.DataFrame) -> list[str]:
         "",
         "Median e_T (deg); 0.1 px, 0.3 m, 100 matches per camera, or tracks.",
         "",
-        f"| data follow | rotation (deg) | {' | '.join(solvers)} |",
-        f"|---|---|{'---|' * len(solvers)}",
     ]
+    found = []
     for (variant, value), rows in table.groupby(["variant", "value"], sort=False):
         cells = [_words(row, "e_T_median") for row in rows.to_dict("records")]
-        lines.append(f"| {variant} | {value:g} | {' | '.join(cells)} |")
-    return lines
+        found.append([variant, f"{value:g}", *cells])
+    return lines + table_lines(["data follow", "rotation (deg)", *solvers], found)
 
 
 def _words(row: Mapping[Hashable, Any], name: str) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -18,6 +17,7 @@ from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import MARKER
 from rsbench.report import pictures
+from rsbench.report.markup import rendered
 from rsbench.report.motion_figures import draw_certainty
 from rsbench.report.pictures import Image
 from rsbench.storage.files import read_json, write_bytes
@@ -193,13 +193,9 @@ def write_page(
         record: what motion.json says, where it is not in ``folder``.
         video: name of a video beside it that shows the frames before and after.
     """
-    environment = Environment(
-        loader=PackageLoader("rsbench.report"),
-        autoescape=select_autoescape(["html", "j2"]),
-        undefined=StrictUndefined,
-    )
     record = read_json(folder / MARKER) if record is None else record
-    html = environment.get_template("correct.html.j2").render(
+    html = rendered(
+        "correct.html.j2",
         title=title,
         subtitle=subtitle,
         facts=facts,

@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from rsbench.benchmark.statistics import share_interval
@@ -24,15 +23,7 @@ from rsbench.benchmark.studies.correction_study import (
 from rsbench.benchmark.studies.real_cameras import BEYOND, kept_sequences
 from rsbench.benchmark.studies.sgm_timing import DELAYS
 from rsbench.report import pictures
-
-
-def markdown(template: str, **values: Any) -> str:
-    """Text of a Markdown template of ``rsbench.report``; a value that the template lacks is an error."""
-    environment = Environment(
-        loader=PackageLoader("rsbench.report"), undefined=StrictUndefined, keep_trailing_newline=True
-    )
-    return environment.get_template(template).render(**values)
-
+from rsbench.report.markup import rendered, table_lines
 
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
@@ -74,7 +65,7 @@ def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFr
         summary, sequences: as of ``by_law`` and ``by_sequence``.
         motions: errors of the estimated motions, a row for each sequence.
     """
-    return markdown(
+    return rendered(
         "laws-correction.md.j2",
         methods=methods_among(set(summary["method"])),
         tables=[law_table(summary, size) for size in SIZES],
@@ -86,23 +77,28 @@ def worst_table(sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
     """A row for each law and size: the sequence that ours corrects worst, and the one with its largest e_T."""
     wide = sequences.pivot(index="sequence", columns="method", values="psnr_covered")
     errors = motions.set_index("sequence")
-    lines = [
-        "| law, size | least PSNR of ours | uncorrected | sequence | largest e_T (e_R there), deg | sequence |",
-        "|" + "---|" * 6,
-    ]
+    head = (
+        "law, size",
+        "least PSNR of ours",
+        "uncorrected",
+        "sequence",
+        "largest e_T (e_R there), deg",
+        "sequence",
+    )
+    rows = []
     for stratum, names in sequences.drop_duplicates("sequence").groupby(law_and_size(sequences), sort=False):
         own = list(names["sequence"])
         dark, off = wide.loc[own, "ours"].idxmin(), errors.loc[own, "e_T_deg_ours"].idxmax()
         error = f"{errors.loc[off, 'e_T_deg_ours']:.3g} ({errors.loc[off, 'e_R_deg_ours']:.2g})"
         psnrs = [f"{wide.loc[dark, method]:.1f}" for method in ("ours", "none")]
-        lines.append(f"| {stratum} | " + " | ".join([*psnrs, str(dark), error, str(off)]) + " |")
-    return "\n".join(lines)
+        rows.append([stratum, *psnrs, dark, error, off])
+    return "\n".join(table_lines(head, rows))
 
 
 def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
     """The page as Markdown."""
     strata = list(dict.fromkeys(summary["stratum"]))
-    return markdown(
+    return rendered(
         "correction.md.j2",
         strata=", ".join(strata),
         methods=methods_among(set(summary["method"])),
@@ -117,14 +113,12 @@ def law_table(laws: pd.DataFrame, size: str) -> str:
     own = laws[laws["stratum"].str.endswith(f", {size}")]
     strata = list(dict.fromkeys(own["stratum"]))
     names = [stratum.partition(",")[0] for stratum in strata]
-    lines = [f"| {size} | " + " | ".join(names) + " |", "|" + "---|" * (1 + len(names))]
+    lines = []
     for method in methods_among(set(own["method"])):
         rows = own[own["method"] == method.key].set_index("stratum")
         cells = [_with_gain(rows.loc[stratum]) for stratum in strata]
-        lines.append(
-            "| " + " | ".join([f"**{method.title}**" if method.key == "ours" else method.title, *cells]) + " |"
-        )
-    return "\n".join(lines)
+        lines.append([f"**{method.title}**" if method.key == "ours" else method.title, *cells])
+    return "\n".join(table_lines([size, *names], lines))
 
 
 def _with_gain(row: pd.Series) -> str:
@@ -153,16 +147,16 @@ def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
     names = list(dict.fromkeys(scenes["scene"]))
     counts = scenes.groupby("scene")["sequences"].first()
     headings = [f"{name} ({counts[name]})" for name in names]
-    scores = ["| method | " + " | ".join(headings) + " |", "|" + "---|" * (1 + len(names))]
-    gains = [scores[0].replace("method", "ours above"), scores[1]]
+    scores, gains = list[list[str]](), list[list[str]]()
     for method in methods_among(set(scenes["method"])):
         own = scenes[scenes["method"] == method.key].set_index("scene")
         cells = [f"{own.loc[name, 'psnr_covered']:.2f} / {own.loc[name, 'psnr_all']:.2f}" for name in names]
-        scores.append("| " + " | ".join([method.title, *cells]) + " |")
+        scores.append([method.title, *cells])
         if method.key != "ours":
             cells = [_with_interval(own.loc[name], "gain", 2) for name in names]
-            gains.append("| " + " | ".join([method.title, *cells]) + " |")
-    return "\n".join(scores), "\n".join(gains)
+            gains.append([method.title, *cells])
+    found = (table_lines(["method", *headings], scores), table_lines(["ours above", *headings], gains))
+    return "\n".join(found[0]), "\n".join(found[1])
 
 
 def _correction_table(summary: pd.DataFrame) -> str:
@@ -178,7 +172,7 @@ def _correction_table(summary: pd.DataFrame) -> str:
         "FLIP covered",
         "own pixels",
     )
-    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+    rows = []
     for _, row in summary.iterrows():
         cells = [
             _TITLES[str(row["method"])],
@@ -196,8 +190,8 @@ def _correction_table(summary: pd.DataFrame) -> str:
             cells[0] += f" ({row['failures']:.0f} failed)"
         if row["method"] == "ours":
             cells[0] = f"**{cells[0]}**"  # the name alone: bold figures would read as the best ones
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append(cells)
+    return "\n".join(table_lines(names, rows))
 
 
 def _with_interval(row: pd.Series, name: str, digits: int) -> str:
@@ -277,7 +271,7 @@ def write_real_page(folder: Path, card: dict[str, Any]) -> Path:
 
 def real_page(summary: pd.DataFrame, motions: pd.DataFrame, card: dict[str, Any]) -> str:
     """The page as Markdown."""
-    return markdown(
+    return rendered(
         "real.md.j2",
         table=_table(summary),
         errors=_errors(summary),
@@ -307,32 +301,24 @@ def _pairs(summary: pd.DataFrame) -> list[tuple[str, pd.Series, pd.Series]]:
 
 
 def _table(summary: pd.DataFrame) -> str:
-    lines = [
-        "| scene, motion | e_R (deg): ideal, real | e_T (deg): ideal, real | PSNR (dB), ideal: before, after "
-        "| real: before, after | real, clean: after | drawn |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("scene, motion", "e_R (deg): ideal, real", "e_T (deg): ideal, real", "PSNR (dB), ideal: before, after")
+    rows = []
     for name, ideal, real in _pairs(summary):
         cells = [name, *(f"{ideal[e]:.3f}, {real[e]:.3f}" for e in ("e_R_deg", "e_T_deg"))]
         cells += [f"{row['psnr_none']:.1f}, {row['psnr_median']:.1f}" for row in (ideal, real)]
-        cells += [f"{real['psnr_clean_median']:.1f}", f"{real['coverage']:.1%}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([*cells, f"{real['psnr_clean_median']:.1f}", f"{real['coverage']:.1%}"])
+    return "\n".join(table_lines([*head, "real: before, after", "real, clean: after", "drawn"], rows))
 
 
 def _errors(summary: pd.DataFrame) -> str:
-    lines = [
-        "| scene, motion | camera | failed | e_R of the worst seed (deg) | e_T of the worst seed (deg) "
-        "| largest error in stated sigmas | PSNR of that seed (dB) |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("scene, motion", "camera", "failed", "e_R of the worst seed (deg)", "e_T of the worst seed (deg)")
+    lines = []
     for name, *rows in _pairs(summary):
         for row in rows:
             cells = [name, row["camera"], f"{row['failures']} of {row['sequences'] * row['seeds']}"]
             cells += [f"{row['e_R_worst_deg']:.3f}", f"{row['e_T_worst_deg']:.3f}", f"{row['sigmas']:.1f}"]
-            cells.append(f"{row['psnr_worst']:.1f}")
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            lines.append([*cells, f"{row['psnr_worst']:.1f}"])
+    return "\n".join(table_lines([*head, "largest error in stated sigmas", "PSNR of that seed (dB)"], lines))
 
 
 def draw_frames(frames: dict[str, NDArray[np.uint8]], path: Path) -> Path:
@@ -361,7 +347,7 @@ def sgm_page(table: pd.DataFrame) -> str:
     none = delayed[delayed["delay"] == 0.0]
     worst = delayed.sort_values("vertical_px").iloc[-1]
     before = none[(none["sequence"] == worst["sequence"]) & (none["stratum"] == worst["stratum"])].iloc[0]
-    return markdown(
+    return rendered(
         "sgm.md.j2",
         table=_markdown(table),
         floor_low=none["error_px"].min(),
@@ -409,14 +395,9 @@ def _markdown(table: pd.DataFrame) -> str:
         "depth_error_m": "depth error (m)",
         "over_2m": "> 2 m",
     }
-    lines = ["| " + " | ".join(names.values()) + " |", "|" + "---|" * len(names)]
-    for _, row in table.iterrows():
-        cells = []
-        for name in names:
-            value = row[name]
-            cells.append(f"{value:.3f}" if isinstance(value, float) else str(value))
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    rows = [[row[name] for name in names] for _, row in table.iterrows()]
+    words = [[f"{value:.3f}" if isinstance(value, float) else value for value in row] for row in rows]
+    return "\n".join(table_lines(list(names.values()), words))
 
 
 def _draw(table: pd.DataFrame, path: Path) -> Path:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import read_headings, read_scores
@@ -23,6 +22,7 @@ from rsbench.core.rig import SIDES, View
 from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.report import pictures
+from rsbench.report.markup import rendered
 from rsbench.report.pictures import Image
 from rsbench.storage.files import (
     HASHES,
@@ -312,15 +312,11 @@ def write_report(dataset: Path, out: Path) -> Path:
     for sequence in read_pairs(dataset):
         captions = write_pictures(sequence, out, chosen, hashes.sha256)
         sections.append(_section(sequence, out / "pictures" / sequence.name, captions))
-    environment = Environment(
-        loader=PackageLoader("rsbench.report"),
-        autoescape=select_autoescape(["html", "j2"]),
-        undefined=StrictUndefined,
-    )
     tables = [
         {"title": table.title, "note": table.note, "html": _html(table.frame)} for table in summary_tables(out)
     ]
-    page = environment.get_template("evaluation.html.j2").render(
+    page = rendered(
+        "evaluation.html.j2",
         title=title,
         subtitle=f"Rolling-shutter stereo evaluation, {date}; pictures: {' + '.join(chosen.values())}",
         tables=tables,

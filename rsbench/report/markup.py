@@ -1,0 +1,30 @@
+"""Pages from templates, and tables in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+
+def rendered(template: str, *, trim: bool = False, **values: Any) -> str:
+    """Text of a template of ``rsbench.report``; a value that the template lacks is an error.
+
+    In HTML what values hold is escaped. ``trim``: lines of instructions alone leave no empty lines.
+    """
+    html = template.endswith(".html.j2")
+    environment = Environment(
+        loader=PackageLoader("rsbench.report"),
+        autoescape=html,
+        undefined=StrictUndefined,
+        trim_blocks=trim,
+        keep_trailing_newline=not html,
+    )
+    return environment.get_template(template).render(**values)
+
+
+def table_lines(head: Sequence[object], rows: Iterable[Iterable[object]]) -> list[str]:
+    """The lines of a table in Markdown."""
+    lines = [f"| {' | '.join(map(str, cells))} |" for cells in (head, *rows)]
+    return [lines[0], "|" + "---|" * len(head), *lines[1:]]
