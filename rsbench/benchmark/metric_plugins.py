@@ -31,7 +31,7 @@ class Column:
     """One number that a metric computes. Raises ValueError on a name or direction that cannot be."""
 
     name: str
-    """As in score files: letters, digits and _, such as ``e_R_deg``."""
+    """Name in score files: letters, digits and _, such as ``e_R_deg``."""
     better: Literal["lower", "higher"]
     worst: float
     """What a failed prediction scores; may be infinite."""
@@ -69,7 +69,7 @@ class PoseCase:
     reference_point: str
     """``body`` or ``left``: the point of the rig whose translation ``d`` is."""
     truth: Motion
-    """Of the body."""
+    """True motion of the body."""
     rig: StereoRig
     shutter: RollingShutter
 

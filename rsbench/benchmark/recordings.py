@@ -154,7 +154,7 @@ class Pair(NamedTuple):
 
 
 def pairs_with_truth(recordings: Sequence[Recording]) -> list[Pair]:
-    """In order of recordings, cameras and frames; those of cameras whose shutter is known."""
+    """Pairs of cameras whose shutter is known, in the order of recordings, cameras and frames."""
     found = list[Pair]()
     for recording in recordings:
         for side in recording.shutters:

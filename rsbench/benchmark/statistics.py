@@ -149,7 +149,7 @@ def _clustered(
 
 
 def _medians(values: FloatArray, labels: NDArray[np.intp], draws: NDArray[np.int64]) -> FloatArray:
-    """Of each draw of clusters (resamples, clusters), the median of their values, of all (n,)."""
+    """Medians (resamples,) of the values (n,) in the clusters of each draw (resamples, clusters)."""
     order = np.argsort(values, kind="stable")
     times = np.sum(draws[:, :, None] == np.arange(draws.shape[1]), axis=1)
     below = np.cumsum(times[:, labels[order]], axis=1)
@@ -242,10 +242,10 @@ def _exponent(value: float) -> int:
 
 
 def median(values: FloatArray) -> FloatArray:
-    """Over the last axis."""
+    """Median over the last axis."""
     return np.asarray(np.median(values, axis=-1))
 
 
 def mean(values: FloatArray) -> FloatArray:
-    """Over the last axis."""
+    """Mean over the last axis."""
     return np.asarray(np.mean(values, axis=-1))

@@ -36,7 +36,7 @@ from rsbench.pipeline.frame_motion import find_motion
 from rsbench.pipeline.sequence_correction import Window, on_one_trajectory
 
 _INLIER_PX, _FEWEST, _DRAWS = 1.5, 6, 1000
-"""Of P3P in RANSAC: threshold, fewest inliers, and samples."""
+"""Threshold, fewest inliers and samples of P3P in RANSAC."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,14 +44,14 @@ class Estimate:
     """The trajectory of an entry; poses are NaN where it has none."""
 
     windows: list[Motion | None]
-    """Of each two successive frames, seen from the body at the start of the first one."""
+    """Motions of each two successive frames, seen from the body at the start of the first one."""
     starts: Pose
     """(n, 3, 3), (n, 3) body_from_world at the starts of these windows."""
     positions: bool = True
     failed: int = 0
 
     def within(self, frame: int, tau: FloatArray) -> Pose:
-        """Of the body at times (n,) of the sequence within a frame, from the body at the start of the frame."""
+        """Pose of the body at times (n,) of the sequence within a frame, from the body at the frame's start."""
         number = min(frame, len(self.windows) - 1)
         motion = self.windows[number]
         if motion is None:
@@ -96,7 +96,7 @@ class Given:
     rig: StereoRig
     shutter: RollingShutter
     matches: list[Correspondences]
-    """Of the frames 0 and 1, 1 and 2, ..."""
+    """Matches of the frames 0 and 1, 1 and 2, ..."""
     gyro: FloatArray | None = None
     """(n, 4) samples, as in ``Correspondences``."""
     seed: int = 0
@@ -174,14 +174,14 @@ def _rolling(given: Given) -> Estimate:
 
 
 class Method(NamedTuple):
-    """A way to a trajectory."""
+    """A method that estimates trajectories."""
 
     solve: Callable[[Given], Estimate | None]
     """None where it is not given what it needs."""
     uses: tuple[str, ...]
-    """Of what the leaderboard gives."""
+    """What it uses of the inputs of the leaderboard."""
     motion_model: str
-    """That it assumes, as the header of a submission says it."""
+    """Motion model that it assumes, as the header of a submission states it."""
     description: str
 
 
@@ -222,15 +222,15 @@ METHODS: dict[str, Method] = {
     ),
     "no-motion": Method(_rolling, ("readout",), "none", "A rig that stands still"),
 }
-"""By the name on a board."""
+"""Methods by their names on a board."""
 
 
 LINES = 9
-"""Of a frame that are scored."""
+"""Lines of a frame that are scored."""
 AUC_DEG = {"auc_way": 0.1, "auc_rows": 0.02}
 """Thresholds of the areas under the curves of errors of lines against the sequence's and the frame's first one."""
 _POINTS_PX = 16
-"""Between points of the middle frame whose ways are followed."""
+"""Distance between the points of the middle frame whose image paths are followed."""
 
 
 def turn_errors(estimate: FloatArray, truth: FloatArray) -> FloatArray:
@@ -306,7 +306,7 @@ class TrueTrajectory:
 
     @cached_property
     def seen(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Of each left frame: the points (n, 3) in the body when they are seen, NaN where not, and when (n,)."""
+        """Points (n, 3) of each left frame, in the body when they are seen, NaN where not, and these times."""
         sequence, found = self.sequence, list[tuple[FloatArray, FloatArray]]()
         for frame in range(sequence.frames):
             seen = rs_project(sequence.rig, sequence.shutter, sequence.motion, "left", frame, self.points)
@@ -325,14 +325,14 @@ def scored_times(shutter: RollingShutter, frame: int, count: int = LINES) -> Flo
 def trajectory_scores(truth: TrueTrajectory, estimate: Estimate) -> dict[str, float]:
     """Scores of a trajectory; NaN where it says nothing of it."""
     sequence, frames = truth.sequence, range(truth.sequence.frames)
-    rows, way = list[FloatArray](), [list[Pose](), list[Pose]()]
+    rows, both = list[FloatArray](), [list[Pose](), list[Pose]()]
     for frame in frames:
         tau = scored_times(sequence.shutter, frame)
         poses = [each.within(frame, tau) for each in (estimate, truth.estimate)]
         rows.append(turn_errors(poses[0].R, poses[1].R))
-        for kept, pose, each in zip(way, poses, (estimate, truth.estimate), strict=True):
+        for kept, pose, each in zip(both, poses, (estimate, truth.estimate), strict=True):
             kept.append(compose(pose, each.start(frame)))
-    whole = [np.concatenate([each.R for each in kept]) for kept in way]
+    whole = [np.concatenate([each.R for each in kept]) for kept in both]
     own = np.rad2deg(np.concatenate(rows))
     gone = np.rad2deg(turn_errors(*whole))
     found = {

@@ -33,7 +33,7 @@ _MARKS = (
     "M0 4L4 -3H-4z",
     "M-3 -3L3 3M-3 3L3 -3",
 )
-"""Colours of board.css.j2 are told apart by people with any colour vision; marks and dashes differ too."""
+"""Colours of board.css.j2 suit any colour vision; marks and dashes differ too."""
 MOST_LINES = len(_MARKS)
 _NOTHING = 1e-6
 """The truth errs by less, and is not drawn: it would stretch the axis."""
@@ -46,7 +46,7 @@ class ErrorLine(NamedTuple):
     errors: FloatArray
     """(n,) in the order of the problems."""
     grey: bool
-    """Of an oracle."""
+    """Whether it is drawn grey, as an oracle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class _Curve:
     at: FloatArray
     """Medians (parts,)."""
     ends: FloatArray
-    """Of their intervals (parts, 2); infinite where the values bound nothing."""
+    """Ends (parts, 2) of their intervals; infinite where the values bound nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +214,7 @@ def _across(labels: Sequence[float | str]) -> FloatArray:
 
 
 def _axis(drawn: Sequence[_Curve]) -> _Axis:
-    """Of all medians and what of their intervals is finite; logarithmic where nothing is 0."""
+    """Axis that shows all medians and the finite ends of their intervals; logarithmic where nothing is 0."""
     every = np.concatenate([np.concatenate([each.at, each.ends.ravel()]) for each in drawn])
     known = every[np.isfinite(every)]
     low, high = float(np.min(known)), float(np.max(known))
@@ -243,7 +243,7 @@ def _word(label: float | str) -> str:
 
 
 def short(value: float) -> str:
-    """With two digits, or none behind the point."""
+    """Number with two digits, or without decimals."""
     return f"{value:.2g}" if abs(value) < 100.0 else f"{value:.0f}"
 
 

@@ -42,25 +42,25 @@ from rsbench.storage.files import write_bytes
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A split with its lines, and what is told of its problems."""
+    """A split with its lines, and the published facts of its problems."""
 
     track: Track
     split: str
     fingerprint: str
     lines: list[Standing]
     facts: pd.DataFrame
-    """By the name of the problem; without columns where they are secret."""
+    """Facts by the name of the problem; without columns where they are secret."""
     problem_pages: bool = True
     """Whether rendered sequences may have pages of their own."""
 
     @property
     def id(self) -> str:
-        """Of its part of the index, of its files, and of the folder of its pages."""
+        """Name of its section of the index, of its files, and of the folder of its pages."""
         return f"{self.track.id}--{self.split}"
 
     @property
     def secret(self) -> bool:
-        """Whether nothing is told of single problems: from a few exact errors of one the truth can be computed."""
+        """Whether single problems are not shown: from a few exact errors of one the truth can be computed."""
         return self.facts.columns.empty
 
     @cached_property
@@ -70,7 +70,7 @@ class Board:
 
     @cached_property
     def scenes(self) -> list[str]:
-        """Of the problems."""
+        """Scenes of the problems."""
         return [str(name) for name in self.lines[0].scored.scores["scene"]]
 
     @property
@@ -84,7 +84,7 @@ class Board:
         return self.problem_pages and self.track.inputs.rendered and not self.secret
 
     def page_of(self, problem: str) -> str:
-        """Where a problem is told, from the folder of the index."""
+        """Page or row of a problem, from the folder of the index."""
         return f"{self.id}/problem/{problem}.html" if self.pages else f"{self.named['problems']}#{problem}"
 
     @property
@@ -159,7 +159,7 @@ def read_split(board: Path, protocol: str, split: str) -> Board:
     """A split of a board; without lines where it has no entries.
 
     Raises:
-        RsbenchError: an entry or what is said of the split is damaged.
+        RsbenchError: an entry or the record of the split is damaged.
     """
     about = about_split(place(board, protocol, split))
     return Board(
@@ -193,7 +193,7 @@ def as_markdown(lines: Sequence[Standing]) -> str:
 
 
 def as_latex(lines: Sequence[Standing]) -> str:
-    """The same as a tabular with the rules of booktabs."""
+    """The same table as a LaTeX tabular with the rules of booktabs."""
     head, *rows = [" & ".join(row).replace("_", r"\_") + r" \\" for row in _brief(lines)]
     width = len(_brief(lines)[0])
     begin, end = rf"\begin{{tabular}}{{ll{'r' * (width - 2)}}}", r"\end{tabular}"
@@ -304,7 +304,7 @@ _LONGEST, _QUALITY = 400, 78
 """Px, and of JPEG: 10 to 35 kB."""
 _THUMB = 120
 _MOST_BYTES = 11_000_000
-"""Of all pictures of a site, which stays below 15 MB."""
+"""Largest size of all pictures of a site, which stays below 15 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,9 +419,9 @@ _WORST = 10
 
 
 def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
-    """Of the template board_entry.html.j2."""
+    """Context of the template board_entry.html.j2."""
     header = line.scored.header
-    said = asdict(header)
+    fields = asdict(header)
     compared = [line, *_best_peer(each, line), *_oracles(each, line)]
     return {
         "header": header,
@@ -430,7 +430,7 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
             ("uses", line.uses),
             ("answers", "handed in as a file" if line.scored.handed_in else "made by this board"),
             *([("in_doubt", line.scored.doubt)] if line.scored.doubt else []),
-            *((name, said[name]) for name in _ABOUT if said[name]),
+            *((name, fields[name]) for name in _ABOUT if fields[name]),
         ],
         "scores": _entry_scores(line),
         "ties": ", ".join(line.ties),
@@ -532,7 +532,7 @@ _SHADES = 5
 
 
 def matrix_context(each: Board, album: Album) -> dict[str, Any]:
-    """Of the template board_problems.html.j2: a row for each problem, a column for each entry."""
+    """Context of the template board_problems.html.j2: a row for each problem, a column for each entry."""
     errors = np.stack([line.scored.scores[each.track.error].to_numpy(dtype=np.float64) for line in each.lines])
     failed = np.stack([line.scored.scores["failure"].to_numpy() > 0.0 for line in each.lines])
     names = [str(name) for name in each.facts.columns]
@@ -644,7 +644,7 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
 
 
 def _section(each: Board, ranked: bool) -> dict[str, Any]:
-    """Of the first page; ``ranked``: whether the protocol has a secret split, which ranks."""
+    """Context of a section of the first page; ``ranked``: whether the protocol has a secret split, which ranks."""
     used = {name for line in each.lines for name in line.scored.header.uses}
     return {
         **each.named,
@@ -691,13 +691,13 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         *(stated if _stated(each) else []),
         *(column(f"part_{name}", name, "down", f"{primary} where the {part} is {name}") for name in parts),
         *([column("assumes", "assumes", "up", "motion model that it assumes", text=True)] if parts else []),
-        column("ties", "ties", "up", "entries that the data do not tell from it", text=True),
+        column("ties", "ties", "up", "entries that the data do not distinguish from it", text=True),
         column("tuned_on", "tuned on", "up", "data by which its parameters were chosen", text=True),
     ]
 
 
 def _scores(each: Board) -> list[Score]:
-    """In the order of the cells: shares, then medians."""
+    """Scores in the order of the cells: shares, then medians."""
     return sorted(each.track.scores, key=lambda score: score.kind == "median")
 
 
@@ -741,7 +741,7 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
 
 
 def _value(value: float) -> str:
-    """As JavaScript reads it, with all digits of the CSV file."""
+    """Number as JavaScript reads it, with all digits of the CSV file."""
     return "" if np.isnan(value) else "Infinity" if np.isinf(value) else repr(float(value))
 
 

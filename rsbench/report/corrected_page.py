@@ -25,13 +25,13 @@ from rsbench.storage.videos import UPRIGHT, upright
 from rsbench.vision.fusion import Fused, Origin
 
 _WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
-_TOLD = 3.0
-"""Deviations from which on something is told from none."""
+_SIGNIFICANT = 3.0
+"""Standard deviations from which on a quantity counts as different from 0."""
 _AXIS_COLOURS = {"x": "#c0392b", "y": "#27855a", "z": "#0b6bcb"}
 
 
 def draw_trajectory(poses: FloatArray, frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Drawings (SVG) of rotation and position, and what is said below; None where there is no trajectory.
+    """Drawings (SVG) of rotation and position, and their caption; None where there is no trajectory.
 
     Args:
         poses: (n, 8) of the body at the starts of frames, as TUM's format has them: tau, position, quaternion.
@@ -73,9 +73,9 @@ def _kind(motions: Sequence[Mapping[str, Any]], w: FloatArray, d: FloatArray) ->
     moved = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in motions]).T
     uneven = [each["uneven"] for each in motions]
     off = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in uneven]).T
-    if np.all(np.median(moved / [w, d], axis=1) < _TOLD):
+    if np.all(np.median(moved / [w, d], axis=1) < _SIGNIFICANT):
         return "The rig stands still."
-    verb = "coasts" if np.all(np.median(off / [w, d], axis=1) < _TOLD) else "shakes or changes its speed"
+    verb = "coasts" if np.all(np.median(off / [w, d], axis=1) < _SIGNIFICANT) else "shakes or changes its speed"
     turn, shift = np.median(off, axis=1)
     return (
         f"The rig {verb}: within a period it leaves an even motion by {np.rad2deg(turn):.2g} deg and "

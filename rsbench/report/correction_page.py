@@ -29,7 +29,7 @@ _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
 """Sequences of a stratum below which a median has no interval, so that nothing is judged by one."""
 SIZES = ("moderate", "aggressive")
-"""Of the motions of the card ``laws``."""
+"""Sizes of the motions of the card ``laws``."""
 _LINES = {
     "none": ("#000000", "--", "x"),
     "gyro": ("#CC79A7", "-.", "+"),
@@ -109,7 +109,7 @@ def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
 
 
 def law_table(laws: pd.DataFrame, size: str) -> str:
-    """By law of motion: covered PSNR, dB, of motions of one size, and in brackets what ours gains, paired."""
+    """Covered PSNR, dB, of motions of one size by law, and in brackets what ours gains, paired."""
     own = laws[laws["stratum"].str.endswith(f", {size}")]
     strata = list(dict.fromkeys(own["stratum"]))
     names = [stratum.partition(",")[0] for stratum in strata]
@@ -130,20 +130,20 @@ def _with_gain(row: pd.Series) -> str:
 
 
 def _sections(images: pd.DataFrame, summary: pd.DataFrame, stratum: str) -> dict[str, str]:
-    """Of one stratum: what its mask is, and its tables over all sequences and by scene."""
+    """Mask of one stratum, and its tables over all sequences and by scene."""
     own = images[images["stratum"] == stratum]
     mask = masks(own).iloc[0]
-    said = (
+    share = (
         f"Covered by every method: {100 * mask['median']:.0f} % of the pixels at the median view, "
         f"{100 * mask['least']:.0f} % at the least."
     )
     table = _correction_table(summary[summary["stratum"] == stratum])
     scores, gains = _scene_tables(by_scene(own))
-    return {"stratum": stratum, "mask": said, "table": table, "scenes": scores, "gains": gains}
+    return {"stratum": stratum, "mask": share, "table": table, "scenes": scores, "gains": gains}
 
 
 def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
-    """By scene: covered PSNR / PSNR of all pixels, dB; and what ours is above each method, dB, covered."""
+    """Covered PSNR / PSNR of all pixels by scene, dB; and by how much ours is above each method, dB, covered."""
     names = list(dict.fromkeys(scenes["scene"]))
     counts = scenes.groupby("scene")["sequences"].first()
     headings = [f"{name} ({counts[name]})" for name in names]

@@ -17,7 +17,7 @@ from rsbench.core.so3 import FloatArray
 _ACCENT, _GREY, _LINE = "#0b6bcb", "#aab3bd", "#d8dde2"
 _WIDE, _ROW, _LEFT, _BAR = 420.0, 24.0, 96.0, 220.0
 _SIDE, _INSET = 240.0, 52.0
-"""Of the square in which directions are drawn, and of its axes' labels, px."""
+"""Side of the square in which directions are drawn, and width of its labels, px."""
 _LEAST = 1e-3
 """Smaller probabilities are called less than this."""
 _WIDEST_DEG = 30.0
@@ -108,7 +108,7 @@ def _odds(probability: Mapping[str, float], used: str) -> Markup:
 
 
 def _ellipses(covariance: FloatArray, names: tuple[str, str]) -> Markup:
-    """Of one deviation and of 95 %, about the estimate; one scale in both directions."""
+    """Ellipses of one deviation and of 95 %, about the estimate; one scale in both directions."""
     values, vectors = np.linalg.eigh(covariance)
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(turn), np.sin(turn)])

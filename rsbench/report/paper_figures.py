@@ -351,7 +351,7 @@ class Scale:
 
 
 def depth_scale(panels: Panels) -> Scale:
-    """Of inverse depth, 1/m, over all but the nearest and farthest hundredth of the surfaces; ticks in metres."""
+    """Scale of inverse depth, 1/m, without the nearest and farthest hundredth of the surfaces; ticks in metres."""
     low, high = np.nanpercentile(1.0 / panels.true_depth, [1, 99])
     even = (low + np.linspace(0.0, 1.0, 4) * (high - low)).tolist()
     texts = [f"{1.0 / value:.2g} m" if k == 0 else f"{1.0 / value:.2g}" for k, value in enumerate(even)]
@@ -359,7 +359,7 @@ def depth_scale(panels: Panels) -> Scale:
 
 
 def _error_scale() -> Scale:
-    """Of the decimal logarithm of the depth error, metres."""
+    """Scale of the decimal logarithm of the depth error, metres."""
     low, high = (math.log10(end) for end in ERROR_M)
     ticks = {"1 mm": -3.0, "1 cm": -2.0, "10 cm": -1.0, "1 m": 0.0}
     return Scale(low=low, high=high, ticks=ticks, colours="inferno")

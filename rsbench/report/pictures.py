@@ -14,7 +14,7 @@ from rsbench.core.so3 import FloatArray
 Image = NDArray[np.uint8]
 
 INLIER, OUTLIER, INVALID = (70, 160, 255), (255, 150, 0), (60, 60, 66)
-"""Blue, orange and dark grey: told apart by colour-blind readers too."""
+"""Blue, orange and dark grey: colour-blind readers distinguish them too."""
 
 
 def overlay(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:

@@ -81,10 +81,10 @@ class SequenceJob:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Of one sequence."""
+    """Scores of one sequence."""
 
     rows: dict[str, list[Row]]
-    """Of each table."""
+    """Rows of each table."""
     stale: list[str]
     """Predictions on disk that are not current, and not scored."""
 
@@ -150,7 +150,7 @@ def _serve_sequences(
     except RsbenchError as error:
         raise EntryFailure(str(error)) from error
     runner, plan = SolverRunner(single_thread=True), isolated(plan, Isolation())  # as long as this process
-    hashes = FileHashes(dataset, out / HASHES)  # the parent has forgotten them, if that was asked
+    hashes = FileHashes(dataset, out / HASHES)  # empty after --force, which clears them in the parent
 
     def run(job: SequenceJob) -> tuple[dict[str, Any] | None, list[str]]:
         sequence, folder = sequences[job.sequence], out / "predictions" / job.sequence
@@ -269,7 +269,7 @@ class Evaluation:
     def run(self, command: str, step: Step, workers: Workers = 1) -> list[str]:
         """Predict and score; writes predictions/, scores/*.csv and provenance.json below ``out``.
 
-        Predictions made before from the same data, components and options are kept and scored, whoever asked for
+        Predictions made before from the same data, components and options are kept and scored, whichever run made
         them. ``workers`` predict and score one sequence each; 1 is this process, with all its threads.
 
         Returns:

@@ -45,12 +45,12 @@ class EvaluationOptions:
 
     solvers: tuple[str, ...]
     correction_solver: str = "rs-stereo-refined"
-    """Whose motion the correction uses; scored like the others."""
+    """Solver whose motion the correction uses; scored like the others."""
     features: str = "sift"
     matcher: str = "sgm"
     corrector: str = "fusion"
     metrics: tuple[str, ...] = ()
-    """Beside ``STANDARD_METRICS``."""
+    """Metrics beside ``STANDARD_METRICS``."""
     only: tuple[str, ...] = ()
     """Names of solvers and sequences to which predicting is limited; all when empty."""
     force: bool = False
@@ -167,7 +167,7 @@ class Recipe:
 
     @property
     def names(self) -> dict[str, str]:
-        """Of corrector, solver and matcher, as in tables."""
+        """Names of corrector, solver and matcher, as in tables."""
         needs = self.chain.corrector.component.spec.needs
         solver = TRUE if self.true_motion else self.chain.solver.name
         matcher = TRUE if self.true_depth else self.chain.matcher.name
@@ -222,7 +222,7 @@ class Places:
         return self._artefact("matches", data=self.data, features=self.chain.features.key)
 
     def motion(self, solver: SolverEntry, seed: int = 0) -> Artefact:
-        """By the samples number ``seed`` of the robust loop."""
+        """Motion by the samples number ``seed`` of the robust loop."""
         return self._artefact(
             f"motion/{solver.name}" if seed == 0 else f"{_SEEDS}/{seed}/{solver.name}",
             matches=self.matches().identity,
@@ -233,7 +233,7 @@ class Places:
         )
 
     def depth(self, matcher: MatcherEntry) -> Artefact:
-        """By the motion of the solver of ``chain`` where the matcher needs one."""
+        """Depth, by the motion of the solver of ``chain`` where the matcher needs one."""
         motion = {"motion": self.motion(self.chain.solver).identity} if needs_motion(matcher) else {}
         return self._artefact(f"depth/{matcher.name}", data=self.data, matcher=matcher.key, **motion)
 
@@ -266,7 +266,7 @@ class Stored(NamedTuple):
 
 
 def stored_motions(places: Places, plan: Plan) -> Iterator[Stored]:
-    """Of every solver and seed, planned or not."""
+    """Motions of every solver and seed, planned or not."""
     chosen = {solver.name: solver for solver in plan.solvers}
     again = cache(partial(_again, partial(_named, load_solver_entry)))
     names = [path.name for path in listed(places.folder / _SEEDS)]
@@ -278,7 +278,7 @@ def stored_motions(places: Places, plan: Plan) -> Iterator[Stored]:
 
 
 def stored_depths(places: Places) -> Iterator[Stored]:
-    """Of every stereo matcher."""
+    """Depths by every stereo matcher."""
     for name, record in records_below(places.folder, "depth"):
         chosen = places.chain.matcher
         entry = chosen if chosen.name == name else _again(partial(_named, load_matcher), record.get("entry"))
@@ -286,7 +286,7 @@ def stored_depths(places: Places) -> Iterator[Stored]:
 
 
 def stored_corrections(places: Places) -> Iterator[Stored]:
-    """Of every recipe."""
+    """Corrections by every recipe."""
     for _, record in records_below(places.folder, "corrected"):
         recipe = _again(partial(_recipe, places.chain), record)
         yield Stored(record, recipe if _current(recipe, places.corrected, record) else None)

@@ -187,7 +187,7 @@ class Bench:
         artefact.finish(record, seconds)
 
     def _disparities(self, entry: MatcherEntry) -> dict[str, NDArray[np.float32]]:
-        """Of each view by its name; a matcher that needs a motion gets the estimated one."""
+        """Disparities by the name of the view; a matcher that needs a motion gets the estimated one."""
         images, sequence = self.images, self.sequence
         found: dict[View, NDArray[np.float32]] = {}
         if needs_motion(entry):

@@ -63,7 +63,7 @@ def metric_keys(metrics: Iterable[MetricEntry], case: type[Case]) -> list[list[s
 
 
 def hash_of_prediction(files: Iterable[Path]) -> str:
-    """Of the bytes of a prediction's files; one that is not there counts too."""
+    """Hash of the bytes of a prediction's files; a missing one counts too."""
     found = [f"{path.name} {sha256(path) if path.is_file() else 'is not there'}" for path in files]
     return hashlib.sha256("\n".join(found).encode()).hexdigest()
 

@@ -72,7 +72,7 @@ class _Correction(_Record):
     matcher: str
     entries: dict[str, str]
     failures: dict[str, str] = field(default_factory=dict)
-    """By views such as ``left_0`` that the corrector gave up, why."""
+    """Why the corrector failed on views such as ``left_0``."""
 
 
 _KINDS: dict[str, type[_Record]] = {
@@ -107,7 +107,7 @@ class Artefact:
     """A prediction on disk, or the place for it."""
 
     folder: Path
-    """Of the sequence."""
+    """Folder of the sequence."""
     name: str
     """Such as ``motion/gs-8pt``."""
     identity: str
@@ -132,12 +132,12 @@ class Artefact:
         self.file(".json").unlink(missing_ok=True)
 
     def start(self) -> None:
-        """Before its files are written."""
+        """Call before its files are written."""
         self.stem.parent.mkdir(parents=True, exist_ok=True)
         self.forget()
 
     def finish(self, record: Mapping[str, Any], seconds: float | None = None) -> None:
-        """When its files are complete: write the record, JSON-ready, and how long it took."""
+        """Call when its files are complete: writes the record, JSON-ready, and the seconds."""
         if seconds is not None:
             write_json(self.folder / SECONDS, read_seconds(self.folder) | {self.name: round(seconds, 4)})
         write_json(self.file(".json"), {"identity": self.identity, **record})

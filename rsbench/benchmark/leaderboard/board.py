@@ -47,7 +47,7 @@ ORACLES = "rsbench leaderboard oracles"
 OWN = (RUN, ORACLES)
 """Commands that make entries without a submission."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
-"""Of an entry; the last one describes the others."""
+"""Files of an entry; the last one describes the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class Recorded:
     header: Header
     predictions_sha256: str
     fingerprint: str
-    """Of the split."""
+    """Fingerprint of the split."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
     doubt: str = ""
@@ -66,7 +66,7 @@ class Recorded:
     accepted: str = ""
     """Why the keeper of the board ranks it although it is in doubt."""
     made: dict[str, Any] = field(default_factory=dict)
-    """By which ``command``, version and machine it was made."""
+    """Its provenance: ``command``, version, machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ class About:
     split: str
     fingerprint: str
     facts: dict[str, dict[str, float | str]]
-    """Of each problem; none where they are secret."""
+    """Facts of each problem; none where they are secret."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -343,10 +343,10 @@ class _Taken(NamedTuple):
     """A file of predictions that becomes an entry."""
 
     submission: Submission
-    """In the folder where the entry is made."""
+    """Its copy in the folder where the entry is made."""
     data: bytes
     files: dict[str, str]
-    """As of ``Recorded``."""
+    """The same as in ``Recorded``."""
 
     @property
     def identity(self) -> list[Any]:

@@ -248,13 +248,13 @@ class TrueFrame:
     """What a corrected frame is compared with."""
 
     name: str
-    """Of the row: ``first``, ``middle`` or ``last``."""
+    """Name of the row: ``first``, ``middle`` or ``last``."""
     picture: Picture
     """(H, W, 3) of a global shutter."""
     common: NDArray[np.bool_]
     """(H, W) see ``TruePictures.common``."""
     parts: Parts
-    """Of the common pixels."""
+    """Parts of the common pixels."""
 
     @classmethod
     def all_of(cls, pictures: TruePictures) -> list[TrueFrame]:
@@ -459,7 +459,7 @@ def _placed(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame)
 
 
 def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float:
-    """Of the place where a window is found from the middle of what is around it, px; infinite at the rim."""
+    """Distance, px, of the best place of a window from the middle of its surroundings; infinite at the rim."""
     found = cv2.matchTemplate(around, window, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(np.argmax(found)), found.shape)
     if not (0 < y < 2 * _REACH_PX and 0 < x < 2 * _REACH_PX):

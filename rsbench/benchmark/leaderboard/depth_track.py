@@ -180,7 +180,7 @@ class TrueDepth:
     seen: NDArray[np.bool_]
     """(H, W) by both cameras."""
     parts: Parts
-    """Of the surface."""
+    """Parts of the surface."""
 
     @classmethod
     def of(cls, pictures: TruePictures) -> TrueDepth:
@@ -191,7 +191,7 @@ class TrueDepth:
 
 
 def depth_scores(true: TrueDepth, depth: NDArray[np.float32] | None) -> Numbers:
-    """Of a depth map (H, W), m, 0 unknown; None: a failure."""
+    """Scores of a depth map (H, W), m, 0 unknown; None: a failure."""
     truth, rig, seen = true.depth, true.rig, true.seen
     found = part_scores(depth, truth, rig, np.ones_like(seen))
     for name, part in (("visible", seen), ("occluded", ~seen)):
@@ -213,7 +213,7 @@ def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRi
 def part_scores(
     depth: NDArray[np.float32] | None, truth: NDArray[np.float32], rig: StereoRig, part: NDArray[np.bool_]
 ) -> Numbers:
-    """Of some pixels. Where none of them shows a surface nothing is wrong; errors in metres do not exist."""
+    """Scores of some pixels. Without a surface there nothing is wrong, and errors in metres do not exist."""
     if depth is None:
         return _WORST_PART
     surface = part & (truth > 0.0)

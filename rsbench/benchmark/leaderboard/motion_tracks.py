@@ -111,7 +111,7 @@ _DECADES = 2.0
 _AREAS_DEG = (0.1, 1.0)
 """Limits of e_R and of e_T in pose-2: a rotation is known ten times as well."""
 _DRAWS = 4000
-"""Of errors at a bound: their median is known to 3 %."""
+"""Errors drawn at a bound: their median is known to 3 %."""
 _RIGHT_PX = 1.0
 """A right match ends so near to the truth."""
 _MATCH_FILES = tuple(f"{key}.csv" for key in COLUMNS)
@@ -243,7 +243,7 @@ def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
 
 
 def rounded(answer: dict[str, Any]) -> dict[str, Any]:
-    """With w and d to twelve digits, and a covariance to six: stored predictions are half as large."""
+    """Round w and d to twelve digits, and a covariance to six: stored predictions are half as large."""
     for name, digits in (("w", 12), ("d", 12), ("covariance", 6)):
         if answer.get(name) is not None:
             found = np.asarray(answer[name])
@@ -470,7 +470,7 @@ def _at_the_bound(split: Split) -> Iterator[dict[str, Any]]:
 
 
 def nearness(over: FloatArray) -> FloatArray:
-    """Of errors (...) over their medians at the bound: 1 up to 1, 0 from 100 on, even in the logarithm."""
+    """Score of errors (...) over their medians at the bound: 1 up to 1, 0 from 100 on, linear in the logarithm."""
     with np.errstate(divide="ignore"):
         return np.clip(1.0 - np.log10(over) / _DECADES, 0.0, 1.0)
 
@@ -510,7 +510,7 @@ def _add_match_columns(rows: list[Row], submission: Submission, split: Split) ->
 
 
 class OwnMatchesTrack(MotionTrack):
-    """Of rendered frames; a method's own matches may be submitted."""
+    """Motions from rendered frames; a method's own matches may be submitted."""
 
     own_matches = True
     also_uses = ("images",)

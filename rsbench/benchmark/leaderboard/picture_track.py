@@ -65,12 +65,12 @@ class CardChain(NamedTuple):
     key: object
     """What decides an answer."""
     uses: tuple[str, ...]
-    """Of ``KNOWLEDGE``."""
+    """Names of ``KNOWLEDGE``."""
     reference: str = ""
     """Where the method is published."""
 
     def choosing(self) -> CardChain:
-        """With the motion model that the matches prefer: what ``rsbench correct`` does."""
+        """The same chain with the motion model that the matches prefer, as ``rsbench correct`` has it."""
         options = replace(self.options, motion_model=AUTO)
         return self._replace(options=options, key=options.key)
 

@@ -35,7 +35,7 @@ from rsbench.storage.untrusted_files import NAME, inside, read_bytes
 from rsbench.vision.stereo_depth import seen_by_other
 
 VIEW: View = ("left", 1)
-"""Whose depth and corrected frames are requested."""
+"""View whose depth and corrected frames are requested."""
 
 
 class RequestedPicture(NamedTuple):
@@ -48,7 +48,7 @@ class RequestedPicture(NamedTuple):
     file: str
     """Path of the true picture below the folder of the sequence."""
     suffixes: tuple[str, ...] = (".png",)
-    """Of the file formats that it may have."""
+    """Suffixes of the file formats that it may have."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -164,7 +164,7 @@ def file_bytes(folder: Path, name: str) -> bytes:
 
 
 def check_own(folder: Path, name: str) -> None:
-    """Raises RsbenchError unless a file, and each folder on the way to it, is there and is no link."""
+    """Raises RsbenchError unless a file, and each folder that leads to it, exists and is no link."""
     path = folder
     *folders, file = name.split("/")
     for part, kind, is_kind in (
@@ -294,7 +294,7 @@ PARTINGS = (
 
 
 def columns(score: str, parting: Parting) -> list[str]:
-    """Of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
+    """Columns of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
     return [f"{score}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
 
 
@@ -327,7 +327,7 @@ class SquareErrors:
 
     def __init__(self, score: str) -> None:
         self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns(score, parting)}
-        """Of squared errors, and how many."""
+        """Sum of squared errors, and their number."""
 
     def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], parts: Parts) -> None:
         """A frame (H, W, 3) and its ``parts_within``; None: a failure, which errs by all levels."""
@@ -338,7 +338,7 @@ class SquareErrors:
             self._sums[name] += np.array([np.sum(inside), inside.size])
 
     def scores(self) -> dict[str, float]:
-        """By column; NaN for a part without pixels."""
+        """Scores by column; NaN for a part without pixels."""
         return {name: math.sqrt(s / n) if n else math.nan for name, (s, n) in self._sums.items()}
 
 

@@ -198,7 +198,7 @@ def _done(
 
 
 def _serve(track: Track, inputs: Path, limits: Limits) -> Any:
-    """In the child: what runs jobs."""
+    """Function that runs jobs, in the child process."""
     use_one_thread()
     warm_up()
     solve = track.solver_of_jobs(inputs, limits)

@@ -215,7 +215,7 @@ def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> 
 
 
 def hashes_of_frames(data: Path) -> dict[str, str]:
-    """Of each sequence of a dataset, a hash of its images and depth maps."""
+    """A hash of the images and depth maps of each sequence of a dataset."""
     manifest, found = read_dataset_manifest(data), dict[str, str]()
     for name in manifest.sequences:
         pictures = [

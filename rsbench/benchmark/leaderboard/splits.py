@@ -36,13 +36,13 @@ Range = tuple[float, float]
 _SHORTEST_SECRET = 16
 """Characters of a seed file: shorter ones could be guessed by trying all."""
 FEATURES = "sift"
-"""Whose matches the protocols of given matches give."""
+"""Matcher of the protocols with given matches."""
 _GYRO = "imu"
 """The channel with the samples of a gyroscope."""
 _AROUND = 1.0
 """Frame periods before the first frame and after the last one of which samples are given."""
 FEWEST_FRAMES, MOST_FRAMES = 4, 250
-"""Of a whole sequence."""
+"""Fewest and most frames of a whole sequence."""
 
 
 # Simulated points
@@ -60,10 +60,10 @@ class Draws:
     """Names of its generators: no two protocols share a draw."""
     problems: int
     setting: Callable[[int, int], Setting]
-    """By seed and number."""
+    """Setting of a problem by seed and number."""
     outlier_images: OutlierImages
     kinds: Callable[[int, int], dict[str, float | str]] = _no_kinds
-    """By seed and number, what else than sizes scores may be drawn against."""
+    """Other facts than sizes that scores may be drawn against, by seed and number."""
 
     def rng(self, seed: int, what: str, number: int) -> np.random.Generator:
         return generator(seed, *self.scope, what, number)
@@ -114,7 +114,7 @@ class RigKind:
     baseline: Range
     depth: Range
     rotation_deg: Range
-    """In a frame period."""
+    """Rotation in a frame period."""
     translation: Range
     """Metres in a frame period."""
     shake: str

@@ -139,7 +139,7 @@ class Standing:
 
     @property
     def stated_words(self) -> dict[str, str]:
-        """By column: how often its ellipsoids of 95 % hold the truth, its log score, and its rank by that."""
+        """How often its ellipsoids of 95 % hold the truth, its log score, and its rank by that, by column."""
         found = self.calibration
         words = {"in 95 %": in_words(*found.covers[-1]) if found else "-"}
         if "log_score" in self.scored.scores:
@@ -154,12 +154,12 @@ class Standing:
 
     @property
     def name(self) -> str:
-        """As tables show it: submitted entries are marked."""
+        """Name in tables, where submitted entries are marked."""
         return self.scored.header.method + (" (handed in)" if self.scored.handed_in else "")
 
     @property
     def uses(self) -> str:
-        """In the order of ``KNOWLEDGE``."""
+        """What it uses, in the order of ``KNOWLEDGE``."""
         return " + ".join(name for name in KNOWLEDGE if name in self.scored.header.uses)
 
 

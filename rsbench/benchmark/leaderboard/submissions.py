@@ -21,7 +21,7 @@ from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
-"""Of a file of motions: 20 kB for each of 800 problems."""
+"""Largest file of motions: 20 kB for each of 800 problems."""
 _LINE_CHARACTERS = 1 << 16
 _MOST_FAULTS = 50
 _OF_SOLVE = (

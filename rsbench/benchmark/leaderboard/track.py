@@ -51,7 +51,7 @@ ORACLE = "truth"
 CHUNK = 10
 """Problems of one job of a solver."""
 PUBLIC_SEED = 1
-"""Of the split ``dev``: its truth is public."""
+"""Seed of the split ``dev``, whose truth is public."""
 LARGEST = 1e9
 """Limit of the numbers in w and d: larger ones are no motions, and their squares overflow."""
 LEAST_D = 1e-9
@@ -221,7 +221,7 @@ class Answer:
 
 
 def _symmetric(covariance: FloatArray) -> bool:
-    """To 0.001 of the standard deviations of row and column: rounded numbers are, a triangle alone is not."""
+    """Whether it is symmetric to 0.001 of its standard deviations: rounded numbers are, a triangle is not."""
     sizes = np.sqrt(np.abs(np.diag(covariance)))
     with np.errstate(over="ignore"):
         return bool(np.all(np.abs(covariance - covariance.T) <= 1e-3 * np.outer(sizes, sizes)))
@@ -233,9 +233,9 @@ class Submission:
 
     header: Header
     answers: Mapping[str, Answer]
-    """By the name of the problem."""
+    """Answers by the name of the problem."""
     folder: Path
-    """Of the file; pictures and matches of its answers lie there."""
+    """Folder of the file, and of the pictures and matches of its answers."""
 
 
 # Problems with their truth
@@ -256,7 +256,7 @@ class Truth:
     sequence: Rendered | None = None
     """Where the truth of rendered frames lies."""
     pictures: TruePictures | None = None
-    """On tracks whose answers are pictures."""
+    """Pictures, on tracks whose answers are pictures."""
     given_rig: StereoRig | None = None
     """What methods are given of the rig, where that is not the true one."""
 
@@ -272,7 +272,7 @@ class Split:
     """Whether the truth may be published."""
     truths: tuple[Truth, ...]
     seed: int = PUBLIC_SEED
-    """Of simulated problems."""
+    """Seed of simulated problems."""
 
     @cached_property
     def fingerprint(self) -> str:
@@ -344,7 +344,7 @@ class Runnable(NamedTuple):
     """A card that a track can run."""
 
     name: str
-    """Of its entry."""
+    """Name of its entry."""
     built_in: bool
     key: object
     """JSON-ready: what decides its answers beside the inputs."""
@@ -359,9 +359,9 @@ class Target(NamedTuple):
 
     card: str
     folder: Path
-    """Of its predictions."""
+    """Folder of its predictions."""
     identity: str
-    """Of these answers."""
+    """Identity of these answers."""
 
 
 class Job(NamedTuple):
@@ -387,9 +387,9 @@ class Track(ABC):
     """
 
     name: str
-    """On the command line."""
+    """Name on the command line."""
     id: str
-    """Of its protocol, which submissions name."""
+    """Name of its protocol, which submissions state."""
     title: str
     allowed: tuple[str, ...]
     """What of ``KNOWLEDGE`` it gives."""
@@ -506,7 +506,7 @@ class Track(ABC):
 
     @abstractmethod
     def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
-        """In the process of a job: what solves jobs on exported inputs."""
+        """Function that solves jobs on exported inputs, in the process of a job."""
 
     def chunk(self, limits: Limits) -> int:
         """Problems of one job. With limits one, so that a job that takes too much fails one problem."""

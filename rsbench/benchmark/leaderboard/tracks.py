@@ -16,7 +16,7 @@ from rsbench.core.errors import RsbenchError
 
 _MODULES = (motion_tracks, rig_tracks, readout_tracks, depth_track, correction_tracks, trajectory_track)
 TRACKS: dict[str, Track] = {track.name: track for module in _MODULES for track in module.TRACKS}
-"""By name, in the order of tables."""
+"""Tracks by name, in the order of tables."""
 _BY_PROTOCOL = {track.id: track for track in TRACKS.values()}
 
 

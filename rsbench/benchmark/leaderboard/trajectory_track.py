@@ -60,7 +60,7 @@ from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.problem import Problem
 
 _MOST_POSES = 500
-"""Of an answer: a line of a file of answers has limited length."""
+"""Most poses of an answer: a line of a file of answers has limited length."""
 APART = 1e-5
 """Frame periods, at least, between two poses of an answer: rows are farther apart, and a spline through nearer
 ones may go anywhere."""

@@ -32,9 +32,9 @@ _STEP = 1e-3
 _DIFFERENCES = (2 / 3, -1 / 12)
 """Fourth-order central differences at 1 and 2 steps, radians and metres: they leave out and round at 1e-13."""
 _SINGULAR = 1e-11
-"""Of the largest singular value. What is not known at all has 1e-13; the least that was seen of what is, 1e-7."""
+"""Share of the largest singular value. Unknown directions have 1e-13; known ones were seen down to 1e-7."""
 _OPEN = 3e-7
-"""Of a point's largest singular value: along directions below, a ray's at no parallax, its position is open."""
+"""Share of a point's largest singular value below which its position is unknown: along a ray without parallax."""
 _FAR_M = 1e6
 
 
@@ -43,11 +43,11 @@ class Bound:
     """Root mean square errors that no unbiased solver undercuts; infinite where the data say nothing."""
 
     rotation_axes: FloatArray
-    """Of the rotation (3,) along its principal axes, radians, largest first."""
+    """Deviations (3,) of the rotation along its principal axes, radians, largest first."""
     direction_axes: FloatArray
-    """Of the direction of d (2,), radians, largest first; meaningful while well below 1."""
+    """Deviations (2,) of the direction of d, radians, largest first; meaningful while well below 1."""
     scale: float
-    """Of the length of d, relative to it."""
+    """Deviation of the length of d, relative to it."""
     root: FloatArray
     """(6, 6) B of the Fisher information B^T B of (w, d)."""
 
@@ -58,12 +58,12 @@ class Bound:
 
     @property
     def rotation(self) -> float:
-        """Of e_R, radians."""
+        """Root mean square of e_R, radians."""
         return float(np.linalg.norm(self.rotation_axes))
 
     @property
     def direction(self) -> float:
-        """Of e_T, radians; meaningful while well below 1."""
+        """Root mean square of e_T, radians; meaningful while well below 1."""
         return float(np.linalg.norm(self.direction_axes))
 
     @property
@@ -291,7 +291,7 @@ def _projection_jacobian(
 
 
 def _derivative(motion: Motion, tau: FloatArray, points: FloatArray, axis: FloatArray) -> FloatArray:
-    """Of points (n, 3), in the body at times (n,), by the motion's end (w, d) along an axis (6,)."""
+    """Derivative of points (n, 3), in the body at times (n,), by the motion's end (w, d) along an axis (6,)."""
 
     def moved(step: float) -> FloatArray:
         w, d = motion.w + step * axis[:3], motion.d + step * axis[3:]

@@ -40,7 +40,7 @@ from rsbench.solvers.engine.base import (
 )
 
 _CLOSE = 0.2
-"""Of the motion's angle, and in radians of direction: nearer to one misreading than any two are to each other."""
+"""Largest error, as a share of the motion's angle and in radians of direction: no two misreadings are so near."""
 
 
 def misreading(
@@ -300,7 +300,7 @@ def given(subject: Subject, simulation: Simulation) -> Correspondences:
 
 
 def true_translation(subject: Subject, simulation: Simulation) -> FloatArray:
-    """Of the point whose translation the solver gives."""
+    """True translation of the point whose translation the solver gives."""
     motion = simulation.motion
     if subject.spec.reference_point == "body":
         return motion.d
@@ -330,7 +330,7 @@ def answers(subject: Subject) -> tuple[Verdict, str]:
 
 _SIZES, _SEEDS = (1.0, 0.5, 0.25), (5, 6, 7)
 _EXACT = 1e-6
-"""Of the motion's angle, in radians of direction, in log of length: rounding, and the last step of a descent."""
+"""Share of the motion's angle, radians of direction, log of length: rounding, and the last step of a descent."""
 _LARGEST, _BIAS = 0.1, (0.02, 0.005, 0.02)
 """What a linearised solver may be off at the paper's motion, and what remains however small the motion is. The
 latter tells a bias of the method from a wrong point of the rig, whose direction is 0.03 rad off."""
@@ -340,7 +340,7 @@ def finds_the_truth(subject: Subject) -> tuple[Verdict, str]:
     """The motion of exact data: exactly, or the better the smaller the motion is."""
     errors = np.array([[_errors(subject, size, seed) for seed in _SEEDS] for size in _SIZES]).max(axis=1)
     names = ("rotation", "direction", "length")
-    told = [f"{name} {full:.0e}" for name, full in zip(names, errors[0], strict=True) if np.isfinite(full)]
+    shown = [f"{name} {full:.0e}" for name, full in zip(names, errors[0], strict=True) if np.isfinite(full)]
     biased = []
     for name, (full, _, quarter), bias in zip(names, errors.T, _BIAS, strict=True):
         if not np.isfinite(full) or max(full, quarter) < _EXACT:
@@ -351,11 +351,11 @@ def finds_the_truth(subject: Subject) -> tuple[Verdict, str]:
             biased.append(f"{name} {quarter:.1e} off however small the motion is")
     if biased:
         return "warning", "; ".join(biased)
-    return "passed", f"relative errors on exact data: {', '.join(told)}"
+    return "passed", f"relative errors on exact data: {', '.join(shown)}"
 
 
 def _errors(subject: Subject, size: float, seed: int) -> tuple[float, float, float]:
-    """Of rotation (share of its angle), direction (rad) and length (log; NaN when it is not metric)."""
+    """Errors of rotation (share of its angle), direction (rad) and length (log; NaN when it is not metric)."""
     simulation = own_problem(subject, size, seed)
     estimate, d = _solved(subject, simulation), true_translation(subject, simulation)
     rotation = rotation_error(estimate.w, simulation.motion.w) / np.linalg.norm(simulation.motion.w)
@@ -428,7 +428,7 @@ def mirrors(subject: Subject) -> tuple[Verdict, str]:
 
 
 _SAME_W, _SAME_D = 1e-6, 1e-5
-"""Radians, and share of the length: the last step of a descent that takes another way."""
+"""Radians, and share of the length: the last step of a descent that takes another path."""
 
 
 def _agree(
@@ -481,7 +481,7 @@ def fails_by_value(subject: Subject) -> tuple[Verdict, str]:
             failures += not estimate.success
             if estimate.success and name in ("two matches", "no matches"):
                 raise BrokenContractError(f"{kind}{name}: gave a motion, which they cannot determine")
-    return "passed", f"{failures} of {3 * len(cases)} problems without a motion were told"
+    return "passed", f"{failures} of {3 * len(cases)} problems without a motion were refused"
 
 
 def _subset(c: Correspondences, *names: str) -> Correspondences:
@@ -511,7 +511,7 @@ CHECKS: Mapping[str, Callable[[Subject], tuple[Verdict, str]]] = {
     "leaves its input alone": leaves_its_input_alone,
     "is quiet": is_quiet,
 }
-"""In this order; without the first, the others are skipped."""
+"""Checks in their order; if the first fails, the others are skipped."""
 
 
 def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:

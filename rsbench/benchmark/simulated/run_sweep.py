@@ -100,7 +100,7 @@ def _parts(card: SweepCard) -> list[_Part]:
 
 
 def geometry_of(card: SweepCard, cell: Cell) -> Cell:
-    """The first cell with the same exact matches: noise and what solvers are told may differ."""
+    """The first cell with the same exact matches: noise and what solvers are given may differ."""
     exact = cell.setting.exact()
     return next(other for other in card.cells() if other.setting.exact() == exact)
 
@@ -179,7 +179,7 @@ def read_bounds(out: Path, card: SweepCard, cell: Cell) -> Arrays:
 
 
 _SAID = ("name", "information", "shutter", "motion_model", "reference_point")
-"""What sweep.json must say of every solver."""
+"""What sweep.json must state of every solver."""
 _REMAKE = "delete the file, and the same command makes it again"
 _TRIALS = {
     "w": ("f", (3,)),
@@ -218,9 +218,9 @@ def read_sweep(folder: Path) -> dict[str, Any]:
         raise RsbenchError(f"{path}: format = {content.get('format')!r}: must be {FORMAT}")
     solvers = content.get("solvers")
     solvers = solvers if isinstance(solvers, list) else [solvers]
-    said = [[one.get(key) for key in _SAID] if isinstance(one, dict) else [None] for one in solvers]
+    stated = [[one.get(key) for key in _SAID] if isinstance(one, dict) else [None] for one in solvers]
     if not (
-        isinstance(content.get("card"), dict) and all(isinstance(word, str) for words in said for word in words)
+        isinstance(content.get("card"), dict) and all(isinstance(word, str) for words in stated for word in words)
     ):
         raise RsbenchError(
             f"{path}: card or solvers are damaged; choose another --out, or remake all with --force"

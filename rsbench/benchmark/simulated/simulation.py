@@ -42,16 +42,16 @@ from rsbench.core.so3 import FloatArray
 SceneShape = Literal["box", "plane"]
 OutlierImages = Literal["frame 1", "all"]
 MOST_POINTS = 1_000_000
-"""Of each set: ten seconds of one core, and a gigabyte."""
+"""Largest number in each set: ten seconds of one core, and a gigabyte."""
 GYRO_RATE = 20
 """Samples of a gyroscope in a frame period, where a solver wants any: 600 Hz at 30 frames a second."""
 
 _MOST_SLANT = np.deg2rad(60.0)
-"""Between the normal of a patch and the ray on which frame 0 sees it."""
+"""Largest angle between the normal of a patch and the ray on which frame 0 sees it."""
 _TILT = (0.3, -0.2)
-"""Of the plane in the axes of the camera that sees it: what its inverse depth gains along the ray, in shares."""
+"""Tilt of the plane in the axes of the camera: relative slope of its inverse depth along x and y of the ray."""
 _DOWN = np.array([0.2, 0.9, -0.3]) / np.sqrt(0.94)
-"""The way things fall, in the axes of the body at time 0."""
+"""Direction of gravity, in the axes of the body at time 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class SimulationOptions:
     outlier_px: float = 80.0
     """Outliers lie uniformly within this distance, per coordinate, of the truth."""
     outlier_images: OutlierImages = "frame 1"
-    """Whose pixels: of frame 1, by one distance in both cameras; or of every image, each by its own."""
+    """Displaced pixels: those of frame 1, alike in both cameras, or those of every image, each by its own draw."""
     depth: tuple[float, float] = (2.0, 10.0)
     """Range of depths in frame 0, metres, uniform."""
     gyro_rate: int = 0
@@ -204,7 +204,7 @@ def _gyro(motion: Motion, options: SimulationOptions, rng: np.random.Generator) 
 
 
 def _gravity(motion: Motion, options: SimulationOptions, rng: np.random.Generator) -> FloatArray:
-    """(2, 4) of a camera that is held at an angle."""
+    """(2, 4) directions of gravity of a tilted camera."""
     if not options.gravity:
         return np.zeros((0, 4))
     tau = np.array([0.0, 1.0])
@@ -246,9 +246,9 @@ def _affine(
 
 
 def _slanted(rays: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Unit normals (n, 3) of patches that unit rays (n, 3) meet, slanted every way."""
-    slant, way = rng.uniform(size=(2, len(rays))) * [[_MOST_SLANT], [2.0 * np.pi]]
-    axis = np.sum(plane_basis(rays) * np.stack([np.cos(way), np.sin(way)], axis=1)[:, None], axis=2)
+    """Unit normals (n, 3) of patches that unit rays (n, 3) meet, slanted in all directions."""
+    slant, turn = rng.uniform(size=(2, len(rays))) * [[_MOST_SLANT], [2.0 * np.pi]]
+    axis = np.sum(plane_basis(rays) * np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, None], axis=2)
     return (so3.exp(slant[:, None] * axis) @ rays[..., None])[..., 0]
 
 

@@ -91,7 +91,7 @@ class Setting:
     outlier_px: float = 80.0
     """Outliers lie uniformly within this distance, per coordinate, of the truth, px."""
     readout_ratio_error: float = 0.0
-    """Readout ratio that the solver is told minus the true one."""
+    """Readout ratio that the solver is given minus the true one."""
     gyro_noise_deg: float = 0.0
     """Standard deviation of a gyroscope's sample on each axis, degrees per frame period; of solvers that need
     one."""
@@ -126,7 +126,7 @@ class Setting:
                 raise ValueError(f"{name!r} is required")
         self.rig()
         self.shutter()
-        self.told_shutter()
+        self.given_shutter()
         if fixed_endpoint(self.motion_model, self.motion_parameters) is not None:
             raise ValueError("motion_parameters must leave the motion free: rotation_deg and translation set it")
         self.motion(np.random.default_rng(0))
@@ -157,8 +157,8 @@ class Setting:
         ratio = self.readout_ratio if tables.readout_ratio is None else tables.readout_ratio
         return self.rig().shutter_of(tables.scanning or Scanning(), ratio)
 
-    def told_shutter(self) -> RollingShutter:
-        """The shutter that the solver believes in."""
+    def given_shutter(self) -> RollingShutter:
+        """The shutter that the solver is given."""
         shutter = self.shutter()
         return shutter.with_ratio(shutter.readout_ratio + self.readout_ratio_error)
 

@@ -196,7 +196,7 @@ def _timed(
     runner: SolverRunner,
 ) -> tuple[MotionEstimate, float]:
     """An answer and its seconds: of the processor, since solvers have one thread and others shall not count."""
-    matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.told_shutter()
+    matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.given_shutter()
     sensed = {name: getattr(simulation.correspondences, name) for name in BESIDE if name in e.solver.spec.needs}
     matches = replace(matches, **sensed)
     if not robust:

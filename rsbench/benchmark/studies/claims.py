@@ -256,7 +256,7 @@ GRID_NOISE_PX, GRID_TRIALS = 1e-3, 100
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """One way to read the paper's solver; the fields are parameters of ``LinearSolver``, by default literal."""
+    """A reading of the paper's solver; the fields are parameters of ``LinearSolver``, by default literal."""
 
     scaling: str = "none"
     baseline_unit: str = "metre"
@@ -275,7 +275,7 @@ class Reading:
 
     @property
     def name(self) -> str:
-        """Of its solver card."""
+        """Name of its solver card."""
         return f"reading-{str(self).replace(', ', '-').replace(' ', '-')}"
 
     @property
@@ -361,11 +361,11 @@ class Claim:
     rule: str
     """The rule in words."""
     check: Callable[[Series, Series], list[Check]]
-    """Of the solver's figures and those of ``other``."""
+    """What judges the solver's figures beside those of ``other``."""
     measures: tuple[str, ...] = MEASURES
     """Figures that tables show."""
     beside: tuple[str, ...] = ()
-    """Figures of what it is compared with; the same where nothing is said."""
+    """Figures of what it is compared with; empty: the same figures."""
     matches: tuple[str, ...] = (ALL, NINE)
     """How many of them it is judged with."""
     against_complete: bool = False

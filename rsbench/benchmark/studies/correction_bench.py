@@ -109,7 +109,7 @@ class Method:
     key: str
     title: str
     kind: str
-    """``none``, ``baseline``, ``ours``, ``law`` (ours, told a law of motion) or ``oracle``."""
+    """``none``, ``baseline``, ``ours``, ``law`` (ours, given a law of motion) or ``oracle``."""
     knows: str
     """What it assumes or is given."""
     slow_scores: bool = False
@@ -164,8 +164,8 @@ METHODS = (
         "SGM finds none",
         slow_scores=True,
     ),
-    Method(key="linear", title="ours, linear", kind="law", knows="the same, told that the motion is `linear`"),
-    Method(key="twist", title="ours, twist", kind="law", knows="the same, told that the motion is a `twist`"),
+    Method(key="linear", title="ours, linear", kind="law", knows="the same, given that the motion is `linear`"),
+    Method(key="twist", title="ours, twist", kind="law", knows="the same, given that the motion is a `twist`"),
     Method(key="true-motion", title="true motion, SGM depth", kind="oracle", knows="true motion; depth as ours"),
     Method(key="true-depth", title="our motion, true depth", kind="oracle", knows="true depth"),
     Method(key="truth", title="true motion, true depth", kind="oracle", knows="true motion and depth"),
@@ -197,7 +197,7 @@ ON_REQUEST = (
         knows="one image: lines along three orthogonal directions",
     ),
 )
-"""Methods that a study has when it is asked for them: docs/explanation/correctors.md compares them."""
+"""Methods that a study includes on request: docs/explanation/correctors.md compares them."""
 
 
 def methods_among(keys: Collection[str]) -> list[Method]:
@@ -296,8 +296,8 @@ class Bench:
         self.matches = find_matches(self.images, self.options)
         self._seed = seed
         self.found = self._found("rs", self.options)
-        self.scaled = self._found("gs-scaled", self._told(_SCALED))
-        self.of_law = {law: self._found("rs", self._told(name)) for law, name in _OF_LAW.items()}
+        self.scaled = self._found("gs-scaled", self._own_law(_SCALED))
+        self.of_law = {law: self._found("rs", self._own_law(name)) for law, name in _OF_LAW.items()}
         rng = generator(seed, "study", sequence.name, "gs")
         self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
         self.sgm = frame_pairs(self.images, self.rig, self.options)
@@ -306,8 +306,8 @@ class Bench:
             self.images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in true.items()}
         )
 
-    def _told(self, solver: str) -> CorrectionOptions:
-        """With a solver that takes its own law of motion, whatever the matches prefer."""
+    def _own_law(self, solver: str) -> CorrectionOptions:
+        """Options with a solver that assumes its own law of motion, whatever the matches prefer."""
         return replace(self.options, solver=load_solver_entry(solver), motion_model=None)
 
     def _found(self, name: str, options: CorrectionOptions) -> FoundMotion | None:
@@ -393,7 +393,7 @@ class Bench:
         return ZhuangCorrector(seed=self._seed).motion(self.matches, self.rig, self.shutter, side)
 
     def _turned(self, key: str) -> dict[View, Attempt]:
-        """By a rotation that may be another one in each view."""
+        """Correct each view by a rotation, which may differ between views."""
         out: dict[View, Attempt] = {}
         far = _infinitely_far(self.true[0].depth["left"])
         for view in VIEWS:

@@ -1,4 +1,4 @@
-"""The correction study: every way to correct a frame, on the same frames, matches and pixels.
+"""The correction study: all correctors on the same frames, matches and pixels.
 
 A method is a depth, a motion and a corrector of the chain that users have. Those that know a scene fill what a
 frame did not see from the other frames; what remains is invented (inpainted), so that every method gives a whole

@@ -35,19 +35,19 @@ class ImageClaim:
 def motion_on_images(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
     """Per sequence: both errors of a solver below those of gs-8pt (medians where there are several runs)."""
     runs = table.groupby(["solver", "sequence"], sort=False)[["e_R_deg", "e_T_deg"]]
-    errors, told = runs.median(), runs.agg(median_and_quartiles)
+    errors, shown = runs.median(), runs.agg(median_and_quartiles)
     baseline, found = errors.loc["gs-8pt"], dict[str, tuple[list[Check], str]]()
     for solver in PUBLISHED:
         own = errors.loc[solver]
         checks = [Check(str(name), bool((own.loc[name] < baseline.loc[name]).all())) for name in own.index]
-        words, others = (_in_degrees(told.loc[[who]].droplevel("solver")) for who in (solver, "gs-8pt"))
+        words, others = (_in_degrees(shown.loc[[who]].droplevel("solver")) for who in (solver, "gs-8pt"))
         found[solver] = (checks, f"{words} deg (GS: {others})")
     return found
 
 
-def _in_degrees(told: pd.DataFrame) -> str:
+def _in_degrees(shown: pd.DataFrame) -> str:
     """e_R and e_T of each sequence: median [quartiles]."""
-    return "; ".join(f"{name}: {told.e_R_deg[name]}, {told.e_T_deg[name]}" for name in told.index)
+    return "; ".join(f"{name}: {shown.e_R_deg[name]}, {shown.e_T_deg[name]}" for name in shown.index)
 
 
 def sgm_is_accurate(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:

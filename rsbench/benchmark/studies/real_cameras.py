@@ -158,7 +158,7 @@ def _corrected(
     motion: Motion | None,
     options: CorrectionOptions,
 ) -> list[Row]:
-    """PSNR of the pixels that are drawn, of the frames and, moved in the same way, of the clean ones."""
+    """PSNR of the pixels that are drawn, of the frames and of the clean ones, warped alike."""
     keys = [{"side": side, "frame": frame} for side, frame in _CORRECTED]
     if motion is None:
         return [key | _LOST for key in keys]
@@ -184,7 +184,7 @@ def _corrected(
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """In how many sequences the stated errors were kept by every seed."""
+    """Number of sequences in which every seed errs by no more than stated."""
 
     kept: int
     sequences: int

@@ -29,17 +29,17 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.stereo_depth import SgmOptions, stereo_disparity
 
 DELAYS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
-"""Of the right camera, frame periods."""
+"""Delays of the right camera, frame periods."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """When the right camera reads its rows."""
+    """Time at which the right camera reads its rows."""
 
     delay: float = 0.0
     """Frame periods after the left camera."""
     opposite: bool = False
-    """From the bottom row to the top row."""
+    """Whether it reads from the bottom row to the top row."""
 
     @property
     def name(self) -> str:

@@ -286,7 +286,7 @@ def test_a_mistake_in_our_own_solver_stops(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_wrong_readout_ratio_reaches_the_solver_only() -> None:
     told = replace(SETTING, readout_ratio_error=-0.3, noise_px=0.0)
-    assert told.shutter().readout_ratio == 0.8 and told.told_shutter().readout_ratio == pytest.approx(0.5)
+    assert told.shutter().readout_ratio == 0.8 and told.given_shutter().readout_ratio == pytest.approx(0.5)
     right, wrong = (trials(s, ("rs-stereo-linear",), 0, 0, 3) for s in (SETTING, told))
     np.testing.assert_array_equal(right["w"], wrong["w"])
     assert not np.any(right["w_est"] == wrong["w_est"])
