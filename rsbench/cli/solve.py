@@ -179,10 +179,11 @@ def _readout(answer: dict[str, Any]) -> str:
     sides = [found["left"]] if found["left"] == found["right"] else [found["left"], found["right"]]
     text = f"ratio {answer['readout_ratio']:.3f} +- {found['readout_ratio_sigma']:.3f} from {' and '.join(sides)}"
     second = next(iter(found["candidates"][1:]), None)
+    text += f", found with the motion; probability that the cameras read so {found['probability']:.1%}"
     if second is None:
-        return f"{text}, found with the motion; nothing else is likely ({found['probability']:.1%})"
-    other = f"{second['left']} and {second['right']} {second['readout_ratio']:.2f} ({second['probability']:.1%})"
-    return f"{text} ({found['probability']:.1%}), found with the motion; next {other}"
+        return f"{text}, else below 1 %"
+    other = f"{second['left']} and {second['right']} {second['readout_ratio']:.2f}"
+    return f"{text}, next {other} with {second['probability']:.1%}"
 
 
 def _row(answer: dict[str, Any]) -> dict[str, str]:
