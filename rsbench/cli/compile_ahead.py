@@ -9,16 +9,28 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import resources
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.compiled import cache_folder
-from rsbench.components.imports import end_with, lifeline, start_child
+from rsbench.components.compiled import (
+    PORTABLE_CPU,
+    SHIPPED,
+    cache_folder,
+    runs_portable_code,
+    shipped_folder,
+)
+from rsbench.components.imports import end_with, ending, lifeline, start_child
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
+from rsbench.storage.files import check_out
 
 _WIDTH, _HEIGHT, _DISPARITY = 160, 120, 5
 _POSIX = os.name == "posix"
@@ -26,10 +38,20 @@ _COMMAND = "import sys; from rsbench.cli.compile_ahead import compile_all; compi
 
 
 @contextmanager
-def compiling_ahead() -> Iterator[None]:
-    """Compile in a second process while the body runs, if nothing is compiled yet and there are two cores."""
+def compiling_ahead(*, to_the_end: bool = False) -> Iterator[None]:
+    """Compile in a second process while the body runs, if nothing is compiled yet and there are two cores.
+
+    Args:
+        to_the_end: the second process goes on after the body, until all is compiled, unless this one is killed.
+    """
     folder = cache_folder()
-    if folder is None or any(folder.glob("*.nbi")) or (os.cpu_count() or 1) < 2:
+    compiled = folder is None or any(folder.glob("*.nbi")) or shipped_folder() is not None
+    if compiled or (os.cpu_count() or 1) < 2:
+        yield
+        return
+    if to_the_end:
+        with suppress(OSError):
+            start_child(_COMMAND, line=-1)
         yield
         return
     with lifeline() as line:
@@ -39,13 +61,52 @@ def compiling_ahead() -> Iterator[None]:
 
 
 def compile_all(line: int) -> None:
-    """Run the parts of the chain on small images; ends with the parent."""
-    if _POSIX:
+    """Run the parts of the chain on small images; ends with the parent if there is a ``line`` to it."""
+    if _POSIX and line >= 0:
         end_with(line)
     gc.disable()  # compiling makes many lasting objects; collecting garbage would take a twentieth of the time
     for part in parts():
         with suppress(Exception):  # the command meets the same error and reports it
             part()
+
+
+def compile_now(step: Callable[[str], None]) -> Path | None:
+    """Compile everything in two processes, and return the folder of the code; None where none can be kept.
+
+    Args:
+        step: called with the name of each of the ``PARTS`` when it is compiled.
+    """
+    with lifeline() as line:
+        with suppress(OSError):
+            start_child(_COMMAND, line=line)
+        for name, part in reversed(list(zip(PARTS, parts(), strict=True))):
+            part()
+            step(name)
+    return cache_folder()
+
+
+def compile_portable() -> None:
+    """Compile everything for ``PORTABLE_CPU`` into the folder of the package, in another process.
+
+    Raises:
+        RsbenchError: the folder cannot be written, or this is no such processor.
+    """
+    if not runs_portable_code():
+        raise RsbenchError(f"compile --portable: this processor cannot run code for {PORTABLE_CPU}")
+    folder = Path(str(resources.files("rsbench"))) / SHIPPED
+    check_out(folder)
+    variables = {
+        "NUMBA_CPU_NAME": PORTABLE_CPU,
+        "NUMBA_CPU_FEATURES": "",
+        "NUMBA_CACHE_DIR": str(folder),
+    }
+    done = subprocess.run([sys.executable, "-m", "rsbench", "compile"], env={**os.environ, **variables})
+    if done.returncode:
+        raise RsbenchError(f"compile --portable: {ending(done.returncode)}")
+
+
+PARTS = ("spline", "depth", "correction", "motion", "matching")
+"""Of the chain, in the order of ``parts``."""
 
 
 def parts() -> list[Callable[[], object]]:

@@ -26,7 +26,16 @@ from rsbench.cli import (
 )
 from rsbench.cli.export import EXPORT_EPILOG, VIEW_EPILOG, export, view
 from rsbench.cli.names import LIST_EPILOG, SHOW_EPILOG, list_, show
-from rsbench.cli.small_commands import CHECK_SOLVER_EPILOG, DOCS_EPILOG, check_solver, demo, docs, doctor
+from rsbench.cli.small_commands import (
+    CHECK_SOLVER_EPILOG,
+    COMPILE_EPILOG,
+    DOCS_EPILOG,
+    check_solver,
+    compile_,
+    demo,
+    docs,
+    doctor,
+)
 from rsbench.core.errors import RsbenchError, printable
 from rsbench.core.version import __version__
 
@@ -79,6 +88,7 @@ app.command(epilog="[bold]Example[/bold]  rsbench demo --scene old-town --out ou
 app.command("list", epilog=LIST_EPILOG)(list_)
 app.command(epilog=SHOW_EPILOG)(show)
 app.command(epilog="[bold]Example[/bold]  rsbench doctor")(doctor)
+app.command("compile", epilog=COMPILE_EPILOG)(compile_)
 generate.register(app)
 verify.register(app)
 digest.register(app)

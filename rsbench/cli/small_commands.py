@@ -21,10 +21,37 @@ def demo(
     from rsbench.cli.evaluate import evaluate_dataset
     from rsbench.cli.generate import generate
 
-    with compiling_ahead():
+    with compiling_ahead(to_the_end=True):
         generate("paper", str(out / scene), [scene], workers=1)
         options = EvaluationOptions(solvers=("rs-stereo-refined", "rs-stereo-linear", "gs-8pt"))
         evaluate_dataset(out / scene, out / f"{scene}-evaluation", options, "rsbench demo")
+
+
+COMPILE_EPILOG = """[bold]Examples[/bold]
+
+  rsbench compile                    [dim](after an installation: the first command need not)[/dim]
+
+  rsbench compile --portable         [dim](before a wheel is built: those who install it need not)[/dim]"""
+
+
+def compile_(
+    portable: Annotated[
+        bool,
+        typer.Option(
+            "--portable", help="For every x86-64-v3 processor, into the package, which brings it to others."
+        ),
+    ] = False,
+) -> None:
+    """Compile now what the first commands would compile, into a cache on disk: a minute."""
+    from rsbench.cli.compile_ahead import PARTS, compile_now, compile_portable
+    from rsbench.cli.console import progress_bar
+
+    if portable:
+        compile_portable()
+        return
+    with progress_bar("compiling", len(PARTS)) as step:
+        folder = compile_now(step)
+    echo(f"compiled: {folder}" if folder is not None else "compiled, but no folder can keep it")
 
 
 def doctor() -> None:

@@ -5,6 +5,9 @@ user set it, else in the user's cache folder, else in a temporary folder. Each v
 its own folder there, because Numba checks only the file of the function that it loads, not the files of functions
 which that one calls. Each signature of a function has its own file, so that processes which compile at the same
 time write the same files.
+
+A package may bring code in ``SHIPPED`` that was compiled for ``PORTABLE_CPU``. It is loaded where nothing else is
+kept, and only on a processor that has all that it uses, under the same Python, Numba and sources.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import contextlib
 import functools
 import hashlib
 import logging
+import platform
 import re
 import tempfile
 import time
@@ -21,6 +25,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
+from llvmlite import binding
 from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.runtime import rtsys
@@ -34,6 +39,15 @@ _LONG_S = 1.0
 _KEPT_DAYS = 30
 _VERSION = re.compile(r"[0-9a-f]{16}")
 """Names of the folders of source versions."""
+SHIPPED = "_compiled"
+"""Folder of the package with portable code, as a cache folder; ``rsbench compile --portable`` writes it."""
+PORTABLE_CPU = "x86-64-v3"
+"""LLVM's name of the processor that portable code is for: most of x86 since 2013 to 2015."""
+_PORTABLE_NEEDS = (
+    *("cx16", "popcnt", "sahf", "sse3", "ssse3", "sse4.1", "sse4.2"),
+    *("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
+)
+"""LLVM's names of what that processor has beyond the first of its kind (x86-64 psABI, level 3)."""
 _MARKS = (b"@compiled", b"MotionKernel")
 """Marks of files with compiled code; the version is the hash of all such files."""
 
@@ -90,8 +104,7 @@ class _KernelCache(FunctionCache):
     def flush(self) -> None:
         """Nothing to do: another version of the sources has another folder."""
 
-    def _file(self, sig: tuple[Any, ...], key: Any) -> IndexDataCacheFile | None:
-        folder = cache_folder()
+    def _file(self, folder: Path | None, sig: tuple[Any, ...], key: Any) -> IndexDataCacheFile | None:
         # The hash of the folder does not cover the code of a foreign type.
         if folder is None or not self._enabled or any(getattr(kind, "foreign", False) for kind in sig):
             return None
@@ -106,22 +119,23 @@ class _KernelCache(FunctionCache):
 
     def _load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
         key = self._index_key(sig, target_context.codegen())
-        file = self._file(sig, key)
-        found = None
-        if file is not None:
+        triple = key[1][0]
+        places = ((cache_folder(), key), (shipped_folder(), (key[0], (triple, PORTABLE_CPU, ""), *key[2:])))
+        for folder, wanted in places:
+            file = self._file(folder, sig, wanted)
             try:
-                found = file.load(key)
-                found = None if found is None else self._impl.rebuild(target_context, found)
+                found = None if file is None else file.load(wanted)
+                if found is not None:
+                    return self._impl.rebuild(target_context, found)
             except Exception:  # half a file, or one of another Numba: it is compiled again
-                found = None
-        if found is None:
-            _STOPWATCH.begin()
-        return found
+                continue
+        _STOPWATCH.begin()
+        return None
 
     def _save_overload(self, sig: tuple[Any, ...], data: Any) -> None:
         _STOPWATCH.end()
         key = self._index_key(sig, data.codegen)
-        file = self._file(sig, key)
+        file = self._file(cache_folder(), sig, key)
         if file is None or not self._impl.check_cachable(data):
             return
         try:
@@ -184,6 +198,21 @@ def cache_folder() -> Path | None:
             _remove_old(folder)
         return folder
     return None
+
+
+@functools.cache
+def shipped_folder() -> Path | None:
+    """Folder of portable code of these sources; None where there is none, or this processor cannot run it."""
+    folder = Path(str(resources.files("rsbench"))) / SHIPPED / "kernels" / source_version()[:16]
+    return folder if folder.is_dir() and runs_portable_code() else None
+
+
+def runs_portable_code() -> bool:
+    """Whether this processor, as the system lets it be used, has all that portable code may use."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return False
+    features = binding.get_host_cpu_features()
+    return all(features.get(name, False) for name in _PORTABLE_NEEDS)
 
 
 def _remove_old(folder: Path) -> None:
