@@ -13,9 +13,10 @@ from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
+    from rsbench.benchmark.leaderboard.board import Scored
     from rsbench.benchmark.leaderboard.standings import Standing
     from rsbench.benchmark.leaderboard.track import Split
     from rsbench.pipeline.problem import Problem
@@ -193,7 +194,18 @@ def run(
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: 1.")] = None,
+    problems: Annotated[
+        int | None, typer.Option(min=1, help="Only the first ones: a split of its own on the board.")
+    ] = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Stored predictions to rank beside, not added to the board. "
+            "Default: those of this track in results/*/predictions of the working folder.",
+        ),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one per core.")] = None,
     scheduler: Scheduler = None,
     time_limit: Annotated[
         float | None, typer.Option(min=0.001, help="Seconds per problem; what takes longer is a failure.")
@@ -204,6 +216,8 @@ def run(
     ] = None,
 ) -> None:
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
+    import os
+
     from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
     from rsbench.benchmark.leaderboard.inputs import prepare_inputs
     from rsbench.benchmark.leaderboard.running import count_steps, load_cards, run_cards
@@ -212,7 +226,9 @@ def run(
     from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 
-    processes, split = chosen_workers(workers, scheduler), split_of(track, data, seed_file, secret)
+    processes = chosen_workers(workers, scheduler, os.cpu_count() or 1)
+    whole = split_of(track, data, seed_file, secret)
+    split, others = _first(whole, problems), _stored(whole, beside)
     load_cards(split.track, entry)  # before anything is written
     limits = Limits(time_limit, memory)
     with results_at(board, scheduler) as place:
@@ -234,7 +250,46 @@ def run(
                 workers=processes,
                 step=step,
             )
-        _show(place, split.track.id, split.name, None)
+        _show(place, split.track.id, split.name, None, beside=_cut(others, split))
+
+
+def _first(split: Split, problems: int | None) -> Split:
+    from dataclasses import replace
+
+    if problems is None or problems == (there := len(split.truths)):
+        return split
+    if problems > there:
+        raise RsbenchError(f"--problems {problems}: split {split.name} has {there}")
+    return replace(split, truths=split.truths[:problems])
+
+
+def _stored(split: Split, folder: Path | None) -> list[Scored]:
+    """Entries of stored predictions of a split: of a folder, or else of the working folder's results."""
+    import tempfile
+
+    from rsbench.benchmark.leaderboard.board import restore
+
+    folders = [folder] if folder is not None else sorted(Path("results").glob(f"*/predictions/{split.track.id}"))
+    found: list[Scored] = []
+    for each in folders:
+        with tempfile.TemporaryDirectory() as board:
+            try:
+                found += restore(each, split, Path(board))
+            except RsbenchError:  # of another split
+                if folder is not None:
+                    raise
+    return found
+
+
+def _cut(entries: list[Scored], split: Split) -> list[Scored]:
+    """Entries of the whole split as if scored on the problems of a part of it."""
+    from dataclasses import replace
+
+    names = list(split.by_name)
+    return [
+        replace(each, scores=each.scores[each.scores["problem"].isin(names)].reset_index(drop=True))
+        for each in entries
+    ]
 
 
 @board_app.command()
@@ -513,15 +568,24 @@ def _track_of(file: Path) -> str:
 
 
 def _show(
-    board: Path, protocol: str, split: str, at_most: str | None, method: str | None = None, *, csv: bool = False
+    board: Path,
+    protocol: str,
+    split: str,
+    at_most: str | None,
+    method: str | None = None,
+    *,
+    csv: bool = False,
+    beside: Sequence[Scored] = (),
 ) -> None:
-    """Print a table; of one method, its line alone."""
+    """Print a table; of one method, its line alone. Of ``beside`` those are in it whose name the board has not."""
     from rsbench.benchmark.leaderboard.board import entries_of
     from rsbench.benchmark.leaderboard.standings import standings, table
     from rsbench.cli.console import print_rows
 
     wanted = None if at_most is None else [name.strip() for name in at_most.split(",")]
-    lines = standings(entries_of(board, protocol, split), wanted)
+    entries = entries_of(board, protocol, split)
+    names = {each.header.method for each in entries}
+    lines = standings([*entries, *(each for each in beside if each.header.method not in names)], wanted)
     if csv:
         echo(table(lines).to_csv(index=False, lineterminator="\n"), nl=False)
         return

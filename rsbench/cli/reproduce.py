@@ -74,6 +74,7 @@ _SEEDS = {Target.images: 20, Target.real: 10}
 """Runs of each solver in what is committed."""
 _MINUTES = {
     Target.images: 3,
+    Target.fig3: 4,
     Target.claims: 15,
     Target.readings: 8,
     Target.sweeps: 9,
@@ -91,6 +92,20 @@ _MINUTES = {
     Target.image_claims: 1,
 }
 """Of two cores, as measured in November 2026: for the time that is left of everything, not as a promise."""
+_RENDERED: dict[Target, tuple[str, ...]] = {
+    Target.images: ("paper",),
+    Target.fig4: ("paper", "moderate", "aggressive"),
+    Target.fig4_literal: ("paper",),
+    Target.correction: ("mild", "moderate", "aggressive", "poles"),
+    Target.laws_correction: ("laws-frames",),
+    Target.sgm: ("mild", "moderate"),
+    Target.real: ("real-ideal", "real"),
+    Target.laws: ("laws-frames",),
+    Target.boards: ("standard",),
+    Target.handheld: ("handheld",),
+    Target.footage: ("footage", "standard"),
+}
+"""Folders of datasets below ``--data`` that a target reads, and renders first where they are missing."""
 _KEPT = 0.1
 """Share of its minutes below which a target had been made before."""
 _TRACKS = (Target.leaderboard, Target.laws, Target.boards, Target.handheld, Target.footage)
@@ -105,9 +120,11 @@ _FOLDERS = {
 
 def reproduce(
     target: Annotated[
-        Target,
+        Target | None,
         typer.Argument(
-            help="images: the paper's image experiment in castle, old-town and room. fig3: its Figure 3 on "
+            show_default=False,
+            help="None: a list, with minutes. "
+            "images: the paper's image experiment in castle, old-town and room. fig3: its Figure 3 on "
             "simulated points. claims: what became of each claim about them, in every reading of the paper's "
             "solver. readings: the claims in settings that it does not state. image-claims: those about images, "
             "from stored results. sweeps: the other simulations. "
@@ -121,9 +138,9 @@ def reproduce(
             "boards: the same of the tracks of frames, on the dataset standard. "
             "handheld: trajectories of whole sequences from hands. "
             "footage: what one camera's correctors make of pairs of frames. "
-            "everything: all of these, one after the other, with the time that each took."
+            "everything: all of these, one after the other, with the time that each took.",
         ),
-    ],
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results"),
     data: Annotated[Path, typer.Option(help="Folder for the rendered data and simulated trials.")] = Path("data"),
     workers: Annotated[
@@ -142,6 +159,12 @@ def reproduce(
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
     from rsbench.storage.files import check_out
 
+    if target is None:
+        for each in Target:
+            of = _ORDER if each is Target.everything else (each,)
+            needs = [_first(each, data)] if each is not Target.everything else []
+            echo(f"{each}: about {sum(_MINUTES[one] for one in of)} minutes on two cores{''.join(needs)}")
+        return
     check_out(out)
     _make(_ORDER if target is Target.everything else (target,), out, data, workers, seeds, width)
 
@@ -153,8 +176,8 @@ def _make(
     begin, paces = time.monotonic(), list[float]()
     for number, each in enumerate(targets):
         start = time.monotonic()
-        if len(targets) > 1:
-            say(f"[{number + 1} of {len(targets)}] {each}: {_left(targets[number:], paces)}")
+        whole = f"[{number + 1} of {len(targets)}] " if len(targets) > 1 else ""
+        say(f"{whole}{each}: {_left(targets[number:], paces)}{_first(each, data)}")
         _reproduce(each, out, data, workers, seeds or _SEEDS.get(each, 1), width)
         paces.append((time.monotonic() - start) / 60.0 / _MINUTES[each])
         echo(f"{each}: {paces[-1] * _MINUTES[each]:.1f} minutes")
@@ -166,7 +189,17 @@ def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
     """About how long the next target, and all of them, take by the pace of those that were made so far."""
     made = [pace for pace in paces if pace > _KEPT]
     minutes = [_MINUTES[each] * (statistics.median(made) if made else 1.0) for each in targets]
-    return f"about {minutes[0]:.0f} minutes; with what follows {sum(minutes) / 60.0:.1f} hours"
+    begin = f"about {minutes[0]:.0f} minutes on two cores"
+    return begin if len(targets) == 1 else f"{begin}; with what follows {sum(minutes) / 60.0:.1f} hours"
+
+
+def _first(target: Target, data: Path) -> str:
+    """What is rendered or needed before a target is made."""
+    if target is Target.image_claims:
+        return "; judges what the other targets have written: make them first"
+    places = [data / name for name in _RENDERED.get(target, ())]
+    missing = [str(place) for place in places if not (place / "dataset.json").is_file()]
+    return f"; renders first what is missing: {', '.join(missing)}" if missing else ""
 
 
 def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:

@@ -100,9 +100,11 @@ def test_everything_makes_each_folder_of_results_once(
     assert made[-1] == "image-claims" and len(set(made)) == len(made)
     lines = capsys.readouterr().out.splitlines()
     # Before each, how long it and the rest take, by how long the others took: at once, as if made before.
-    assert lines[0].startswith(f"[1 of {len(made)}] {made[0]}: about 3 minutes; with what follows 12")
+    assert lines[0].startswith(f"[1 of {len(made)}] {made[0]}: about 3 minutes on two cores; with what follows 12")
     assert lines[::2][:-1] == [each for each in lines if each.startswith("[")]
-    assert lines[-3].endswith("image-claims: about 1 minutes; with what follows 0.0 hours")
+    assert lines[-3].endswith(
+        "image-claims: about 1 minutes on two cores; judges what the other targets have written: make them first"
+    )
     printed = [line.partition(":")[0] for line in lines if not line.startswith("[")]
     assert printed == [*made, "everything"]
     assert command._left([Target.fig4, Target.sgm], [0.0, 2.0]).startswith("about 18 minutes")
