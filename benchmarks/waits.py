@@ -27,6 +27,7 @@ import pandas as pd
 from memory import children, resident_mb
 
 from rsbench.benchmark.provenance import provenance
+from rsbench.components.compiled import SHIPPED
 from rsbench.storage.files import write_bytes, write_json, write_table
 
 ROOT = Path(__file__).parents[1]
@@ -36,6 +37,7 @@ COLUMNS = ["command", "seconds", "least", "most", "processor_s", "memory_mb", "r
 VIEWS = ("left_0", "right_0", "left_1", "right_1")
 SOLVERS = ("--solver", "rs-stereo-refined", "--solver", "gs-8pt", "--solver", "rs-stereo-linear")
 EVERY_S = 0.02
+SHIPPED_CODE = ROOT / "rsbench" / SHIPPED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,16 +46,16 @@ class Wait:
 
     name: str
     words: tuple[str, ...]
-    fresh: Path | None = None
-    """A folder that is removed before each run."""
+    fresh: tuple[Path, ...] = ()
+    """Folders that are removed before each run."""
     variables: dict[str, str] = field(default_factory=dict)
     most_runs: int = 100
 
 
 def run(wait: Wait) -> tuple[float, float, float]:
     """Seconds, processor seconds with children, and MB of the largest process."""
-    if wait.fresh is not None:
-        shutil.rmtree(wait.fresh, ignore_errors=True)
+    for each in wait.fresh:
+        shutil.rmtree(each, ignore_errors=True)
     before, began, most = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0.0
     command = [sys.executable, "-m", "rsbench", "--quiet", *wait.words]
     # Compiled Python is kept, as it is by default: without, each command compiles all that it imports.
@@ -75,12 +77,12 @@ def waits(folder: Path) -> Iterator[Wait]:
     yield Wait(
         name="`generate` a sequence of `paper`: 4 frames 900 x 900, their truth",
         words=("generate", "paper", "--sequence", "castle", "--out", str(data)),
-        fresh=data,
+        fresh=(data,),
     )
     yield Wait(name="`verify` of it", words=("verify", str(data)))
     yield Wait(name="`verify --fast` of it", words=("verify", str(data), "--fast"))
     evaluated = ("evaluate", str(data), *SOLVERS, "--out", str(out))
-    yield Wait(name="`evaluate` of it, three solvers", words=evaluated, fresh=out)
+    yield Wait(name="`evaluate` of it, three solvers", words=evaluated, fresh=(out,))
     yield Wait(name="the same again, nothing changed", words=evaluated)
     camera = "{fx = 1384.6, fy = 1384.6, cx = 449.5, cy = 449.5}"
     rig = folder / "rig.toml"
@@ -92,10 +94,21 @@ def waits(folder: Path) -> Iterator[Wait]:
     yield Wait(
         name="`correct` of them, the first command of an installation",
         words=correct,
-        fresh=kernels,
+        fresh=(kernels, SHIPPED_CODE),
         variables={"NUMBA_CACHE_DIR": str(kernels)},
         most_runs=2,
     )
+    yield Wait(name="`compile --portable`, before a wheel is built", words=("compile", "--portable"), most_runs=1)
+    yield Wait(
+        name="`correct` of them, the first command of such a wheel",
+        words=correct,
+        fresh=(kernels,),
+        variables={"NUMBA_CACHE_DIR": str(kernels)},
+    )
+    problem = ROOT / "examples" / "problem.json"
+    yield Wait(name="`solve` of 80 matches", words=("solve", str(problem)))
+    yield Wait(name="`solve --help`", words=("solve", "--help"))
+    yield Wait(name="`--help`", words=("--help",))
     yield Wait(name="`correct --help`", words=("correct", "--help"))
 
 

@@ -98,6 +98,7 @@ def compile_portable() -> None:
     variables = {
         "NUMBA_CPU_NAME": PORTABLE_CPU,
         "NUMBA_CPU_FEATURES": "",
+        "NUMBA_DISABLE_INTEL_SVML": "1",  # others may lack the library
         "NUMBA_CACHE_DIR": str(folder),
     }
     done = subprocess.run([sys.executable, "-m", "rsbench", "compile"], env={**os.environ, **variables})

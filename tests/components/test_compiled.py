@@ -197,3 +197,38 @@ def test_only_compiled_code_of_old_versions_is_removed(tmp_path: Path) -> None:
     compiled._remove_old(tmp_path / "0123456789abcdef")
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == kept
     assert not (tmp_path / "aaaaaaaaaaaaaaaa").exists()
+
+
+LOADS_SHIPPED = """
+    import sys; sys.path.insert(0, {folder!r})
+    from pathlib import Path
+    from rsbench.components import compiled
+    compiled.resources.files = lambda name: Path({folder!r})
+    compiled.source_version = lambda: "0" * 64
+    lacking = {lacking!r}
+    found = compiled.binding.get_host_cpu_features()
+    found.update(dict.fromkeys(lacking, False))
+    compiled.binding.get_host_cpu_features = lambda: found
+    import adds
+    assert adds.quotient(3.0, 2.0) == 1.5
+    assert compiled.shipped_folder() is None if lacking else compiled.shipped_folder() is not None
+"""
+
+
+@pytest.mark.skipif(not compiled.runs_portable_code(), reason="no processor for portable code")
+def test_portable_code_is_loaded_on_processors_that_have_what_it_uses_alone(tmp_path: Path) -> None:
+    (tmp_path / "adds.py").write_text(textwrap.dedent(ADDS))
+    shipped = tmp_path / compiled.SHIPPED
+    portable = {"NUMBA_CPU_NAME": compiled.PORTABLE_CPU, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(shipped)}
+    code = LOADS_SHIPPED.format(folder=str(tmp_path), lacking=[])
+    made = child(code.replace("compiled.shipped_folder() is not None", "True"), **portable)
+    assert made.returncode == 0, made.stderr
+    assert sorted(shipped.rglob("*.nbi"))
+    for number, lacking in enumerate([[], ["avx2"], ["movbe"]]):
+        own = tmp_path / f"own-{number}"
+        code = LOADS_SHIPPED.format(folder=str(tmp_path), lacking=lacking)
+        done = child(code, NUMBA_CACHE_DIR=str(own))
+        assert done.returncode == 0, done.stderr
+        assert bool(list(own.rglob("*.nbi"))) == bool(lacking), (
+            "compiled what was shipped, or ran what it must not"
+        )
