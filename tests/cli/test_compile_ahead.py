@@ -58,6 +58,7 @@ def test_the_second_process_ends_with_the_command(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(subprocess, "Popen", noted)
     monkeypatch.setattr(compile_ahead, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compile_ahead, "shipped_folder", lambda: None)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     with compile_ahead.compiling_ahead():

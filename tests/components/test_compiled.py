@@ -224,7 +224,8 @@ def test_portable_code_is_loaded_on_processors_that_have_what_it_uses_alone(tmp_
     made = child(code.replace("compiled.shipped_folder() is not None", "True"), **portable)
     assert made.returncode == 0, made.stderr
     assert sorted(shipped.rglob("*.nbi"))
-    for number, lacking in enumerate([[], ["avx2"], ["movbe"]]):
+    processors: list[list[str]] = [[], ["avx2"], ["movbe"]]
+    for number, lacking in enumerate(processors):
         own = tmp_path / f"own-{number}"
         code = LOADS_SHIPPED.format(folder=str(tmp_path), lacking=lacking)
         done = child(code, NUMBA_CACHE_DIR=str(own))
