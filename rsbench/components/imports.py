@@ -299,7 +299,7 @@ def start_child(
 
     Args:
         code: its last argument is ``line``.
-        line: see ``lifeline``.
+        line: see ``lifeline``; -1 for a child that outlives this process.
         stream: ``subprocess.DEVNULL`` or ``PIPE``, for all three standard streams.
         environment: that of this process when None.
     """
@@ -310,7 +310,7 @@ def start_child(
         stderr=stream,
         start_new_session=True,
         env=environment,
-        pass_fds=(line,) if _POSIX else (),
+        pass_fds=(line,) if _POSIX and line >= 0 else (),
     )
 
 

@@ -65,6 +65,15 @@ def test_the_second_process_ends_with_the_command(tmp_path: Path, monkeypatch: p
         time.sleep(1.0)
         assert started[0].poll() is None
     assert started[0].wait(10.0) != 0
+    with compile_ahead.compiling_ahead(to_the_end=True):
+        pass
+    outlives = started.pop()
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            outlives.wait(1.0)
+    finally:
+        outlives.kill()
+        outlives.wait()
     (tmp_path / "function.nbi").touch()
     with compile_ahead.compiling_ahead():
         assert len(started) == 1
