@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rsbench.cli.console import echo
+from rsbench.cli.correct_input import ReadoutOptions, say_notes
 from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
@@ -52,8 +53,8 @@ class _Options(NamedTuple):
     windows: int
     features: str
     seed: int
-    fps: float | None
-    """Frames a second, for the line delays of a calibration of another tool."""
+    readout: ReadoutOptions
+    """What is printed beside the estimate, in place of what a calibration says."""
 
 
 def inspect(
@@ -81,13 +82,22 @@ def inspect(
         float | None,
         typer.Option(help="Frames a second, for a calibration's line delay. Default: what the video says."),
     ] = None,
+    readout_ratio: Annotated[
+        float | None, typer.Option(help="Readout time over frame period, to compare with, in place of the rig's.")
+    ] = None,
+    shutter: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The same from a mode: rsbench list shutters.")
+    ] = None,
 ) -> None:
     """Estimate scan direction, readout ratio and delay of each camera from matches, where they tell it."""
     from rsbench.capture.hypotheses import MODELS
     from rsbench.capture.two_frame_estimate import conclude
     from rsbench.components.motion_models import load_kernel
 
-    options = _Options(tuple(motion_model or MODELS), windows, features, seed, fps)
+    readout = ReadoutOptions(readout_ratio=readout_ratio, shutter=shutter, fps=fps)
+    options = _Options(tuple(motion_model or MODELS), windows, features, seed, readout)
+    if readout.any and rig is None:
+        raise RsbenchError("--readout-ratio, --shutter: need --rig; problems and datasets state their own shutter")
     for model in options.models:
         load_kernel(model)
     answers, wrong, determined = list[dict[str, Any]](), False, True
@@ -157,11 +167,10 @@ def _of_footage(left: Path | None, right: Path | None, card: Path, options: _Opt
 
 def _framed(name: str, left: FrameSource, right: FrameSource, card: Path, options: _Options) -> _Case:
     """Frames of a user, whose card says the rig."""
-    from rsbench.cli.correct_input import ReadoutOptions, say_notes
     from rsbench.interop.readers.rig_files import read_rig_file
 
     first, second = next(iter(left)), next(iter(right))
-    readout = ReadoutOptions(readout_ratio=None, shutter=None, fps=options.fps).beside(card, False, left.path)
+    readout = options.readout.beside(card, False, left.path)
     given, notes = read_rig_file(card, readout, lambda: (first.shape[1], first.shape[0]))
     say_notes("--rig", notes)
     rig = given.rig_of(first, second)

@@ -70,11 +70,9 @@ class OneCameraCard:
         if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
             raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
         if self.fov_deg is not None and self.camera is not None:
-            raise ValueError("fov_deg: leave it out beside [camera], which says the focal length")
-        if self.camera is not None and self.camera.lens is not None:
-            raise ValueError("camera.lens: leave it out; undistort frames of one camera first")
+            raise ValueError("fov_deg: leave it out beside [camera], which has the focal length")
         if self.camera is not None and self.camera.sigma:
-            raise ValueError("camera.focal_sigma, k1_sigma: leave them out; of one camera neither is found")
+            raise ValueError("camera.focal_sigma, k1_sigma: leave them out; neither is estimated for one camera")
 
     @classmethod
     def of(cls, camera: PinholeCamera | float | None, readout_ratio: float | None) -> OneCameraCard:
@@ -96,8 +94,10 @@ class OneCameraCard:
     def camera_of(self, width: int, height: int) -> PinholeCamera:
         """The camera of images of this size; of ``DEFAULT_FOCAL`` if none is given."""
         if self.camera is not None:
-            c = self.camera
-            return PinholeCamera(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy)
+            try:
+                return self.camera.camera((width, height))
+            except ValueError as error:
+                raise RsbenchError(f"--camera: of images of {width} x {height} pixels: {error}") from error
         if self.fov_deg is not None:
             focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
             return PinholeCamera.centred(width, height, focal)

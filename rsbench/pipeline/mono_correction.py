@@ -483,8 +483,10 @@ def turned(camera: PinholeCamera, shutter: RollingShutter) -> Turned:
     scan, c = shutter.scan_of("left"), camera
     exchanged, flipped = scan in ("left", "right"), scan in ("bottom", "right")
     if exchanged:
-        c = PinholeCamera(width=c.height, height=c.width, fx=c.fy, fy=c.fx, cx=c.cy, cy=c.cx)
+        lens = None if c.lens is None else replace(c.lens, p1=c.lens.p2, p2=c.lens.p1)
+        c = PinholeCamera(width=c.height, height=c.width, fx=c.fy, fy=c.fx, cx=c.cy, cy=c.cx, lens=lens)
     if flipped:
-        c = replace(c, cy=c.height - 1 - c.cy)
+        lens = None if c.lens is None else replace(c.lens, p1=-c.lens.p1)
+        c = replace(c, cy=c.height - 1 - c.cy, lens=lens)
     rows = RollingShutter(height=c.height, readout_ratio=shutter.readout_ratio)
     return Turned(camera=c, shutter=rows, exchanged=exchanged, flipped=flipped)

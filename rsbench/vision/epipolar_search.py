@@ -359,7 +359,7 @@ def sweep_frames(
 
     Args:
         greys: (H, W) of frames 0 and 1.
-        rig: its body is where that camera is; without a lens.
+        rig: its body is where that camera is.
         shutter: reads rows.
         motion: of the body.
         side: which camera.

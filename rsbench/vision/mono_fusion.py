@@ -30,7 +30,7 @@ from rsbench.vision.epipolar_search import SweepOptions, Swept, largest_seen, se
 from rsbench.vision.flow import dense_flow, returns_px
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import grey_u8, map_frames, resample
-from rsbench.vision.reprojection import Reprojection, parallax_gain, reprojection_of
+from rsbench.vision.reprojection import Reprojection, look, look_between, parallax_gain, reprojection_of
 from rsbench.vision.stereo_depth import fill_holes
 
 F32 = NDArray[np.float32]
@@ -135,7 +135,7 @@ class OwnMotion:
     """What one camera did over two frames."""
 
     rig: StereoRig
-    """Its body is where that camera is; without a lens."""
+    """Its body is where that camera is."""
     shutter: RollingShutter
     """Reads rows."""
     side: Side
@@ -349,14 +349,17 @@ def _triangulated(
     size = len(pick[0]), len(pick[1])
     rho, miss = np.zeros(size, np.float32), np.zeros(size, np.float32)
     _triangulate(flow, *pick, maps, rho, miss)
-    return rho, miss
+    return np.nan_to_num(rho), np.nan_to_num(miss, nan=np.inf, posinf=np.inf)
 
 
 @compiled(error_model="numpy")
 def _triangulate(
     flow: F32, rows: NDArray[np.intp], columns: NDArray[np.intp], maps: Reprojection, rho: F32, miss: F32
 ) -> None:
-    """Fill ``rho`` and ``miss`` (h, w): least squares of ``(a + rho T)_xy - end (a + rho T)_z``, in pixels."""
+    """Fill ``rho`` and ``miss`` (h, w): least squares of ``(a + rho T)_xy - end (a + rho T)_z``, in ideal pixels.
+
+    NaN where the lens shows no ray.
+    """
     G, c, A, B = maps.G, maps.c, maps.A, maps.B
     last = len(A) - 1
     a, T = np.zeros(3), np.zeros(3)
@@ -365,11 +368,13 @@ def _triangulate(
             u, v = x + flow[y, x, 0], y + flow[y, x, 1]
             line = min(max(int(np.floor(v)), 0), max(last - 1, 0))
             beside, part = min(line + 1, last), v - line
+            gx, gy = look(maps.ideal, x, y)
+            u, v = look_between(maps.ideal, u, v)
             for i in range(3):
                 a[i], T[i] = 0.0, (1.0 - part) * B[line, i] + part * B[beside, i]
                 for j in range(3):
                     m = (1.0 - part) * A[line, i, j] + part * A[beside, i, j]
-                    a[i] += m * (G[y, j, 0] * x + G[y, j, 1] * y + G[y, j, 2])
+                    a[i] += m * (G[y, j, 0] * gx + G[y, j, 1] * gy + G[y, j, 2])
                     T[i] += m * c[y, j]
             px, py = a[0] - u * a[2], a[1] - v * a[2]
             qx, qy = T[0] - u * T[2], T[1] - v * T[2]

@@ -91,6 +91,20 @@ def look(ideal: Table, x: int, y: int) -> tuple[float, float]:
 
 
 @compiled(error_model="numpy")
+def look_between(ideal: Table, u: float, v: float) -> tuple[float, float]:
+    """Ideal pixel of any place of the image, linear between pixels; beyond the border as at the border."""
+    if ideal is None:
+        return u, v
+    height, width = ideal.shape[:2]
+    x, y = min(max(int(np.floor(u)), 0), width - 2), min(max(int(np.floor(v)), 0), height - 2)
+    p, q = u - x, v - y
+    a, b, c, d = (1.0 - p) * (1.0 - q), p * (1.0 - q), (1.0 - p) * q, p * q
+    gx = a * ideal[y, x, 0] + b * ideal[y, x + 1, 0] + c * ideal[y + 1, x, 0] + d * ideal[y + 1, x + 1, 0]
+    gy = a * ideal[y, x, 1] + b * ideal[y, x + 1, 1] + c * ideal[y + 1, x, 1] + d * ideal[y + 1, x + 1, 1]
+    return gx, gy
+
+
+@compiled(error_model="numpy")
 def see(lens: Table, u: float, v: float) -> tuple[float, float]:
     """Pixel at which the camera sees what it would see at an ideal pixel without its lens; NaN for none."""
     if lens is None:

@@ -121,11 +121,6 @@ def read_camera_file(
             f"{path}: is of images of {size[0]} x {size[1]} pixels, and the frames are {wanted[0]} x {wanted[1]}; "
             "give the calibration of that size, or rsbench rig --resize where frames were scaled, not cropped"
         )
-    if "lens" in own:
-        raise RsbenchError(
-            f"{path}: has a lens ({own['lens']['model']}), which frames of one camera may not have: undistort "
-            "them and give the calibration of the undistorted ones"
-        )
     table = readout.into({"camera": own})
     if delay is not None and "readout_ratio" not in table and "shutter" not in table:
         if delay == 0.0:
