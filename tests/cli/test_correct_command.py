@@ -159,6 +159,17 @@ def test_a_camera_that_was_found_and_errors_of_its_calibration_are_two_lines(
         assert lines[-1].endswith("rows by up to 1.0 px") and lines[:-1] == [camera][: bool(camera)]
 
 
+@pytest.mark.slow
+def test_an_inspected_shutter_is_compared_with_the_options(frames: list[Path], rig: Path) -> None:
+    found = run_here("inspect", *frames, "--rig", rig, "--readout-ratio", 0.25, "--json")
+    assert found.returncode in (0, 1), found.stderr
+    assert json.loads(found.stdout)["said"]["readout_ratio"] == 0.25
+
+
+def test_options_of_a_shutter_need_a_rig_to_inspect(tmp_path: Path) -> None:
+    assert_refused(run_here("inspect", tmp_path, "--shutter", "gopro-hero6-4k30"), "--shutter", "--rig")
+
+
 def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) -> None:
     for number, path in enumerate(frames):
         side = tmp_path / ("left", "right")[number % 2]
