@@ -61,8 +61,10 @@ class Hand:
         return rotations, six[:, 3:] + [0.0, 0.0, 0.0] + seconds[:, None] * [0.1, 0.0, 0.25]
 
 
-def view(size: tuple[int, int], hand: Hand, seconds: NDArray[np.float64], walls: list[Any]) -> NDArray[np.uint8]:
-    """Image (H, W, 3) whose rows are taken at these times (H,)."""
+def view(
+    size: tuple[int, int], hand: Hand, seconds: NDArray[np.float64], walls: list[Any], per_metre: float = 220.0
+) -> NDArray[np.uint8]:
+    """Image (H, W, 3) whose rows are taken at these times (H,); pixels of the textures in a metre."""
     width, height = size
     focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FOV_DEG))
     x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -80,7 +82,7 @@ def view(size: tuple[int, int], hand: Hand, seconds: NDArray[np.float64], walls:
         for side in (0, 1):
             mine = (which == axis) & ((points[..., axis] > 0.0) == bool(side))
             u, v = (points[..., k] for k in range(3) if k != axis)
-            places = (np.stack([u, v], axis=-1) * 220.0 % 1023.0).astype(np.float32)
+            places = (np.stack([u, v], axis=-1) * per_metre % (len(walls[0]) - 1.0)).astype(np.float32)
             seen = cv2.remap(walls[2 * axis + side], places, None, cv2.INTER_LINEAR)
             image[mine] = seen[mine]
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)

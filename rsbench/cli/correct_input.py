@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -298,6 +297,7 @@ def check_out(out: Path) -> None:
     """
     from rsbench.core.errors import RsbenchError
     from rsbench.dataset.corrected_frames import is_video
+    from rsbench.storage.files import check_out as can_be_written
 
     video = is_video(out)
     if _is_image(out):
@@ -306,8 +306,7 @@ def check_out(out: Path) -> None:
     there = next(folder for folder in (place, *place.parents) if folder.exists())
     if not there.is_dir():
         raise RsbenchError(f"--out {out}: {there} is a file, not a folder; choose another place")
-    if not os.access(there, os.W_OK):
-        raise RsbenchError(f"--out {out}: {there} cannot be written; choose another place")
+    can_be_written(place)
 
 
 @dataclass(frozen=True, kw_only=True)

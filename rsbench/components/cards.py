@@ -217,7 +217,11 @@ def _first_problem(cls: type, error: ValidationError) -> str:
     location = problem["loc"][1:]
     field = ".".join(str(part) for part in location)
     if problem["type"] in _UNKNOWN_KEY:
-        return f"unknown key {field!r}{choices(str(location[-1]), _keys_at(cls, location[:-1]))}"
+        key, keys = str(location[-1]), _keys_at(cls, location[:-1])
+        hint = choices(key, keys)
+        if "parameters" in keys and "did you mean" not in hint:
+            hint = f" (did you mean parameters = {{ {key} = ... }}?){hint}"
+        return f"unknown key {field!r}{hint}"
     if problem["type"].startswith("missing"):
         return f"{field!r} is required"
     message = problem["msg"].removeprefix("Value error, ")

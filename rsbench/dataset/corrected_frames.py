@@ -159,11 +159,14 @@ def copy_frame(folder: Path, name: str, twin: str) -> None:
             shutil.copyfile(written, folder / part / f"{name}{suffix}")
 
 
-def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True) -> None:
-    """corrected/NAME.png, mask/NAME.png and, of a ``whole`` frame, depth/NAME.exr below ``folder``."""
+def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True, orientation: int = UPRIGHT) -> None:
+    """corrected/NAME.png, mask/NAME.png and, of a ``whole`` frame, depth/NAME.exr below ``folder``.
+
+    The ``orientation``, EXIF's number, goes into the first one; pixels stay as the sensor has them.
+    """
     for part in _PARTS if whole else list(_PARTS)[:2]:
         (folder / part).mkdir(parents=True, exist_ok=True)
-    write_png(folder / "corrected" / f"{name}.png", fused.image)
+    write_png(folder / "corrected" / f"{name}.png", fused.image, orientation)
     write_origin(folder / "mask" / f"{name}.png", fused.origin)
     if not whole:
         return

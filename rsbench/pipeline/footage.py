@@ -349,7 +349,7 @@ _LEAST_RUN = 12
 """Frames by which a shutter is found as well as by more, or nearly."""
 _NEARLY, _SHARE, _NEIGHBOURS = 0.5, 0.1, 3
 """Grey levels, and share of the difference of neighbouring frames, below which a frame is a copy."""
-_COPIES, _EVENLY, _SPREAD = 4, 1.05, 1.0
+_COPIES, _EVENLY, _SPREAD = 3, 1.05, 1.0
 """Copies at like distances, and periods per original, from which on these were taken evenly, within so many."""
 _JITTER = 0.01
 """Frame periods by which time stamps err, beside their rounding."""
@@ -372,8 +372,10 @@ def _spread(originals: NDArray[np.intp], count: int) -> float | None:
     copies = np.setdiff1d(np.arange(count), originals)
     if len(copies) < _COPIES or len(originals) < 2 or np.ptp(np.diff(copies)) > 1:
         return None
-    slope, start = np.polyfit(np.arange(len(originals)), originals, 1)
-    off = np.abs(originals - (start + slope * np.arange(len(originals))))
+    between = np.count_nonzero((originals > copies[0]) & (originals < copies[-1]))
+    slope = (copies[-1] - copies[0]) / max(between, 1)
+    off = originals - slope * np.arange(len(originals))
+    off = np.abs(off - np.median(off))
     return float(slope) if slope > _EVENLY and np.max(off) < _SPREAD else None
 
 
@@ -387,10 +389,10 @@ def _timeline(twins: NDArray[np.intp], times: Times | None) -> Timeline:
     if seconds is None or times is None:
         starts = np.arange(float(len(originals))) if spread else originals - float(originals[0])
         return Timeline(twins=twins, starts=starts.astype(np.float64), period_s=None, first_s=0.0)
-    period = float(np.median(np.diff(seconds[originals])))
+    period = float(np.quantile(np.diff(seconds[originals]), 0.5, method="lower"))  # one that there is
     first = float(seconds[0])
     if spread:
-        period = spread * float(np.median(np.diff(seconds)))
+        period = spread * float(seconds[-1] - first) / (count - 1)
         return Timeline(twins=twins, starts=np.arange(float(len(originals))), period_s=period, first_s=first)
     steps = np.diff(seconds[originals]) / period
     rounded = np.maximum(np.rint(steps), 1.0)

@@ -159,7 +159,7 @@ def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
         if np.mean(variance > _TEXTURE_LEVELS**2) < _TEXTURED:
             return f"the {name} frame shows no texture: nothing to find its motion by"
     clear = variances[1] >= np.quantile(variances[1], 1.0 - _CLEAREST)
-    if float(np.quantile(np.linalg.norm(flows.flow[1][clear], axis=-1), _MOST)) < _STILL_PX:
+    if float(np.quantile(np.linalg.norm(flows.flow[1][clear], axis=-1), _MOST)) < _STILL_PX * flows.scale:
         return STILL
     if float(np.mean(flows.returns[1] < _RETURNS_PX)) < _FOLLOWED:
         return CUT

@@ -13,7 +13,9 @@ import io
 import json
 import os
 import stat
+import struct
 import tempfile
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -87,13 +89,22 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """8-bit image (H, W, 3) RGB or (H, W)."""
+_PNG_HEAD = 33
+"""Bytes of a PNG file before its second chunk."""
+
+
+def write_png(path: Path, image: NDArray[np.uint8], orientation: int = 1) -> None:
+    """8-bit image (H, W, 3) RGB or (H, W), with EXIF's number of how it is to be turned for a person."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     ok, data = cv2.imencode(".png", pixels)
     if not ok:
         raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
-    write_bytes(path, data.tobytes())
+    content = data.tobytes()
+    if orientation != 1:  # TIFF's header, and a folder of one entry: tag 0x112, a short
+        tags = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x112, 3, 1, orientation, 0)
+        chunk = struct.pack(">I", len(tags)) + b"eXIf" + tags + struct.pack(">I", zlib.crc32(b"eXIf" + tags))
+        content = content[:_PNG_HEAD] + chunk + content[_PNG_HEAD:]
+    write_bytes(path, content)
 
 
 def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:

@@ -415,7 +415,17 @@ def largest_seen(
 
 def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int]:
     """Rows and columns at which frames (H, W) are compared."""
-    return max(shape[0] // options.shrink, 8), max(shape[1] // options.shrink, 8)
+    shrink = options.shrink * reduction(shape)
+    return max(shape[0] // shrink, 8), max(shape[1] // shrink, 8)
+
+
+_ENOUGH = 1 << 21
+"""Pixels, just above 1920 x 1080; more show motion and depth no better (``benchmarks/footage_sizes.py``)."""
+
+
+def reduction(shape: tuple[int, ...]) -> int:
+    """The factor by which frames (H, W[, C]) are shrunk before motion and depth are found: 2 of 4K, 1 of HD."""
+    return max(math.ceil(math.sqrt(shape[0] * shape[1] / _ENOUGH) - 1e-9), 1)
 
 
 def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:

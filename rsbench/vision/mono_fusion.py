@@ -26,7 +26,7 @@ from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import WarpOptions, draw_within, line_maps, move_pixels
-from rsbench.vision.epipolar_search import SweepOptions, Swept, largest_seen, search_size, sweep_frames
+from rsbench.vision.epipolar_search import SweepOptions, Swept, largest_seen, reduction, search_size, sweep_frames
 from rsbench.vision.flow import dense_flow, returns_px
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import grey_u8, map_frames, resample
@@ -113,7 +113,10 @@ class Flows(NamedTuple):
     flow: tuple[F32, F32]
     """(H, W, 2) px, of each frame to the other."""
     returns: tuple[F32, F32]
-    """(H, W) px between a pixel and the end of its flow there and back, the flow of the border beyond it."""
+    """(H, W) px between a pixel and the end of its flow there and back, the flow of the border beyond it; px of
+    the size at which the flow was found."""
+    scale: float = 1.0
+    """Pixels of the frames for one of that size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +149,16 @@ class OwnMotion:
 
 
 def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
-    """Flow from each of two frames to the other (H, W[, 3]), uint8 or uint16."""
+    """Flow of two frames to each other (H, W[, 3]), uint8 or uint16; found at a size of ``reduction``."""
     height, width = images[0].shape[:2]
+    scale = reduction(images[0].shape)
+    if scale > 1:
+        size = max(width // scale, 1), max(height // scale, 1)
+        small = find_flows([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
+        factors = np.array([width / size[0], height / size[1]], np.float32)
+        flow = [np.asarray(cv2.resize(each, (width, height)) * factors) for each in small.flow]
+        returns = [np.asarray(cv2.resize(each, (width, height))) for each in small.returns]
+        return Flows((flow[0], flow[1]), (returns[0], returns[1]), float(scale))
     both = map_frames(lambda i: dense_flow(images[i], images[1 - i]), FRAMES, height * width, _FLOW_BYTES)
     return Flows((both[0], both[1]), (returns_px(*both), returns_px(*both[::-1])))
 
@@ -219,7 +230,10 @@ class MonoFusion:
         poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
         maps = [reprojection_of(own.rig.sensor(own.side), poses[frame], poses[1 - frame]) for frame in FRAMES]
         pick = _picked(shape, search_size(shape, self.options.sweep))
-        met = [_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES]
+        met = [
+            (rho, miss / np.float32(self.flows.scale))
+            for rho, miss in (_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES)
+        ]
         offs = [off[np.ix_(*pick)] for off in self.flows.returns]
         greys = [grey_u8(image) for image in self.images]
         known, options = (greys, own.rig, own.shutter, own.motion, own.side), self.options.sweep
