@@ -43,6 +43,7 @@ def correct_sequence_given(given: CorrectInput, target: str, options: Correction
         check_cameras(card.rig_of(*first), card.scanning or Scanning(), options, card.disparity_offset)
     else:
         _say_input(given, sources[0], first[0].shape, options)
+    _warn_of_times(sources)
     run = _run_key(given, sources, options, close, gyro)
     with video_place(out, run) if video else fresh_folder(out, run=run) as folder:
         known = know_capture(sources, card, options, gyro, progress_bar)
@@ -81,6 +82,19 @@ def _say_input(
     echo(f"{len(timeline.twins)} frames of {width} x {height}{rate}: {forecast}")
     row = "the middle row" if options.target_row == (height - 1) / 2 else f"row {options.target_row:g}"
     echo(f"output: {given.out}, each frame at the time of {row} (--target)")
+
+
+def _warn_of_times(sources: list[FrameSource]) -> None:
+    """Name a rig's videos whose frames repeat others or come at other times: they are taken as they come."""
+    for side, source in zip(("left", "right"), sources if len(sources) == 2 else [], strict=False):
+        if source.video is None:
+            continue
+        timeline = source.timeline
+        copies = len(timeline.twins) - len(timeline.starts)
+        if copies:
+            echo(f"rsbench: {side}: {copies} of {len(timeline.twins)} frames repeat the one before", err=True)
+        elif not timeline.even:
+            echo(f"rsbench: {side}: frames do not follow each other evenly, and are taken as if they did", err=True)
 
 
 def _gyro(given: CorrectInput, first: FrameSource, options: CorrectionOptions) -> Gyroscope | None:
@@ -160,7 +174,7 @@ def _correct_into(
 
         copies()
         for moment in correct_sequence(sources, known, options, len(entries)):
-            entries.append(_write(folder, moment, close, given, known))
+            entries.append(_write(folder, moment, close, given, known, sources[0].orientation))
             advance(f"frame {moment.number}")
             copies()
     return entries
@@ -177,7 +191,7 @@ def _write_copy(folder: Path, number: int, twin: dict[str, Any]) -> dict[str, An
 
 
 def _write(
-    folder: Path, moment: CorrectedMoment, close: bool, given: CorrectInput, known: KnownCapture
+    folder: Path, moment: CorrectedMoment, close: bool, given: CorrectInput, known: KnownCapture, orientation: int
 ) -> dict[str, Any]:
     """Write a corrected time, and then its record: a time with a record is complete."""
     import numpy as np
@@ -187,9 +201,10 @@ def _write(
     from rsbench.vision.fusion import finished
 
     entry: dict[str, Any] = {"number": moment.number}
+    how: dict[str, Any] = {"whole": not is_video(given.out), "orientation": orientation}
     for side, fused in (moment.shown if given.one_camera else moment.frames).items():
         name, fused = _name(side, moment.number, given.one_camera), finished(fused) if close else fused
-        write_frame(folder, name, fused, whole=not is_video(given.out))
+        write_frame(folder, name, fused, **how)
         if given.rectify:
             write_rectified(folder, name, fused, known.rig, side)
         entry |= fused.shares() if given.one_camera else {side: fused.shares()}
@@ -276,7 +291,9 @@ def _write_video(
 
     from rsbench.core.rig import SIDES
     from rsbench.dataset.corrected_frames import fps_of, read_corrected, write_video
+    from rsbench.storage.videos import UPRIGHT, upright
 
+    turn = UPRIGHT if len(sources) == 1 else sources[0].orientation  # of both, so that they stay side by side
     one = len(sources) == 1
 
     def shown(side: str, number: int, image: Any) -> Any:
@@ -284,10 +301,10 @@ def _write_video(
         return read_corrected(folder, name) if (folder / "corrected" / f"{name}.png").is_file() else image
 
     images = (
-        np.hstack([shown(side, number, image) for side, image in zip(SIDES, moment, strict=False)])
+        np.hstack([upright(shown(side, number, image), turn) for side, image in zip(SIDES, moment, strict=False)])
         for number, moment in enumerate(zip(*sources, strict=True))
     )
-    return write_video(out, folder, images, fps_of(sources[0].path), record, sources[0] if one else None, others)
+    return write_video(out, folder, images, fps_of(sources[0].path), record, sources[0], others, None if one else UPRIGHT)
 
 
 def _say(out: Path, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:

@@ -446,6 +446,7 @@ def write_video(
     record: dict[str, Any],
     source: FrameSource | None = None,
     others: Sequence[Path] = (),
+    orientation: int | None = None,
 ) -> list[str]:
     """Write frames (H, W[, 3]) RGB or grey, uint8 or uint16, and their record beside them; returns notes.
 
@@ -456,6 +457,7 @@ def write_video(
         fps: frames per second of images.
         record: what was found, for JSON.
         source: the frames read: what is written has their times, orientation, colours and sound.
+        orientation: EXIF's number, in place of the source's.
         others: files that are ready in ``half`` and go beside the video, with the video's name in theirs.
 
     Raises:
@@ -463,7 +465,8 @@ def write_video(
     """
     part = half.parent / f"part{out.suffix.lower()}"
     like, times = (None, None) if source is None else (source.video, source.times)
-    orientation = UPRIGHT if source is None else source.orientation
+    if orientation is None:
+        orientation = UPRIGHT if source is None else source.orientation
     count, notes = write_frames(part, frames, fps=fps, times=times, like=like, orientation=orientation, named=out)
     written = VideoFile.open(part).count
     if written not in (0, count):

@@ -556,4 +556,4 @@ class Forecast:
         return f"about {time} on two cores, {gigabytes:.1f} GB of memory"
 
 
-FORECAST = Forecast(seconds=2.5, bytes=1000.0, start_s=10.0, start_bytes=4e8)
+FORECAST = Forecast(seconds=2.5, bytes=450.0, start_s=10.0, start_bytes=4.3e8)

@@ -260,10 +260,10 @@ def test_a_frame_after_a_gap_is_moved_by_the_share_of_the_longer_interval() -> N
     )
     camera = PinholeCamera.centred(SIZE[1], SIZE[0], 130.0)
     shutter = RollingShutter(height=SIZE[0], readout_ratio=1.0)
-    options, errors = MonoOptions(target_row=48.0), []
+    options, errors = MonoOptions(target_row=48.0), list[float]()
     for given in (starts, None):
         image = list(correct_frames(frames, camera, shutter, options, starts=given))[2].fused.image
-        errors.append(np.sqrt(np.mean((image - truth)[8:-8, 30:-30] ** 2)))
+        errors.append(float(np.sqrt(np.mean((image - truth)[8:-8, 30:-30] ** 2))))
     before = np.sqrt(np.mean((frames[2] - truth)[8:-8, 30:-30] ** 2))
     assert errors[0] < 0.3 * before < errors[1]
 
