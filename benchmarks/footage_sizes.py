@@ -48,7 +48,7 @@ def main() -> None:
     list(correct_frames(few, PinholeCamera.centred(*tiny, camera.fx / 8), quarter))  # compiles
     start, before = time.process_time(), []
     for each, truth, image in zip(correct_frames(frames, camera, shutter), truths, frames, strict=True):
-        before.append((psnr(image, truth), psnr(each.fused.image, truth)))
+        before.append((psnr(image, truth), psnr(each.shown["left"].image, truth)))
     spent = (time.process_time() - start) / FRAMES
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found = " ".join(f"{a:.2f}->{b:.2f}" for a, b in before)

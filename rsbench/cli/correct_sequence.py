@@ -94,7 +94,9 @@ def _warn_of_times(sources: list[FrameSource]) -> None:
         if copies:
             echo(f"rsbench: {side}: {copies} of {len(timeline.twins)} frames repeat the one before", err=True)
         elif not timeline.even:
-            echo(f"rsbench: {side}: frames do not follow each other evenly, and are taken as if they did", err=True)
+            echo(
+                f"rsbench: {side}: frames do not follow each other evenly, and are taken as if they did", err=True
+            )
 
 
 def _gyro(given: CorrectInput, first: FrameSource, options: CorrectionOptions) -> Gyroscope | None:
@@ -304,7 +306,9 @@ def _write_video(
         np.hstack([upright(shown(side, number, image), turn) for side, image in zip(SIDES, moment, strict=False)])
         for number, moment in enumerate(zip(*sources, strict=True))
     )
-    return write_video(out, folder, images, fps_of(sources[0].path), record, sources[0], others, None if one else UPRIGHT)
+    return write_video(
+        out, folder, images, fps_of(sources[0].path), record, sources[0], others, None if one else UPRIGHT
+    )
 
 
 def _say(out: Path, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:

@@ -18,7 +18,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import MotionCard
 from rsbench.pipeline import mono_sequence
 from rsbench.pipeline.footage import FrameSource, read_frame
-from rsbench.pipeline.mono_sequence import MonoOptions, correct_frames
+from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
 from rsbench.storage.untrusted_files import PIXELS, check_size
 from rsbench.storage.videos import Times, VideoFile, upright, write_frames
 from rsbench.vision import epipolar_search
@@ -260,9 +260,9 @@ def test_a_frame_after_a_gap_is_moved_by_the_share_of_the_longer_interval() -> N
     )
     camera = PinholeCamera.centred(SIZE[1], SIZE[0], 130.0)
     shutter = RollingShutter(height=SIZE[0], readout_ratio=1.0)
-    options, errors = MonoOptions(target_row=48.0), list[float]()
+    options, errors = options_of_camera(None, 0, 48.0), list[float]()
     for given in (starts, None):
-        image = list(correct_frames(frames, camera, shutter, options, starts=given))[2].fused.image
+        image = list(correct_frames(frames, camera, shutter, options, starts=given))[2].shown["left"].image
         errors.append(float(np.sqrt(np.mean((image - truth)[8:-8, 30:-30] ** 2))))
     before = np.sqrt(np.mean((frames[2] - truth)[8:-8, 30:-30] ** 2))
     assert errors[0] < 0.3 * before < errors[1]
