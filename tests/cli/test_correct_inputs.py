@@ -190,7 +190,7 @@ def test_halves_of_a_frame_are_the_cameras_of_a_rig(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(command, "_correct_given", lambda given, *rest: calls.append(given))
     given = ("correct", tmp_path / "a.mkv", "--rig", tmp_path / "rig.toml", "--side-by-side")
     assert run_here(*given, "--out", tmp_path / "out").returncode == 0
-    left, right = calls[0].footage()
+    left, right = calls[0].sources()
     np.testing.assert_array_equal(next(iter(left)), _seen(ROWS))
     np.testing.assert_array_equal(next(iter(right)), _seen(ROWS)[::-1])
 
