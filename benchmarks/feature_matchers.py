@@ -13,19 +13,27 @@ slows them alike. A table of each sequence is written beside the summary by sens
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.motion_tracks import match_scores
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import VIEWS
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
+from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.answer import solve_problem
+from rsbench.pipeline.footage import read_frame, read_rig_card
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_components import SolverRunner
@@ -36,49 +44,100 @@ from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.features import forget_features
 
 
-def row_of(sequence: Sequence, features: str, model: str | None, most: int, seed: int) -> dict[str, float | str]:
-    """Figures of one matcher on one sequence."""
-    images = {view: sequence.image("rs", *view) for view in VIEWS}
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Case:
+    """Four frames with their truth."""
+
+    name: str
+    law: str
+    sensor: str
+    images: dict[View, NDArray[Any]]
+    rig: StereoRig
+    shutter: RollingShutter
+    w: FloatArray
+    d: FloatArray
+    sequence: Sequence | None = None
+    """With the true depth."""
+
+
+def rendered(folder: Path) -> Iterator[Case]:
+    """Of a dataset of rsbench."""
+    for sequence in read_dataset(folder):
+        yield Case(
+            name=sequence.name,
+            law=sequence.motion.name,
+            sensor="ideal" if sequence.sensor is None else "real",
+            images={view: sequence.image("rs", *view) for view in VIEWS},
+            rig=sequence.rig,
+            shutter=sequence.shutter,
+            w=sequence.motion.w,
+            d=sequence.motion.d,
+            sequence=sequence,
+        )
+
+
+def foreign(folder: Path) -> Iterator[Case]:
+    """Pairs of times that ``foreign_frames.py`` traced."""
+    for place in sorted(each.parent for each in folder.glob("*/truth.json")):
+        truth = json.loads((place / "truth.json").read_text("utf-8"))
+        if truth["frames"] != len(FRAMES):
+            continue
+        images = {(side, frame): read_frame(place / f"{side}_{frame}.png") for side, frame in VIEWS}
+        card, sizes = read_rig_card(place / "told.toml"), [images[side, 0].shape[1::-1] for side in SIDES]
+        rig = card.rig(*sizes)
+        yield Case(
+            name=place.name,
+            law=truth["motion_model"] or truth["law"],
+            sensor="noise",
+            images=images,
+            rig=rig,
+            shutter=rig.shutter_of(card.scanning or Scanning(), truth["ratio"]),
+            w=np.array(truth["w"]),
+            d=np.array(truth["d"]),
+        )
+
+
+def row_of(case: Case, features: str, model: str, most: int, seed: int) -> dict[str, Any]:
+    """Figures of one matcher on one case."""
     options = CorrectionOptions(features=load_features(features))
     forget_features()
     begin = time.process_time()
-    matches = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, options)
+    matches = find_matches_of_rig(case.images, case.rig, case.shutter.scanning, options)
     matched = time.process_time()
     if 0 < most < len(matches.tracks):
         kept = np.sort(np.random.default_rng(seed).permutation(len(matches.tracks))[:most])
         matches = Correspondences(tracks=matches.tracks[kept])
-    problem = Problem(
-        name=sequence.name, correspondences=matches, rig=sequence.rig, known_shutter=sequence.shutter
-    )
+    problem = Problem(name=case.name, correspondences=matches, rig=case.rig, known_shutter=case.shutter)
     solving = time.process_time()
     with SolverRunner() as runner:
         entry = load_solver_entry("rs-stereo-refined")
-        found = solve_problem(problem, entry, RobustOptions(), runner, seed, (), model or sequence.motion.name)
+        found = solve_problem(problem, entry, RobustOptions(), runner, seed, (), model)
     solved = time.process_time()
     w, d = (np.full(3, np.nan) if found[key] is None else np.array(found[key]) for key in ("w", "d"))
     errors = pose_errors(
         w,
         d,
-        true_w=sequence.motion.w,
-        true_d=sequence.motion.d,
-        rig=sequence.rig,
+        true_w=case.w,
+        true_d=case.d,
+        rig=case.rig,
         success=bool(found["success"]),
         metric=bool(found["metric"]),
         reference_point=found["reference_point"],
     )
     e_R, e_T = float(errors["e_R_deg"]), float(errors["e_T_deg"])
-    score = 0.5 * (max(0.0, 1.0 - e_R / 0.1) + max(0.0, 1.0 - e_T))
-    right = match_scores(sequence, Correspondences(tracks=matches.tracks))["matches_1px"]
+    wrong = float("nan")
+    if case.sequence is not None and case.rig.rectified:
+        wrong = 1.0 - match_scores(case.sequence, Correspondences(tracks=matches.tracks))["matches_1px"]
     return {
-        "sequence": sequence.name,
-        "law": sequence.motion.name,
-        "sensor": "ideal" if sequence.sensor is None else "real",
-        "features": features,
+        "sequence": case.name,
+        "law": case.law,
+        "sensor": case.sensor,
+        "features": Path(features).stem,
         "tracks": len(matches.tracks),
-        "wrong": 1.0 - right,
+        "wrong": wrong,
         "e_R": e_R,
         "e_T": e_T,
-        "score": score,
+        "score": 0.5 * (max(0.0, 1.0 - e_R / 0.1) + max(0.0, 1.0 - e_T)),
         "model": str(found["motion_model"]),
         "matching_s": matched - begin,
         "solving_s": solved - solving,
@@ -98,7 +157,7 @@ def summary(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="dataset of two frames with their truth")
+    parser.add_argument("--data", type=Path, required=True, help="dataset, or folder of foreign_frames.py")
     parser.add_argument("--features", nargs="+", default=["sift", "sift-refined", "dense"], help="names or cards")
     parser.add_argument("--only", default="", help="sequences whose name holds this")
     parser.add_argument("--true-law", action="store_true", help="solve under the law that the rig follows")
@@ -106,16 +165,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the solver's samples")
     parser.add_argument("--out", type=Path, help="table of each sequence and matcher")
     arguments = parser.parse_args()
-    rows = list[dict[str, float | str]]()
-    for sequence in read_dataset(arguments.data):
-        if arguments.only not in sequence.name:
+    rows = list[dict[str, Any]]()
+    for case in (rendered if (arguments.data / "dataset.json").is_file() else foreign)(arguments.data):
+        if arguments.only not in case.name:
             continue
         for features in arguments.features:
-            model = None if arguments.true_law else "auto"
-            rows.append(row_of(sequence, features, model, arguments.most, arguments.seed))
-            row = rows[-1]
+            model = case.law if arguments.true_law else "auto"
+            row = row_of(case, features, model, arguments.most, arguments.seed)
+            rows.append(row)
             sys.stdout.write(
-                f"{row['sequence']:40} {Path(features).stem:14} {row['tracks']:5d} tracks, "
+                f"{row['sequence']:40} {row['features']:14} {row['tracks']:5d} tracks, "
                 f"{row['wrong']:6.1%} wrong, e_R {row['e_R']:.4f}, e_T {row['e_T']:.3f}, "
                 f"score {row['score']:.3f}, {row['model']}, "
                 f"{row['matching_s']:.2f} + {row['solving_s']:.2f} s\n"

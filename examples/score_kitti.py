@@ -15,6 +15,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import match_frames, solve_frames
 from rsbench.pipeline.sequence_capture import camera_of_frames, estimate_sequence_capture, spread_windows
+from rsbench.vision.feature_matcher import load_features
 
 Step = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,), metres, of the body from one frame to the next."""
@@ -134,6 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--focal-sigma", type=float, default=0.0, help="px: how sure it is; it is then found")
     parser.add_argument("--k1-sigma", type=float, default=0.0, help="of the lens that undistortion left; likewise")
     parser.add_argument("--every", type=step, default=1, help="score every n-th window")
+    parser.add_argument("--features", help="feature matcher, a name or a card; by default that of correct")
     parser.add_argument("--trajectory", action="store_true", help="one trajectory through all windows")
     given = parser.parse_args(arguments)
     try:
@@ -179,6 +182,8 @@ def score(given: argparse.Namespace) -> list[str]:
     sources = [FrameSource(given.folder / name) for name in (given.left, given.right)]
     files = [sorted(path for path in source.path.iterdir() if path.is_file()) for source in sources]
     rig, options = read_rig(given.folder, files[0][0], given.focal), CorrectionOptions()
+    if given.features:
+        options = replace(options, features=load_features(given.features))
     poses = read_matrices(given.folder / "poses.txt")
     if not len(files[0]) == len(files[1]) == len(poses):
         raise RsbenchError(

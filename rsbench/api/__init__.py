@@ -196,7 +196,7 @@ def pose_errors(
     return {name: float(value) for name, value in errors.items()}
 
 
-def match(images: Series[Image], *, features: str | Path = "sift-refined") -> Correspondences:
+def match(images: Series[Image], *, features: str | Path = "dense") -> Correspondences:
     """Matches of the four images of a rig over two frames: over time, left to right, and through all four.
 
     Args:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rsbench.solvers.engine.base import Solver
     from rsbench.vision.fusion import Fused
 
-_COMPONENTS = ("rs-stereo-refined", None, "sgm", "sift-refined", "fusion")
+_COMPONENTS = ("rs-stereo-refined", None, "sgm", "dense", "fusion")
 """Defaults for a rig: solver, motion model, matcher, features and corrector."""
 
 
@@ -31,7 +31,7 @@ def correct(
     solver: str | Path | Solver = "rs-stereo-refined",
     motion_model: str | None = None,
     matcher: str | Path = "sgm",
-    features: str | Path = "sift-refined",
+    features: str | Path = "dense",
     corrector: str | Path = "fusion",
     target_row: float = 0.0,
     inpaint: bool | None = None,
@@ -66,7 +66,7 @@ def correct(
     solver: str | Path | Solver = "rs-stereo-refined",
     motion_model: str | None = None,
     matcher: str | Path = "sgm",
-    features: str | Path = "sift-refined",
+    features: str | Path = "dense",
     corrector: str | Path = "fusion",
     target_row: float = 0.0,
     inpaint: bool | None = None,

@@ -26,7 +26,7 @@ def estimate_trajectory(
     rig: StereoRig,
     shutter: RollingShutter | None = None,
     *,
-    features: str = "sift-refined",
+    features: str = "dense",
     seed: int = 0,
     gyro: ArrayLike | None = None,
 ) -> Trajectory:

@@ -110,7 +110,7 @@ def correct(
     solver: Annotated[str, named("solvers", "Estimates the motion, in metres: name or card.")] = _SOLVER,
     motion_model: Annotated[str | None, typer.Option(metavar="auto|NAME", help=_MODEL)] = None,
     matcher: Annotated[str, named("matchers", "Estimates depth: a name or a card.")] = "sgm",
-    features: Annotated[str, named("features", "Matches features: a name or a card.")] = "sift-refined",
+    features: Annotated[str, named("features", "Matches features: a name or a card.")] = "dense",
     corrector: Annotated[str, named("correctors", "Makes the corrected frames: a name or a card.")] = "fusion",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     fast: Annotated[bool, typer.Option("--fast", help=_FAST)] = False,

@@ -75,7 +75,7 @@ def inspect(
         float, typer.Option(min=0.0, help="Largest standard deviation of a readout ratio that is reported.")
     ] = 0.015,
     motion_model: Annotated[list[str] | None, typer.Option(metavar="NAME", help=_MODEL)] = None,
-    features: Annotated[str, named("features", "Feature matcher for frames: a name or a card.")] = "sift-refined",
+    features: Annotated[str, named("features", "Feature matcher for frames: a name or a card.")] = "dense",
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per rig, each on a line.")] = False,
     fps: Annotated[

@@ -61,8 +61,8 @@ class DenseOptions:
     row_tolerance: float | None = 1.0
     """Left-right ends differ by at most this many rows of the level: both cameras read a row at the same time.
     None, where they do not."""
-    fewest: int = 100
-    """Tracks below which SIFT's, aligned, are added; 0: never."""
+    fewest: int = 700
+    """Tracks below which SIFT's, aligned, are added, which thin and near things have more of; 0: never."""
     half: bool = False
     """Work on images of half the size: faster, and less accurate."""
 
@@ -100,7 +100,7 @@ class DenseMatcher(DenseOptions, FeatureMatcher):
             if still(found) or len(found.tracks) == 0:
                 return more
             tracks = np.concatenate([found.tracks, more.tracks])
-            return replace(more, tracks=tracks, **_halves(tracks, more))
+            return replace(more, tracks=tracks, **_halves(found.tracks, more))
         return replace(found, **_halves(found.tracks))
 
 
