@@ -39,7 +39,7 @@ class CorrectionOptions:
     """The four components of the chain, each of which may be anybody's, and what happens between them."""
 
     features: FeatureEntry = field(default_factory=lambda: load_features("sift-refined"))
-    """Finds the matches that the motion is solved from."""
+    """Finds the matches that the motion is solved from; commands take ``dense``, boards and studies this one."""
     solver: SolverEntry = field(default_factory=lambda: load_solver_entry("rs-stereo-refined"))
     """Any solver that gives the length of d."""
     matcher: MatcherEntry = field(default_factory=lambda: load_matcher("sgm"))

@@ -30,7 +30,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs
 from rsbench.core.rig import SIDES, VIEWS, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher, of_sensors, undistorted
-from rsbench.vision.features import BLUR_PX, ROW_TOLERANCE_PX, Aligned, SiftMatcher, align, still
+from rsbench.vision.features import BLUR_PX, ROW_TOLERANCE_PX, Aligned, SiftMatcher, align, refine_matches, still
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.images import grey_u8, halved
 
@@ -93,6 +93,9 @@ class DenseMatcher(DenseOptions, FeatureMatcher):
         else:
             straight = {view: undistorted(image, rig.eye(view[0])) for view, image in images.items()}
             found = of_sensors(dense_tracks(straight, self), rig, _BORDER_PX)
+            if not self.half:  # interpolating has moved what is seen by hundredths of a pixel
+                alone = refine_matches(images, Correspondences(tracks=found.tracks), None if rig.aligned else rig)
+                found = replace(found, tracks=alone.tracks)
         if len(found.tracks) < self.fewest or still(found):
             rows = None if self.row_tolerance is None else ROW_TOLERANCE_PX
             sift = SiftMatcher(refine=True, half=self.half, row_tolerance=rows)
@@ -120,6 +123,8 @@ _RETURN_PX = 1.0
 """Distance of a flow there and back, pixels of the level, at most."""
 _FLAT = 0.002
 """Corners are at least so strong, as a share of strong ones."""
+_FLOOR_PX = 0.02
+"""Deviation of an end that no grey levels predict."""
 _SMALLEST, _SMALLEST_CELL = 64, 6
 """Width or height of a level, and of a cell, px."""
 
@@ -150,11 +155,22 @@ def dense_tracks(images: Mapping[View, NDArray[Any]], options: DenseOptions | No
         if sum(map(len, tracks)) >= options.enough:
             break
     together, covariance = np.concatenate(tracks), np.concatenate(covariances)
+    if len(together) > options.enough:
+        best = _worth_taking(covariance, options.enough)
+        together, covariance = together[best], covariance[best]
     if options.half:
         scale = _scale(shape, grey["left", 0].shape)
         together, covariance = _resized(together, scale), covariance * _products(scale)
     inside = np.all((together >= 0.0) & (together <= np.tile(np.array(shape[::-1]) - 1.0, 4)), axis=1)
     return Correspondences(tracks=together[inside], covariance=covariance[inside])
+
+
+def _worth_taking(covariance: FloatArray, least: int) -> NDArray[np.int64]:
+    """The tracks, ``least`` and more, with which a mean without weights would have the smallest variance."""
+    variance = 0.5 * (covariance[:, 0] + covariance[:, 2]) + _FLOOR_PX**2
+    order, count = np.argsort(variance, kind="stable"), np.arange(1, len(variance) + 1)
+    of_mean = np.cumsum(variance[order]) / count**2
+    return np.sort(order[: max(least, int(np.argmin(of_mean)) + 1)])
 
 
 class _Flows(NamedTuple):

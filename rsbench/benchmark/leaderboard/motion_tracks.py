@@ -516,7 +516,7 @@ class OwnMatchesTrack(MotionTrack):
     also_uses = ("images",)
 
     def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
-        """Solvers get the matches that ``rsbench correct`` finds by default, or those of ``features``."""
+        """Solvers get the matches of ``sift-refined``, or those of ``features``."""
         options = CorrectionOptions(features=load_features(features)) if features else CorrectionOptions()
         found = list[Problem]()
         for problem in read_inputs(inputs, self):

@@ -77,7 +77,7 @@ def run_cards(
         workers: processes; 0: this one, without limits, for rsbench's own components.
         limits: of each problem.
         step: called with the name of an entry, or of a problem, when a part is done.
-        features: on tracks without given matches, those that solvers get; None: the default of ``correct``.
+        features: on tracks without given matches, those that solvers get; None: ``sift-refined``.
 
     Raises:
         RsbenchError: a card does not fit the track; processes died each time over the same problems: what is
