@@ -32,6 +32,8 @@ class Seen:
     images: list[NDArray[np.uint8]]
     still: list[NDArray[np.uint8]]
     """At the time of each frame's first line, without noise."""
+    depth: list[Image]
+    """Metres along each camera's axis, of the images."""
     rig: StereoRig
     shutter: RollingShutter
     motion: LinearMotion
@@ -70,7 +72,8 @@ def seen(drawn: frames.Case, rng: np.random.Generator) -> Seen:
     traced = frames.trace_case(drawn, rng, _photographs())
     views = [(side, frame) for frame in (0, 1) for side in SIDES]
     rolling, still = ([frames.grey(images[view]) for view in views] for images in (traced.rolling, traced.still))
-    return Seen(rolling, still, *ours(drawn.rig), LinearMotion(*motion.between(drawn.law, 0.0, 1.0)))
+    depth = [traced.depth[view] for view in views]
+    return Seen(rolling, still, depth, *ours(drawn.rig), LinearMotion(*motion.between(drawn.law, 0.0, 1.0)))
 
 
 def corrected(images: list[NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter) -> Any:

@@ -58,16 +58,28 @@ def trace(world: World, camera: Camera, poses: tuple[Array, Array], samples: int
         poses: of the camera, one for each line, or one for all.
         samples: points of a pixel in each direction.
     """
-    ray = rays(camera, samples)
-    shape = camera.height * samples, camera.width * samples
+    near, texels = _drawn(world, camera, poses, samples)
+    blur = rays(camera, samples).blur - 1.5 * np.log2(near)
+    values = _sample(world.atlas, texels[0], texels[1], texels[2] + blur)
+    values[near <= _FAR] = 0.0
+    mean = values.reshape(camera.height, samples, camera.width, samples).mean(axis=(1, 3), dtype=np.float64)
+    return np.asarray(mean, dtype=np.float32)
+
+
+def trace_depth(world: World, camera: Camera, poses: tuple[Array, Array]) -> Image:
+    """Depth (height, width), metres along the camera's axis, in the middle of each pixel; infinite of nothing."""
+    near, _ = _drawn(world, camera, poses, 1)
+    return np.where(near > _FAR, np.float32(1.0) / near, np.float32(np.inf))
+
+
+def _drawn(world: World, camera: Camera, poses: tuple[Array, Array], samples: int) -> tuple[Image, Image]:
+    """Inverse depth of all samples, and (3, ...) their texels and levels of detail at depth 1."""
+    ray, shape = rays(camera, samples), (camera.height * samples, camera.width * samples)
     near = np.full(shape, _FAR, dtype=np.float32)
     texels = np.zeros((3, *shape), dtype=np.float32)
     for quad, place in zip(world.quads, world.places, strict=True):
         _draw(quad, place, camera, poses, ray, near, texels)
-    values = _sample(world.atlas, texels[0], texels[1], texels[2] + ray.blur - 1.5 * np.log2(near))
-    values[near <= _FAR] = 0.0
-    mean = values.reshape(camera.height, samples, camera.width, samples).mean(axis=(1, 3), dtype=np.float64)
-    return np.asarray(mean, dtype=np.float32)
+    return near, texels
 
 
 def _draw(
@@ -295,23 +307,28 @@ class Traced:
     rolling: dict[tuple[str, int], Image]
     still: dict[tuple[str, int], Image]
     """At the time of the frame's first line, without noise."""
+    depth: dict[tuple[str, int], Image]
+    """Metres, of the rolling images; of two frames alone."""
     noise: float
     world: World
 
 
 def trace_case(case: Case, rng: np.random.Generator, photographs: list[Image]) -> Traced:
     """What both cameras see of a world that the generator makes."""
-    rig, rolling, still = case.rig, {}, {}
+    rig, rolling, still, depth = case.rig, {}, {}, {}
     path = motion.centres(case.law, np.linspace(0.0, case.frames, 20 * case.frames)) @ case.upright
     focal = case.focal or rig.left.focal
     world = turned_world(random_world(rng, path, focal, photographs), case.upright)
     noise = float(rng.uniform(1.0, 2.0)) if case.noise is None else case.noise
     for view in ((side, frame) for frame in range(case.frames) for side in SIDES):
         camera = rig.camera(view[0])
-        seen = trace(world, camera, rig.poses(case.law, view[0], camera.times(view[1])))
+        poses = rig.poses(case.law, view[0], camera.times(view[1]))
+        seen = trace(world, camera, poses)
+        if case.frames == 2:
+            depth[view] = trace_depth(world, camera, poses)
         rolling[view] = seen + rng.normal(0.0, noise, seen.shape).astype(np.float32)
         still[view] = trace(world, camera, rig.poses(case.law, view[0], camera.start(view[1])))
-    return Traced(rolling, still, noise, world)
+    return Traced(rolling, still, depth, noise, world)
 
 
 def write_case(row: str, seed: int, folder: Path, photographs: list[Image]) -> float:

@@ -457,6 +457,12 @@ class PinholeCamera:
         inside_x = (p[..., 0] >= -0.5) & (p[..., 0] <= self.width - 0.5)
         return inside_x & (p[..., 1] >= -0.5) & (p[..., 1] <= self.height - 0.5)
 
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """The camera of the same images at another size."""
+        x, y = width / self.width, height / self.height
+        cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=cx, cy=cy)
+
     def pixel_grid(self) -> FloatArray:
         """Centres of all pixels, (height, width, 2)."""
         x, y = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))

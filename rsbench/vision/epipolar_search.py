@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, Side, StereoRig
@@ -367,7 +366,7 @@ def sweep_frames(
         options: see there.
     """
     height, width = search_size(greys[0].shape, options)
-    camera = _resized(rig.sensor(side), width, height)
+    camera = rig.sensor(side).resized(width, height)
     small = [np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)) for grey in greys]
     poses = [_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
     maps = [reprojection_of(camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
@@ -426,19 +425,6 @@ _ENOUGH = 1 << 21
 def reduction(shape: tuple[int, ...]) -> int:
     """The factor by which frames (H, W[, C]) are shrunk before motion and depth are found: 2 of 4K, 1 of HD."""
     return max(math.ceil(math.sqrt(shape[0] * shape[1] / _ENOUGH) - 1e-9), 1)
-
-
-def _resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * x,
-        fy=camera.fy * y,
-        cx=(camera.cx + 0.5) * x - 0.5,
-        cy=(camera.cy + 0.5) * y - 0.5,
-    )
 
 
 def _poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, height: int) -> Pose:

@@ -306,17 +306,7 @@ class _Scene:
     def coarse(self) -> _Scene:
         """The same at a quarter of the size; a line is then read 1.5 lines too early, which moves no range."""
         height, width = (max(n // _COARSE, _FEWEST) for n in self.size)
-        camera = self.rig.camera
-        x, y = width / camera.width, height / camera.height
-        camera = replace(
-            camera,
-            width=width,
-            height=height,
-            fx=camera.fx * x,
-            fy=camera.fy * y,
-            cx=(camera.cx + 0.5) * x - 0.5,
-            cy=(camera.cy + 0.5) * y - 0.5,
-        )
+        camera = self.rig.camera.resized(width, height)
         small = {
             view: np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
             for view, image in self.images.items()

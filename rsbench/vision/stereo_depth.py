@@ -31,14 +31,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
+from rsbench.components.motion_kernels import Vector
 from rsbench.core.arguments import check_ranges
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig
+from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import grey_u8, guided_upsample, halved, keys_weights, resample
+from rsbench.vision.reprojection import distort, lens_table
 from rsbench.vision.stereo_matcher import (
     F32,
     MatcherEntry,
@@ -46,6 +48,8 @@ from rsbench.vision.stereo_matcher import (
     between_pixels,
     body_depth,
     find_disparities,
+    level_pixels,
+    level_places,
     own_depths,
     pixel_rays,
     widened,
@@ -591,45 +595,43 @@ def timed_depth(
     return out
 
 
-_ROUNDS, _SETTLED, _STILL_PX = 5, 0.02, 0.5
-"""Most rounds of matching; it ends earlier where less than this share of the pixels moves by more than so many px.
-Late cameras and columns take two or three, opposite scans all."""
-_STEPS = 5
-"""Steps of the search for the line that sees a point: each scales the error by the motion, px, in one line."""
+_ROUNDS, _SETTLED, _STILL_PX = 4, 0.02, 0.5
+"""Most rounds of matching at a fraction of the size; they end earlier where less than this share of the pixels is
+resampled from a place that changed by more than so many px. Late cameras take two or three, opposite scans all."""
+_SMALL, _LEAST_SIDE = 4, 60
+"""That fraction, and the least side, px, of an image at it. The last round is at full size."""
+_STEPS, _SAME_LINE = 6, 1e-3
+"""Most steps of the search for the line that sees a point, each of which scales the error by the motion, px, in
+one line; and the step, lines, after which it ends."""
+_ONE_SURFACE_PX = 1.0
+"""Neighbours that the motion moves more unlike are not interpolated between."""
 _SMOOTH = 5
 """Window, px, of the median filter on known inverse depth before images are resampled by it."""
 
 
 class _Eye(NamedTuple):
-    """One camera of the rig, and the poses of its lines, in the body's axes."""
+    """One camera of the rig for compiled loops, and the poses of its lines, in the body's axes."""
 
-    camera: PinholeCamera | AlignedCamera
-    poses: Pose
-    axis: int
-
-    def pose_at(self, pixels: FloatArray) -> Pose:
-        """Pose (..., 3, 3), (..., 3) of the line of pixels (..., 2), between lines by straight interpolation.
-
-        It errs by an eighth of the square of the turn between two lines, 1e-10 of a fast one.
-        """
-        numbers = np.concatenate([self.poses.R.reshape(-1, 9), self.poses.t], axis=1)
-        steps, count = np.diff(numbers, axis=0), len(numbers)
-        line = np.clip(np.nan_to_num(pixels[..., self.axis]), -count, 2 * count)
-        below = np.clip(np.floor(line).astype(np.int64), 0, count - 2)
-        found = np.take(steps, below, axis=0)
-        found *= (line - below)[..., None]
-        found += np.take(numbers, below, axis=0)
-        return Pose(found[..., :9].reshape(*line.shape, 3, 3), found[..., 9:])
+    turn: FloatArray
+    """(3, 3) from rays to homogeneous pixels of the camera itself without its lens."""
+    lens: FloatArray
+    """(14,) ``Optics.lens``; of a camera without a lens one that bends nothing."""
+    lines: FloatArray
+    """(lines, 12) rotation and translation of each line."""
+    columns: bool
+    size: tuple[int, int]
+    """Width and height."""
 
 
-class _Looked(NamedTuple):
-    """Pixels (H, W, 2) of a camera and their rays (H, W, 3); NaN where its lens shows nothing.
+class _Pair(NamedTuple):
+    """The camera whose disparities are wanted, the other one, and their level images."""
 
-    Both from ideal places: from pixels with a lens Newton's method would have to find the rays.
-    """
-
-    pixels: FloatArray
-    rays: FloatArray
+    eye: _Eye
+    other: _Eye
+    level: tuple[float, float, float, float]
+    """fx, fy, cx, cy."""
+    shift: float
+    """px from a place of the other level image to its partner in the own one, of inverse depth 1 / m."""
 
 
 def moving_disparities(
@@ -645,134 +647,236 @@ def moving_disparities(
     A disparity is that which the other camera would have shown at the time of the pixel: ``rig.depth`` makes it
     the depth, along the body's z, from the camera of the pixel's own line. ``images`` (H, W[, 3]) by side.
 
+    Where the other camera, read at other times, saw a point depends on its depth. The left image's is found in
+    rounds at a quarter of the size, then at full size; the right one's begins with the left one's.
+
     Raises:
         RsbenchError: see ``find_disparities``.
     """
-    eyes = {
-        side: _Eye(
-            rig.eye(side),
-            rig.eye_from_world(motion, shutter.line_times(frame, side), side),
-            shutter.axis(side),
-        )
-        for side in SIDES
+    eyes = {side: _eye(rig, shutter, motion, side, frame) for side in SIDES}
+    level, gain = replace(rig.ideal, camera=widened(rig)), rig.camera.fx * rig.baseline
+    own = {
+        side: images[side] if rig.rectified else resample(images[side], level_places(rig, side)) for side in SIDES
     }
-    first, second = (_of_side(entry, images, rig, eyes, side) for side in SIDES)
-    return first, second
+    rho, found = _first_guess(entry, own["left"], images["right"], level, _pair(eyes, level, "left")), list[F32]()
+    for side, other in (SIDES, SIDES[::-1]):
+        pair = _pair(eyes, level, side)
+        ends, rays = _ends(pair, rho)
+        here = _of_one(entry, own[side], resample(images[other], ends), level, side)
+        disparity = np.full_like(here, np.nan)
+        _fill_disparities(here, rays, pair, disparity)
+        rho = _without_holes(disparity / np.float32(gain))
+        found.append(disparity if rig.rectified else between_pixels(disparity, level_pixels(rig, side)))
+    return found[0], found[1]
 
 
-def _of_side(
-    entry: MatcherEntry,
-    images: Mapping[Side, NDArray[np.uint8]],
-    rig: StereoRig,
-    eyes: Mapping[Side, _Eye],
-    side: Side,
-) -> F32:
-    wide = widened(rig)
-    other: Side = "right" if side == "left" else "left"
-    camera, there_camera = eyes[side].camera, eyes[other].camera
-    sign, grid, level = (1.0 if side == "left" else -1.0), wide.pixel_grid(), replace(rig.ideal, camera=wide)
-    own = images[side] if camera.is_ideal else resample(images[side], _shown(camera, wide, grid))
-    rho = np.zeros(grid.shape[:2])
+def _eye(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int) -> _Eye:
+    poses, camera = rig.eye_from_world(motion, shutter.line_times(frame, side), side), rig.sensor(side)
+    lines = np.concatenate([poses.R.reshape(-1, 9), poses.t], axis=1)
+    table = lens_table(camera, camera.lens or Lens(model="brown-conrady"))
+    size = camera.width, camera.height
+    return _Eye(camera.ideal.K @ rig.own(side).R, table, lines, shutter.axis(side) == 0, size)
+
+
+def _pair(eyes: Mapping[Side, _Eye], level: StereoRig, side: Side) -> _Pair:
+    camera, gain = level.camera, level.camera.fx * level.baseline
+    numbers = camera.fx, camera.fy, camera.cx, camera.cy
+    if side == "left":
+        return _Pair(eyes["left"], eyes["right"], numbers, gain)
+    return _Pair(eyes["right"], eyes["left"], numbers, -gain)
+
+
+def _first_guess(entry: MatcherEntry, own: U8, there: U8, level: StereoRig, pair: _Pair) -> F32:
+    """Inverse depth (H, W), 1 / m, on the right level image, in rounds at a fraction of its size.
+
+    Args:
+        own: left level image (H, W[, 3]).
+        there: the right camera's image.
+    """
+    size = level.camera.width, level.camera.height
+    shrink = max(min(_SMALL, min(size) // _LEAST_SIDE), 1)
+    width, height = size[0] // shrink, size[1] // shrink
+    level = replace(level, camera=level.camera.resized(width, height))
+    pair = _pair({"left": pair.eye, "right": pair.other}, level, "left")
+    taken = max(pair.other.size[0] // shrink, 1), max(pair.other.size[1] // shrink, 1)
+    scale = np.divide(taken, pair.other.size).astype(np.float32)
+    small, there = (
+        np.asarray(cv2.resize(image, to, interpolation=cv2.INTER_AREA))
+        for image, to in ((own, (width, height)), (there, taken))
+    )
+    rho, before = np.zeros((height, width), np.float32), None
     for _ in range(_ROUNDS):
-        ends, column = _ends(level, eyes[side], eyes[other], sign, rho)
-        seen = resample(images[other], _inside(there_camera, ends).astype(np.float32))
-        left, right = (own, seen) if side == "left" else (seen, own)
-        both = find_disparities(entry, left, right, level)
-        here, there = both if side == "left" else both[::-1]
-        partner = grid + _across(sign * there)
-        before, gain = rho, rig.camera.fx * rig.baseline
-        looked = _looked(camera, wide, partner)
-        rho = _without_holes(_inverse_depth(eyes[side], eyes[other], looked, ends, column))
-        if np.mean(gain * np.abs(rho - before) > _STILL_PX) < _SETTLED:
+        ends, rays = _ends(pair, rho)
+        ends = (ends + np.float32(0.5)) * scale - np.float32(0.5)
+        if before is not None and np.mean(np.abs(ends - before).max(axis=-1) > _STILL_PX) < _SETTLED:
             break
-    known = np.isfinite(here)
-    places: FloatArray = np.where(known[..., None], grid - _across(sign * here), 0.0)
-    # A turned camera's pixels are not near the ideal ones: only what the motion adds is alike in neighbours.
-    rest, at_rest = (grid, places) if rig.aligned else (_pixels(there_camera, wide, p) for p in (grid, places))
-    moved = (ends - rest).astype(np.float32)
-    ends = at_rest + np.stack([between_pixels(moved[..., k], places) for k in (0, 1)], axis=-1)
-    ends = _inside(there_camera, ends)
-    column = there_camera.unproject(ends)[..., 0]
-    rho = _inverse_depth(eyes[side], eyes[other], _looked(camera, wide, grid), ends, column)
-    disparity = np.where(known, gain * rho, np.nan)
-    return _on_sensor(camera, wide, pixel_rays(rig, side), disparity.astype(np.float32))
+        before = ends
+        right = find_disparities(entry, small, resample(there, ends), level)[1]
+        rho = np.full_like(right, np.nan)
+        _fill_inverse_depths(right, rays, pair, rho)
+        rho = _without_holes(rho)
+    return np.asarray(cv2.resize(rho, size, interpolation=cv2.INTER_LINEAR))
 
 
-def _ends(rig: StereoRig, eye: _Eye, other: _Eye, sign: float, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the other camera, at its own times, sees what it would see at its ideal pixels at those of ``eye``.
+def _of_one(entry: MatcherEntry, own: U8, seen: U8, level: StereoRig, side: Side) -> F32:
+    """Disparity (H, W) on one level image alone: our matcher is sooner done with one."""
+    left, right = (own, seen) if side == "left" else (seen, own)
+    if isinstance(entry.component, SgmMatcher):
+        return stereo_disparity(left, right, level, side, entry.component)
+    return find_disparities(entry, left, right, level)[SIDES.index(side)]
 
-    (H, W, 2) px of the other image, NaN where it does not; ``rho`` (H, W) 1 / m is the inverse depth there, and
-    that of the partner in ``eye``, whose line's time is meant. And x / z (H, W) of their rays.
+
+def _ends(pair: _Pair, rho: F32) -> tuple[F32, F32]:
+    """Where the other camera, at its own times, sees what its level image shows, at those of the own one.
+
+    (H, W, 2) px of the other image, NaN where it does not, and x / z, y / z (H, W, 2) of the rays. ``rho`` (H, W),
+    1 / m, is the inverse depth there, and that of the partner in the own camera, whose line's time is meant.
     """
-    grid = rig.camera.pixel_grid()
-    partner = _looked(eye.camera, rig.camera, grid + _across(sign * rig.camera.fx * rig.baseline * rho))
-    R, t = eye.pose_at(partner.pixels)
-    X = _turned(np.swapaxes(R, -1, -2), partner.rays - rho[..., None] * t)
-    ends, seen = _pixels(other.camera, rig.camera, grid), X
-    for _ in range(_STEPS):
-        R, t = other.pose_at(ends)
-        seen = _turned(R, X) + rho[..., None] * t
-        ends = other.camera.project(seen)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return ends, seen[..., 0] / seen[..., 2]
+    ends, rays = (np.full((*rho.shape, 2), np.nan, np.float32) for _ in range(2))
+    _fill_ends(rho, pair, ends, rays)
+    return ends, rays
 
 
-def _inverse_depth(eye: _Eye, other: _Eye, own: _Looked, ends: FloatArray, column: FloatArray) -> FloatArray:
-    """Inverse depth (H, W), 1 / m, of pixels (H, W, 2) whose points the other camera sees at ``ends``; NaN: none.
-
-    By the ``column`` of the ends, x / z (H, W), as disparities are; the rows hold the guess that the image was
-    resampled by.
-    """
-    (R, t), (S, s) = eye.pose_at(own.pixels), other.pose_at(ends)
-    turn = S @ np.swapaxes(R, -1, -2)
-    ray, step = _turned(turn, own.rays), s - _turned(turn, t)
-    column = np.where(np.isfinite(ends[..., 0]), column, np.nan)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rho = (ray[..., 0] - column * ray[..., 2]) / (column * step[..., 2] - step[..., 0])
-        return np.where(np.isfinite(rho) & (rho >= 0.0), rho, np.nan)
-
-
-def _without_holes(rho: FloatArray) -> FloatArray:
+def _without_holes(rho: F32) -> F32:
     """Inverse depth (H, W) without holes: there that of the farther neighbour in the row; and without specks."""
-    filled = fill_holes(rho.astype(np.float32))
+    filled = fill_holes(rho)
     anywhere = np.nanmedian(filled) if np.any(np.isfinite(filled)) else 0.0
-    filled = np.where(np.isfinite(filled), filled, np.float32(anywhere))
-    return np.asarray(cv2.medianBlur(filled, _SMOOTH), dtype=np.float64)
+    filled = np.where(np.isfinite(filled), filled, np.float32(anywhere)).astype(np.float32)
+    return np.asarray(cv2.medianBlur(filled, _SMOOTH))
 
 
-def _turned(R: FloatArray, x: FloatArray) -> FloatArray:
-    return np.asarray((R @ x[..., None])[..., 0])
+@compiled(error_model="numpy", inline="always")
+def _seen_at(eye: _Eye, x: float, y: float, z: float) -> tuple[float, float]:
+    """Pixel at which a camera sees a point in the body's axes; NaN where it does not."""
+    m = eye.turn
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
+    s = 1.0 / depth if depth > 0.0 else np.nan
+    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) * s
+    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) * s
+    return distort(eye.lens, u, v)
 
 
-def _across(steps: NDArray[Any]) -> FloatArray:
-    """(H, W, 2) px along rows."""
-    return np.stack([steps, np.zeros_like(steps)], axis=-1).astype(np.float64)
+@compiled(error_model="numpy", inline="always")
+def _line(eye: _Eye, along: float) -> tuple[int, float]:
+    """The line before a place, and the share of the next one: poses between lines are interpolated straight.
+
+    That errs by an eighth of the square of the turn between two lines, 1e-10 of a fast one.
+    """
+    last = len(eye.lines) - 1
+    at = min(max(along, -last), 2.0 * last) if along == along else 0.0
+    below = min(max(int(np.floor(at)), 0), last - 1)
+    return below, at - below
 
 
-def _pixels(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, places: FloatArray) -> FloatArray:
-    """Pixels (H, W, 2) of the camera with its lens at places of the wide one without."""
-    return places if wide is camera else camera.project(wide.unproject(places))
+@compiled(error_model="numpy", inline="always")
+def _pose(lines: FloatArray, below: int, s: float, k: int) -> Vector:
+    """Numbers 3 k to 3 k + 2 of a pose between lines."""
+    a, b, c = lines[below, 3 * k], lines[below, 3 * k + 1], lines[below, 3 * k + 2]
+    return (
+        a + s * (lines[below + 1, 3 * k] - a),
+        b + s * (lines[below + 1, 3 * k + 1] - b),
+        c + s * (lines[below + 1, 3 * k + 2] - c),
+    )
 
 
-def _looked(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, places: FloatArray) -> _Looked:
-    rays, pixels = wide.unproject(places), _pixels(camera, wide, places)
-    return _Looked(pixels, np.where(np.isfinite(pixels[..., :1]), rays, np.nan))
+@compiled(error_model="numpy")
+def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
+    eye, other = pair.eye, pair.other
+    fx, fy, cx, cy = pair.level
+    width, height = other.size
+    for row in range(rho.shape[0]):
+        for column in range(rho.shape[1]):
+            far = rho[row, column]
+            x, y = (column + pair.shift * far - cx) / fx, (row - cy) / fy
+            u, v = _seen_at(eye, x, y, 1.0)
+            if not abs(u + v) < np.inf:
+                continue
+            below, s = _line(eye, u if eye.columns else v)
+            a, b = _pose(eye.lines, below, s, 0), _pose(eye.lines, below, s, 1)
+            c, t = _pose(eye.lines, below, s, 2), _pose(eye.lines, below, s, 3)
+            p, q, r = x - far * t[0], y - far * t[1], 1.0 - far * t[2]
+            X = a[0] * p + b[0] * q + c[0] * r
+            Y = a[1] * p + b[1] * q + c[1] * r
+            Z = a[2] * p + b[2] * q + c[2] * r
+            u, v = _seen_at(other, (column - cx) / fx, y, 1.0)
+            before = u if other.columns else v
+            for _ in range(_STEPS):
+                below, s = _line(other, before)
+                a, b = _pose(other.lines, below, s, 0), _pose(other.lines, below, s, 1)
+                c, t = _pose(other.lines, below, s, 2), _pose(other.lines, below, s, 3)
+                p = a[0] * X + a[1] * Y + a[2] * Z + far * t[0]
+                q = b[0] * X + b[1] * Y + b[2] * Z + far * t[1]
+                r = c[0] * X + c[1] * Y + c[2] * Z + far * t[2]
+                u, v = _seen_at(other, p, q, r)
+                along = u if other.columns else v
+                if abs(along - before) < _SAME_LINE:
+                    break
+                before = along
+            rays[row, column, 0], rays[row, column, 1] = p / r, q / r
+            if -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5:
+                ends[row, column, 0], ends[row, column, 1] = u, v
 
 
-def _shown(camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, places: FloatArray) -> F32:
-    return _inside(camera, _pixels(camera, wide, places)).astype(np.float32)
+@compiled(error_model="numpy", inline="always")
+def _inverse_depth(pair: _Pair, x: float, y: float, p: float, q: float) -> float:
+    """Inverse depth, 1 / m, of the ray (x, y, 1) whose point the other camera sees along (p, q, 1); NaN: none.
+
+    By the column of that ray, as disparities are; its row holds the guess that the image was resampled by.
+    """
+    eye, other = pair.eye, pair.other
+    u, v = _seen_at(other, p, q, 1.0)
+    if not (-0.5 <= u <= other.size[0] - 0.5 and -0.5 <= v <= other.size[1] - 0.5):
+        return np.nan
+    below, s = _line(other, u if other.columns else v)
+    d, e = _pose(other.lines, below, s, 0), _pose(other.lines, below, s, 2)
+    there = _pose(other.lines, below, s, 3)
+    u, v = _seen_at(eye, x, y, 1.0)
+    if not abs(u + v) < np.inf:
+        return np.nan
+    below, s = _line(eye, u if eye.columns else v)
+    a, b = _pose(eye.lines, below, s, 0), _pose(eye.lines, below, s, 1)
+    c, t = _pose(eye.lines, below, s, 2), _pose(eye.lines, below, s, 3)
+    # In the world's axes: the ray, and the way from the own camera's centre to it.
+    X, far_x = a[0] * x + b[0] * y + c[0], a[0] * t[0] + b[0] * t[1] + c[0] * t[2]
+    Y, far_y = a[1] * x + b[1] * y + c[1], a[1] * t[0] + b[1] * t[1] + c[1] * t[2]
+    Z, far_z = a[2] * x + b[2] * y + c[2], a[2] * t[0] + b[2] * t[1] + c[2] * t[2]
+    ray_x, ray_z = d[0] * X + d[1] * Y + d[2] * Z, e[0] * X + e[1] * Y + e[2] * Z
+    step_x = there[0] - (d[0] * far_x + d[1] * far_y + d[2] * far_z)
+    step_z = there[2] - (e[0] * far_x + e[1] * far_y + e[2] * far_z)
+    rho = (ray_x - p * ray_z) / (p * step_z - step_x)
+    return rho if 0.0 <= rho < np.inf else np.nan
 
 
-def _inside(camera: PinholeCamera | AlignedCamera, pixels: FloatArray) -> FloatArray:
-    """Pixels (H, W, 2), NaN beside the image."""
-    return np.where(camera.contains(pixels)[..., None], pixels, np.nan)
+@compiled(error_model="numpy")
+def _fill_inverse_depths(disparity: F32, rays: F32, pair: _Pair, rho: F32) -> None:
+    """On the other level image, whose disparities (H, W) these are."""
+    fx, fy, cx, cy = pair.level
+    sign = 1.0 if pair.shift > 0.0 else -1.0
+    for row in range(rho.shape[0]):
+        for column in range(rho.shape[1]):
+            x = (column + sign * disparity[row, column] - cx) / fx
+            p, q = rays[row, column, 0], rays[row, column, 1]
+            rho[row, column] = _inverse_depth(pair, x, (row - cy) / fy, p, q)
 
 
-def _on_sensor(
-    camera: PinholeCamera | AlignedCamera, wide: PinholeCamera, rays: FloatArray, disparity: F32
-) -> F32:
-    """Disparity of the wide camera on the pixels of the camera with its lens."""
-    if wide is camera:
-        return disparity
-    shift = np.array([wide.cx - camera.ideal.cx, wide.cy - camera.ideal.cy])
-    return between_pixels(disparity, camera.ideal.project(rays) + shift)
+@compiled(error_model="numpy")
+def _fill_disparities(matched: F32, rays: F32, pair: _Pair, disparity: F32) -> None:
+    """On the own level image, from those that were ``matched`` with the other one as it was resampled."""
+    fx, fy, cx, cy = pair.level
+    sign, gain, last = (1.0 if pair.shift > 0.0 else -1.0), abs(pair.shift), matched.shape[1] - 1
+    for row in range(matched.shape[0]):
+        for column in range(matched.shape[1]):
+            at = column - sign * matched[row, column]
+            if not (-0.5 <= at <= last + 0.5):
+                continue
+            i = min(max(int(np.floor(at)), 0), last - 1)
+            s, y = at - i, (row - cy) / fy
+            # What the motion adds to the level ray is alike in neighbours of one surface.
+            p, q = rays[row, i, 0] - (i - cx) / fx, rays[row, i, 1] - y
+            along, across = rays[row, i + 1, 0] - (i + 1 - cx) / fx - p, rays[row, i + 1, 1] - y - q
+            one = abs(along) * fx <= _ONE_SURFACE_PX and abs(across) * fy <= _ONE_SURFACE_PX
+            s = s if one else np.floor(s + 0.5)
+            if s != 0.0:
+                p, q = p + s * along, q + s * across
+            found = _inverse_depth(pair, (column - cx) / fx, y, (at - cx) / fx + p, y + q)
+            disparity[row, column] = gain * found

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components import plugins
+from rsbench.components.compiled import compiled
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import check_cameras_of, check_ideal
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig, View
+from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import resample
@@ -212,22 +213,14 @@ def sensor_disparities(
     """
     if rig.rectified:
         return find_disparities(entry, left, right, rig)
-    eyes, wide, levels = {side: rig.eye(side) for side in SIDES}, widened(rig), list[NDArray[np.uint8]]()
-    for side, image in zip(SIDES, (left, right), strict=True):
-        places = eyes[side].project(wide.unproject(wide.pixel_grid()))
-        inside: F32 = np.where(eyes[side].contains(places)[..., None], places, np.nan).astype(np.float32)
-        levels.append(resample(image, inside))
+    wide, images = widened(rig), zip(SIDES, (left, right), strict=True)
+    levels = [resample(image, level_places(rig, side)) for side, image in images]
     both = find_disparities(entry, levels[0], levels[1], replace(rig.ideal, camera=wide))
-    shift = np.array([wide.cx - rig.camera.cx, wide.cy - rig.camera.cy])
-    on_sensors = []
-    for side, found in zip(SIDES, both, strict=True):
-        ideal, other = (
-            rig.camera.ideal.project(pixel_rays(rig, side)),
-            eyes["right" if side == "left" else "left"],
-        )
-        sign = 1.0 if side == "left" else -1.0
-        on_sensors.append(_with_partner(between_pixels(found, ideal + shift), ideal, other, sign))
-    return on_sensors[0], on_sensors[1]
+    first, second = (
+        _with_partner(between_pixels(found, level_pixels(rig, side)), rig, side)
+        for side, found in zip(SIDES, both, strict=True)
+    )
+    return first, second
 
 
 def widened(rig: StereoRig) -> PinholeCamera:
@@ -254,6 +247,21 @@ def pixel_rays(rig: StereoRig, side: Side) -> FloatArray:
     return rays
 
 
+@lru_cache(maxsize=2 * len(SIDES))
+def level_pixels(rig: StereoRig, side: Side) -> FloatArray:
+    """(H, W, 2) pixels of the level image, which ``widened`` would see, that all pixels of a camera are at."""
+    shift = np.array([widened(rig).cx - rig.camera.cx, widened(rig).cy - rig.camera.cy])
+    return rig.camera.ideal.project(pixel_rays(rig, side)) + shift
+
+
+@lru_cache(maxsize=2 * len(SIDES))
+def level_places(rig: StereoRig, side: Side) -> F32:
+    """(h, w, 2) pixels of a camera at which all pixels of the level image are; NaN beside it."""
+    wide, eye = widened(rig), rig.eye(side)
+    places = eye.project(wide.unproject(wide.pixel_grid()))
+    return np.where(eye.contains(places)[..., None], places, np.nan).astype(np.float32)
+
+
 @lru_cache(maxsize=4)
 def own_depths(rig: StereoRig, side: Side) -> F32:
     """(H, W) ``StereoRig.own_depth`` of all pixels of a camera."""
@@ -277,18 +285,34 @@ def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
 
 def between_pixels(disparity: F32, places: FloatArray) -> F32:
     """Disparity (H, W), px, at places (h, w, 2): between its pixels on one surface, else that of the nearest."""
+    out = np.full(places.shape[:2], np.nan, np.float32)
+    _fill_between(disparity, places, out)
+    return out
+
+
+@compiled(error_model="numpy")
+def _fill_between(disparity: F32, places: FloatArray, out: F32) -> None:
     height, width = disparity.shape
-    x, y = np.moveaxis(np.clip(np.floor(places).astype(np.int64), 0, [width - 2, height - 2]), -1, 0)
-    s, t = places[..., 0] - x, places[..., 1] - y
-    corners = [disparity[y, x], disparity[y, x + 1], disparity[y + 1, x], disparity[y + 1, x + 1]]
-    upper, lower = (a + s * (b - a) for a, b in (corners[:2], corners[2:]))
-    nearest = np.select([(t < 0.5) & (s < 0.5), t < 0.5, s < 0.5], corners[:3], corners[3])
-    one = np.ptp(np.stack(corners), axis=0) <= _ONE_SURFACE_PX  # false where one of them is not known
-    inside = np.all((places >= -0.5) & (places <= np.array([width, height]) - 0.5), axis=-1)
-    return np.where(inside, np.where(one, upper + t * (lower - upper), nearest), np.nan).astype(np.float32)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            u, v = places[row, column, 0], places[row, column, 1]
+            if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+                continue
+            x, y = min(max(int(np.floor(u)), 0), width - 2), min(max(int(np.floor(v)), 0), height - 2)
+            s, t = u - x, v - y
+            a, b, c, d = disparity[y, x], disparity[y, x + 1], disparity[y + 1, x], disparity[y + 1, x + 1]
+            if max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) <= _ONE_SURFACE_PX and a + b + c + d < np.inf:
+                upper, lower = a + s * (b - a), c + s * (d - c)
+                out[row, column] = upper + t * (lower - upper)
+            elif t < 0.5:
+                out[row, column] = a if s < 0.5 else b
+            else:
+                out[row, column] = c if s < 0.5 else d
 
 
-def _with_partner(disparity: F32, ideal: FloatArray, other: PinholeCamera | AlignedCamera, sign: float) -> F32:
-    """The disparities whose other end the other camera shows."""
-    ends = np.stack([ideal[..., 0] - sign * disparity, ideal[..., 1]], axis=-1)
-    return np.where(other.contains(other.lens_pixels(ends)), disparity, np.float32(np.nan))
+def _with_partner(disparity: F32, rig: StereoRig, side: Side) -> F32:
+    """The disparities (H, W) of a camera's pixels whose other end the other camera shows."""
+    sign, other = (1.0, rig.eye("right")) if side == "left" else (-1.0, rig.eye("left"))
+    rays = pixel_rays(rig, side).copy()
+    rays[..., 0] -= sign / rig.camera.fx * disparity
+    return np.where(other.contains(other.project(rays)), disparity, np.float32(np.nan))
