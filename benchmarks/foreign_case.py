@@ -14,15 +14,19 @@ from typing import Any
 import foreign_frames as frames
 import foreign_motion as motion
 import numpy as np
-from foreign_rig import NAMES, SIDES, Camera, Rig
+from foreign_rig import NAMES, Camera, Rig
 from foreign_world import Image, read_photographs
 from numpy.typing import NDArray
 
 import rsbench
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import Lens, PinholeCamera
-from rsbench.core.rig import StereoRig
+from rsbench.core.motion import Motion
+from rsbench.core.rig import FRAMES, SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.pipeline.chain import Given, correct_four
+from rsbench.pipeline.frame_depth import CorrectionOptions, known_depth
+from rsbench.vision.fusion import Fused
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ def case(row: str, seed: int = 0) -> Seen:
 def seen(drawn: frames.Case, rng: np.random.Generator) -> Seen:
     """What both cameras see of a world that the generator makes."""
     traced = frames.trace_case(drawn, rng, _photographs())
-    views = [(side, frame) for frame in (0, 1) for side in SIDES]
+    views = [(side, frame) for frame in FRAMES for side in SIDES]
     rolling, still = ([frames.grey(images[view]) for view in views] for images in (traced.rolling, traced.still))
     depth = [traced.depth[view] for view in views]
     return Seen(rolling, still, depth, *ours(drawn.rig), LinearMotion(*motion.between(drawn.law, 0.0, 1.0)))
@@ -79,6 +83,17 @@ def seen(drawn: frames.Case, rng: np.random.Generator) -> Seen:
 def corrected(images: list[NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter) -> Any:
     """What ``rsbench.correct`` makes of them where the shutter and the law are given."""
     return rsbench.correct(images, rig, shutter.readout_ratio, scanning=shutter.scanning, motion_model="linear")
+
+
+def truth_fed(
+    images: list[NDArray[np.uint8]], depth: list[Image], rig: StereoRig, shutter: RollingShutter, motion: Motion
+) -> dict[View, Fused]:
+    """What the same corrector makes of them with true depth (H, W) and motion: the most that a view allows."""
+    views = [(side, frame) for frame in FRAMES for side in SIDES]
+    seen = dict(zip(views, images, strict=True))
+    given = Given(motion=motion, pairs=known_depth(seen, dict(zip(views, depth, strict=True))))
+    options = CorrectionOptions(depth_from_motion=False)
+    return correct_four(seen, rig, shutter.readout_ratio, options, given=given, scanning=shutter.scanning).frames
 
 
 @cache

@@ -9,7 +9,7 @@ such frames cannot be right by a mistake that both share.
 Each case gets a folder ROW-SEED: left_0.png, right_0.png ... of two times, or left/ and right/ of more; the same
 below gs/, at the time of each frame's first line, without noise; told.toml and untold.toml, rigs for ``rsbench
 correct`` with and without what the shutter does; of the rows of general rigs camchain.yaml, the same as Kalibr
-writes it; and truth.json.
+writes it, and near.npz, the true inverse depth of each pixel; and truth.json.
 """
 
 from __future__ import annotations
@@ -344,6 +344,8 @@ def write_case(row: str, seed: int, folder: Path, photographs: list[Image]) -> f
         text = (card if row in RIGS else short_card)(case.rig, told)
         (folder / f"{name}.toml").write_text(text, "utf-8")
     if row in RIGS:
+        near = {picture(Path(), 2, *view).stem: np.float32(1.0) / depth for view, depth in traced.depth.items()}
+        np.savez_compressed(folder / "near.npz", **near)
         (folder / "camchain.yaml").write_text(camchain(case.rig), "utf-8")
     truth = {
         "row": row,

@@ -8,7 +8,7 @@ middle between both centres. Lenses are OpenCV's: k1, k2, p1, p2, k3, and k1 to 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -197,6 +197,16 @@ def equal(
         for scan in scans
     )
     return Rig(left=left, right=right)
+
+
+def loosened(rig: Rig, rng: np.random.Generator) -> Rig:
+    """The rig as a loose calibration has it: off by 0.2 deg, 0.1 deg of the baseline's direction, and 0.5 %."""
+    turn, lean = (Rotation.from_rotvec(np.radians(rng.normal(0.0, s, 3))).as_matrix() for s in (0.2, 0.1))
+    left, right = (
+        replace(c, fx=c.fx * longer, fy=c.fy * longer)
+        for c, longer in zip(rig._pair, np.exp(rng.normal(0.0, 0.005, 2)), strict=True)
+    )
+    return Rig(left=left, right=right, R=turn @ rig.R, t=lean @ rig.t)
 
 
 def turned(x: float, y: float, z: float) -> Array:

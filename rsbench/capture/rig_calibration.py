@@ -208,18 +208,49 @@ def refine_rig(
         return None
     problem = _Problem(found, rig, shutter, prior, motion_model)
     errors, thetas, H = problem.solved(start.copy(), thetas)
-    inverse = inverse_definite(H)
-    sigma = np.zeros(len(ERRORS))
-    if inverse is None:
+    sigma = problem.sigma(H)
+    if sigma is None:
         return None
-    sigma[problem.free] = np.sqrt(np.diagonal(inverse))
-    # Errors that matches share move all of them alike: no number of matches averages them away.
-    shared = _SHARED_PX / rig.camera.fx
-    sigma[problem.free] = np.minimum(np.hypot(sigma[problem.free], shared), prior[problem.free])
     count = sum(len(each.tracks) for each in found)
     return FoundRig(
         rig=with_errors(rig, errors), shutter=_read(shutter, errors), errors=errors, sigma=sigma, tracks=count
     )
+
+
+def agrees(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    prior: FloatArray,
+    deviations: float,
+    robust: RobustOptions | None = None,
+    seed: int = 0,
+    motion_model: str = "linear",
+) -> bool:
+    """Whether the first step of ``refine_rig`` from a calibration without errors finds none beyond the deviations.
+
+    It is a fifth of the work. One step is enough of errors that move rows by a fraction of a pixel: what it leaves
+    out is their square.
+    """
+    start = np.zeros(len(ERRORS))
+    found, thetas, _ = _moving(windows, rig, shutter, start, robust or RobustOptions(), seed, motion_model)
+    if not found:
+        return False
+    problem = _Problem(found, rig, shutter, prior, motion_model)
+    _, g, H, _ = problem.local(start, thetas)
+    sigma = problem.sigma(H)
+    if sigma is None:
+        return False
+    return bool(np.all(np.abs(np.linalg.solve(H, g)) <= deviations * sigma[problem.free]))
+
+
+def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
+    """Root mean square, px, over the image by which ``ERRORS`` (8,) move the rows of the right camera's rays."""
+    camera = rig.camera
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, 5), np.linspace(0, camera.height - 1, 5))
+    rays = camera.ideal.unproject(np.stack([x, y], axis=-1).reshape(-1, 2))[:, :2]
+    moved = _row_columns(rays) @ np.append(errors[:3], errors[5] - errors[6])
+    return camera.fx * float(np.sqrt(np.mean(moved**2)))
 
 
 def _moving(
@@ -272,6 +303,17 @@ class _Problem:
     ) -> None:
         self.windows, self.rig, self.shutter, self.prior, self.model = windows, rig, shutter, prior, motion_model
         self.free = np.flatnonzero(prior > 0.0)
+
+    def sigma(self, H: FloatArray) -> FloatArray | None:
+        """(8,) standard deviations of the errors by the Hessian of the free ones; None where it is singular."""
+        inverse, sigma = inverse_definite(H), np.zeros(len(ERRORS))
+        if inverse is None:
+            return None
+        # Errors that matches share move all of them alike: no number of matches averages them away.
+        shared = _SHARED_PX / self.rig.camera.fx
+        each = np.hypot(np.sqrt(np.diagonal(inverse)), shared)
+        sigma[self.free] = np.minimum(each, self.prior[self.free])
+        return sigma
 
     def _packed(self, window: _Window, errors: FloatArray) -> Packed:
         matches = Correspondences(tracks=window.tracks)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -38,6 +38,8 @@ WIDEST = 1.5
 _CONVERGED = 1e-14
 """Newton steps end when they are as short as this, relative to 1 + the radius: rounding."""
 _MOST_STEPS = 40
+_FEW = 16384
+"""Numbers of places whose ideal ones are remembered."""
 _ENTRIES = 4097
 """Radii of the table in which Newton's method for a rational lens starts."""
 
@@ -154,6 +156,12 @@ class Lens:
         wanted = np.asarray(xy, dtype=np.float64)
         if self.model == "double-sphere":
             return self._from_spheres(wanted)
+        if wanted.size > _FEW:
+            return self.solved(wanted)
+        return _of_few(self, wanted.tobytes(), wanted.shape).copy()
+
+    def solved(self, wanted: FloatArray) -> FloatArray:
+        """``undistort`` by Newton's method."""
         flat = wanted.reshape(-1, 2)
         ideal = self._start(flat)
         done = np.zeros(len(flat), dtype=np.bool_)
@@ -318,6 +326,12 @@ def _first_root(coefficients: list[float]) -> float:
 
 _TRIED = 33
 """Columns and rows of the points, spread over the whole image, at which a lens must be invertible."""
+
+
+@lru_cache(maxsize=64)
+def _of_few(lens: Lens, values: bytes, shape: tuple[int, ...]) -> FloatArray:
+    """``Lens.undistort`` of a few places: estimates of poses ask for the same ones again and again."""
+    return lens.solved(np.frombuffer(values).reshape(shape))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,16 @@ import numpy as np
 from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, check_rig, recalibrated
 from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
-from rsbench.capture.rig_calibration import FoundRig, prior_of, refine_rig, rotation_of_rows, with_errors
+from rsbench.capture.rig_calibration import (
+    ERRORS,
+    FoundRig,
+    agrees,
+    prior_of,
+    refine_rig,
+    rotation_of_rows,
+    rows_moved,
+    with_errors,
+)
 from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
     NoMotionError,
@@ -141,6 +150,8 @@ def find_rig(
 
 _CLEAR = 3.0
 """Deviations beyond which an error of a calibration is one: to estimate none costs accuracy of the motion."""
+_LIKELY_ROWS_PX = 0.3
+"""Rows' error, px, up to which a calibration is first tried as it is."""
 
 
 def rig_of_matches(
@@ -155,10 +166,28 @@ def rig_of_matches(
         return None
     ideal = without_lens(matches, rig)
     rows = rotation_of_rows(np.concatenate([ideal.stereo_0, ideal.stereo_1]), rig, options.seed)
-    found = None if rows is None else _refined(matches, rig, rows[0], inputs, options)
+    if rows is None or (
+        rows_moved(rows[0], rig) < _LIKELY_ROWS_PX and _as_calibrated(matches, rig, inputs, options)
+    ):
+        return None
+    found = _refined(matches, rig, rows[0], inputs, options)
     # Rows differ by the motion too, where both cameras read a point at two times: that is no error.
     agrees = found is None or bool(np.all(np.abs(found.errors) <= _CLEAR * found.sigma))
     return None if agrees else found
+
+
+def _as_calibrated(
+    matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+) -> bool:
+    """Whether the matches agree with the calibration; False where the ratio is unknown, or that is not clear."""
+    if inputs.readout_ratio is None:
+        return False
+    prior, model = prior_of(np.zeros(len(ERRORS))), _law(options)
+    return agrees([matches], rig, inputs.shutter_of(rig), prior, _CLEAR, options.robust, options.seed, model)
+
+
+def _law(options: CorrectionOptions) -> str:
+    return options.motion_model if options.motion_model in MODELS else "linear"
 
 
 def _refined(
@@ -170,8 +199,8 @@ def _refined(
         shutter = inputs.shutter_of(turned)
     else:
         shutter = solve_frames(matches, turned, inputs, options, with_motion=False).shutter
-    model = options.motion_model if options.motion_model in MODELS else "linear"
-    return refine_rig([matches], rig, shutter, start, prior_of(start), options.robust, options.seed, str(model))
+    prior = prior_of(start)
+    return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _law(options))
 
 
 def match_unknown(
