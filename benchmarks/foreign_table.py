@@ -3,7 +3,7 @@
 Each case is corrected twice: told everything (readout ratio, scans, and the law of motion where rsbench knows it),
 and told nothing but the cameras. Those of ``RIGS`` are corrected with rig.toml, with Kalibr's file, with a loose
 calibration, and rectified as ``rectify_study.py`` does. Frames are compared with the traced global-shutter ones
-on the pixels that the correction claims (mask above 0); the gain is over the uncorrected frames on the same pixels.
+on the pixels that the correction claims (mask above 0); the gain is over the uncorrected frames on the same ones.
 
 Another rig has another view, whose textures may be harder to resample. Rigs are therefore compared by what they
 lose to the same corrector fed with the true depth and motion, on the pixels that both claim.

@@ -260,12 +260,14 @@ def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: Stereo
     """
     options, reach = MatchOptions(), float(max(left.shape[:2]))
     eyes = [rig.eye(side) for side in SIDES]
-    a, b = (
-        detect(undistorted(level, eye), options) for level, eye in zip(eight_bit([left, right]), eyes, strict=True)
-    )
+    levels = zip(eight_bit([left, right]), eyes, strict=True)
+    if rig.aligned:
+        a, b = (detect(undistorted(level, eye), options) for level, eye in levels)
+    else:  # as matches will ask for them
+        a, b = (detect(level, options, eye) for level, eye in levels)
     anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     pairs = match(a, b, anywhere, options)
-    ends = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
+    ends = a.places[pairs[:, 0]], b.places[pairs[:, 1]]
     # Beyond the borders of what the lens shows there is a mirror of it.
     shown = np.logical_and.reduce(
         [eye.contains(eye.lens_pixels(end)) for eye, end in zip(eyes, ends, strict=True)]

@@ -36,7 +36,6 @@ from rsbench.core.arguments import check_ranges
 from rsbench.core.camera import Lens
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import grey_u8, guided_upsample, halved, keys_weights, resample
@@ -556,9 +555,6 @@ def _is_far(area: Mask, disparity: NDArray[np.float32], far: float) -> bool:
     return rim.size == 0 or float(np.quantile(rim, 0.25)) <= far
 
 
-_CHUNK = 1 << 16
-
-
 def timed_depth(
     depth: F32, rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int
 ) -> F32:
@@ -568,30 +564,13 @@ def timed_depth(
     at another time. The depth is that at which the other camera, where it was then, sees the point in that column.
     What is unknown (0) and infinitely far (inf) stays so; a point behind either camera becomes infinitely far.
     """
-    sign = 1.0 if side == "left" else -1.0
-    other: Side = "right" if side == "left" else "left"
-    all_rays, ideal, partner = pixel_rays(rig, side), rig.camera.ideal, rig.eye(other)
-    out, depth = depth.copy(), body_depth(depth, rig, side)
-    y, x = np.nonzero((depth > 0.0) & np.isfinite(depth))
-    poses, axis = rig.eye_from_world(motion, shutter.line_times(frame, side), side), shutter.axis(side)
-    for start in range(0, len(y), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        pixels = np.stack([x[part], y[part]], axis=-1)
-        lines = pixels[:, axis]
-        rays = all_rays[y[part], x[part]]
-        ends = ideal.project(rays)
-        ends[:, 0] -= sign * rig.disparity(depth[y[part], x[part]])
-        tau = shutter.pixel_time(partner.lens_pixels(ends), frame, other)
-        # Beyond what the lens shows there is no time: as if it were read with the pixel itself.
-        tau = np.where(np.isnan(tau), shutter.pixel_time(pixels, frame, side), tau)
-        R, t = compose(rig.eye_from_world(motion, tau, other), inverse(Pose(poses.R[lines], poses.t[lines])))
-        column = ideal.unproject(ends)[:, 0]
-        turned = (R @ rays[..., None])[..., 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = (column * t[:, 2] - t[:, 0]) / (turned[:, 0] - column * turned[:, 2])
-        ahead = np.isfinite(z) & (z > 0.0) & (turned[:, 2] * z + t[:, 2] > 0.0)
-        own = 1.0 if rig.aligned else own_depths(rig, side)[y[part], x[part]]
-        out[y[part], x[part]] = np.where(ahead, z * own, np.inf)
+    pair = _pair({each: _eye(rig, shutter, motion, each, frame) for each in SIDES}, rig.ideal, side)
+    own = np.ones(depth.shape, np.float32) if rig.aligned else own_depths(rig, side)
+    out, other = depth.copy(), "right" if side == "left" else "left"
+    # The line of the other camera that is read with one of this camera, by both lines' times.
+    (a, b), (c, d) = (shutter.line_time(np.array([0.0, 1.0]), frame, each) for each in (side, other))
+    same = (0.0, 0.0) if c == d else (float((a - c) / (d - c)), float((b - a) / (d - c)))
+    _fill_timed(depth, own, pixel_rays(rig, side), pair, same, out)
     return out
 
 
@@ -819,21 +798,29 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
 
 @compiled(error_model="numpy", inline="always")
 def _inverse_depth(pair: _Pair, x: float, y: float, p: float, q: float) -> float:
-    """Inverse depth, 1 / m, of the ray (x, y, 1) whose point the other camera sees along (p, q, 1); NaN: none.
-
-    By the column of that ray, as disparities are; its row holds the guess that the image was resampled by.
-    """
+    """``_rho`` where both cameras show these rays; NaN elsewhere."""
     eye, other = pair.eye, pair.other
     u, v = _seen_at(other, p, q, 1.0)
     if not (-0.5 <= u <= other.size[0] - 0.5 and -0.5 <= v <= other.size[1] - 0.5):
         return np.nan
-    below, s = _line(other, u if other.columns else v)
-    d, e = _pose(other.lines, below, s, 0), _pose(other.lines, below, s, 2)
-    there = _pose(other.lines, below, s, 3)
+    there = u if other.columns else v
     u, v = _seen_at(eye, x, y, 1.0)
     if not abs(u + v) < np.inf:
         return np.nan
-    below, s = _line(eye, u if eye.columns else v)
+    return _rho(pair, x, y, p, u if eye.columns else v, there)
+
+
+@compiled(error_model="numpy", inline="always")
+def _rho(pair: _Pair, x: float, y: float, p: float, here_line: float, there_line: float) -> float:
+    """Inverse depth, 1 / m, of the ray (x, y, 1) whose point the other camera sees in column p; NaN: none.
+
+    By the column, x / z, alone, as disparities are; the row holds the guess that the image was resampled by.
+    """
+    eye, other = pair.eye, pair.other
+    below, s = _line(other, there_line)
+    d, e = _pose(other.lines, below, s, 0), _pose(other.lines, below, s, 2)
+    there = _pose(other.lines, below, s, 3)
+    below, s = _line(eye, here_line)
     a, b = _pose(eye.lines, below, s, 0), _pose(eye.lines, below, s, 1)
     c, t = _pose(eye.lines, below, s, 2), _pose(eye.lines, below, s, 3)
     # In the world's axes: the ray, and the way from the own camera's centre to it.
@@ -844,7 +831,25 @@ def _inverse_depth(pair: _Pair, x: float, y: float, p: float, q: float) -> float
     step_x = there[0] - (d[0] * far_x + d[1] * far_y + d[2] * far_z)
     step_z = there[2] - (e[0] * far_x + e[1] * far_y + e[2] * far_z)
     rho = (ray_x - p * ray_z) / (p * step_z - step_x)
-    return rho if 0.0 <= rho < np.inf else np.nan
+    return rho if 0.0 <= rho < np.inf and ray_z + rho * step_z > 0.0 else np.nan
+
+
+@compiled(error_model="numpy")
+def _fill_timed(depth: F32, own: F32, rays: FloatArray, pair: _Pair, same: tuple[float, float], out: F32) -> None:
+    """``timed_depth``; ``same``: the other camera's line read with line 0 of this one, and more per line."""
+    eye, other = pair.eye, pair.other
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            if not (0.0 < depth[row, column] < np.inf):
+                continue
+            x, y = rays[row, column, 0], rays[row, column, 1]
+            p = x - pair.shift / pair.level[0] * own[row, column] / depth[row, column]
+            u, v = _seen_at(other, p, y, 1.0)
+            line, there = float(column if eye.columns else row), u if other.columns else v
+            if not abs(there) < np.inf:
+                there = same[0] + same[1] * line  # the lens does not show it: as if read with the pixel itself
+            rho = _rho(pair, x, y, p, line, there)
+            out[row, column] = own[row, column] / rho if rho > 0.0 else np.inf
 
 
 @compiled(error_model="numpy")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsbench.capture.rig_calibration import prior_of, refine_rig, rotation_of_rows, with_errors
+from rsbench.capture.rig_calibration import agrees, prior_of, refine_rig, rotation_of_rows, rows_moved, with_errors
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
@@ -92,6 +92,17 @@ def test_a_loose_calibration_is_found_within_the_stated_deviations() -> None:
     assert np.mean(squares < 9.0) >= 0.95
     # Chi-squared of 84: the mean lies between 0.6 and 1.6 in all but one of ten thousand.
     assert 0.4 < np.mean(squares) < 1.6
+
+
+def test_one_step_decides_whether_a_calibration_agrees() -> None:
+    """What rows hardly show, an error of the convergence, shows in one step as it does in the whole estimate."""
+    prior = prior_of(np.zeros(8))
+    for seed in range(3):
+        tracks = Correspondences(tracks=tracks_of(np.random.default_rng(200 + seed), 0.3, 250))
+        assert agrees([tracks], TRUE, SHUTTER, prior, 3.0)
+        turned = with_errors(TRUE, np.eye(8)[1] * np.deg2rad(0.15))
+        assert rows_moved(np.eye(8)[1] * np.deg2rad(0.15), TRUE) < 0.3
+        assert not agrees([tracks], turned, SHUTTER, prior, 3.0)
 
 
 def test_a_late_right_camera_is_found_with_its_rotation() -> None:
