@@ -338,7 +338,7 @@ def _of_rigs(outcomes: Sequence[Outcome]) -> list[str]:
             beyond = [name for name, value in found.items() if value > LIMITS[name]]
             beyond += ["dB"] if more and np.median(more) > LIMITS["dB"] else []
         else:
-            cells, beyond = [*cells, *["-"] * (len(head) - 5)], []
+            cells, beyond = [*cells, *["-"] * (len(head) - 5)], list[str]()
         lines.append(f"| {' | '.join([*cells, ', '.join(beyond)])} |")
     return lines
 

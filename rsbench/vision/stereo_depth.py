@@ -48,7 +48,6 @@ from rsbench.vision.stereo_matcher import (
     body_depth,
     find_disparities,
     level_pixels,
-    level_places,
     own_depths,
     pixel_rays,
     widened,
@@ -584,6 +583,8 @@ _STEPS, _SAME_LINE = 6, 1e-3
 one line; and the step, lines, after which it ends."""
 _ONE_SURFACE_PX = 1.0
 """Neighbours that the motion moves more unlike are not interpolated between."""
+_ORDINARY = 1 / 32
+"""Disparity of ordinary things, widths of the level image."""
 _SMOOTH = 5
 """Window, px, of the median filter on known inverse depth before images are resampled by it."""
 
@@ -611,6 +612,8 @@ class _Pair(NamedTuple):
     """fx, fy, cx, cy."""
     shift: float
     """px from a place of the other level image to its partner in the own one, of inverse depth 1 / m."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Slope of the level images' row 0 in the body's axes, and by how much more that of each further row is."""
 
 
 def moving_disparities(
@@ -626,27 +629,68 @@ def moving_disparities(
     A disparity is that which the other camera would have shown at the time of the pixel: ``rig.depth`` makes it
     the depth, along the body's z, from the camera of the pixel's own line. ``images`` (H, W[, 3]) by side.
 
-    Where the other camera, read at other times, saw a point depends on its depth. The left image's is found in
-    rounds at a quarter of the size, then at full size; the right one's begins with the left one's.
+    The rig moves between both times, so that epipolar lines are those of another baseline: level images are tilted
+    along them. What is left of where the other camera saw a point depends on its depth. The left image's is found
+    in rounds at a quarter of the size, then at full size; the right one's begins with the left one's.
 
     Raises:
         RsbenchError: see ``find_disparities``.
     """
     eyes = {side: _eye(rig, shutter, motion, side, frame) for side in SIDES}
     level, gain = replace(rig.ideal, camera=widened(rig)), rig.camera.fx * rig.baseline
-    own = {
-        side: images[side] if rig.rectified else resample(images[side], level_places(rig, side)) for side in SIDES
-    }
-    rho, found = _first_guess(entry, own["left"], images["right"], level, _pair(eyes, level, "left")), list[F32]()
+    tilt, own = _tilt(_pair(eyes, level, "left"), level), dict[Side, U8]()
+    level, tilt, pad = _heightened(level, tilt)
+    for side in SIDES:
+        places = np.full((level.camera.height, level.camera.width, 2), np.nan, np.float32)
+        _fill_places(_pair(eyes, level, side, tilt), places)
+        own[side] = resample(images[side], places)
+    rho = _first_guess(entry, own["left"], images["right"], level, _pair(eyes, level, "left", tilt))
+    found = list[F32]()
     for side, other in (SIDES, SIDES[::-1]):
-        pair = _pair(eyes, level, side)
+        pair = _pair(eyes, level, side, tilt)
         ends, rays = _ends(pair, rho)
         here = _of_one(entry, own[side], resample(images[other], ends), level, side)
         disparity = np.full_like(here, np.nan)
         _fill_disparities(here, rays, pair, disparity)
         rho = _without_holes(disparity / np.float32(gain))
-        found.append(disparity if rig.rectified else between_pixels(disparity, level_pixels(rig, side)))
+        found.append(between_pixels(disparity, _untilted(level_pixels(rig, side), pair, pad)))
     return found[0], found[1]
+
+
+def _tilt(pair: _Pair, level: StereoRig) -> tuple[float, float]:
+    """``_Pair.tilt`` along which the other camera sees points of a ray from infinity to an ordinary disparity."""
+    camera = level.camera.resized(level.camera.width // _SMALL, level.camera.height // _SMALL)
+    small = pair._replace(level=(camera.fx, camera.fy, camera.cx, camera.cy), shift=camera.fx * level.baseline)
+    step = max(round(camera.width * _ORDINARY), 1)
+    far = np.zeros((camera.height, camera.width), np.float32)
+    (_, there), (_, near) = _ends(small, far), _ends(small, far + np.float32(step / small.shift))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along, across = np.moveaxis(near[:, :-step] - there[:, step:], -1, 0)
+        slopes = across / along
+    known = np.isfinite(slopes).sum(axis=1) > slopes.shape[1] // 4
+    if np.count_nonzero(known) < 2:
+        return 0.0, 0.0
+    rows = ((np.arange(camera.height) + 0.5) * (level.camera.height / camera.height) - 0.5)[known]
+    steeper, first = np.polyfit(rows, np.nanmedian(slopes[known], axis=1), 1)
+    return float(first), float(steeper)
+
+
+def _heightened(level: StereoRig, tilt: tuple[float, float]) -> tuple[StereoRig, tuple[float, float], int]:
+    """The level images with so many more rows above and below that the tilt cuts nothing off, and their tilt."""
+    camera = level.camera
+    x = max(camera.cx, camera.width - 1 - camera.cx) / camera.fx
+    steepest = max(abs(tilt[0]), abs(tilt[0] + tilt[1] * (camera.height - 1)))
+    pad = min(math.ceil(steepest * x * camera.fy), camera.height // 4)
+    taller = replace(camera, height=camera.height + 2 * pad, cy=camera.cy + pad)
+    return replace(level, camera=taller), (tilt[0] - tilt[1] * pad, tilt[1]), pad
+
+
+def _untilted(places: FloatArray, pair: _Pair, pad: int) -> FloatArray:
+    """Places (H, W, 2) of the tilted level image, of those of the one that is not and has ``pad`` rows less."""
+    (fx, fy, cx, _), (first, steeper) = pair.level, pair.tilt
+    x, out = (places[..., 0] - cx) / fx, places.copy()
+    out[..., 1] = (places[..., 1] + pad - fy * first * x) / (1.0 + fy * steeper * x)
+    return out
 
 
 def _eye(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int) -> _Eye:
@@ -657,12 +701,14 @@ def _eye(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, fr
     return _Eye(camera.ideal.K @ rig.own(side).R, table, lines, shutter.axis(side) == 0, size)
 
 
-def _pair(eyes: Mapping[Side, _Eye], level: StereoRig, side: Side) -> _Pair:
+def _pair(
+    eyes: Mapping[Side, _Eye], level: StereoRig, side: Side, tilt: tuple[float, float] = (0.0, 0.0)
+) -> _Pair:
     camera, gain = level.camera, level.camera.fx * level.baseline
     numbers = camera.fx, camera.fy, camera.cx, camera.cy
     if side == "left":
-        return _Pair(eyes["left"], eyes["right"], numbers, gain)
-    return _Pair(eyes["right"], eyes["left"], numbers, -gain)
+        return _Pair(eyes["left"], eyes["right"], numbers, gain, tilt)
+    return _Pair(eyes["right"], eyes["left"], numbers, -gain, tilt)
 
 
 def _first_guess(entry: MatcherEntry, own: U8, there: U8, level: StereoRig, pair: _Pair) -> F32:
@@ -675,8 +721,9 @@ def _first_guess(entry: MatcherEntry, own: U8, there: U8, level: StereoRig, pair
     size = level.camera.width, level.camera.height
     shrink = max(min(_SMALL, min(size) // _LEAST_SIDE), 1)
     width, height = size[0] // shrink, size[1] // shrink
-    level = replace(level, camera=level.camera.resized(width, height))
-    pair = _pair({"left": pair.eye, "right": pair.other}, level, "left")
+    level, down = replace(level, camera=level.camera.resized(width, height)), size[1] / height
+    tilt = pair.tilt[0] + pair.tilt[1] * 0.5 * (down - 1.0), pair.tilt[1] * down
+    pair = _pair({"left": pair.eye, "right": pair.other}, level, "left", tilt)
     taken = max(pair.other.size[0] // shrink, 1), max(pair.other.size[1] // shrink, 1)
     scale = np.divide(taken, pair.other.size).astype(np.float32)
     small, there = (
@@ -736,6 +783,25 @@ def _seen_at(eye: _Eye, x: float, y: float, z: float) -> tuple[float, float]:
 
 
 @compiled(error_model="numpy", inline="always")
+def _level_ray(pair: _Pair, column: float, row: int) -> tuple[float, float]:
+    """x / z, y / z of a place of the level images."""
+    x = (column - pair.level[2]) / pair.level[0]
+    return x, (row - pair.level[3]) / pair.level[1] + (pair.tilt[0] + pair.tilt[1] * row) * x
+
+
+@compiled(error_model="numpy")
+def _fill_places(pair: _Pair, places: F32) -> None:
+    """Pixels (H, W, 2) of the own camera at which it sees what its level image shows; NaN beside it."""
+    eye = pair.eye
+    for row in range(places.shape[0]):
+        for column in range(places.shape[1]):
+            x, y = _level_ray(pair, column, row)
+            u, v = _seen_at(eye, x, y, 1.0)
+            if -0.5 <= u <= eye.size[0] - 0.5 and -0.5 <= v <= eye.size[1] - 0.5:
+                places[row, column, 0], places[row, column, 1] = u, v
+
+
+@compiled(error_model="numpy", inline="always")
 def _line(eye: _Eye, along: float) -> tuple[int, float]:
     """The line before a place, and the share of the next one: poses between lines are interpolated straight.
 
@@ -761,12 +827,11 @@ def _pose(lines: FloatArray, below: int, s: float, k: int) -> Vector:
 @compiled(error_model="numpy")
 def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
     eye, other = pair.eye, pair.other
-    fx, fy, cx, cy = pair.level
     width, height = other.size
     for row in range(rho.shape[0]):
         for column in range(rho.shape[1]):
             far = rho[row, column]
-            x, y = (column + pair.shift * far - cx) / fx, (row - cy) / fy
+            x, y = _level_ray(pair, column + pair.shift * far, row)
             u, v = _seen_at(eye, x, y, 1.0)
             if not abs(u + v) < np.inf:
                 continue
@@ -777,7 +842,8 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
             X = a[0] * p + b[0] * q + c[0] * r
             Y = a[1] * p + b[1] * q + c[1] * r
             Z = a[2] * p + b[2] * q + c[2] * r
-            u, v = _seen_at(other, (column - cx) / fx, y, 1.0)
+            p, q = _level_ray(pair, column, row)
+            u, v = _seen_at(other, p, q, 1.0)
             before = u if other.columns else v
             for _ in range(_STEPS):
                 below, s = _line(other, before)
@@ -855,19 +921,17 @@ def _fill_timed(depth: F32, own: F32, rays: FloatArray, pair: _Pair, same: tuple
 @compiled(error_model="numpy")
 def _fill_inverse_depths(disparity: F32, rays: F32, pair: _Pair, rho: F32) -> None:
     """On the other level image, whose disparities (H, W) these are."""
-    fx, fy, cx, cy = pair.level
     sign = 1.0 if pair.shift > 0.0 else -1.0
     for row in range(rho.shape[0]):
         for column in range(rho.shape[1]):
-            x = (column + sign * disparity[row, column] - cx) / fx
-            p, q = rays[row, column, 0], rays[row, column, 1]
-            rho[row, column] = _inverse_depth(pair, x, (row - cy) / fy, p, q)
+            x, y = _level_ray(pair, column + sign * disparity[row, column], row)
+            rho[row, column] = _inverse_depth(pair, x, y, rays[row, column, 0], rays[row, column, 1])
 
 
 @compiled(error_model="numpy")
 def _fill_disparities(matched: F32, rays: F32, pair: _Pair, disparity: F32) -> None:
     """On the own level image, from those that were ``matched`` with the other one as it was resampled."""
-    fx, fy, cx, cy = pair.level
+    fx, fy = pair.level[0], pair.level[1]
     sign, gain, last = (1.0 if pair.shift > 0.0 else -1.0), abs(pair.shift), matched.shape[1] - 1
     for row in range(matched.shape[0]):
         for column in range(matched.shape[1]):
@@ -875,13 +939,15 @@ def _fill_disparities(matched: F32, rays: F32, pair: _Pair, disparity: F32) -> N
             if not (-0.5 <= at <= last + 0.5):
                 continue
             i = min(max(int(np.floor(at)), 0), last - 1)
-            s, y = at - i, (row - cy) / fy
+            s = at - i
             # What the motion adds to the level ray is alike in neighbours of one surface.
-            p, q = rays[row, i, 0] - (i - cx) / fx, rays[row, i, 1] - y
-            along, across = rays[row, i + 1, 0] - (i + 1 - cx) / fx - p, rays[row, i + 1, 1] - y - q
+            (x, y), (x2, y2) = _level_ray(pair, i, row), _level_ray(pair, i + 1, row)
+            p, q = rays[row, i, 0] - x, rays[row, i, 1] - y
+            along, across = rays[row, i + 1, 0] - x2 - p, rays[row, i + 1, 1] - y2 - q
             one = abs(along) * fx <= _ONE_SURFACE_PX and abs(across) * fy <= _ONE_SURFACE_PX
             s = s if one else np.floor(s + 0.5)
             if s != 0.0:
                 p, q = p + s * along, q + s * across
-            found = _inverse_depth(pair, (column - cx) / fx, y, (at - cx) / fx + p, y + q)
+            (x, y), (x2, y2) = _level_ray(pair, column, row), _level_ray(pair, at, row)
+            found = _inverse_depth(pair, x, y, x2 + p, y2 + q)
             disparity[row, column] = gain * found
