@@ -82,6 +82,26 @@ def test_a_shaken_body_starts_at_rest_in_the_world_and_shakes_as_strongly_as_sai
     assert np.all((law.amplitudes[3:] > 0.002) & (law.amplitudes[3:] < 0.008))
 
 
+def test_depth_is_that_of_a_wall(programs_: Programs) -> None:
+    """z = n c / (n ray) of a pixel's ray, in the camera of its line; infinite beside the wall."""
+    foreign, law = programs_.rig.equal(ratio=0.8, **SMALL), programs_.motion.Linear(W, D)
+    corner, across, down = np.array([-0.5, -9.0, 4.0]), np.array([9.0, 0.0, 2.0]), np.array([0.0, 18.0, 0.0])
+    quad = programs_.world.Quad(corner, across, down)
+    world = programs_.world.assemble([quad], [np.zeros((8, 8), np.float32)])
+    camera = foreign.left
+    R, t = foreign.poses(law, "left", camera.times(1))
+    found = programs_.frames.trace_depth(world, camera, (R, t))
+    rays = programs_.case.our_camera(camera).unproject(
+        np.stack(np.meshgrid(np.arange(160), np.arange(120)), axis=-1)
+    )
+    normal = R @ np.cross(across, down)
+    distance = np.sum(normal * (R @ corner + t), axis=-1)
+    known = np.isfinite(found)
+    true = distance[:, None] / np.sum(normal[:, None] * rays, axis=-1)
+    np.testing.assert_allclose(found[known], true[known], rtol=1e-5)  # of float32
+    assert 0.4 < np.mean(known) < 0.9
+
+
 @pytest.mark.parametrize(("ratio", "scans", "k1"), CASES)
 @pytest.mark.parametrize("side", SIDES)
 def test_dots_are_drawn_where_the_row_equation_has_them(
