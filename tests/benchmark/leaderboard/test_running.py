@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -370,3 +371,19 @@ def test_entries_of_laws_answer_what_is_asked() -> None:
     choosers = {protocol for protocol, names in entries.items() if motion_tracks.CHOOSES in names}
     assert choosers == {"points-2", "pose-2", "readout-3"} and entries["points-2"] == entries["pose-2"]
     assert "gyro" not in entries["correction-3"]
+
+
+def test_the_first_problems_are_a_split_of_their_own_ranked_beside_stored_entries(tmp_path: Path) -> None:
+    split, stored, board = TRACKS["points"].split(None), tmp_path / "stored", tmp_path / "board"
+    stored.mkdir()
+    truth = write_truth(split, tmp_path / "truth")
+    (stored / "truth.jsonl.xz").write_bytes(lzma.compress(truth.read_bytes()))
+    where = ("--entry", "gs-8pt", "--board", board, "--beside", stored, "--workers", "1")
+    ran = run_here("leaderboard", "run", "points", *where, "--problems", "3")
+    assert ran.returncode == 0, ran.stderr
+    assert "oracle" in ran.stdout and "gs-8pt" in ran.stdout
+    ((protocol, name),) = splits_of(board)
+    assert name != split.name
+    (entry,) = entries_of(board, protocol, name)  # what is stored is beside the board, not on it
+    assert list(entry.scores["problem"]) == list(split.by_name)[:3]
+    assert_refused(run_here("leaderboard", "run", "points", *where, "--problems", "1000"), "--problems 1000")
