@@ -15,6 +15,7 @@ show stays at the prior, and its deviation says so.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.rig import RigCamera, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import clustered, larger, variance_factor
 from rsbench.solvers.engine.packed import Packed, heavy_tailed, inverse_definite, pack
 from rsbench.solvers.engine.residuals import add_tracks
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
@@ -193,6 +195,9 @@ def refine_rig(
         start: (8,) errors near the right ones, such as ``rotation_of_rows`` gives.
         prior: (8,) standard deviations of the errors about 0; 0 is exact.
 
+    Of several windows, errors count as they scatter from window to window: motion that no law describes, and
+    things that move by themselves, pull the convergence by several deviations of the noise.
+
     Returns:
         None where no motion explains the tracks.
     """
@@ -208,7 +213,7 @@ def refine_rig(
         return None
     problem = _Problem(found, rig, shutter, prior, motion_model)
     errors, thetas, H = problem.solved(start.copy(), thetas)
-    sigma = problem.sigma(H)
+    sigma = problem.sigma(H, problem.pulls(errors, thetas))
     if sigma is None:
         return None
     count = sum(len(each.tracks) for each in found)
@@ -304,11 +309,23 @@ class _Problem:
         self.windows, self.rig, self.shutter, self.prior, self.model = windows, rig, shutter, prior, motion_model
         self.free = np.flatnonzero(prior > 0.0)
 
-    def sigma(self, H: FloatArray) -> FloatArray | None:
+    def pulls(self, errors: FloatArray, thetas: Sequence[FloatArray]) -> FloatArray:
+        """(windows, k) gradient of each window's cost by the free errors, its motion fitted."""
+        out, weight = list[FloatArray](), self.prior[self.free] ** -2.0
+        for window, theta in zip(self.windows, thetas, strict=True):
+            alone = copy.copy(self)
+            alone.windows = [window]
+            out.append(alone.local(errors, [theta])[1] - weight * errors[self.free])
+        return np.array(out)
+
+    def sigma(self, H: FloatArray, pulls: FloatArray | None = None) -> FloatArray | None:
         """(8,) standard deviations of the errors by the Hessian of the free ones; None where it is singular."""
         inverse, sigma = inverse_definite(H), np.zeros(len(ERRORS))
         if inverse is None:
             return None
+        if pulls is not None and len(pulls) > 1:
+            scatter = clustered(pulls @ inverse, np.arange(len(pulls)))
+            inverse = larger(scatter * variance_factor(len(pulls) - 1.0, 1), inverse)
         # Errors that matches share move all of them alike: no number of matches averages them away.
         shared = _SHARED_PX / self.rig.camera.fx
         each = np.hypot(np.sqrt(np.diagonal(inverse)), shared)

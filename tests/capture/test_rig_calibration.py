@@ -117,3 +117,33 @@ def test_a_late_right_camera_is_found_with_its_rotation() -> None:
     assert found.sigma[7] < 0.005
     assert found.shutter.right_delay == pytest.approx(-0.02 + found.errors[7])
     assert "right camera later by" in found.words
+
+
+def test_a_start_of_wrong_convergence_is_not_kept() -> None:
+    """Rows do not show it: of two starts the one counts under which more tracks agree with a motion."""
+    rng = np.random.default_rng(8)
+    tracks, errors = tracks_of(rng, 0.3, 250), np.array([*np.deg2rad([0.2, -0.1, 0.1, 0.0, 0.0]), 0.0, 0.0, 0.0])
+    given = with_errors(TRUE, errors)
+    start = -errors + np.deg2rad(4.0) * np.eye(8)[1]
+    found = refine_rig([Correspondences(tracks=tracks)], given, SHUTTER, start, prior_of(-errors))
+    assert found is not None
+    assert abs(found.errors[1] + errors[1]) < 4.0 * found.sigma[1] < np.deg2rad(0.2)
+
+
+def test_windows_that_pull_apart_state_larger_deviations() -> None:
+    """Each has a convergence of its own, as things that move by themselves make it: their scatter counts."""
+    rng, windows = np.random.default_rng(9), list[Correspondences]()
+    turns = np.deg2rad([-0.1, 0.1, -0.06, 0.08])
+    for turn in turns:
+        tracks = tracks_of(rng, 0.1, 150)
+        shift = 527.0 * turn * np.ones(len(tracks))  # what a turn of the right camera does near the middle
+        tracks[:, [2, 6]] += shift[:, None]
+        windows.append(Correspondences(tracks=tracks))
+    none = np.zeros(8)
+    one, pooled = (refine_rig(each, TRUE, SHUTTER, none, prior_of(none)) for each in (windows[:1], windows))
+    assert one is not None
+    assert pooled is not None
+    assert abs(one.errors[1]) > 3.0 * one.sigma[1]
+    # The mean of four such turns has a deviation of half of their scatter, 0.045 deg.
+    assert np.deg2rad(0.03) < pooled.sigma[1]
+    assert abs(pooled.errors[1] + np.mean(turns)) < 3.0 * pooled.sigma[1]
