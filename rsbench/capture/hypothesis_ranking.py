@@ -40,7 +40,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, without_len
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.packed import each_term, heavy_tailed
+from rsbench.solvers.engine.packed import HeavyTailed, each_term, heavy_tailed
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
@@ -333,7 +333,9 @@ def window_evidence(
         return None
     full, near = sharpened
     sharp = _Slope(comparison.cost(full, near[0].hypothesis), near[0])
-    dispersion = _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else 1.0
+    dispersion = (
+        _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else comparison.shared(full, sharp.best)
+    )
     near = _near(near, full.scale, _LIKELY * dispersion)
     slopes = [sharp, *(_Slope(comparison.cost(full, fit.hypothesis), fit) for fit in near[1:])]
     reference, unit = min(slope.best.cost for slope in slopes), full.scale**2 * dispersion
@@ -481,6 +483,15 @@ class _Comparison:
                 break
             scale = full.scale
         return full, _near(fits, full.scale)
+
+    def shared(self, likelihood: Likelihood, fit: CaptureFit) -> float:
+        """Variance of the motion over the one that independent errors would give, at least 1."""
+        read = self.timed[fit.hypothesis.motion_model].read(fit.hypothesis.scans, likelihood.chosen)
+        packed, trust = read.packed(fit.unknowns), likelihood.trust
+        trust = np.ones(read.count) if trust is None else trust
+        tailed = HeavyTailed(**vars(packed), nu=likelihood.nu, scale=likelihood.scale, trust=trust)
+        stated = tailed.stated(fit.theta)
+        return 1.0 if stated is None else stated.shared
 
     def distribution(self, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:
         """Of the errors under one fit, of the chosen matches that are not wrong."""

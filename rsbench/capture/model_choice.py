@@ -14,6 +14,7 @@ from rsbench.capture.two_frame_estimate import CERTAIN, Capture
 from rsbench.components.motion_models import load_kernel, make_motion
 from rsbench.core.motion import Motion
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import spread_about
 
 AUTO = "auto"
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
@@ -30,7 +31,7 @@ class ModelChoice:
     probability: Mapping[str, float]
     """Of each model that was compared, the most probable first."""
     decided: bool
-    """Whether the first of them is beyond doubt."""
+    """Whether the one that is used has a probability of 0.95 and more."""
     rival: str
     """The most probable other one; empty where none was compared."""
     d_angle_deg: float
@@ -38,7 +39,8 @@ class ModelChoice:
     d_length_percent: float
     """By how much the rival's d is longer."""
     spread: FloatArray
-    """(6, 6) what the uncertain ratio, offset and parameters of the model add to the covariance."""
+    """(6, 6) what the uncertain ratio, offset and parameters of the model add to the covariance, and what the
+    other models do by how far their motions are from this one's, where the matches chose it."""
 
     def record(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -65,7 +67,7 @@ class ModelChoice:
 
 
 def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
-    """The most probable model; where that is in doubt linear, the paper's, unless the matches exclude it.
+    """The most probable model; the distance of the others' motions is in ``spread``, by their probabilities.
 
     None where no hypothesis was compared.
 
@@ -76,12 +78,14 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
         return None
     probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
     best = next(iter(probability))
-    undecided = probability[best] < CERTAIN and probability.get("linear", 0.0) > 1.0 - CERTAIN
-    used = requested if requested != AUTO else "linear" if undecided else best
+    used = best if requested == AUTO else requested
     rival = next((name for name in probability if name != used), "")
-    d = motion_at(capture.peaks[used]).d
-    other = motion_at(capture.peaks[rival]).d if rival else d
-    angle, percent = _apart(d, other)
+    motions = {name: motion_at(capture.peaks[name]) for name in probability}
+    angle, percent = _apart(motions[used].d, motions[rival or used].d)
+    spread = spread_by_unknowns(capture.peaks[used])
+    if requested == AUTO:
+        values = {name: np.concatenate([each.w, each.d]) for name, each in motions.items()}
+        spread = spread + spread_about(values[used], list(probability.values()), np.stack(list(values.values())))
     return ModelChoice(
         used=used,
         parameters=_parameters(capture.peaks[used]),
@@ -90,19 +94,25 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
         rival=rival,
         d_angle_deg=angle,
         d_length_percent=percent,
-        spread=spread_by_unknowns(capture.peaks[used]),
+        spread=spread,
     )
 
 
-def spline_choice(choice: ModelChoice | None, spline: Motion, law: Motion, probability: float) -> ModelChoice:
-    """The choice of a spline with this probability in place of the motion model ``law``."""
+def spline_choice(
+    choice: ModelChoice | None, spline: Motion, law: Motion, probability: float, unique: bool
+) -> ModelChoice:
+    """The choice of a spline with this probability in place of the motion model ``law``.
+
+    Args:
+        unique: whether no other spline explains the matches as well.
+    """
     laws = {law.name: 1.0} if choice is None else choice.probability
     angle, percent = _apart(spline.d, law.d)
     return ModelChoice(
         used=spline.name,
         parameters={},
         probability={spline.name: probability, **{name: (1.0 - probability) * p for name, p in laws.items()}},
-        decided=True,
+        decided=unique,
         rival=law.name,
         d_angle_deg=angle,
         d_length_percent=percent,

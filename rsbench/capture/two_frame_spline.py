@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from rsbench.capture.hypotheses import LEAST_SCALE_PX
 from rsbench.capture.trajectory_estimate import Trajectory, TrajectoryOptions, estimate_trajectory
 from rsbench.capture.trajectory_fit import Fit, covariance_band, first_curve, fit, normal_equations, right_tracks
 from rsbench.capture.trajectory_spline import (
@@ -31,11 +32,14 @@ from rsbench.capture.trajectory_spline import (
     span_of,
 )
 from rsbench.capture.trajectory_tracks import Tails, TimedTracks, informative, pack_windows
+from rsbench.components.motion_models import make_motion
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import spread_about, tempered
+from rsbench.solvers.engine.packed import each_term, heavy_tailed, pack
 
 _OF_A_MODEL = 6.0
 """Parameters of a motion model, at least."""
@@ -43,6 +47,16 @@ _FEWEST = 30
 """Tracks, or matches of one camera, from which on a spline is fitted to two frames."""
 _KNOTS = 0.25
 """Frame periods between control poses."""
+_DEPTHS = 3.0
+"""Deviations of a disparity by which depth is observed: half of the disparities must be larger."""
+_PARTS, _OF_A_PART = 6, 10
+"""Parts of the rows, at most, and tracks in one, at least, whose motions are compared."""
+_DISPERSION, _CHANCE = 1.5, 1e-3
+"""Dispersion by common errors of neighbours, and the probability, under a law, to ask for a spline."""
+_APART = 6.0
+"""Squared deviations, in sum over the six, within which two splines are one."""
+_MEDIAN = 4.35
+"""Of chi-squared of five degrees of freedom."""
 _SHARE, _SHARE_OF_VIDEO = 0.15, 0.5
 """Weight of a track beside the prior, and in the covariance, for two frames and for more. Two frames hardly show
 rotations of rows that are alike in both: with a larger weight, common errors of tracks of a tenth of a pixel
@@ -74,32 +88,82 @@ class TwoFrameSpline:
     """Of the tracks."""
     probability: float
     """Of the spline, against the motion model."""
+    unique: bool
+    """Whether no other spline, from another start, explains the matches as well."""
 
 
 def two_frame_spline(
     matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion, seed: int = 0
 ) -> TwoFrameSpline | None:
-    """The spline beside a motion of the body by a model; None where there are few tracks, or no fit.
+    """The spline beside a motion of the body by a model, where the matches ask for one.
+
+    None where there are few tracks, no fit, no depth, or no trace of time in what the model leaves. Where the law
+    is far off, a search from it alone ends beside the best spline: one from rest is made too. On a plane several
+    splines explain the matches; their distance is in the covariance.
 
     Args:
         law: the motion of largest likelihood under a model, where the search begins.
     """
     window = informative(matches)
-    if shutter.still or len(window.tracks) < _FEWEST:
+    if shutter.still or len(window.tracks) < _FEWEST or not _asks_for_one(window, rig, shutter, law):
         return None
-    spline = _Spline.through(window, rig, shutter, law, seed)
-    if spline is None:
+    starts = [law, make_motion("linear", np.zeros(3), np.zeros(3))]
+    splines = [_Spline.through(window, rig, shutter, start, seed) for start in starts]
+    fitted = [each for each in splines if each is not None]
+    if not fitted:
         return None
+    tails = min((each.found.fit.tails for each in fitted), key=lambda each: each.scale)
+    everything = np.ones(len(fitted[0].tracks))
+    worths = np.array([each.worth(each.found.curve, each.determined, tails, everything) for each in fitted])
+    spline = fitted[int(np.argmax(worths))]
+    odds = tempered(np.exp(worths - worths.max()), 1.0 / _SHARE)
+    motions = np.stack([np.concatenate([each.found.motion.w, each.found.motion.d]) for each in fitted])
     found, errors = spline.found, (spline.found.fit.tails, spline.found.fit.trust)
     theirs = approximated(law.body_from_world, span_of(1, shutter), _KNOTS)
-    odds = spline.worth(found.curve, spline.determined, *errors) - spline.worth(theirs, _OF_A_MODEL, *errors)
+    gain = spline.worth(found.curve, spline.determined, *errors) - spline.worth(theirs, _OF_A_MODEL, *errors)
+    covariance = motion_covariance(found.curve, covariance_band(found.fit, spline.tracks, _SHARE), 0.0)
+    apart = spread_about(motions[int(np.argmax(worths))], odds, motions)
+    unique = covariance is not None and float(np.trace(np.linalg.solve(covariance, apart))) < _APART
     return TwoFrameSpline(
         motion=found.motion,
-        covariance=motion_covariance(found.curve, covariance_band(found.fit, spline.tracks, _SHARE), 0.0),
+        covariance=None if covariance is None else covariance + apart,
         noise_px=found.noise_px,
         inliers=found.inliers[0],
-        probability=float(scipy.special.expit(odds)),
+        probability=float(scipy.special.expit(gain)),
+        unique=unique,
     )
+
+
+def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:
+    """Whether depth is observed, and what a law leaves of the tracks depends on when their rows were read.
+
+    Tracks of a part of the rows would each like another motion. The squared steps to it, over the information, are
+    chi-squared of six for each part but one under the law (score test, C. Rao, Proc. Cambridge Philosophical
+    Society 1948); errors that neighbours share make them larger by their dispersion.
+    """
+    packed = pack(Correspondences(tracks=window.tracks), rig, shutter, law.name, motion_parameters=law.parameters)
+    theta = packed.theta(law.w, law.d)
+    squares = each_term(packed, theta).squares
+    tailed = heavy_tailed(packed, theta, max(float(np.sqrt(np.median(squares) / _MEDIAN)), LEAST_SCALE_PX))
+    if tailed is None:
+        return False
+    each = each_term(tailed, theta)
+    timed = tailed.tracks.ndim == 3
+    ends = tailed.tracks
+    disparities = rig.camera.fx * (ends[:, 0, 0] - ends[:, 1, 0]) if timed else ends[:, 2]
+    if float(np.median(disparities)) < _DEPTHS * tailed.scale * np.sqrt(2.0):
+        return False
+    times = ends[:, 0, 2] if timed else ends[:, 6]
+    count = min(_PARTS, len(times) // _OF_A_PART)
+    parts = np.argsort(np.argsort(times, kind="stable"), kind="stable") * count // len(times)
+    slopes = tailed.weights(each.squares)[:, None] * each.gradients
+    expected = tailed.trust * (tailed.nu + tailed.freedom) / (tailed.nu + tailed.freedom + 2.0)
+    square = 0.0
+    for own in (parts == number for number in range(count)):
+        slope = np.sum(slopes[own], axis=0)
+        information = np.tensordot(expected[own], each.hessians[own], 1)
+        square += float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) / tailed.scale**2
+    return square > _DISPERSION * float(scipy.special.chdtri(6 * (count - 1), _CHANCE))
 
 
 def log_odds_of_opposite(

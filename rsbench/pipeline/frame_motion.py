@@ -390,7 +390,7 @@ def or_spline(
         inliers={**robust.inliers, "tracks": found.inliers},
         counts={**robust.counts, "tracks": count},
     )
-    return robust, spline_choice(choice, motion, law, found.probability), motion
+    return robust, spline_choice(choice, motion, law, found.probability, found.unique), motion
 
 
 def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:

@@ -312,10 +312,10 @@ def test_it_is_at_the_bound_of_one_camera() -> None:
         assert estimate.covariance is not None
         scale = np.repeat([1.0, length], 3)
         stated.append(np.sum(F * (estimate.covariance * np.outer(scale, scale))))
-    # Standard deviations of the means: sqrt(2 * 5 / 40) = 0.5, and of the noise's own estimate from 95 degrees of
-    # freedom each, 5 * sqrt(2 / 95 / 40) = 0.12.
+    # Standard deviations of the means: sqrt(2 * 5 / 40) = 0.5. What is stated is the larger of two covariances,
+    # with the factors of few measurements and of common errors, at least 1: it may exceed the bound by a half.
     assert np.mean(distances) == pytest.approx(5.0, abs=1.5)
-    assert np.mean(stated) == pytest.approx(5.0, abs=0.5)
+    assert 4.5 < np.mean(stated) < 8.0
 
 
 def test_the_baseline_and_the_right_camera_say_nothing() -> None:

@@ -15,6 +15,12 @@ Lange, R. Little, J. Taylor, Robust statistical modeling using the t distributio
 The weight cannot see a wrong match that bends the motion until its own residual vanishes. What shows it is its
 leverage, its share of the information of all measurements (6 in sum); a bounded leverage keeps the residual
 visible (Mallows weights; P. Huber, Robust Statistics, 1981, 7.2: leverages up to 0.2 are safe).
+
+Wrong matches that lie within ten scales by chance are no tail of that distribution: they would make it look
+heavier than it is, and pull. Errors are therefore a mixture of the t distribution and a uniform one over the ball
+of ten scales, whose share is estimated with them (EM: A. Dempster, N. Laird, D. Rubin, J. Royal Statistical
+Society B 1977; uniform outliers: P. Torr, A. Zisserman, MLESAC, 2000). A measurement counts by the probability
+that it is right.
 """
 
 from __future__ import annotations
@@ -36,6 +42,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, temporal_pa
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import Stated, stated_covariance
 from rsbench.solvers.engine.residuals import BEHIND, count_in_front, pair_terms, track_terms
 
 
@@ -163,11 +170,23 @@ class Packed:
         return 2.0 * cost / freedom if freedom > 0 else 0.0
 
     def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
-        """Covariance (6, 6) of theta at the minimum; None when it does not exist."""
-        inverse = inverse_definite(H)
-        return (
-            None if inverse is None or self.constraints <= self.parameters else self.noise_variance(cost) * inverse
-        )
+        """Covariance (6, 6) of theta at the minimum, see ``core.uncertainty``; None when it does not exist."""
+        inverse, variance = inverse_definite(H), self.noise_variance(cost)
+        if inverse is None or self.constraints <= self.parameters:
+            return None
+        each = each_term(self, theta)
+        if not variance > _EXACT_PX**2:
+            return variance * inverse
+        leverages = _leverages(self, theta, each, np.ones(len(each.squares)))
+        return self._stated(each.gradients, inverse, variance * inverse, leverages).covariance
+
+    def _stated(
+        self, gradients: FloatArray, inverse: FloatArray, information: FloatArray, leverages: FloatArray
+    ) -> Stated:
+        """``stated_covariance`` of the measurements at their places in frame 0."""
+        tracks = self.tracks[:, :2] if self.tracks.ndim == 2 else self.tracks[:, 0, :2]
+        places = np.concatenate([self.pairs[:, :2], tracks])
+        return stated_covariance(gradients, inverse, information, leverages, places, self.parameters)
 
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
@@ -373,6 +392,10 @@ _TAILS = (3.0, 5.0, 10.0, 30.0)
 """Degrees of freedom to choose from: SIFT under photon noise has about 3; 30 is as good as normal."""
 _REACH = 10.0
 """Errors, in scales, beyond which a match is wrong: its weight would be below 0.04."""
+_FIRST_NU, _MIXTURE_STEPS, _MOST_RIGHT = 3.0, 4, 0.999
+"""Tails to begin with; rounds of the mixture's EM; and the share of right ones within the reach, at most."""
+_EXACT_PX = 1e-7
+"""Noise below which matches are exact."""
 _SAFE_LEVERAGE, _TIMES_THE_MEAN = 0.2, 3.0
 _LEVERAGE_STEPS = 4
 _SCALE_STEPS, _SCALE_FLAT = 50, 1e-4
@@ -390,7 +413,10 @@ class HeavyTailed(Packed):
     scale: float
     """s, px."""
     trust: FloatArray
-    """(n + m,) Mallows weights of the pairs and of the tracks, at most 1."""
+    """(n + m,) weights of the pairs and of the tracks, at most 1: those of Mallows times the probability to be
+    right."""
+    doubt: FloatArray | None = None
+    """(n + m,) probability that each is wrong; None: 0."""
 
     @property
     def freedom(self) -> FloatArray:
@@ -429,23 +455,31 @@ class HeavyTailed(Packed):
         return (self.scale * float(scipy.special.stdtrit(self.nu, _ONE_SIGMA))) ** 2
 
     def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
-        """Covariance (6, 6) of theta at the minimum, whatever the distribution of the errors; None for none.
+        """Covariance (6, 6) of theta at the minimum, whatever the distribution of the errors; None for none."""
+        stated = self.stated(theta)
+        return None if stated is None else stated.covariance
 
-        A^-1 B A^-1 with A the Hessian of the cost and B the sum of g g^T, where g is one measurement's share of
-        the gradient (P. Huber, Proc. Fifth Berkeley Symposium, 1967; H. White, Econometrica 1980) divided by
-        1 - leverage, for the part of its error that the motion has followed (HC3: J. MacKinnon, H. White,
-        J. Econometrics 1985). A track is one measurement: errors that its keypoints share are counted together.
+    def stated(self, theta: FloatArray) -> Stated | None:
+        """The covariance with what it was made from; None where there is none.
+
+        See ``core.uncertainty``. The Hessian of the mixture is that of the t distribution less what is missing
+        because nobody knows which measurements are right (T. Louis, J. Royal Statistical Society B 1982). A track
+        is one measurement: errors that its keypoints share are counted together.
         """
-        each = each_term(self, theta)
+        each, variance = each_term(self, theta), self.scale**2
         weights = self.weights(each.squares)
-        bend = 2.0 * weights / (self.nu * self.scale**2 + each.squares)
+        bend = 2.0 * weights / (self.nu * variance + each.squares)
+        if self.doubt is not None:
+            tails = (self.nu + self.freedom) / (self.nu + each.squares / variance)
+            bend += weights * self.doubt * tails / variance
+        expected = self.trust * (self.nu + self.freedom) / (self.nu + self.freedom + 2.0)
+        information = inverse_definite(self.definite(theta, np.tensordot(expected, each.hessians, 1)))
         A = np.tensordot(weights, each.hessians, 1) - (bend[:, None] * each.gradients).T @ each.gradients
         inverse = inverse_definite(self.definite(theta, A))
-        if inverse is None:
+        if inverse is None or information is None:
             return None
-        kept = 1.0 - np.minimum(_leverages(self, theta, each, weights), 0.5)
-        shares = (weights / kept)[:, None] * each.gradients @ inverse
-        return np.asarray(shares.T @ shares)
+        leverages = _leverages(self, theta, each, weights)
+        return self._stated(weights[:, None] * each.gradients, inverse, variance * information, leverages)
 
 
 def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed | None:
@@ -456,21 +490,43 @@ def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed
     """
     each = each_term(packed, theta)
     freedom = _freedom(packed)
-    means = each.squares / freedom
-    for _ in range(2):
+    means, right, nu = each.squares / freedom, np.ones(len(freedom)), _FIRST_NU
+    for step in range(_MIXTURE_STEPS):
         near = means <= (_REACH * scale) ** 2
         if np.count_nonzero(near) < _FEWEST:
             return None
-        left = max(float(np.sum(freedom[near])) - _PARAMETERS, 1.0)
-        nu, scale = t_distribution(each.squares[near], freedom[near], scale, left)
+        q, p = each.squares[near], freedom[near]
+        if step > 0:
+            right[near] = _probability_right(q, p, nu, scale, float(np.mean(right[near])))
+        count = right[near]
+        nu, scale = t_distribution(q, p, scale, max(float(count @ p) - _PARAMETERS, 1.0), count=count)
     near = means <= (_REACH * scale) ** 2
-    tailed = HeavyTailed(**vars(packed.only(near)), nu=nu, scale=scale, trust=np.ones(np.count_nonzero(near)))
+    right = np.where(near, right, 0.0)[near]
+    tailed = HeavyTailed(**vars(packed.only(near)), nu=nu, scale=scale, trust=right, doubt=1.0 - right)
     each = Each(*(part[near] for part in each))
-    return replace(tailed, trust=_bounded(tailed, theta, each, tailed.weights(each.squares)))
+    return replace(tailed, trust=right * _bounded(tailed, theta, each, tailed.weights(each.squares)))
+
+
+def _probability_right(q: FloatArray, p: FloatArray, nu: float, scale: float, share: float) -> FloatArray:
+    """(n,) that measurements within the reach are no wrong matches, of which there is a share besides.
+
+    Args:
+        share: of right ones among them.
+    """
+    gammaln = scipy.special.gammaln
+    inside = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * (nu + p) * np.log1p(q / (nu * scale**2))
+    outside = gammaln(0.5 * p + 1.0) - 0.5 * p * np.log(_REACH**2 * p / nu)  # one over the volume of the ball
+    share = min(share, _MOST_RIGHT)
+    return np.asarray(scipy.special.expit(inside - outside + np.log(share / (1.0 - share))))
 
 
 def t_distribution(
-    squares: FloatArray, p: FloatArray, scale: float, freedom: float, least: float = _LEAST_SCALE_PX
+    squares: FloatArray,
+    p: FloatArray,
+    scale: float,
+    freedom: float,
+    least: float = _LEAST_SCALE_PX,
+    count: FloatArray | None = None,
 ) -> tuple[float, float]:
     """nu and s of the largest likelihood.
 
@@ -479,36 +535,40 @@ def t_distribution(
         scale: a first guess of s, px.
         freedom: residuals less the degrees of freedom that the fit has taken.
         least: of s.
+        count: (n,) how much each measurement counts; None: 1.
     """
-    found = [(nu, _scale(squares, p, nu, scale, freedom, least)) for nu in _TAILS]
-    return max(found, key=lambda tails: _likelihood(squares, p, *tails))
+    count = np.ones(len(p)) if count is None else count
+    found = [(nu, _scale(squares, p, nu, scale, freedom, least, count)) for nu in _TAILS]
+    return max(found, key=lambda tails: _likelihood(squares, p, *tails, count))
 
 
 def _freedom(packed: Packed) -> FloatArray:
     return np.repeat([float(_PAIR_FREEDOM), float(_TRACK_FREEDOM)], [len(packed.pairs), len(packed.tracks)])
 
 
-def _scale(squares: FloatArray, p: FloatArray, nu: float, scale: float, freedom: float, least: float) -> float:
+def _scale(
+    squares: FloatArray, p: FloatArray, nu: float, scale: float, freedom: float, least: float, count: FloatArray
+) -> float:
     """Scale of the largest likelihood.
 
     By the parameter-expanded EM algorithm, in half the steps of the plain one: the mean that weights have in the
     end is known, and a step divides by the one they have (C. Liu, D. Rubin, Y. Wu, Biometrika 1998).
     """
-    count = len(p) + (float(np.sum(p)) - freedom) / nu
+    mean = float(np.sum(count)) + (float(count @ p) - freedom) / nu
     for _ in range(_SCALE_STEPS):
-        weights = (nu + p) / (nu + squares / scale**2)
-        last, scale = scale, float(np.sqrt(weights @ squares / freedom * count / np.sum(weights)))
+        weights = count * (nu + p) / (nu + squares / scale**2)
+        last, scale = scale, float(np.sqrt(weights @ squares / freedom * mean / np.sum(weights)))
         scale = max(scale, least)
         if abs(scale - last) <= _SCALE_FLAT * scale:
             break
     return scale
 
 
-def _likelihood(squares: FloatArray, p: FloatArray, nu: float, scale: float) -> float:
+def _likelihood(squares: FloatArray, p: FloatArray, nu: float, scale: float, count: FloatArray) -> float:
     """Logarithm, without terms that are the same for all nu and scales."""
     gammaln = scipy.special.gammaln
     norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
-    return float(np.sum(norm - 0.5 * (nu + p) * np.log1p(squares / (nu * scale**2))))
+    return float(count @ (norm - 0.5 * (nu + p) * np.log1p(squares / (nu * scale**2))))
 
 
 def _leverages(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray) -> FloatArray:
