@@ -1,4 +1,4 @@
-"""The motion model that a correction uses: one of the models that the matches support, or a spline."""
+"""The motion model that a correction uses: the one that the matches support most, or a spline."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rsbench.capture.hypotheses import ACCELERATION
+from rsbench.capture.hypotheses import ACCELERATION, MODELS
 from rsbench.capture.hypothesis_ranking import Peak
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture
 from rsbench.components.motion_models import load_kernel, make_motion
@@ -17,6 +17,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import spread_about
 
 AUTO = "auto"
+_EQUAL = 0.99
+"""Share of the largest probability from which on models are equal, and the first one is used, the paper's."""
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Differences between motions that count as the same, as of all models under a global shutter."""
 
@@ -77,7 +79,8 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
     if requested not in (AUTO, *capture.peaks) or not capture.peaks:
         return None
     probability = {name: p for name, p in capture.models.items() if name in capture.peaks}
-    best = next(iter(probability))
+    most = max(probability.values())
+    best = next(name for name in (*MODELS, *probability) if probability.get(name, 0.0) >= _EQUAL * most)
     used = best if requested == AUTO else requested
     rival = next((name for name in probability if name != used), "")
     motions = {name: motion_at(capture.peaks[name]) for name in probability}
@@ -90,7 +93,7 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
         used=used,
         parameters=_parameters(capture.peaks[used]),
         probability=probability,
-        decided=used == best and probability[best] >= CERTAIN,
+        decided=probability[used] >= CERTAIN,
         rival=rival,
         d_angle_deg=angle,
         d_length_percent=percent,

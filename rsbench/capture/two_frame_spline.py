@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -32,13 +33,13 @@ from rsbench.capture.trajectory_spline import (
     span_of,
 )
 from rsbench.capture.trajectory_tracks import Tails, TimedTracks, informative, pack_windows
-from rsbench.components.motion_models import make_motion
+from rsbench.components.motion_models import has_kernel, make_motion
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.core.uncertainty import spread_about, tempered
+from rsbench.core.uncertainty import small_sample_factor, spread_about, tempered
 from rsbench.solvers.engine.packed import each_term, heavy_tailed, pack
 
 _OF_A_MODEL = 6.0
@@ -51,8 +52,9 @@ _DEPTHS = 3.0
 """Deviations of a disparity by which depth is observed: half of the disparities must be larger."""
 _PARTS, _OF_A_PART = 6, 10
 """Parts of the rows, at most, and tracks in one, at least, whose motions are compared."""
-_DISPERSION, _CHANCE = 1.5, 1e-3
-"""Dispersion by common errors of neighbours, and the probability, under a law, to ask for a spline."""
+_DISPERSION, _CHANCE, _DOUBTFUL = 1.5, 1e-3, 0.05
+"""Dispersion by common errors of neighbours, and the probability, under a law, to ask for a spline, and to widen
+what is stated of the law's motion."""
 _APART = 6.0
 """Squared deviations, in sum over the six, within which two splines are one."""
 _MEDIAN = 4.35
@@ -121,7 +123,10 @@ def two_frame_spline(
     found, errors = spline.found, (spline.found.fit.tails, spline.found.fit.trust)
     theirs = approximated(law.body_from_world, span_of(1, shutter), _KNOTS)
     gain = spline.worth(found.curve, spline.determined, *errors) - spline.worth(theirs, _OF_A_MODEL, *errors)
+    # The prior's strength is estimated from as many accelerations as the matches determine.
+    factor = small_sample_factor(max(spline.determined - _OF_A_MODEL, 0.0), int(_OF_A_MODEL))
     covariance = motion_covariance(found.curve, covariance_band(found.fit, spline.tracks, _SHARE), 0.0)
+    covariance = None if covariance is None else factor * covariance
     apart = spread_about(motions[int(np.argmax(worths))], odds, motions)
     unique = covariance is not None and float(np.trace(np.linalg.solve(covariance, apart))) < _APART
     return TwoFrameSpline(
@@ -134,25 +139,56 @@ def two_frame_spline(
     )
 
 
+class _Rows(NamedTuple):
+    """What the tracks of each part of the rows say against one law for all, see ``_by_rows``."""
+
+    square: float
+    freedom: int
+    parts: int
+    depth: bool
+    """Whether depth is observed."""
+
+
+def dispersion_of_rows(matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> float:
+    """Variance of a law's motion over that which noise leaves, at least 1, where its rows ask for several motions.
+
+    These motions scatter about the mean one, and the answer is that of the first rows (random effects; R.
+    DerSimonian, N. Laird, Controlled Clinical Trials 1986).
+
+    Args:
+        law: as of ``two_frame_spline``.
+    """
+    rows = None if shutter.still else _by_rows(informative(matches), rig, shutter, law)
+    if rows is None or rows.square <= float(scipy.special.chdtri(rows.freedom, _DOUBTFUL)):
+        return 1.0
+    return 1.0 + rows.parts * (rows.square / rows.freedom - 1.0)
+
+
 def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:
-    """Whether depth is observed, and what a law leaves of the tracks depends on when their rows were read.
+    """Whether depth is observed, and rows ask for more motions than errors that neighbours share would."""
+    rows = _by_rows(window, rig, shutter, law)
+    if rows is None or not rows.depth:
+        return False
+    return rows.square > _DISPERSION * float(scipy.special.chdtri(rows.freedom, _CHANCE))
+
+
+def _by_rows(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> _Rows | None:
+    """Whether what a law leaves of the tracks depends on when their rows were read.
 
     Tracks of a part of the rows would each like another motion. The squared steps to it, over the information, are
     chi-squared of six for each part but one under the law (score test, C. Rao, Proc. Cambridge Philosophical
-    Society 1948); errors that neighbours share make them larger by their dispersion.
+    Society 1948). None for few tracks, or a law without equations.
     """
+    if len(window.tracks) < _FEWEST or not has_kernel(law.name):
+        return None
     packed = pack(Correspondences(tracks=window.tracks), rig, shutter, law.name, motion_parameters=law.parameters)
     theta = packed.theta(law.w, law.d)
     squares = each_term(packed, theta).squares
     tailed = heavy_tailed(packed, theta, max(float(np.sqrt(np.median(squares) / _MEDIAN)), LEAST_SCALE_PX))
     if tailed is None:
-        return False
-    each = each_term(tailed, theta)
-    timed = tailed.tracks.ndim == 3
-    ends = tailed.tracks
+        return None
+    each, ends, timed = each_term(tailed, theta), tailed.tracks, tailed.tracks.ndim == 3
     disparities = rig.camera.fx * (ends[:, 0, 0] - ends[:, 1, 0]) if timed else ends[:, 2]
-    if float(np.median(disparities)) < _DEPTHS * tailed.scale * np.sqrt(2.0):
-        return False
     times = ends[:, 0, 2] if timed else ends[:, 6]
     count = min(_PARTS, len(times) // _OF_A_PART)
     parts = np.argsort(np.argsort(times, kind="stable"), kind="stable") * count // len(times)
@@ -163,7 +199,8 @@ def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutt
         slope = np.sum(slopes[own], axis=0)
         information = np.tensordot(expected[own], each.hessians[own], 1)
         square += float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) / tailed.scale**2
-    return square > _DISPERSION * float(scipy.special.chdtri(6 * (count - 1), _CHANCE))
+    deep = float(np.median(disparities)) >= _DEPTHS * tailed.scale * np.sqrt(2.0)
+    return _Rows(square=square, freedom=6 * (count - 1), parts=count, depth=deep)
 
 
 def log_odds_of_opposite(

@@ -32,7 +32,7 @@ from rsbench.capture.shutter_decision import (
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
-from rsbench.capture.two_frame_spline import log_odds_of_opposite, two_frame_spline
+from rsbench.capture.two_frame_spline import dispersion_of_rows, log_odds_of_opposite, two_frame_spline
 from rsbench.components.motion_models import load_kernel, make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, without_lens
@@ -378,7 +378,7 @@ def or_spline(
     """An answer of a solver that ``takes_models``, or in its place a spline, where the matches ask for it."""
     found = two_frame_spline(matches, rig, shutter, law, seed)
     if found is None or found.probability < CERTAIN:
-        return robust, choice, law
+        return scaled(robust, dispersion_of_rows(matches, rig, shutter, law)), choice, law
     motion = found.motion
     estimate = replace(
         robust.estimate, w=motion.w, d=motion.d, noise_px=found.noise_px, covariance=found.covariance
@@ -399,6 +399,12 @@ def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:
     return (
         robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=known + spread))
     )
+
+
+def scaled(robust: RobustEstimate, factor: float) -> RobustEstimate:
+    """With a covariance of so many times the variance."""
+    known = robust.estimate.covariance
+    return robust if known is None else widened(robust, (factor - 1.0) * known)
 
 
 def _solved(

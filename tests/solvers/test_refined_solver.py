@@ -423,3 +423,16 @@ def test_matches_where_a_lens_shows_nothing_are_named() -> None:
         np.random.default_rng(0),
     )
     assert "left[5]" in found.estimate.reason and not found.estimate.success
+
+
+def test_disparities_below_their_noise_state_no_deviation() -> None:
+    """A baseline of 2 cm, f = 300 px, 1.5 px of noise: the motion is given, its deviation is refused."""
+    rig = StereoRig(camera=PinholeCamera.centred(640, 480, 300.0), baseline=0.02)
+    shutter = RollingShutter(height=480, readout_ratio=0.8)
+    motion = make_motion("linear", [0.0, 0.03, 0.0], [0.1, 0.0, 0.2])
+    for noise, refused in ((1.5, True), (0.1, False)):
+        options = SimulationOptions(tracks=40, noise_px=noise)
+        data = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
+        found = RefinedSolver().estimate(data, rig, shutter)
+        assert found.success and (found.covariance is None) == refused
+        assert ("smaller than their noise" in found.reason) == refused
