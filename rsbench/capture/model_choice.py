@@ -17,7 +17,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import spread_about
 
 AUTO = "auto"
-_EQUAL = 0.99
+_EQUAL = 0.9
 """Share of the largest probability from which on models are equal, and the first one is used, the paper's."""
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Differences between motions that count as the same, as of all models under a global shutter."""

@@ -233,7 +233,7 @@ def test_what_matches_cannot_tell_is_said_and_the_likeliest_model_used() -> None
     capture = conclude([examine(matches, RIG, known, start=truth)])
     choice = choose_model(capture)
     assert choice is not None and not choice.decided
-    assert choice.probability[choice.used] >= 0.99 * max(choice.probability.values())
+    assert choice.probability[choice.used] >= 0.9 * max(choice.probability.values())
     assert str(choice).startswith(f"cannot tell, so {choice.used} is used (")
     requested = choose_model(capture, "twist")
     assert requested is not None and requested.used == "twist" and requested.rival != "twist"
