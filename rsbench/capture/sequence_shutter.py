@@ -16,7 +16,7 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 
 from rsbench.capture.hypotheses import scans_of
-from rsbench.capture.shutter_decision import OPPOSITE, rig_of, shutter_found, shutter_of
+from rsbench.capture.shutter_decision import OPPOSITE, shutter_found, shutter_of
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions, noise_px
 from rsbench.capture.trajectory_fit import Fit, choose, first_curve, fit, log_evidence, window_motions
 from rsbench.capture.trajectory_spline import NotDefiniteError, span_of
@@ -149,7 +149,7 @@ def capture_of_video(
     """
     matches, scan = [Correspondences(left=each) for each in windows], scan or "top"
     scannings = Scanning(scan=scan), Scanning(scan=OPPOSITE[scan])
-    found = capture_of_sequence(_nothing_of(matches), matches, rig_of(camera), scannings, seed)
+    found = capture_of_sequence(_nothing_of(matches), matches, StereoRig.of_one(camera), scannings, seed)
     return found if found.candidates else None
 
 

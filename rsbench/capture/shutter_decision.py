@@ -280,11 +280,6 @@ def candidates_of(capture: Capture) -> list[dict[str, Any]]:
 # One camera
 
 
-def rig_of(camera: PinholeCamera) -> StereoRig:
-    """A rig whose body is where this camera is, the left one; there are no matches of the right one."""
-    return StereoRig(camera=camera, baseline=1.0).about("left")
-
-
 def known_alone(scan: Scan | None = None) -> Known:
     """What is known of a camera whose readout ratio is not given, with its ``scan`` if that is.
 
@@ -299,7 +294,7 @@ def examine_alone(
     matches: FloatArray, camera: PinholeCamera, known: Known, options: RobustOptions, seed: int = 0
 ) -> Window:
     """Matches (n, 4) x0, y0, x1, y1, px, of two frames of a camera under each hypothesis; with outliers."""
-    given, rig = Correspondences(left=matches), rig_of(camera)
+    given, rig = Correspondences(left=matches), StereoRig.of_one(camera)
     # The search starts from the motion under a shutter between those that are possible.
     starts = {scans.left for scans in known.scans}
     scan, ratio = next(each for each in COARSE if ("global" if each[1] == 0.0 else each[0]) in starts)
@@ -317,7 +312,9 @@ def fits_backwards(
     noise, given = list[float](), Correspondences(left=matches[:: max(len(matches) // _LOOK, 1)])
     for scan in (shutter.scan_of("left"), OPPOSITE[shutter.scan_of("left")]):
         solver, rng = RefinedSolver(motion_model="inertial", one_camera=True), np.random.default_rng(seed)
-        found = estimate_motion(given, rig_of(camera), replace(shutter, scan=scan), solver, options, rng).estimate
+        found = estimate_motion(
+            given, StereoRig.of_one(camera), replace(shutter, scan=scan), solver, options, rng
+        ).estimate
         noise.append(found.noise_px or np.inf if found.success else np.inf)
     return noise[1] < _CLEARLY_LESS * noise[0]
 
@@ -347,7 +344,7 @@ def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
     certain = best.probability >= CERTAIN
     harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
     if certain and (best.sigma <= _MAX_SIGMA or harmless):
-        return shutter_of(best, rig_of(camera))
+        return shutter_of(best, StereoRig.of_one(camera))
     if certain:
         how = f"{words(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
     else:

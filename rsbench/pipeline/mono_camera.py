@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,7 +26,7 @@ from rsbench.capture.shutter_decision import (
     shutter_alone,
 )
 from rsbench.capture.two_frame_estimate import Capture, Window
-from rsbench.components.cards import SHUTTER_KEY, parse_card, read_toml, with_shutter
+from rsbench.components.cards import SHUTTER_KEY
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
@@ -102,16 +101,6 @@ class OneCameraCard:
             focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
             return PinholeCamera.centred(width, height, focal)
         return PinholeCamera.centred(width, height, DEFAULT_FOCAL * width)
-
-
-def read_one_camera(path: Path) -> OneCameraCard:
-    """Card: ``readout_ratio`` or ``shutter``, ``scan``; ``[camera]`` (fx, fy, cx, cy), ``fov_deg``, or neither.
-
-    Raises:
-        RsbenchError: one line with the file, the field, the value and what is allowed.
-    """
-    table = read_toml(path)
-    return parse_card(OneCameraCard, with_shutter(table, str(path)), str(path))
 
 
 # How the camera of a video reads its lines: as its card says, or as its frames show.

@@ -99,7 +99,7 @@ def pair_rates(
         begins: (n,) times of the frames' first rows, frame periods; pairs not about 1 apart are left out.
     """
     turn = turned(camera, shutter)
-    rig = StereoRig(camera=turn.camera, baseline=1.0)
+    rig = StereoRig.of_one(turn.camera)
     starts, rates = list[float](), list[FloatArray]()
     every = max((count - 1) // PAIRS, 1)
     for number, images in islice(enumerate(pairwise(frames)), 0, every * PAIRS, every):
