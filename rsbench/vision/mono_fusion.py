@@ -4,9 +4,10 @@ A pixel of the scene at rest has one unknown, its inverse depth: found along its
 (``epipolar_search``), where the other frame confirms it; else by the dense flow, where that returns to its start
 and ends on the curve; in a band along the border, by extending the surface beside it (``continued``); else it is
 that of the farther neighbour in its row. What consistent flow carries off the curve moves by itself: it is moved
-by its flow, scaled by the times of the rows. Both displacements are weighted by their variances. Each frame is
-drawn at the target, the nearer surface first, and what the first frame leaves empty is taken from the other one,
-moved to the same time.
+by its flow, scaled by the times of the rows. Both displacements are weighted by their variances; where consistent
+flow as a whole is off the curves, the law of motion does not hold, and flow moves everything. Each frame is drawn
+at the target, the nearer surface first, and what the first frame leaves empty is taken from the other one, moved
+to the same time, where its place was measured.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from rsbench.vision.reprojection import Reprojection, look, look_between, parall
 from rsbench.vision.stereo_depth import fill_holes
 
 F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 _FITTED, _WIDEST = 0.125, 0.15
 """Shares of the image's height or width: what a line is fitted to beside a band, and the widest band."""
 _BESIDE = 1 / 16
@@ -85,7 +87,6 @@ def _below(rho: F32, most: float) -> F32:
     return out
 
 
-Mask = NDArray[np.bool_]
 _RETURNS_PX = 1.0
 """Distance from a pixel to where flow there and back ends, below which the flow is believed."""
 _ON_CURVE_PX = 1.5
@@ -99,6 +100,10 @@ _SAME_PX = 2.0
 finer than planes."""
 _CONFIRMED = 16.0
 """How much less flow counts where the search on the curve is confirmed by the other frame."""
+_LAWFUL, _DISTRUST = 2.0, 50.0
+"""Median distance of the flow from the curve, over that by which it does not return, up to which the law of motion
+holds: 0.6 to 1.5 on published pairs whose motion a law describes, with noise and blur of a sensor too, and 6.5 on
+one whose motion none does. And variance of the geometry, over the square of what is beyond, px."""
 _SMOOTH_PX = 5
 _STRETCH = 2.5
 """px between neighbours at the target, above which what lies between them is not seen: an edge uncovers it there.
@@ -170,6 +175,8 @@ class _Layer(NamedTuple):
     """(H, W) inverse depth in each row's own camera."""
     flow_share: F32
     """(H, W) weight of the scaled flow beside that of the geometry, 0 to 1."""
+    measured: Mask
+    """(H, W) whether search or flow found the place of the pixel, and not its neighbours."""
 
 
 class Beyond(NamedTuple):
@@ -207,7 +214,7 @@ class MonoFusion:
             empty, stretched = origin == Origin.NOBODY, (origin == Origin.GUESSED) & (pair is self)
             if not np.any(empty | stretched):
                 continue
-            other, behind, how = pair._drawn(1 - same, tau)
+            other, behind, how = pair._drawn(1 - same, tau, measured=True)
             behind *= _unit(self._layers[frame].rho, pair._layers[same].rho)
             # An edge uncovers what is farther than itself.
             take = (how == Origin.HERE) & (empty | (stretched & (behind <= _BEHIND * buffer)))
@@ -223,10 +230,11 @@ class MonoFusion:
 
     def _find_layers(self) -> list[_Layer]:
         own, shape = self.own, self.images[0].shape[:2]
+        known = np.ones(shape, dtype=np.bool_)
         if own.motion is None:
-            return [_Layer(np.zeros(shape, np.float32), np.ones(shape, np.float32)) for _ in FRAMES]
+            return [_Layer(np.zeros(shape, np.float32), np.ones(shape, np.float32), known) for _ in FRAMES]
         if own.far:
-            return [_Layer(np.zeros(shape, np.float32), np.zeros(shape, np.float32)) for _ in FRAMES]
+            return [_Layer(np.zeros(shape, np.float32), np.zeros(shape, np.float32), known) for _ in FRAMES]
         poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
         maps = [reprojection_of(own.rig.sensor(own.side), poses[frame], poses[1 - frame]) for frame in FRAMES]
         pick = _picked(shape, search_size(shape, self.options.sweep))
@@ -240,14 +248,19 @@ class MonoFusion:
         gain = parallax_gain(own.rig.sensor(own.side), *maps)
         most = max(_range(offs, met, gain), largest_seen(*known, options))
         swept, same = sweep_frames(*known, most, options), _SAME_PX / max(gain, 1e-9)
-        return [_layer(swept[frame], offs[frame], *met[frame], shape, same) for frame in FRAMES]
+        leaves = [_leaves(flow)[np.ix_(*pick)] for flow in self.flows.flow]
+        return [_layer(swept[frame], offs[frame], *met[frame], leaves[frame], shape, same) for frame in FRAMES]
 
-    def _drawn(self, frame: int, target_tau: float) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
-        """Image (H, W[, C]), inverse depth and origin (H, W) of one frame at the target.
+    def _drawn(
+        self, frame: int, target_tau: float, measured: bool = False
+    ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
+        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame at the target; ``measured``: of such pixels.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
         """
         moved = self.places(frame, target_tau)
+        if measured:
+            moved[~self._layers[frame].measured] = np.nan
         whole, stretched = draw_within(moved, np.inf), np.zeros(moved.shape[:2], dtype=np.bool_)
         source_map, buffer = whole
         if self.own.motion is not None:
@@ -326,7 +339,16 @@ def _range(offs: Sequence[F32], met: Sequence[tuple[F32, F32]], gain: float) -> 
     return largest * _RANGE_MARGIN + _RANGE_PX / max(gain, 1e-9)
 
 
-def _layer(swept: Swept, off: F32, rho: F32, miss: F32, shape: tuple[int, ...], same: float) -> _Layer:
+def _leaves(flow: F32) -> Mask:
+    """(H, W) whether a flow (H, W, 2) leads out of the image."""
+    height, width = flow.shape[:2]
+    x, y = np.arange(width) + flow[..., 0], np.arange(height)[:, None] + flow[..., 1]
+    return np.asarray((x < 0.0) | (x > width - 1.0) | (y < 0.0) | (y > height - 1.0))
+
+
+def _layer(
+    swept: Swept, off: F32, rho: F32, miss: F32, leaves: Mask, shape: tuple[int, ...], same: float
+) -> _Layer:
     """Depth and weights (H, W) of a frame.
 
     ``off`` (h, w) says where its flow returns, ``rho`` and ``miss`` (h, w) are those of ``_triangulated``, and
@@ -339,12 +361,19 @@ def _layer(swept: Swept, off: F32, rho: F32, miss: F32, shape: tuple[int, ...], 
     filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
     # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
     wrong = np.maximum(miss - _ON_CURVE_PX, np.float32(0.0))
-    geometry = np.minimum(wrong, np.float32(1e3)) ** 2
+    medians = np.median([miss[still], off[still]], axis=1) if np.any(still) else np.zeros(2)
+    unexplained = max(float(medians[0] - _LAWFUL * medians[1]), 0.0)
+    geometry = np.minimum(wrong, np.float32(1e3)) ** 2 + np.float32(_DISTRUST * unexplained**2)
     flow = (np.minimum(off, np.float32(1e3)) / _RETURNS_PX) ** 4 + _SIGMA_PX**2
     flow = np.where(swept.agrees, flow * _CONFIRMED, flow)
     share = (geometry / (geometry + flow)).astype(np.float32)
     share = cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX))
-    return _Layer(np.asarray(filled), np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)))
+    measured = (np.isfinite(found) | (off < _RETURNS_PX) | leaves).astype(np.uint8)
+    return _Layer(
+        rho=np.asarray(filled),
+        flow_share=np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)),
+        measured=np.asarray(cv2.resize(measured, full, interpolation=cv2.INTER_NEAREST)) > 0,
+    )
 
 
 def _filled(rho: NDArray[Any]) -> F32:

@@ -114,6 +114,39 @@ def test_what_moves_by_itself_goes_its_own_flow(world: Build, shapes: Any, u8: A
     assert _rms(fused.image, 255.0 * true, inner) < 0.5 * _rms(images[1], 255.0 * true, inner)
 
 
+@pytest.mark.parametrize("frame", [0, 1])
+def test_where_no_law_explains_the_flow_the_flow_moves_everything(
+    scene: Any, u8: Any, truth: Any, frame: int
+) -> None:
+    """A motion that is wrong by 0.3 deg about each axis, 1.6 px: geometry alone would be off by as much."""
+    images = _frames(scene, u8)
+    flows = find_flows(images)
+    found = find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions()).own
+    assert found.motion is not None
+    wrong = found.motion.with_endpoint(found.motion.w + np.deg2rad([0.3, -0.3, 0.3]), found.motion.d)
+    true = truth(scene, "left", frame, frame + 0.5)
+    seen = cv2.erode(true.visible.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    with_wrong, with_flow = (
+        MonoFusion(images, replace(found, motion=motion), flows).corrected(frame, frame + 0.5)
+        for motion in (wrong, None)
+    )
+    assert _rms(with_wrong.image, 255.0 * true.image, seen) < 1.1 * _rms(with_flow.image, 255.0 * true.image, seen)
+
+
+def test_holes_are_not_filled_by_pixels_whose_place_is_a_guess(scene: Any, u8: Any) -> None:
+    """Flow that does not return, and no search that agrees: the other frame fills nothing by such pixels."""
+    images = _frames(scene, u8)
+    flows = find_flows(images)
+    found = find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions()).own
+    fusion = MonoFusion(images, found, flows)
+    filled = fusion.corrected(1, 1.5).origin == Origin.OTHER_FRAME
+    guessed = np.zeros(filled.shape, dtype=bool)
+    fusion._layers[0] = fusion._layers[0]._replace(measured=guessed)
+    unfilled = fusion.corrected(1, 1.5).origin
+    assert np.any(filled) and not np.any(unfilled == Origin.OTHER_FRAME)
+    assert np.all(np.isin(unfilled[filled], [Origin.NOBODY, Origin.GUESSED]))
+
+
 def test_without_a_motion_everything_is_scaled_flow(scene: Any, u8: Any) -> None:
     """At the time of a row, the pixels of that row stay where they are."""
     images = _frames(scene, u8)

@@ -1,41 +1,48 @@
-"""Scores of corrections with one camera on twelve published pairs, and how rows of a real rig agree.
+"""Scores of corrections with one camera on published frames, and how rows of a real rig agree.
 
-The frames of one camera are those in ``demo/`` of github.com/ethliup/DeepUnrollNet (Liu, Cui, Larsson, Pollefeys,
-Deep Shutter Unrolling Network, CVPR 2020): six pairs of Carla-RS (640 x 448, rendered, a field of view of 90
-degrees) and six of Fastec-RS (640 x 480, rows of the frames of a high-speed camera of unknown focal length; 768 px
-are assumed). They are not ours to pass on: give the folder.
+The frames of one camera are pairs in ``demo/`` of repositories of learned correctors: of Carla-RS (rendered, a
+field of view of 90 degrees) and Fastec-RS (rows of the frames of a high-speed camera; 768 px are assumed as its
+focal length), Liu, Cui, Larsson, Pollefeys, Deep Shutter Unrolling Network, CVPR 2020, both read in the whole
+period; and of BS-RSC, real rolling shutter beside real global shutter, Cao, Zhong, Wang, Zheng, Learning Adaptive
+Warping for Real-World Rolling Shutter Correction, CVPR 2022, read in 0.45 of the period, of unknown focal length.
+They are not ours to pass on: give the folder that holds them.
 
-    git clone https://github.com/ethliup/DeepUnrollNet
-    python benchmarks/public_rolling_pairs.py DeepUnrollNet/demo
+    git clone https://github.com/ethliup/DeepUnrollNet    # twelve pairs, on which constants were chosen
+    git clone https://github.com/GitCVfb/RSSR             # and CVR, LBCNet of the same author
+    python benchmarks/public_frames.py FOLDER
 
-A pair is rs_0.png, rs_1.png and gs_1.png, the truth of the second frame at the time of its middle row: row 224 of
-Carla-RS and rows 240 and 241 of Fastec-RS, two of which are read at once, are equal in both. The repository has no
-masks for these pairs. ``covered`` are therefore, for every method alike, the pixels that the second frame shows
-when its optical flow moves it to that time.
+A pair is rs_0.png, rs_1.png and a truth of one of them or both at the time of its middle row: gs_1.png or
+gs_1_m.png of the second, gs_0_m.png of the first. Pairs with equal frames count once. There are no masks that all
+of these have. ``covered`` are therefore, for every method alike, the pixels that the corrected frame shows when
+its optical flow moves it to that time.
 
 ``flow`` is optical flow (DIS) scaled by the times of the rows; what it leaves empty is black in ``flow, black``
-and invented from its surroundings in ``flow``. PSNR in dB over all channels, the mean of the pairs' values.
+and invented from its surroundings in ``flow``. PSNR in dB over all channels, the mean of the frames' values. The
+methods that the repositories publish are trained on frames of these data, and report their own test sets, which
+are larger: their figures are not comparable with these.
 
 The frames of a rig are previews of WHUVID (Chen et al., Remote Sensing 14(9) 2033, 2022), of a ZED 2 on a car,
 side by side, with the calibration of its authors (Kalibr):
 
     git clone https://github.com/SleepEarlyLiveLong/WHUVID
-    python benchmarks/public_rolling_pairs.py WHUVID
+    python benchmarks/public_frames.py WHUVID
 
-A preview has about every seventh or eighth frame, as the sizes of the published sequences say, so that its readout
-ratio is 18.4 ms (Stereolabs) over as many times 33.3 ms. Row differences are medians, px of the preview, of all
-left-right matches in ideal pixels, under the calibration as it is, and under the rig that the tracks show
+A preview has about every seventh or eighth frame, as the sizes of the published sequences say, so that its
+readout ratio is 18.4 ms (Stereolabs) over as many times 33.3 ms. Row differences are medians, px of the preview,
+of all left-right matches in ideal pixels, under the calibration as it is, and under the rig that the tracks show
 (``refine_rig``); disparities of far points tell whether the cameras converge as they should, for none is below 0.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -58,8 +65,20 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint
 from rsbench.vision.mono_fusion import MonoFusion, MonoFusionOptions, OwnMotion, find_flows
 
-SETS = {"Carla": 320.0, "Fastec": 768.0}
-"""Focal length, px."""
+
+class FrameSet(NamedTuple):
+    """Frames of one kind of camera."""
+
+    name: str
+    """Of the folder that holds the pairs."""
+    readout_ratio: float
+    focal: float | None
+    """px; None: found."""
+
+
+SETS = (FrameSet("Carla", 1.0, 320.0), FrameSet("Fastec", 1.0, 768.0), FrameSet("BSRSC", 0.45, None))
+TRUTHS = {0: ("gs_0_m.png",), 1: ("gs_1.png", "gs_1_m.png")}
+"""Global-shutter images of both frames at the time of their middle rows, the first that there is."""
 METHODS = ("uncorrected", "flow, black", "flow", "mono-fusion")
 WORST_LOSS = 0.3
 """dB that a pair may lose against scaled flow."""
@@ -79,36 +98,53 @@ def psnr(estimate: Image, truth: Image, mask: NDArray[np.bool_] | None = None) -
     return float(10.0 * np.log10(255.0**2 / np.mean(error if mask is None else error[mask])))
 
 
-def score_pair(folder: Path, focal: float | None) -> tuple[Scores, float]:
-    """PSNR of all pixels and of covered ones by method, and seconds of ours.
+def pairs_in(folder: Path) -> Iterator[tuple[FrameSet, Path]]:
+    """Pairs below a folder by set, each once however many repositories have it."""
+    seen = set[bytes]()
+    for each in SETS:
+        for first in sorted(folder.glob(f"**/{each.name}/*/rs_0.png")):
+            pair = first.parent
+            digest = hashlib.sha256(first.read_bytes() + (pair / "rs_1.png").read_bytes()).digest()
+            if digest not in seen:
+                seen.add(digest)
+                yield each, pair
 
-    ``focal``: px; None: as the command finds it, or assumes it.
-    """
-    images = [read_frame(folder / f"{name}.png") for name in ("rs_0", "rs_1", "gs_1")]
-    first, second, truth = (image[..., :3] for image in images)
-    height, width = truth.shape[:2]
-    shutter, target = RollingShutter(height=height, readout_ratio=1.0), 1.5
+
+def score_pair(folder: Path, of: FrameSet) -> tuple[dict[int, Scores], str, float]:
+    """PSNR of all pixels and of covered ones by frame and method, the law of motion, and seconds of ours."""
+    images = [read_frame(folder / f"rs_{frame}.png")[..., :3] for frame in (0, 1)]
+    height, width = images[0].shape[:2]
+    shutter = RollingShutter(height=height, readout_ratio=of.readout_ratio)
     started = time.perf_counter()
-    card = OneCameraCard(readout_ratio=1.0)
-    if focal is None:
-        camera = find_camera([first, second], 2, card, shutter, RobustOptions())[0]
+    if of.focal is None:
+        card = OneCameraCard(readout_ratio=of.readout_ratio)
+        camera = find_camera(images, 2, card, shutter, RobustOptions())[0]
     else:
-        camera = PinholeCamera.centred(width, height, focal)
+        camera = PinholeCamera.centred(width, height, of.focal)
     rig = StereoRig(camera=camera, baseline=1.0)
-    flows = find_flows([first, second])
+    flows = find_flows(images)
     found = find_own_motion(flows, rig, shutter, "left", RobustOptions())
-    ours = MonoFusion([first, second], found.own, flows).corrected(1, target)
+    fusion = MonoFusion(images, found.own, flows)
+    truths = {
+        frame: read_frame(path)[..., :3]
+        for frame, names in TRUTHS.items()
+        for path in [folder / name for name in names if (folder / name).is_file()][:1]
+    }
+    times = {frame: float(shutter.pixel_time(np.array([0.0, height // 2]), frame, "left")) for frame in truths}
+    ours = {frame: fusion.corrected(frame, times[frame]) for frame in truths}
     seconds = time.perf_counter() - started
     bare = MonoFusionOptions(fill=False, inpaint=False)
     still = OwnMotion(rig=found.own.rig, shutter=shutter, side="left", motion=None)
-    flowed = MonoFusion([first, second], still, flows, bare).corrected(1, target)
-    covered = flowed.origin != Origin.NOBODY
-    estimates = (second, flowed.image, inpaint(flowed.image, ~covered), ours.image)
-    scores = {
-        method: (psnr(estimate, truth), psnr(estimate, truth, covered))
-        for method, estimate in zip(METHODS, estimates, strict=True)
-    }
-    return scores, seconds
+    by_flow, scores = MonoFusion(images, still, flows, bare), {}
+    for frame, truth in truths.items():
+        flowed = by_flow.corrected(frame, times[frame])
+        covered = flowed.origin != Origin.NOBODY
+        estimates = (images[frame], flowed.image, inpaint(flowed.image, ~covered), ours[frame].image)
+        scores[frame] = {
+            method: (psnr(estimate, truth), psnr(estimate, truth, covered))
+            for method, estimate in zip(METHODS, estimates, strict=True)
+        }
+    return scores, "flow alone" if found.own.motion is None else type(found.own.motion).__name__, seconds
 
 
 def windows_of(preview: Path, firsts: tuple[int, ...]) -> list[dict[View, Image]]:
@@ -169,23 +205,28 @@ def _say(line: str) -> None:
 def main() -> int:
     """Print the table; 1 where a pair is worse than what the corrector promises."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("demo", type=Path, help="folder that holds Carla/seq_01 and so on, or that of WHUVID")
-    parser.add_argument("--untold", action="store_true", help="do not tell the focal length")
+    parser.add_argument("folder", type=Path, help="folder that holds repositories, or the repository WHUVID")
+    parser.add_argument("--unknown-focal", action="store_true", help="do not give the focal length")
+    parser.add_argument("--only", default="", help="pairs whose path has this word")
     arguments = parser.parse_args()
-    if (arguments.demo / CALIBRATION).is_file():
-        return 0 if all([show_rig(arguments.demo, name) for name in PREVIEWS]) else 1
-    good = True
-    for name, focal in SETS.items():
-        pairs = {}
-        for folder in sorted((arguments.demo / name).iterdir()):
-            pairs[folder.name], seconds = score_pair(folder, None if arguments.untold else focal)
-            values = "  ".join("{:5.2f} / {:5.2f}".format(*pairs[folder.name][each]) for each in METHODS)
-            _say(f"{name:7}{folder.name:8}{values}  {seconds:.2f} s")
-            scores = pairs[folder.name]
-            good &= scores["mono-fusion"][0] > max(scores["flow"][0] - WORST_LOSS, scores["uncorrected"][0])
-        means = [np.mean([scores[each] for scores in pairs.values()], axis=0) for each in METHODS]
-        _say(f"{name:7}{'mean':8}" + "  ".join(f"{a:5.2f} / {b:5.2f}" for a, b in means))
-    _say(f"columns: {', '.join(METHODS)}; all pixels / covered ones, dB")
+    if (arguments.folder / CALIBRATION).is_file():
+        return 0 if all([show_rig(arguments.folder, name) for name in PREVIEWS]) else 1
+    good, table = True, dict[str, list[Scores]]()
+    _say(f"columns: {', '.join(METHODS)}; all pixels / covered ones, dB; law of motion")
+    for of, pair in pairs_in(arguments.folder):
+        if arguments.only not in pair.as_posix():
+            continue
+        found, law, seconds = score_pair(pair, of._replace(focal=None) if arguments.unknown_focal else of)
+        for frame, scores in found.items():
+            values = "  ".join("{:5.2f} / {:5.2f}".format(*scores[each]) for each in METHODS)
+            lost = scores["mono-fusion"][0] < max(scores["flow"][0] - WORST_LOSS, scores["uncorrected"][0])
+            name = f"{pair.relative_to(arguments.folder).as_posix()} {frame}"
+            _say(f"{name:44}{values}  {law:17} {seconds:6.1f} s{'  LOSES' if lost else ''}")
+            good &= not lost
+            table.setdefault(of.name, []).append(scores)
+    for name, rows in table.items():
+        means = [np.mean([scores[each] for scores in rows], axis=0) for each in METHODS]
+        _say(f"{name + ', mean of ' + str(len(rows)):44}" + "  ".join(f"{a:5.2f} / {b:5.2f}" for a, b in means))
     return 0 if good else 1
 
 
