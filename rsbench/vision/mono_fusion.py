@@ -254,7 +254,7 @@ class MonoFusion:
     def _drawn(
         self, frame: int, target_tau: float, measured: bool = False
     ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
-        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame at the target; ``measured``: of such pixels.
+        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame, or of its ``measured`` pixels, at a time.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
         """
