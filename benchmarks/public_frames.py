@@ -12,9 +12,10 @@ They are not ours to pass on: give the folder that holds them.
     python benchmarks/public_frames.py FOLDER
 
 A pair is rs_0.png, rs_1.png and a truth of one of them or both at the time of its middle row: gs_1.png or
-gs_1_m.png of the second, gs_0_m.png of the first. Pairs with equal frames count once. There are no masks that all
-of these have. ``covered`` are therefore, for every method alike, the pixels that the corrected frame shows when
-its optical flow moves it to that time.
+gs_1_m.png of the second, gs_0_m.png of the first. Pairs with equal frames count once, and one image for both
+truths is none of either (Fastec-RS in LBCNet). There are no masks that all of these have. ``covered`` are
+therefore, for every method alike, the pixels that the corrected frame shows when its optical flow moves it to
+that time.
 
 ``flow`` is optical flow (DIS) scaled by the times of the rows; what it leaves empty is black in ``flow, black``
 and invented from its surroundings in ``flow``. PSNR in dB over all channels, the mean of the frames' values. The
@@ -59,7 +60,7 @@ from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.pipeline.footage import FrameSource, RigCard, read_frame
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_matches_of_rig
-from rsbench.pipeline.mono_camera import OneCameraCard, find_camera
+from rsbench.pipeline.mono_camera import OneCameraCard, find_camera_alone
 from rsbench.pipeline.mono_correction import find_own_motion
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint
@@ -105,9 +106,16 @@ def pairs_in(folder: Path) -> Iterator[tuple[FrameSet, Path]]:
         for first in sorted(folder.glob(f"**/{each.name}/*/rs_0.png")):
             pair = first.parent
             digest = hashlib.sha256(first.read_bytes() + (pair / "rs_1.png").read_bytes()).digest()
-            if digest not in seen:
+            truths = [path.read_bytes() for path in truths_of(pair).values()]
+            if digest not in seen and len(set(truths)) == len(truths):
                 seen.add(digest)
                 yield each, pair
+
+
+def truths_of(pair: Path) -> dict[int, Path]:
+    """The truth of each frame that has one."""
+    found = {frame: [pair / name for name in names if (pair / name).is_file()] for frame, names in TRUTHS.items()}
+    return {frame: paths[0] for frame, paths in found.items() if paths}
 
 
 def score_pair(folder: Path, of: FrameSet) -> tuple[dict[int, Scores], str, float]:
@@ -118,18 +126,14 @@ def score_pair(folder: Path, of: FrameSet) -> tuple[dict[int, Scores], str, floa
     started = time.perf_counter()
     if of.focal is None:
         card = OneCameraCard(readout_ratio=of.readout_ratio)
-        camera = find_camera(images, 2, card, shutter, RobustOptions())[0]
+        camera = find_camera_alone(images, 2, card, shutter, RobustOptions())[0]
     else:
         camera = PinholeCamera.centred(width, height, of.focal)
     rig = StereoRig(camera=camera, baseline=1.0)
     flows = find_flows(images)
     found = find_own_motion(flows, rig, shutter, "left", RobustOptions())
     fusion = MonoFusion(images, found.own, flows)
-    truths = {
-        frame: read_frame(path)[..., :3]
-        for frame, names in TRUTHS.items()
-        for path in [folder / name for name in names if (folder / name).is_file()][:1]
-    }
+    truths = {frame: read_frame(path)[..., :3] for frame, path in truths_of(folder).items()}
     times = {frame: float(shutter.pixel_time(np.array([0.0, height // 2]), frame, "left")) for frame in truths}
     ours = {frame: fusion.corrected(frame, times[frame]) for frame in truths}
     seconds = time.perf_counter() - started
