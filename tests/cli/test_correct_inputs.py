@@ -81,7 +81,8 @@ def test_a_phone_s_video_becomes_an_upright_one_with_sound_and_a_page(
         inner = np.s_[8:-8, 24:-24]
         before, after = (np.sqrt(np.mean((image - truth)[inner] ** 2)) for image in (rolling, frame))
         assert after < 0.4 * before  # what H.264 loses, twice, is a fifth of it
-    np.testing.assert_allclose(frames[3].astype(int), frames[4], atol=6)  # the copy has its twin's result
+    # The copy has its twin's result, to what H.264 makes of it: two frames of the video differ by 15 levels.
+    assert np.mean(np.abs(frames[3].astype(float) - frames[4])) < 1.0
     with av.open("film-corrected.mp4") as written, av.open("film.mp4") as read:
         times = [[round(600 * frame.time) for frame in each.decode(video=0)] for each in (written, read)]
         assert times[0] == times[1]
