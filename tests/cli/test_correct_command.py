@@ -303,7 +303,7 @@ def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Pa
     assert_refused(correct(*frames[:3], *common), "3 images")
     assert_refused(correct(*frames, "--rig", rig, "--out", tmp_path / "film.mp4"), "give a folder")
     assert_refused(correct(*frames[:3], small, *common), "small.png", "128 x 60", "128 x 96")
-    assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "No such file")
+    assert_refused(correct(*frames[:3], tmp_path / "none.png", *common), "none.png", "does not exist")
     assert_refused(correct(*[flat] * 4, *common), "no texture")
     assert_refused(correct(*frames, *common, "--target", "500"), "--target 500", "95")
     assert_refused(correct(*frames, *common, "--row-poses"), "two times have no trajectory")
