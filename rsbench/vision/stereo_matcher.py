@@ -284,10 +284,10 @@ def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
 
 
 def between_pixels(disparity: F32, places: FloatArray) -> F32:
-    """Disparity (H, W), px, at places (h, w, 2): between its pixels on one surface, else that of the nearest."""
-    out = np.full(places.shape[:2], np.nan, np.float32)
-    _fill_between(disparity, places, out)
-    return out
+    """Disparity (H, W), px, at places (..., 2): between its pixels on one surface, else that of the nearest."""
+    out = np.full((1, places.size // 2), np.nan, np.float32)
+    _fill_between(disparity, places.reshape(1, -1, 2), out)
+    return out.reshape(places.shape[:-1])
 
 
 @compiled(error_model="numpy")

@@ -109,7 +109,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RsbenchError, match="cannot be read"):
         read_problem(tmp_path / "missing.json")
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(RsbenchError, match="not UTF-8"):
+    with pytest.raises(RsbenchError, match="is UTF-16 text"):
         read_problem(tmp_path / "binary.json")
 
 

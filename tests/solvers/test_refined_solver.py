@@ -227,7 +227,10 @@ def normalised_square(estimate: MotionEstimate, motion: Motion, noise_px: float)
 @pytest.mark.parametrize("noise_px", [0.1, 1.0])
 @pytest.mark.parametrize("sets", ["pairs", "tracks"])
 def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:
-    """The mean of 150 normalised squared errors lies in the 99 % band of chi-squared with 6 degrees of freedom."""
+    """The mean of 150 normalised squared errors is at most what chi-squared with 6 degrees of freedom allows.
+
+    And, for Hotelling's factor of few matches, no less than for axes that are 1.3 times as long.
+    """
     squares, noises = list[float](), list[float]()
     for seed in range(150):
         rng = np.random.default_rng(seed)
@@ -242,7 +245,7 @@ def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:
         noises.append(estimate.noise_px or np.nan)
     assert len(squares) >= 148
     band = np.asarray(chi2.ppf([0.005, 0.995], 6 * len(squares))) / len(squares)
-    assert band[0] < np.mean(squares) < band[1]
+    assert band[0] / 1.3**2 < np.mean(squares) < band[1]
     assert np.mean(noises) == pytest.approx(noise_px, rel=0.02)
 
 

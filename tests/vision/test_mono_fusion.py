@@ -40,7 +40,7 @@ from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, 
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.storage.files import read_json, read_png, write_png
 from rsbench.vision.corrector import CorrectionProblem, load_corrector
-from rsbench.vision.fusion import Origin
+from rsbench.vision.fusion import Origin, finished
 from rsbench.vision.mono_fusion import MonoFusion, OwnMotion, continued, find_flows
 
 Build = Callable[..., Any]
@@ -513,7 +513,7 @@ def test_the_command_takes_a_log(tmp_path: Path, world: Any, shapes: Any, u8: An
     assert [each["motion"]["model"] for each in record["frames"]] == ["gyro", "gyro"]
     image = read_png(tmp_path / "out" / "corrected" / "000001.png").astype(int)
     assert (
-        np.max(np.abs(image - corrected(scene, u8, samples).shown["left"].image)) <= 1
+        np.max(np.abs(image - finished(corrected(scene, u8, samples).shown["left"]).image)) <= 1
     )  # times in whole nanoseconds
     early = [f"{int(row.split(',')[0]) - 1_500_000_000},{row.partition(',')[2]}" for row in rows]
     (tmp_path / "early.csv").write_text("stamp_ns,wx,wy,wz\n" + "\n".join(early), encoding="utf-8")

@@ -506,7 +506,7 @@ SPECIAL: dict[str, tuple[Callable[[Path], object], str]] = {
     "a folder": (lambda path: path.mkdir(), "is no file"),
     "1 GB": (_huge, "bytes: 1073741824 is more than"),
     "a circle of links": (_loop, "cannot be read"),
-    "other bytes": (lambda path: path.write_bytes(b"\xff\xfe{}"), "not UTF-8"),
+    "other bytes": (lambda path: path.write_bytes(b"\xff\xfe{}"), "is UTF-16 text"),
     "a zip file": (lambda path: path.write_bytes(b"PK\x03\x04\x14\x00\x00\x00"), "not valid JSON"),
 }
 

@@ -155,7 +155,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\n" + "planes,1,2,3,4\n" * 7681),
         "7681 matches of planes: more than pixels, 7680",
     ),
-    "other bytes": (lambda p: (p / "left.csv").write_bytes(b"\xff\xfe\x00"), "not UTF-8"),
+    "other bytes": (lambda p: (p / "left.csv").write_bytes(b"\xff\xfe\x00"), "is UTF-16 text"),
 }
 
 
