@@ -115,10 +115,11 @@ def parts() -> list[Callable[[], object]]:
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
     from rsbench.capture.hypotheses import KnownInputs
     from rsbench.capture.two_frame_spline import two_frame_spline
-    from rsbench.components.motion_models import LinearMotion
+    from rsbench.components.motion_models import InertialMotion, LinearMotion
     from rsbench.core.camera import PinholeCamera
     from rsbench.core.rig import FRAMES, StereoRig
     from rsbench.core.shutter import RollingShutter
+    from rsbench.core.spline_motion import SplineMotion
     from rsbench.pipeline.chain import correct_frames, find_depth
     from rsbench.pipeline.frame_depth import CorrectionOptions, depth_of_pair
     from rsbench.pipeline.frame_motion import match_frames, solve_frames
@@ -129,8 +130,12 @@ def parts() -> list[Callable[[], object]]:
         LinearMotion([0.0, 0.02, 0.0], [0.1, 0.0, 0.2]),
     )
     options, images = CorrectionOptions(motion_model="auto"), _images()
-    data = simulate(
-        rig, shutter, motion, SimulationOptions(pairs=80, tracks=80, noise_px=0.1), np.random.default_rng(0)
+    few = SimulationOptions(pairs=80, tracks=80, noise_px=0.1)
+    shaken = SplineMotion([0.03, 0.05, 0.0], [0.1, 0.0, 0.2], preset="handheld")
+    # A law without a kernel of its own, and shakes that need a spline.
+    turning, shaking = (
+        simulate(rig, shutter, each, few, np.random.default_rng(0)).correspondences
+        for each in (InertialMotion([0.05, 0.12, 0.05], [0.1, 0.0, 0.2]), shaken)
     )
     wall = [np.full((_HEIGHT, _WIDTH), 9.0, dtype=np.float32)] * 2
     wall[0][40:60, 40:60] = np.nan
@@ -143,10 +148,10 @@ def parts() -> list[Callable[[], object]]:
         return correct_frames(images, (first, second), rig, shutter, motion, options)
 
     return [
-        lambda: two_frame_spline(data.correspondences, rig, shutter, motion),
+        lambda: two_frame_spline(shaking, rig, shutter, LinearMotion(shaken.w, shaken.d)),
         lambda: find_depth(images, rig, shutter, motion, options),
         corrected,
-        lambda: solve_frames(data.correspondences, rig, KnownInputs(readout_ratio=shutter.readout_ratio), options),
+        lambda: solve_frames(turning, rig, KnownInputs(readout_ratio=shutter.readout_ratio), options),
         lambda: match_frames(images, rig, options),
     ]
 
