@@ -145,7 +145,7 @@ def correct(
         _correct_given(alone, row, options_of_camera(inpaint, seed, 0.0), inpaint is None)
         return
     if fov is not None:
-        raise RsbenchError("--fov: is of one camera; a rig's is in its calibration, --rig")
+        raise RsbenchError("--fov: has no effect with --rig, whose calibration gives focal lengths; leave it out")
     both = given_frames(given.frames, rig, out, given.left, given.right, log, readout, row_poses, side_by_side)
     given_rig = replace(both, rectify=rectify)
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "motion_model": motion_model}

@@ -181,7 +181,7 @@ class Arranged:
 
 
 def is_rendered(folder: Path) -> bool:
-    """Whether a folder is of a dataset or one of its sequences."""
+    """Whether a folder is a dataset or one of its sequences."""
     return any((folder / name).is_file() for name in ("dataset.json", "sequence.json"))
 
 
@@ -235,8 +235,8 @@ def _arranged_films(films: list[Path], files: list[Path], rig: Path | None, side
         raise RsbenchError("--rig: is required with --side-by-side: the calibration of both cameras")
     if len(films) == 1 and rigged and not side_by_side:
         raise RsbenchError(
-            f"{films[0]}: one {kind}, and --rig is of two cameras: add --side-by-side if both are in each frame, "
-            "or give two; of one camera leave --rig out"
+            f"{films[0]}: one {kind}, but --rig describes two cameras: add --side-by-side if each frame shows "
+            "both, or give two; for one camera leave --rig out"
         )
     if len(films) == 2 and not rigged:
         raise RsbenchError(
@@ -331,7 +331,7 @@ class CorrectInput:
 
     @property
     def one_camera(self) -> bool:
-        """Whether frames are of one camera."""
+        """Whether one camera took all frames."""
         return len(self.footage) == 1
 
     def sources(self) -> list[FrameSource]:

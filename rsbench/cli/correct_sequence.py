@@ -72,8 +72,8 @@ def _say_input(
         echo(given.words)
     if source.orientation != UPRIGHT:
         echo(
-            f"shown {ORIENTATIONS[source.orientation]}: rows, --target, --fov and scan are of frames as they are "
-            "stored, and the result is shown alike"
+            f"shown {ORIENTATIONS[source.orientation]}: rows, --target, --fov and scan refer to frames as they "
+            "are stored, and the result is shown alike"
         )
     for line in timeline.words:
         echo(line)

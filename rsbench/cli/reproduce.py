@@ -123,7 +123,7 @@ def reproduce(
         Target | None,
         typer.Argument(
             show_default=False,
-            help="None: a list, with minutes. "
+            help="Without one, a list with minutes. "
             "images: the paper's image experiment in castle, old-town and room. fig3: its Figure 3 on "
             "simulated points. claims: what became of each claim about them, in every reading of the paper's "
             "solver. readings: the claims in settings that it does not state. image-claims: those about images, "

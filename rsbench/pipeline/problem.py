@@ -36,6 +36,7 @@ COLUMNS = {
 }
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 _LINES = (".jsonl", ".ndjson")
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".mp4", ".mov", ".mkv", ".avi")
 _BESIDE = {
     "affine": "dx1/dx0, dx1/dy0, dy1/dx0, dy1/dy0",
     "gyro": "tau, wx, wy, wz",
@@ -159,6 +160,11 @@ def _shutter_record(problem: Problem) -> dict[str, Any]:
 
 def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
     try:
+        if path.suffix.lower() in _PICTURES:
+            raise RsbenchError(
+                f"{path}: is an image or a video, and not matches: rsbench correct takes it, and inspect four "
+                "images with --rig"
+            )
         if path.suffix == ".npz":
             yield _from_npz(path)
             return

@@ -28,6 +28,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.scenes.model import FloatArray
 from rsbench.storage.untrusted_files import (
     FILE_BYTES,
+    NUMBER,
     check_amount,
     check_image_size,
     parse_json,
@@ -444,14 +445,11 @@ def _map_options(value: Sequence[str]) -> tuple[dict[str, list[str]], str]:
     options, rest = dict[str, list[str]](), value[0].strip() if value else ""
     while rest.startswith("-") and len(words := rest.split()) > 2:
         count = 1
-        while count < _OPTIONS.get(words[0], 1) and len(words) > count + 2 and _NUMBER.fullmatch(words[count + 1]):
+        while count < _OPTIONS.get(words[0], 1) and len(words) > count + 2 and NUMBER.fullmatch(words[count + 1]):
             count += 1
         options[words[0]] = words[1 : 1 + count]
         rest = rest.split(maxsplit=1 + count)[1 + count]
     return options, rest
-
-
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 def _plain_polygons(text: bytes) -> bytes:

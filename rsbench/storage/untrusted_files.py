@@ -26,6 +26,8 @@ from rsbench.core.errors import RsbenchError
 
 LIMITS = "RSBENCH_LIMITS"
 """Environment variable: factor for all limits."""
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+"""A finite number in text."""
 MB = 1 << 20
 CARD_BYTES = MB
 """Limit for a TOML card: its reader takes seconds for a MB."""

@@ -111,6 +111,9 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RsbenchError, match="is UTF-16 text"):
         read_problem(tmp_path / "binary.json")
+    for name in ("frame.png", "Film.MP4"):
+        with pytest.raises(RsbenchError, match="is an image or a video, and not matches"):
+            read_problem(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["left", "right", "stereo_0", "tracks"])

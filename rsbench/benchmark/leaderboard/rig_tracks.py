@@ -78,7 +78,7 @@ class RigFrames(Frames):
                 yield unmatched(each) if track.gives_images else matched(each, options)
 
     def pairs(self, track: Track, folder: Path) -> list[Rendered]:
-        """Pairs of frames; on tracks of pictures, which are of the left camera, only where that camera rolls."""
+        """Pairs of frames; where pictures of the left camera are scored, only rigs whose left camera rolls."""
         found = read_pairs(folder)
         return [each for each in found if each.shutter.ratio_of("left") > 0.0] if track.pictures else found
 

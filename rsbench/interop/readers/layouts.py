@@ -79,7 +79,7 @@ from rsbench.interop.readers.calibrations import (
 from rsbench.pipeline.footage import read_frame
 from rsbench.pipeline.mono_camera import DEFAULT_FOCAL
 from rsbench.storage.files import read_grey_png
-from rsbench.storage.untrusted_files import inside, read_bytes, read_text
+from rsbench.storage.untrusted_files import NUMBER, inside, read_bytes, read_text
 
 
 def numbers(text: str, where: object, count: int | None = None) -> FloatArray:
@@ -244,15 +244,12 @@ def _colmap_image_lines(path: Path) -> Iterator[tuple[str, str]]:
         if line.lstrip().startswith("#"):
             continue
         words = line.split()
-        of_points = len(words) != 10 and all(_NUMBER.fullmatch(word) for word in words)
+        of_points = len(words) != 10 and all(NUMBER.fullmatch(word) for word in words)
         if image:
             yield image, line if of_points else ""
         image = "" if of_points else line
     if image:
         yield image, ""
-
-
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
