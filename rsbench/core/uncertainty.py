@@ -1,7 +1,7 @@
-"""What a stated deviation means, in one place: covariances, intervals and mixtures that cover the truth.
+"""What a stated deviation means, in one place: covariances for ellipsoids that hold the truth.
 
 An estimate minimises a cost, the sum over measurements i of negative log-likelihoods with gradients g_i and
-curvatures H_i at the minimum. Five things make the inverse curvature too small a covariance, and each has one
+curvatures H_i at the minimum. Four things make the inverse curvature too small a covariance, and each has one
 function here.
 
 1. The model of the noise is approximate. The sandwich A^-1 (sum g_i g_i^T) A^-1 holds whatever the noise is (P.
@@ -20,20 +20,20 @@ function here.
    divides log-likelihoods where hypotheses are compared (P. McCullagh, J. Nelder, Generalized Linear Models, 1989,
    9.2: quasi-likelihood; R. Royall, T.-S. Tsou, J. Royal Statistical Society B 2003).
 4. The hypothesis itself is uncertain. The covariance of a mixture adds the squared distances between what the
-   hypotheses give, weighted by their probabilities (``spread_about``, ``mixture``; J. Hoeting, D. Madigan, A.
+   hypotheses give, weighted by their probabilities (``spread_about``; J. Hoeting, D. Madigan, A.
    Raftery, C. Volinsky, Statistical Science 1999, eq. 3).
-5. The likelihood is not Gaussian: a bound, two optima, a long tail. An interval then holds all values that the
-   likelihood ratio does not reject (``likelihood_interval``; S. Wilks, Annals of Mathematical Statistics 1938).
 
-Each stated number is one standard deviation of the error against the truth, and each covariance C such that the
-error e has e^T C^-1 e below the 95 % quantile of chi-squared in 95 of 100 problems. It has no part for errors of
+A likelihood that is not Gaussian (a bound, two optima, a long tail) is not stated as one.
+
+Each stated number is meant as one standard deviation of the error against the truth, and each covariance C is made
+for errors e with e^T C^-1 e below the 95 % quantile of chi-squared in 95 of 100 problems; how often that holds is
+measured in docs/explanation/deviations.md. It has no part for errors of
 what is given (calibration, shutter): where these are estimated, the caller adds what they contribute.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +50,6 @@ _LEAST_FREEDOM = 3.0
 """Of the denominator of F: fewer have quantiles that say nothing."""
 _MOST_FOLLOWED = 0.5
 """Largest leverage for which HC3 corrects."""
-_DOUBLINGS, _HALVINGS = 40, 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -174,79 +173,3 @@ def spread_about(used: FloatArray, probabilities: ArrayLike, values: FloatArray)
     """(p, p) mean square of the distance of hypotheses' values (k, p) from the value (p,) that is used."""
     away = np.asarray(values) - used
     return np.asarray((np.asarray(probabilities)[:, None] * away).T @ away)
-
-
-def mixture(probabilities: ArrayLike, values: ArrayLike, sigmas: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation (...) of a mixture of parts with these means and deviations (k, ...)."""
-    weights, values = np.asarray(probabilities), np.asarray(values)
-    mean = np.asarray(np.tensordot(weights, values, 1))
-    variance = np.tensordot(weights, np.asarray(sigmas) ** 2 + (values - mean) ** 2, 1)
-    return mean, np.sqrt(variance)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Interval:
-    """Values that a likelihood does not reject."""
-
-    low: float
-    high: float
-    bounded: bool
-    """Whether both ends are the likelihood's, and neither is a limit of the values."""
-
-    @property
-    def half(self) -> float:
-        """Half of its length."""
-        return 0.5 * (self.high - self.low)
-
-    def holds(self, value: float) -> bool:
-        """Whether it contains a value."""
-        return self.low <= value <= self.high
-
-
-def likelihood_interval(
-    cost: Callable[[float], float],
-    at: float,
-    step: float,
-    limits: tuple[float, float] = (-np.inf, np.inf),
-    level: float = LEVEL,
-    dispersion: float = 1.0,
-) -> Interval:
-    """All values about the best one whose likelihood ratio is not rejected.
-
-    Args:
-        cost: negative log-likelihood of a value, all else fitted to it.
-        at: the value of the least cost.
-        step: a first guess of its deviation.
-        limits: of the values.
-        level: probability with which the interval holds the truth.
-        dispersion: ``shared`` above, by which log-likelihoods are divided.
-    """
-    allowed = cost(at) + 0.5 * dispersion * float(scipy.special.chdtri(1, 1.0 - level))
-    (low, low_found), (high, high_found) = (
-        _crossing(cost, at, sign * step, allowed, limit) for sign, limit in zip((-1.0, 1.0), limits, strict=True)
-    )
-    return Interval(low=low, high=high, bounded=low_found and high_found)
-
-
-def _crossing(
-    cost: Callable[[float], float], at: float, step: float, allowed: float, limit: float
-) -> tuple[float, bool]:
-    """Where a cost exceeds what is allowed, in the direction of the step; the limit where it does not before."""
-    inside, reach = at, step
-    for _ in range(_DOUBLINGS):
-        outside = at + reach
-        if (outside - limit) * step >= 0.0:
-            outside = limit
-        if cost(outside) > allowed:
-            break
-        if outside == limit:
-            return limit, False
-        inside, reach = outside, 2.0 * reach
-    else:
-        return inside, False
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (inside + outside)
-        if abs(outside - inside) <= 1e-3 * abs(middle - at):
-            break
-        inside, outside = (middle, outside) if cost(middle) <= allowed else (inside, middle)
-    return 0.5 * (inside + outside), True

@@ -89,27 +89,3 @@ def test_a_regression_is_covered_with_unequal_noise_and_few_measurements() -> No
         for name, C in (("stated", stated), ("plain", inverse @ (X * left[:, None] ** 2).T @ X @ inverse)):
             held[name] += bool(error @ np.linalg.solve(C, error) <= scipy.stats.chi2.ppf(0.95, 3))
     assert 0.93 < held["stated"] / 600 < 0.985 and held["plain"] / 600 < 0.9
-
-
-def test_a_mixture_has_the_variance_within_and_between() -> None:
-    mean, sigma = u.mixture([0.5, 0.5], [[0.0], [2.0]], [[1.0], [1.0]])
-    assert mean == pytest.approx([1.0]) and sigma == pytest.approx([np.sqrt(2.0)])
-    spread = u.spread_about(np.zeros(2), [0.75, 0.25], np.array([[0.0, 0.0], [2.0, 1.0]]))
-    np.testing.assert_allclose(spread, [[1.0, 0.5], [0.5, 0.25]])
-    np.testing.assert_allclose(u.tempered([0.8, 0.2], 2.0), [2.0 / 3.0, 1.0 / 3.0])
-
-
-def test_the_interval_of_a_normal_value_is_that_of_its_deviation_and_of_poisson_counts_the_exact_one() -> None:
-    found = u.likelihood_interval(lambda x: 0.5 * ((x - 3.0) / 0.2) ** 2, 3.0, 0.01)
-    assert found.bounded and found.low == pytest.approx(3.0 - 1.96 * 0.2, abs=1e-3)
-    assert found.high == pytest.approx(3.0 + 1.96 * 0.2, abs=1e-3) and found.holds(3.0)
-    counts = u.likelihood_interval(lambda m: m - 5.0 * np.log(max(m, 1e-300)), 5.0, 1.0, (0.0, np.inf))
-
-    def excess(m: float) -> float:
-        """Deviance of a Poisson rate behind 5 counts, less the quantile."""
-        return float(2.0 * (m - 5.0 - 5.0 * np.log(m / 5.0)) - scipy.stats.chi2.ppf(0.95, 1))
-
-    for found_end, ends in ((counts.low, (1e-3, 5.0)), (counts.high, (5.0, 50.0))):
-        assert found_end == pytest.approx(scipy.optimize.brentq(excess, *ends), abs=1e-2)
-    flat = u.likelihood_interval(lambda x: 0.0, 0.5, 0.1, (0.0, 1.0))
-    assert not flat.bounded and (flat.low, flat.high) == (0.0, 1.0)
