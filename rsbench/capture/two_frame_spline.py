@@ -40,7 +40,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import small_sample_factor, spread_about, tempered
-from rsbench.solvers.engine.packed import each_term, heavy_tailed, pack
+from rsbench.solvers.engine.packed import HeavyTailed, each_term, heavy_tailed, pack
 
 _OF_A_MODEL = 6.0
 """Parameters of a motion model, at least."""
@@ -126,7 +126,8 @@ def two_frame_spline(
     # The prior's strength is estimated from as many accelerations as the matches determine.
     factor = small_sample_factor(max(spline.determined - _OF_A_MODEL, 0.0), int(_OF_A_MODEL))
     covariance = motion_covariance(found.curve, covariance_band(found.fit, spline.tracks, _SHARE), 0.0)
-    covariance = None if covariance is None else factor * covariance
+    if covariance is not None:
+        covariance = factor * covariance + _of_common_shifts(window, rig, shutter, law)
     apart = spread_about(motions[int(np.argmax(worths))], odds, motions)
     unique = covariance is not None and float(np.trace(np.linalg.solve(covariance, apart))) < _APART
     return TwoFrameSpline(
@@ -179,15 +180,14 @@ def _by_rows(window: Correspondences, rig: StereoRig, shutter: RollingShutter, l
     chi-squared of six for each part but one under the law (score test, C. Rao, Proc. Cambridge Philosophical
     Society 1948). None for few tracks, or a law without equations.
     """
-    if len(window.tracks) < _FEWEST or not has_kernel(law.name):
-        return None
-    packed = pack(Correspondences(tracks=window.tracks), rig, shutter, law.name, motion_parameters=law.parameters)
-    theta = packed.theta(law.w, law.d)
-    squares = each_term(packed, theta).squares
-    tailed = heavy_tailed(packed, theta, max(float(np.sqrt(np.median(squares) / _MEDIAN)), LEAST_SCALE_PX))
+    tailed = _under_law(window, rig, shutter, law)
     if tailed is None:
         return None
-    each, ends, timed = each_term(tailed, theta), tailed.tracks, tailed.tracks.ndim == 3
+    each, ends, timed = (
+        each_term(tailed, tailed.theta(law.w, law.d)),
+        tailed.tracks,
+        tailed.tracks.ndim == 3,
+    )
     disparities = rig.camera.fx * (ends[:, 0, 0] - ends[:, 1, 0]) if timed else ends[:, 2]
     times = ends[:, 0, 2] if timed else ends[:, 6]
     count = min(_PARTS, len(times) // _OF_A_PART)
@@ -201,6 +201,29 @@ def _by_rows(window: Correspondences, rig: StereoRig, shutter: RollingShutter, l
         square += float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) / tailed.scale**2
     deep = float(np.median(disparities)) >= _DEPTHS * tailed.scale * np.sqrt(2.0)
     return _Rows(square=square, freedom=6 * (count - 1), parts=count, depth=deep)
+
+
+def _under_law(
+    window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion
+) -> HeavyTailed | None:
+    """Tracks with the distribution of their errors; None for few tracks, or a law without equations."""
+    if len(window.tracks) < _FEWEST or not has_kernel(law.name):
+        return None
+    packed = pack(Correspondences(tracks=window.tracks), rig, shutter, law.name, motion_parameters=law.parameters)
+    theta = packed.theta(law.w, law.d)
+    squares = each_term(packed, theta).squares
+    return heavy_tailed(packed, theta, max(float(np.sqrt(np.median(squares) / _MEDIAN)), LEAST_SCALE_PX))
+
+
+def _of_common_shifts(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> FloatArray:
+    """(6, 6) what errors that all matches of a region share do to w and d, by the equations of a law nearby."""
+    tailed = _under_law(window, rig, shutter, law)
+    theta = None if tailed is None else tailed.theta(law.w, law.d)
+    stated = None if tailed is None or theta is None else tailed.stated(theta)
+    if tailed is None or theta is None or stated is None:
+        return np.zeros((6, 6))
+    J = tailed.motion_jacobian(theta)
+    return np.asarray(J @ stated.shifted @ J.T)
 
 
 def log_odds_of_opposite(

@@ -33,6 +33,7 @@ from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import FEWEST_PER_PARAMETER
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.levenberg_marquardt import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, heavy_tailed, pack, pack_pairs, solve_triples
@@ -366,10 +367,10 @@ class RefinedSolver(Solver):
         if rotation_sigma(best.H, max(variance, _LEAST_NOISE_PX**2)) > self.max_rotation_sigma:
             return MotionEstimate.failed("the rotation is not determined: degenerate matches")
         w, d = packed.motion(best.theta)
-        covariance = packed.covariance(best.theta, best.cost, best.H)
-        if covariance is not None:
+        stated, covariance = packed.stated(best.theta, best.cost, best.H), None
+        if stated is not None:
             J = packed.motion_jacobian(best.theta)
-            covariance = J @ covariance @ J.T
+            covariance = J @ stated.covariance @ J.T
         if packed.one_camera:
             d, covariance = _of_unit_length(d, covariance)
         scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
@@ -385,6 +386,9 @@ class RefinedSolver(Solver):
         if linked and variance > 0.0 and _depths(packed, variance) < _LEAST_DEPTHS:
             covariance = None
             reasons.append("no deviation can be stated: disparities are smaller than their noise")
+        elif stated is not None and stated.count < FEWEST_PER_PARAMETER * packed.parameters:
+            covariance = None
+            reasons.append(f"no deviation can be stated: all depends on some {stated.count:.0f} matches")
         if not direction_known:
             why = "another motion explains these matches as well (a plane)" if rival else "too little translation"
             reasons.append(f"the direction of d is not determined: {why}")

@@ -89,3 +89,19 @@ def test_a_regression_is_covered_with_unequal_noise_and_few_measurements() -> No
         for name, C in (("stated", stated), ("plain", inverse @ (X * left[:, None] ** 2).T @ X @ inverse)):
             held[name] += bool(error @ np.linalg.solve(C, error) <= scipy.stats.chi2.ppf(0.95, 3))
     assert 0.93 < held["stated"] / 600 < 0.985 and held["plain"] / 600 < 0.9
+
+
+def test_common_shifts_of_tiles_are_covered_where_plain_deviations_are_a_third() -> None:
+    """A mean of 1200 places whose tiles are shifted: the shift of a tile does not average out within it."""
+    rng, n = np.random.default_rng(0), 1200
+    places = rng.uniform(size=(n, 2))
+    groups, X = u.tiles(places), np.column_stack([np.ones(n), places])
+    inverse = np.asarray(np.linalg.inv(X.T @ X), dtype=np.float64)
+    added = u.common_shifts(X[None] @ inverse, groups, sigma_px=0.1)
+    errors = []
+    for _ in range(4000):
+        e = 0.1 * rng.normal(size=n) + u.SHIFT_PX * rng.normal(size=12)[groups]
+        errors.append(inverse @ X.T @ e)
+    expected = 0.01 * inverse + added
+    np.testing.assert_allclose(np.cov(np.transpose(errors)), expected, atol=0.06 * np.max(expected))
+    assert np.all(u.common_shifts(X[None] @ inverse, groups, sigma_px=1e-3) < 1e-2 * np.abs(added) + 1e-12)

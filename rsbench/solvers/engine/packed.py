@@ -26,7 +26,7 @@ that it is right.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple
@@ -169,24 +169,69 @@ class Packed:
         freedom = self.constraints - self.parameters
         return 2.0 * cost / freedom if freedom > 0 else 0.0
 
-    def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
+    def stated(self, theta: FloatArray, cost: float, H: FloatArray) -> Stated | None:
         """Covariance (6, 6) of theta at the minimum, see ``core.uncertainty``; None when it does not exist."""
         inverse, variance = inverse_definite(H), self.noise_variance(cost)
         if inverse is None or self.constraints <= self.parameters:
             return None
         each = each_term(self, theta)
         if not variance > _EXACT_PX**2:
-            return variance * inverse
-        leverages = _leverages(self, theta, each, np.ones(len(each.squares)))
-        return self._stated(each.gradients, inverse, variance * inverse, leverages).covariance
+            return Stated(variance * inverse)
+        return self._stated(theta, each, np.ones(len(each.squares)), inverse, variance * inverse, variance)
 
     def _stated(
-        self, gradients: FloatArray, inverse: FloatArray, information: FloatArray, leverages: FloatArray
+        self,
+        theta: FloatArray,
+        each: Each,
+        weights: FloatArray,
+        inverse: FloatArray,
+        information: FloatArray,
+        variance: float,
     ) -> Stated:
-        """``stated_covariance`` of the measurements at their places in frame 0."""
+        """``stated_covariance`` of the measurements, of this ``variance`` (px^2), at their places in frame 0."""
         tracks = self.tracks[:, :2] if self.tracks.ndim == 2 else self.tracks[:, 0, :2]
-        places = np.concatenate([self.pairs[:, :2], tracks])
-        return stated_covariance(gradients, inverse, information, leverages, places, self.parameters)
+        moved = list[FloatArray]()
+        for shifted in self.shifted(_SHIFT_STEP_PX):
+            there = each_term(shifted, theta)
+            seen = (each.squares < BEHIND) & (there.squares < BEHIND)
+            moved.append(np.where(seen[:, None], there.gradients - each.gradients, 0.0) / _SHIFT_STEP_PX)
+        return stated_covariance(
+            weights[:, None] * each.gradients,
+            inverse,
+            information,
+            _leverages(self, theta, each, weights),
+            np.concatenate([self.pairs[:, :2], tracks]),
+            self.parameters,
+            weights[:, None] * np.stack(moved),
+            math.sqrt(variance),
+        )
+
+    def shifted(self, px: float) -> Iterator[Packed]:
+        """The measurements with the right ends of frame 0 shifted, with those of frame 1, with all of frame 1.
+
+        Each along x and along y, where the measurements depend on it.
+        """
+        timed, step = self.tracks.ndim == 3 or self.pairs.shape[1] == 17, px * np.eye(2)
+        for ends, axis in product(((1,), (3,), (2, 3)), range(2)):
+            pairs, tracks = self.pairs.copy(), self.tracks.copy()
+            if 2 in ends:
+                pairs[:, 2:4] += (
+                    (pairs[:, 11:15].reshape(-1, 2, 2) if timed else np.eye(2)) @ step[axis] / self.focal
+                )
+            if self.tracks.ndim == 3:
+                for end in ends:
+                    tracks[:, end, :2] += tracks[:, end, 3:7].reshape(-1, 2, 2) @ step[axis] / self.focal
+            elif 2 in ends:
+                tracks[:, 3 + axis] += px
+            elif axis == 1:  # one row of both images
+                continue
+            elif ends == (1,):
+                tracks[:, 0] += 0.5 * px / self.focal[0]
+                tracks[:, 2] -= px
+            else:
+                tracks[:, 3] += 0.5 * px
+                tracks[:, 5] -= px
+            yield replace(self, pairs=pairs, tracks=tracks)
 
     def in_front(self, theta: FloatArray) -> int:
         """Number of pairs whose point lies in front of both cameras."""
@@ -394,6 +439,8 @@ _REACH = 10.0
 """Errors, in scales, beyond which a match is wrong: its weight would be below 0.04."""
 _FIRST_NU, _MIXTURE_STEPS, _MOST_RIGHT = 3.0, 4, 0.999
 """Tails to begin with; rounds of the mixture's EM; and the share of right ones within the reach, at most."""
+_SHIFT_STEP_PX = 1e-3
+"""Of numerical derivatives by the pixels of measurements."""
 _EXACT_PX = 1e-7
 """Noise below which matches are exact."""
 _SAFE_LEVERAGE, _TIMES_THE_MEAN = 0.2, 3.0
@@ -454,13 +501,8 @@ class HeavyTailed(Packed):
         """Variance of a coordinate, px^2, without tails: two in three errors are below its root."""
         return (self.scale * float(scipy.special.stdtrit(self.nu, _ONE_SIGMA))) ** 2
 
-    def covariance(self, theta: FloatArray, cost: float, H: FloatArray) -> FloatArray | None:
-        """Covariance (6, 6) of theta at the minimum, whatever the distribution of the errors; None for none."""
-        stated = self.stated(theta)
-        return None if stated is None else stated.covariance
-
-    def stated(self, theta: FloatArray) -> Stated | None:
-        """The covariance with what it was made from; None where there is none.
+    def stated(self, theta: FloatArray, cost: float = 0.0, H: FloatArray | None = None) -> Stated | None:
+        """The covariance whatever the distribution of the errors, with what it was made from; None for none.
 
         See ``core.uncertainty``. The Hessian of the mixture is that of the t distribution less what is missing
         because nobody knows which measurements are right (T. Louis, J. Royal Statistical Society B 1982). A track
@@ -478,8 +520,7 @@ class HeavyTailed(Packed):
         inverse = inverse_definite(self.definite(theta, A))
         if inverse is None or information is None:
             return None
-        leverages = _leverages(self, theta, each, weights)
-        return self._stated(weights[:, None] * each.gradients, inverse, variance * information, leverages)
+        return self._stated(theta, each, weights, inverse, variance * information, self.noise_variance(0.0))
 
 
 def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed | None:
