@@ -158,8 +158,8 @@ def asked_over_matched(data: Path) -> tuple[Work, Work]:
     from rsbench.capture.shutter_decision import known_of
     from rsbench.capture.two_frame_estimate import conclude, examine
     from rsbench.dataset.sequence import read_dataset
+    from rsbench.pipeline.frame_capture import match_unknown
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.frame_motion import match_unknown
     from rsbench.vision.features import forget_features
 
     sequence, options = next(iter(read_dataset(data))), CorrectionOptions()

@@ -27,8 +27,9 @@ from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
+from rsbench.pipeline.frame_capture import know_matches, match_frames
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.vision.features import forget_features
 
 BOUND = 10.0
@@ -51,8 +52,8 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
     forget_features()
     matches = timed("match", lambda: match_frames(images, rig, options))
     ratio = sequence.shutter.readout_ratio
-    solved = timed("solve", lambda: solve_frames(matches, rig, KnownInputs(readout_ratio=ratio), options))
-    found, shutter = solved.found, solved.shutter
+    inputs, shutter = KnownInputs(readout_ratio=ratio), sequence.shutter
+    found = timed("solve", lambda: solve_frames(*know_matches(matches, rig, inputs, options), options))
     pairs = timed("depth", lambda: find_depth(images, rig, shutter, found.motion, options))
     timed("correct", lambda: correct_frames(images, pairs, rig, shutter, found.motion, options))
     return times

@@ -42,8 +42,8 @@ from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
 from rsbench.pipeline.answer import solve_problem
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 

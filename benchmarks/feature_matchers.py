@@ -34,8 +34,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.answer import solve_problem
 from rsbench.pipeline.footage import read_frame, read_rig_card
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import load_solver_entry

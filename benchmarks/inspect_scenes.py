@@ -29,8 +29,8 @@ from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCa
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_dataset
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 
 SCENES = {
     "castle": 1.0,

@@ -23,8 +23,8 @@ from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of,
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_capture import match_unknown
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import match_unknown
 from rsbench.pipeline.sequence_capture import window_images
 
 

@@ -25,8 +25,9 @@ from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.arrays import options_of
 from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
-from rsbench.pipeline.sequence_capture import CorrectedMoment, KnownCapture
+from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.pipeline.sequence_correction import correct_sequence
 from rsbench.vision.fusion import finished
 

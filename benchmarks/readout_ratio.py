@@ -36,8 +36,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.sequence import read_dataset
+from rsbench.pipeline.frame_capture import match_frames
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import match_frames
 
 RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 NOISE_PX, NORMAL = 0.3, 1e6

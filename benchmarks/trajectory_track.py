@@ -43,8 +43,8 @@ from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline import chain
 from rsbench.pipeline.chain import correct_four
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions, frame_pairs
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.renderers.backend import start_backend
 from rsbench.vision.fusion import Origin
 

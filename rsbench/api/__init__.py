@@ -130,7 +130,7 @@ def estimate_motion(
         RsbenchError: no such solver or motion model, or the solver can take no other than its own.
         ValueError: an argument of another type or out of its range.
     """
-    from rsbench.api.estimating import under_model
+    from rsbench.api.estimating import estimate_under
     from rsbench.solvers.engine.base import entry_of
     from rsbench.solvers.engine.robust_motion import RobustOptions
     from rsbench.solvers.engine.robust_motion import estimate_motion as estimate_robustly
@@ -144,10 +144,9 @@ def estimate_motion(
     if threshold_px is not None:
         options = RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
     entry, rng = entry_of(solver), np.random.default_rng(seed)
-    found = estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
-    if motion_model is None:
-        return found
-    return under_model(motion_model, found, entry, correspondences, rig, shutter, options, seed)
+    if motion_model is not None:
+        return estimate_under(motion_model, entry, correspondences, rig, shutter, options, seed)
+    return estimate_robustly(correspondences, rig, shutter, entry.solver, options, rng, entry.options.robust)
 
 
 def pose_errors(
@@ -207,8 +206,8 @@ def match(images: Series[Image], *, features: str | Path = "dense") -> Correspon
         ValueError: not four images that are alike, uint8 or uint16.
         RsbenchError: no such feature matcher.
     """
+    from rsbench.pipeline.frame_capture import find_matches
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.frame_motion import find_matches
     from rsbench.vision.feature_matcher import load_features
 
     return find_matches(

@@ -67,9 +67,8 @@ def estimate_trajectory(
     return trajectory_of(windows, rig, shutter, seed, samples)
 
 
-def under_model(
+def estimate_under(
     requested: str,
-    found: RobustEstimate,
     entry: SolverEntry,
     matches: Correspondences,
     rig: StereoRig,
@@ -77,25 +76,22 @@ def under_model(
     options: RobustOptions,
     seed: int,
 ) -> RobustEstimate:
-    """An estimate again, under the motion model that is requested or that the matches prefer (``auto``).
+    """An estimate under the motion model that is requested or that the matches prefer (``auto``).
 
     Raises:
         RsbenchError: no such model, or the solver can take no other than its own.
+        NoMotionError: the solver found only the direction of the translation.
     """
-    from rsbench.capture.model_choice import AUTO
-    from rsbench.pipeline.frame_motion import check_model, chosen_model, entry_of, motion_of, or_spline, widened
+    from rsbench.pipeline.frame_motion import Matched, check_model, motion_of, under_model
     from rsbench.solvers.engine.robust_motion import estimate_motion
 
+    def solve(entry: SolverEntry) -> RobustEstimate:
+        rng = np.random.default_rng(seed)
+        return estimate_motion(matches, rig, shutter, entry.solver, options, rng, entry.options.robust)
+
     check_model(requested, entry)
-    if not found.estimate.success:
-        return found
-    start = motion_of(found.estimate, entry, rig)
-    choice = chosen_model(requested, start, matches, rig, shutter, options, seed)
-    if choice is not None:
-        entry, rng = entry_of(entry, choice), np.random.default_rng(seed)
-        found = estimate_motion(matches, rig, shutter, entry.solver, options, rng, entry.options.robust)
-        found = widened(found, choice.spread)
-    if requested == AUTO and found.estimate.success:
-        law = motion_of(found.estimate, entry, rig)
-        found, choice, _ = or_spline(found, choice, law, matches, rig, shutter, seed)
+    given = Matched(matches, rig, shutter)
+    found, entry, choice, motion = under_model(requested, entry, solve, given, options, seed)
+    if found.estimate.success and isinstance(motion, str):
+        motion_of(found.estimate, entry, rig)
     return found if choice is None else replace(found, motion_model=choice.used)

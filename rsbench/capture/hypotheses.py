@@ -155,15 +155,16 @@ class KnownInputs:
     """Errors of the calibration, see ``calibration.TERMS``."""
     models: tuple[str, ...] = MODELS
 
-    def shutter_of(self, rig: StereoRig) -> RollingShutter:
-        """The shutter of a given readout ratio; without a scanning, rows from the top.
+    @property
+    def reading(self) -> Scanning:
+        """How the cameras read; without a scanning, rows from the top."""
+        return self.scanning or Scanning()
 
-        Raises:
-            ValueError: there is no readout ratio.
-        """
+    def shutter_of(self, rig: StereoRig) -> RollingShutter:
+        """The shutter of a given readout ratio; ValueError where there is none."""
         if self.readout_ratio is None:
             raise ValueError("readout_ratio: must be given")
-        return rig.shutter_of(self.scanning or Scanning(), self.readout_ratio)
+        return rig.shutter_of(self.reading, self.readout_ratio)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,8 +121,9 @@ def parts() -> list[Callable[[], object]]:
     from rsbench.core.shutter import RollingShutter
     from rsbench.core.spline_motion import SplineMotion
     from rsbench.pipeline.chain import correct_frames, find_depth
+    from rsbench.pipeline.frame_capture import know_matches, match_frames
     from rsbench.pipeline.frame_depth import CorrectionOptions, depth_of_pair
-    from rsbench.pipeline.frame_motion import match_frames, solve_frames
+    from rsbench.pipeline.frame_motion import solve_frames
 
     rig = StereoRig(camera=PinholeCamera.centred(_WIDTH, _HEIGHT, 150.0), baseline=0.3)
     shutter, motion = (
@@ -130,6 +131,7 @@ def parts() -> list[Callable[[], object]]:
         LinearMotion([0.0, 0.02, 0.0], [0.1, 0.0, 0.2]),
     )
     options, images = CorrectionOptions(motion_model="auto"), _images()
+    known = KnownInputs(readout_ratio=shutter.readout_ratio)
     few = SimulationOptions(pairs=80, tracks=80, noise_px=0.1)
     shaken = SplineMotion([0.03, 0.05, 0.0], [0.1, 0.0, 0.2], preset="handheld")
     # A law without a kernel of its own, and shakes that need a spline.
@@ -151,7 +153,7 @@ def parts() -> list[Callable[[], object]]:
         lambda: two_frame_spline(shaking, rig, shutter, LinearMotion(shaken.w, shaken.d)),
         lambda: find_depth(images, rig, shutter, motion, options),
         corrected,
-        lambda: solve_frames(turning, rig, KnownInputs(readout_ratio=shutter.readout_ratio), options),
+        lambda: solve_frames(*know_matches(turning, rig, known, options), options),
         lambda: match_frames(images, rig, options),
     ]
 

@@ -16,8 +16,9 @@ from rsbench.core.errors import RsbenchError
 if TYPE_CHECKING:
     from rsbench.cli.correct_input import CorrectInput
     from rsbench.pipeline.footage import FrameSource
+    from rsbench.pipeline.frame_capture import KnownCapture
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope, KnownCapture
+    from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope
 
 _PAGE_FRAMES = 6
 

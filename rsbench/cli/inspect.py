@@ -232,8 +232,8 @@ def _frame_windows(left: FrameSource, right: FrameSource, rig: StereoRig, option
     from rsbench.capture.two_frame_estimate import examine
     from rsbench.core.shutter import Scanning
     from rsbench.pipeline.footage import check_alike
+    from rsbench.pipeline.frame_capture import find_matches_of_rig
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.frame_motion import find_matches_of_rig
     from rsbench.pipeline.isolated_components import Isolation
     from rsbench.vision.feature_matcher import load_features
 

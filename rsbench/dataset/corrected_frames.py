@@ -28,11 +28,11 @@ from rsbench.core.se3 import Pose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import cameras_record
 from rsbench.pipeline.footage import FrameSource, read_frame
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import CONTRADICTED
-from rsbench.pipeline.sequence_capture import KnownCapture
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
 from rsbench.storage.videos import UPRIGHT, VideoFile, write_frames, written_as_video
 from rsbench.storage.work_folder import (

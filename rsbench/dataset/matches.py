@@ -186,8 +186,8 @@ def matched_frames(geometry: Geometry, first: int, images: Images, entry: Featur
     Raises:
         RsbenchError: that failed, see ``find_correspondences``.
     """
+    from rsbench.pipeline.frame_capture import find_matches_of_rig
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.frame_motion import find_matches_of_rig
     from rsbench.pipeline.isolated_components import Isolation
 
     levels = {(side, frame): images[side, first + frame] for side, frame in VIEWS}

@@ -9,23 +9,16 @@ import numpy as np
 
 from rsbench.capture.calibration import recalibrated
 from rsbench.capture.hypotheses import KnownInputs
-from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model
-from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, record_of, shutter_found
-from rsbench.capture.two_frame_estimate import Capture, conclude, examine
+from rsbench.capture.shutter_decision import NoMotionError, record_of, shutter_found
+from rsbench.capture.trajectory_spline import ContinuousMotion
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.core.correspondences import Correspondences, join_stereo
 from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.pipeline.frame_motion import (
-    SHAKES,
-    body_motion,
-    chosen_model,
-    entry_of,
-    or_spline,
-    takes_models,
-    widened,
-)
+from rsbench.pipeline.frame_capture import capture_of
+from rsbench.pipeline.frame_motion import SHAKES, Matched, body_motion, takes_models, under_model
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
@@ -57,10 +50,19 @@ def solve_problem(
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
     matches = _at_rest(joined.correspondences, problem.rig, shutter, capture)
-    given = (matches, problem.rig, shutter, options, np.random.default_rng(seed))
-    result = _unsolved(doubt, options) if doubt else runner.robust(entry, *given)
-    if motion_model is not None and takes_models(entry) and not doubt:
-        entry, result, choice = _under_model(motion_model, entry, result, runner, given, capture, seed)
+    given, rng = Matched(matches, problem.rig, shutter), np.random.default_rng(seed)
+
+    def solve(entry: SolverEntry) -> RobustEstimate:
+        return runner.robust(entry, *given, options, rng)
+
+    if doubt:
+        result = _unsolved(doubt, options)
+    elif motion_model is not None and takes_models(entry):
+        result, entry, choice, motion = under_model(motion_model, entry, solve, given, options, seed, capture)
+        if capture is not None and isinstance(motion, ContinuousMotion):
+            result, choice = _unsolved(SHAKES, options), None
+    else:
+        result = solve(entry)
     estimate = result.estimate
     body = body_motion(estimate, spec, problem.rig)
     notes = [estimate.reason] if joined.note in estimate.reason else [estimate.reason, joined.note]
@@ -93,9 +95,6 @@ def solve_problem(
     }
 
 
-Given = tuple[Correspondences, StereoRig, RollingShutter, RobustOptions, np.random.Generator]
-
-
 def _shutter_of(
     problem: Problem, matches: Correspondences, entry: SolverEntry, options: RobustOptions, seed: int
 ) -> tuple[RollingShutter, Capture | None, str]:
@@ -103,12 +102,10 @@ def _shutter_of(
     still = problem.rig.shutter_of(Scanning(), 0.0)
     if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
         return problem.known_shutter or still, None, ""
-    known = known_of(matches, problem.rig, KnownInputs(scanning=problem.scanning))
     try:
-        capture = conclude([examine(matches, problem.rig, known, options, seed)])
+        capture = capture_of(matches, problem.rig, KnownInputs(scanning=problem.scanning), options, seed)
     except ValueError as error:  # a match where a lens shows no ray
         return still, None, str(error)
-    capture = as_global(capture, [matches], problem.rig, known)
     try:
         return shutter_found(capture, problem.rig), capture, ""
     except NoMotionError as error:
@@ -132,32 +129,6 @@ def _says(problem: Problem, capture: Capture | None, doubt: str) -> bool:
 def _unsolved(reason: str, options: RobustOptions) -> RobustEstimate:
     failed = MotionEstimate.failed(reason)
     return RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=options.threshold_px)
-
-
-def _under_model(
-    requested: str,
-    entry: SolverEntry,
-    result: RobustEstimate,
-    runner: SolverRunner,
-    given: Given,
-    capture: Capture | None,
-    seed: int,
-) -> tuple[SolverEntry, RobustEstimate, ModelChoice | None]:
-    """The answer under the motion model that the matches prefer, or that is requested."""
-    matches, rig, shutter, options, _ = given
-    start = body_motion(result.estimate, entry.solver.spec, rig)
-    choice = None if capture is None else choose_model(capture, requested)
-    if choice is None and isinstance(start, Motion):
-        choice = chosen_model(requested, start, matches, rig, shutter, options, seed)
-    other = entry if choice is None else entry_of(entry, choice)
-    result = result if other is entry else runner.robust(other, *given)
-    result = result if choice is None else widened(result, choice.spread)
-    law = body_motion(result.estimate, other.solver.spec, rig)
-    if requested == AUTO and isinstance(law, Motion):
-        result, choice, motion = or_spline(result, choice, law, matches, rig, shutter, seed)
-        if capture is not None and motion is not law:
-            return other, _unsolved(SHAKES, options), None
-    return other, result, choice
 
 
 def _of_cameras(

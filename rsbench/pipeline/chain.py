@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, of_offset
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, of_offset
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.two_frame_estimate import Capture
@@ -22,6 +22,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.frame_capture import KnownCapture, know_four
 from rsbench.pipeline.frame_depth import (
     CorrectionOptions,
     Images,
@@ -32,16 +33,8 @@ from rsbench.pipeline.frame_depth import (
     moving_pairs,
     timed_pairs,
 )
-from rsbench.pipeline.frame_motion import (
-    FoundMotion,
-    find_rig,
-    match_frames,
-    match_unknown,
-    rig_of_matches,
-    solve_frames,
-)
+from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
-from rsbench.vision.features import forget_features
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion
 
@@ -129,30 +122,36 @@ def correct_four(
     clock, needs = _Clock(step), options.corrector.component.spec.needs
     calibration = None if disparity_offset is None else of_offset(disparity_offset)
     inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration)
-    matches, found, shutter, capture, rig_found = _solve(images, rig, inputs, options, given, clock)
-    rig = rig if rig_found is None else rig_found.rig
-    offset = disparity_offset or 0.0 if found is None else found.disparity_offset
-    if capture is not None:
+    wanted, matches = given.motion is None and "motion" in needs, given.matches
+    if readout_ratio is not None and not wanted and (matches is not None or "matches" not in needs):
+        known = KnownCapture(rig=rig, shutter=inputs.shutter_of(rig), calibration=calibration or NO_ERRORS)
+        clock("matching")
+    else:
+        matches, known = know_four(images, rig, inputs, options, matches, clock)
+    found = solve_frames(matches, known, options) if wanted and matches is not None else None
+    clock("motion")
+    rig, shutter, offset = known.rig, known.shutter, known.calibration[OFFSET]
+    if known.capture is not None:
         check_cameras(rig, shutter.scanning, options, disparity_offset, given.pairs is not None)
     motion = given.motion if found is None else found.motion
     pairs = (
         find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
     )
     clock("depth")
-    known = replace(given, matches=matches, motion=motion, pairs=pairs)
+    given = replace(given, matches=matches, motion=motion, pairs=pairs)
     frames, *at_rows = correct_known_rows(
-        images, known, rig, shutter, options, views, offset, (options.target_row, *rows)
+        images, given, rig, shutter, options, views, offset, (options.target_row, *rows)
     )
     clock("correction")
     return CorrectedFrames(
         motion=motion,
         found=found,
         shutter=shutter,
-        capture=capture,
+        capture=known.capture,
         matches=matches,
         pairs=pairs,
         rig=rig,
-        rig_found=rig_found,
+        rig_found=known.rig_found,
         frames=frames,
         at_rows=at_rows,
         seconds=clock.seconds,
@@ -201,52 +200,6 @@ def _check_matcher(options: CorrectionOptions, disparity_offset: float | None) -
             f"disparity_offset = {disparity_offset}: must be 0 with matcher {options.matcher.name!r}; "
             "calibrate the rig again"
         )
-
-
-def _solve(
-    images: Images,
-    rig: StereoRig,
-    inputs: KnownInputs,
-    options: CorrectionOptions,
-    given: Given,
-    clock: _Clock,
-) -> tuple[Correspondences | None, FoundMotion | None, RollingShutter, Capture | None, FoundRig | None]:
-    """Matches, motion, shutter and errors of the rig, as far as they are needed and not given."""
-    needs = options.corrector.component.spec.needs
-    wanted = given.motion is None and "motion" in needs
-    matched = given.matches is not None or "matches" not in needs
-    doubt, matches = None, given.matches
-    if inputs.readout_ratio is not None and not wanted and matched:
-        clock("matching")
-        clock("motion")
-        return matches, None, inputs.shutter_of(rig), None, None
-    forget_features()
-    own = matches is None and rig.rows_together(inputs.scanning or Scanning(), inputs.readout_ratio)
-    rig_found = None
-    try:
-        if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
-            matches, doubt = match_unknown(images, rig, options)
-        elif matches is None:
-            matches = match_frames(images, rig, options, inputs.scanning)
-        clock("matching")
-        if own and doubt is None and not rig.aligned and inputs.calibration is None:
-            rig_found = rig_of_matches(matches, rig, inputs, options)
-        rig, inputs = _as_found(rig, inputs, rig_found)
-        solved = solve_frames(matches, rig, inputs, options, doubt=doubt, with_motion=wanted)
-    except RefusedFramesError as refusal:
-        if refusal.stereo is None or not own:
-            raise
-        rig_found, matches = find_rig(images, rig, inputs, options, refusal)
-        rig, inputs = _as_found(rig, inputs, rig_found)
-        solved = solve_frames(matches, rig, inputs, options, with_motion=wanted)
-    clock("motion")
-    return solved.matches, solved.found, solved.shutter, solved.capture, rig_found
-
-
-def _as_found(rig: StereoRig, inputs: KnownInputs, found: FoundRig | None) -> tuple[StereoRig, KnownInputs]:
-    """The rig as its frames show it; the errors of one that is not ideal are looked for nowhere else."""
-    rig = rig if found is None else found.rig
-    return rig, inputs if rig.aligned else replace(inputs, calibration=inputs.calibration or NO_ERRORS)
 
 
 def find_depth(

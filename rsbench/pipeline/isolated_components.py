@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -370,16 +370,15 @@ class Isolation:
 
     def chain(self, options: CorrectionOptions) -> CorrectionOptions:
         """The options with all but the solver isolated, which ``find_motion`` runs apart by itself."""
-        serve, matcher = (
-            (_serve_motion_matcher, _MotionMatcher)
-            if needs_motion(options.matcher)
-            else (_serve_matcher, _Matcher)
-        )
+        with_motion = needs_motion(options.matcher)
+        find, matcher = (find_depths, _MotionMatcher) if with_motion else (find_disparities, _Matcher)
+        features = partial(_serve, load_features, find_correspondences)
+        depth, corrected = partial(_serve, load_matcher, find), partial(_serve, load_corrector, find_corrected)
         return replace(
             options,
-            features=self.wrap(FEATURE_MATCHERS, options.features, _serve_features, (Correspondences,), _Features),
-            matcher=self.wrap(STEREO_MATCHERS, options.matcher, serve, (), matcher),
-            corrector=self.wrap(CORRECTORS, options.corrector, _serve_corrector, (Fused,), _Corrector),
+            features=self.wrap(FEATURE_MATCHERS, options.features, features, (Correspondences,), _Features),
+            matcher=self.wrap(STEREO_MATCHERS, options.matcher, depth, (), matcher),
+            corrector=self.wrap(CORRECTORS, options.corrector, corrected, (Fused,), _Corrector),
         )
 
     def wrap(
@@ -478,49 +477,14 @@ class _Corrector(Corrector):
 # In the child
 
 
-def _serve_features(place: str) -> Callable[..., object]:
+def _serve(load: Callable[[str], Any], find: Callable[..., Any], place: str) -> Callable[..., object]:
+    """What answers calls to an entry that ``load`` loads: by ``find``, which is given it first."""
     with entrys_own():
-        entry = load_features(place)
+        entry = load(place)
 
-    def answer(images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
+    def answer(*given: object) -> object:
         with entrys_own():
-            return find_correspondences(entry, images)
-
-    return answer
-
-
-def _serve_matcher(place: str) -> Callable[..., object]:
-    with entrys_own():
-        entry = load_matcher(place)
-
-    def answer(left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig) -> object:
-        with entrys_own():
-            return find_disparities(entry, left, right, rig)
-
-    return answer
-
-
-def _serve_motion_matcher(place: str) -> Callable[..., object]:
-    with entrys_own():
-        entry = load_matcher(place)
-
-    def answer(
-        images: Mapping[View, NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter, motion: Motion
-    ) -> object:
-        with entrys_own():
-            found = find_depths(entry, images, rig, shutter, motion)
-        return {f"{side}_{frame}": depth for (side, frame), depth in found.items()}
-
-    return answer
-
-
-def _serve_corrector(place: str) -> Callable[..., object]:
-    with entrys_own():
-        entry = load_corrector(place)
-
-    def answer(problem: CorrectionProblem, views: list[View]) -> dict[str, Fused]:
-        with entrys_own():
-            found = find_corrected(entry, problem, views)
-        return {f"{side}_{frame}": fused for (side, frame), fused in found.items()}
+            found = find(entry, *given)
+        return {f"{view[0]}_{view[1]}": each for view, each in found.items()} if isinstance(found, dict) else found
 
     return answer

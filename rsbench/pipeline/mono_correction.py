@@ -10,10 +10,8 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import NO_ERRORS
-from rsbench.capture.hypotheses import KnownInputs
+from rsbench.capture.hypotheses import Known
 from rsbench.capture.model_choice import motion_at
-from rsbench.capture.shutter_decision import known_of
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.capture.two_frame_spline import camera_trajectory, camera_two_frame_spline
@@ -64,11 +62,7 @@ def select_motion_model(
     """
     inertial = InertialMotion(found.estimate.w, found.estimate.d)
     given = Correspondences(left=matches)
-    known_shutter = KnownInputs(
-        readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=NO_ERRORS
-    )
-    known = known_of(given, rig, known_shutter)
-    capture = conclude([examine(given, rig, known, options, seed, inertial)])
+    capture = conclude([examine(given, rig, Known().with_shutter(shutter), options, seed, inertial)])
     laws = [name for name in capture.models if name in capture.peaks]
     if not laws or laws[0] == inertial.name or capture.models.get(inertial.name, 0.0) > 1.0 - CERTAIN:
         return found, inertial

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rsbench.capture.calibration import NO_ERRORS, CardSigma, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
 from rsbench.capture.rig_calibration import FoundRig
-from rsbench.capture.self_calibration import FoundCamera, FoundFocal, find_camera
+from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_tracks import ENOUGH
@@ -29,9 +29,8 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import FrameSource, Progress, RigCard, check_alike, no_progress
-from rsbench.pipeline.frame_depth import CorrectionOptions, Images
-from rsbench.pipeline.frame_motion import (
-    FoundMotion,
+from rsbench.pipeline.frame_capture import (
+    KnownCapture,
     find_rig,
     match_frames,
     match_unknown,
@@ -39,10 +38,12 @@ from rsbench.pipeline.frame_motion import (
     rig_of_matches,
     with_enough,
 )
+from rsbench.pipeline.frame_depth import CorrectionOptions, Images
+from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, OneCameraCard, find_camera_alone, find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
-from rsbench.pipeline.mono_gyro import Clock, in_time, pair_rates
+from rsbench.pipeline.mono_gyro import in_time, pair_rates
 from rsbench.vision.fusion import Fused
 
 
@@ -54,29 +55,6 @@ class Gyroscope:
     """(n, 4) tau, w, as of ``Correspondences.gyro``; tau 0 is the first row of the first frame."""
     clock_error: float = 0.0
     """Frame periods by which its clock may be off; 0: the times are exact."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class KnownCapture:
-    """How frames were taken, given or estimated, and where each estimate comes from."""
-
-    rig: StereoRig
-    """The cameras; of one camera ``StereoRig.of_one``."""
-    shutter: RollingShutter
-    capture: Capture | None = None
-    """How the shutter was estimated; None where it is given."""
-    calibration: tuple[float, ...] = NO_ERRORS
-    """Errors of the calibration, see ``calibration.TERMS``."""
-    rig_found: FoundRig | None = None
-    """How rotation, focal lengths and delay of the right camera were estimated; None where they are as given."""
-    focal: FoundFocal | None = None
-    """How one camera's focal length was estimated; None where it is given."""
-    camera_note: str = ""
-    """What was estimated of a rig's focal length and k1."""
-    gyro: FloatArray | None = None
-    """(n, 4) samples of a gyroscope at the times of the frames; None without one."""
-    clock: Clock | None = None
-    """Error of the gyroscope's clock; None where its times are exact."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -271,7 +249,7 @@ def estimate_sequence_capture(
     shutter that is found to be global it is found as if that had been known.
 
     Args:
-        readout_ratio, scanning, calibration: see ``solve_frames``.
+        readout_ratio, scanning, calibration: see ``know_matches``.
         advance: called for each window.
 
     Raises:
@@ -434,7 +412,7 @@ def camera_of_frames(
     """``find_camera`` from the matches of a few windows; those without matches say nothing.
 
     Args:
-        readout_ratio, scanning: see ``solve_frames``.
+        readout_ratio, scanning: see ``know_matches``.
     """
     matches = list[Correspondences]()
     for images in islice(windows, _WINDOWS):

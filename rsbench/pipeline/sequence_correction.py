@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsbench.capture.calibration import OFFSET, RefusedFramesError, recalibrated
-from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.model_choice import AUTO
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import StreamedWindow, stream_trajectory
@@ -27,14 +26,14 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
 from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_capture import KnownCapture, match_frames, with_enough
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images, Pairs, frame_pair
-from rsbench.pipeline.frame_motion import FoundMotion, match_frames, solve_frames, with_enough
+from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.pipeline.mono_sequence import correct_frames
 from rsbench.pipeline.sequence_capture import (
     FEWEST_FRAMES,
     JUDGED,
     CorrectedMoment,
-    KnownCapture,
     Refusals,
     frames_with_times,
     window_images,
@@ -219,7 +218,7 @@ def _windows(
     needs, refusals = options.corrector.component.spec.needs, Refusals(left)
     matching = options if with_motion or "matches" in needs else with_enough(options, ENOUGH)
     number = -1
-    inputs = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning, calibration=calibration)
+    known = KnownCapture(rig=rig, shutter=shutter, calibration=calibration)
     for number, images in enumerate(window_images(left, right)):
         found, reason, matches = None, "", None
         if needs & {"motion", "matches"}:
@@ -227,7 +226,7 @@ def _windows(
                 judged = number < JUDGED
                 matches = match_frames(images, rig, matching, shutter.scanning, judge_rig=judged)
                 if "motion" in needs and with_motion:
-                    found = solve_frames(matches, rig, inputs, options, in_order=True).found
+                    found = solve_frames(matches, known, options, in_order=True)
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:

@@ -10,7 +10,7 @@ reprojection errors of the inliers, of both cameras.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, final
 
@@ -90,8 +90,8 @@ def poselib_pose(poselib: Any, R: FloatArray, t: FloatArray) -> Any:
     return pose
 
 
-def rig_extrinsics(poselib: Any, rig: StereoRig) -> list[Any]:
-    return [poselib_pose(poselib, np.eye(3), rig.offset(side)) for side in SIDES]
+def rig_extrinsics(poselib: Any, rig: StereoRig, sides: Iterable[Side] = SIDES) -> list[Any]:
+    return [poselib_pose(poselib, np.eye(3), rig.offset(side)) for side in sides]
 
 
 def estimate_of(pose: Any, metric: bool) -> MotionEstimate:
@@ -127,9 +127,35 @@ def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstima
     return [motion for motion in motions if motion.success]
 
 
+@dataclass(frozen=True, kw_only=True)
+class PoselibPairsSolver(PoselibSolver):
+    """From the left camera's motion: its length is 1, or half a baseline where the refinement finds it."""
+
+    def _length(self, rig: StereoRig) -> float:
+        return 0.5 * rig.baseline if self.spec.metric else 1.0
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        short = self.spec.shortage({side: len(temporal_pairs(correspondences, side)) for side in SIDES})
+        if short is not None:
+            return short
+        start = left_start(temporal_pairs(correspondences, "left"), rig)
+        if not start.success:
+            return start
+        return self.improve(replace(start, d=self._length(rig) * start.d), correspondences, rig, shutter)
+
+    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
+        return {"left": 5}
+
+    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
+        motions = five_point_motions(temporal_pairs(sample, "left"), rig)
+        return [replace(motion, d=self._length(rig) * motion.d) for motion in motions]
+
+
 @final
 @dataclass(frozen=True, kw_only=True)
-class PoselibMonoSolver(PoselibSolver):
+class PoselibMonoSolver(PoselibPairsSolver):
     """Left camera only: five-point proposals, then the Sampson error of all matches."""
 
     spec = SolverSpec(
@@ -143,22 +169,6 @@ class PoselibMonoSolver(PoselibSolver):
         assumes="global shutter; translation",
     )
 
-    def estimate(
-        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
-    ) -> MotionEstimate:
-        matches = temporal_pairs(correspondences, "left")
-        short = self.spec.shortage({"left": len(matches)})
-        if short is not None:
-            return short
-        start = left_start(matches, rig)
-        return self.improve(start, correspondences, rig, shutter) if start.success else start
-
-    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        return {"left": 5}
-
-    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        return five_point_motions(temporal_pairs(sample, "left"), rig)
-
     def refined(
         self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
     ) -> Any:
@@ -169,7 +179,7 @@ class PoselibMonoSolver(PoselibSolver):
 
 @final
 @dataclass(frozen=True, kw_only=True)
-class PoselibStereoSolver(PoselibSolver):
+class PoselibStereoSolver(PoselibPairsSolver):
     """Left and right pairs of the rig as one generalised camera."""
 
     spec = SolverSpec(
@@ -182,27 +192,6 @@ class PoselibStereoSolver(PoselibSolver):
         reference="PoseLib, generalised relative pose of left-left and right-right matches",
         assumes="global shutter; translation; rotation that moves the baseline, for the scale",
     )
-
-    def estimate(
-        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
-    ) -> MotionEstimate:
-        short = self.spec.shortage({side: len(temporal_pairs(correspondences, side)) for side in SIDES})
-        if short is not None:
-            return short
-        start = left_start(temporal_pairs(correspondences, "left"), rig)
-        if not start.success:
-            return start
-        return self.improve(replace(start, d=0.5 * rig.baseline * start.d), correspondences, rig, shutter)
-
-    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        return {"left": 5}
-
-    def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        length = 0.5 * rig.baseline
-        return [
-            replace(motion, d=length * motion.d)
-            for motion in five_point_motions(temporal_pairs(sample, "left"), rig)
-        ]
 
     def refined(
         self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
@@ -268,16 +257,29 @@ class PoselibPnpSolver(PoselibSolver):
         self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
     ) -> Any:
         tracks = with_depth(correspondences.tracks)
-        points = stereo_points(tracks, rig)
-        pose, _ = poselib.refine_generalized_absolute_pose(
-            [tracks[:, 4:6], tracks[:, 6:8]],
-            [points, points],
-            start,
-            rig_extrinsics(poselib, rig),
-            [poselib_camera(rig.camera)] * 2,
-            options,
-        )
-        return pose
+        everywhere = dict.fromkeys(SIDES, np.ones(len(tracks), dtype=np.bool_))
+        return pose_of_points(poselib, start, tracks, everywhere, rig, options)
+
+
+def pose_of_points(
+    poselib: Any,
+    start: Any,
+    tracks: FloatArray,
+    used: Mapping[Side, BoolArray],
+    rig: StereoRig,
+    options: dict[str, Any],
+) -> Any:
+    """PoseLib's pose of the body from the points of tracks (n, 8) and the pixels of frame 1 that masks name."""
+    points = stereo_points(tracks, rig)
+    pose, _ = poselib.refine_generalized_absolute_pose(
+        [tracks[mask, FRAME_1[side]] for side, mask in used.items()],
+        [points[mask] for mask in used.values()],
+        start,
+        rig_extrinsics(poselib, rig, used),
+        [poselib_camera(rig.camera)] * len(used),
+        options,
+    )
+    return pose
 
 
 def _shifted(pose: Any, offset: FloatArray) -> MotionEstimate:
@@ -286,7 +288,6 @@ def _shifted(pose: Any, offset: FloatArray) -> MotionEstimate:
 
 _LEAST = 10
 """Samples, as in rsbench's own robust loop."""
-_BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
 
 
 @final
@@ -341,22 +342,10 @@ class P3pSolver(Solver):
             return MotionEstimate.failed(f"no consensus: {found['num_inliers']} points fit one pose")
         R = np.array(pose.R)
         start = poselib_pose(poselib, R, np.array(pose.t) + R @ offset - offset)
-        return estimate_of(self._refined(poselib, start, tracks, rig), self.spec.metric)
-
-    def _refined(self, poselib: Any, start: Any, tracks: FloatArray, rig: StereoRig) -> Any:
-        """PoseLib's pose of the body, from the pixels near it."""
-        points, camera = stereo_points(tracks, rig), poselib_camera(rig.camera)
         sides: tuple[Side, ...] = SIDES if self.cameras_used == "both" else ("left",)
-        near = [self._near(start, points, tracks[:, FRAME_1[side]], rig, side) for side in sides]
-        end, _ = poselib.refine_generalized_absolute_pose(
-            [tracks[mask, FRAME_1[side]] for side, mask in zip(sides, near, strict=True)],
-            [points[mask] for mask in near],
-            start,
-            [poselib_pose(poselib, np.eye(3), rig.offset(side)) for side in sides],
-            [camera] * len(sides),
-            _BUNDLE,
-        )
-        return end
+        body = stereo_points(tracks, rig)
+        near = {side: self._near(start, body, tracks[:, FRAME_1[side]], rig, side) for side in sides}
+        return estimate_of(pose_of_points(poselib, start, tracks, near, rig, _BUNDLE), self.spec.metric)
 
     def _near(self, pose: Any, points: FloatArray, pixels: FloatArray, rig: StereoRig, side: Side) -> BoolArray:
         """Mask (n,) of the pixels of frame 1 near which a pose of the body shows its points."""

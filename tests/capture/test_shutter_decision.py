@@ -45,6 +45,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.frame_capture import know_matches
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.solvers.engine.robust_motion import RobustOptions
@@ -165,9 +166,9 @@ def test_frames_in_the_wrong_order_are_noticed() -> None:
         assert runs_backwards(found_in(given, MODELS), scans_of(data.shutter)) == backwards
     for ratio in (None, 0.8):
         with pytest.raises(RefusedFramesError, match="backwards"):
-            solve_frames(
-                turned, RIG, KnownInputs(readout_ratio=ratio, scanning=TOP), CorrectionOptions(motion_model=AUTO)
-            )
+            options = CorrectionOptions(motion_model=AUTO)
+            inputs = KnownInputs(readout_ratio=ratio, scanning=TOP)
+            solve_frames(*know_matches(turned, RIG, inputs, options), options)
 
 
 def test_a_disparity_offset_is_found_with_the_ratio() -> None:
@@ -206,16 +207,16 @@ def matches_of(model: str, seed: int = 0) -> Correspondences:
 def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     """Among outliers; chi-squared with 6 degrees of freedom: beyond 22.5 in one of a thousand."""
     options = CorrectionOptions(motion_model=AUTO)
-    solved = solve_frames(matches_of(model), RIG, AT_TOP, options, in_order=True)
-    assert solved.found is not None and solved.found.choice is not None
-    choice, found = solved.found.choice, solved.found.robust.estimate
+    solved = solve_frames(*know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
+    assert solved.choice is not None
+    choice, found = solved.choice, solved.robust.estimate
     assert choice.used == model and sum(choice.probability.values()) == pytest.approx(1.0)
     assert choice.decided or model == "linear"
     error = np.concatenate([found.w - W, found.d - D])
     assert error @ np.linalg.solve(_known(found.covariance), error) < 22.5
     if model != "linear":
-        linear = solve_frames(matches_of(model), RIG, AT_TOP, CorrectionOptions(), in_order=True).found
-        assert linear is not None
+        options = CorrectionOptions()
+        linear = solve_frames(*know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
         assert np.linalg.norm(linear.motion.d - D) > 2 * np.sqrt(np.trace(_known(found.covariance)[3:, 3:]))
 
 

@@ -28,8 +28,8 @@ from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
 from rsbench.dataset.tracks import jacobians_of
 from rsbench.dataset.views import ImageView, PixelClass
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.renderers.image import to_srgb8
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png

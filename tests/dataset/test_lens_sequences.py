@@ -26,8 +26,8 @@ from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.channels import Channel
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_sequence
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.storage.files import read_depth, read_png
 from rsbench.verification import content, verify_dataset
 from rsbench.verification.pose_checks import pose_faults

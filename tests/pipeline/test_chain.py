@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
@@ -21,8 +20,9 @@ from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, uncorrected
 from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_capture import KnownCapture, match_frames
 from rsbench.pipeline.frame_depth import CorrectionOptions, depth_of_pair
-from rsbench.pipeline.frame_motion import match_frames, motion_of, solve_frames
+from rsbench.pipeline.frame_motion import motion_of, solve_frames
 from rsbench.solvers.engine.base import MotionEstimate, load_solver_entry
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, Corrector, CorrectorSpec, load_corrector
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS, FeatureMatcher
@@ -173,7 +173,7 @@ def test_what_is_given_is_not_looked_for(castle: Sequence, monkeypatch: pytest.M
     def never(*_: object) -> None:
         raise AssertionError("not needed")
 
-    for name in ("chain.match_frames", "chain.solve_frames", "frame_motion.estimate_motion", "chain.frame_pairs"):
+    for name in ("chain.know_four", "chain.solve_frames", "frame_motion.estimate_motion", "chain.frame_pairs"):
         monkeypatch.setattr(f"rsbench.pipeline.{name}", never)
     given = Given(matches=first.matches, motion=first.motion, pairs=first.pairs)
     again = correct_four(images, castle.rig, ratio, options, given=given, views=(("right", 1),))
@@ -284,7 +284,8 @@ def test_matches_without_a_motion_say_why(castle: Sequence) -> None:
     rng = np.random.default_rng(0)
     noise = Correspondences(left=rng.uniform(0, 90, (8, 4)), right=rng.uniform(0, 90, (8, 4)))
     with pytest.raises(NoMotionError, match="found no motion: "):
-        solve_frames(noise, castle.rig, KnownInputs(readout_ratio=0.8), CorrectionOptions())
+        known = KnownCapture(rig=castle.rig, shutter=castle.shutter)
+        solve_frames(noise, known, CorrectionOptions())
 
 
 def test_sixteen_bits_use_one_factor_for_all() -> None:

@@ -15,9 +15,10 @@ from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import correct_four
 from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_capture import KnownCapture, estimate_sequence_capture
+from rsbench.pipeline.sequence_capture import estimate_sequence_capture
 from rsbench.pipeline.sequence_correction import correct_sequence
 
 Folders = tuple[FrameSource, FrameSource]

@@ -18,8 +18,8 @@ from rsbench.core.correspondences import Correspondences, lens_covariance, witho
 from rsbench.core.projection import back_project, rs_project
 from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import Scanning
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.vision.dense_matcher import DenseMatcher, DenseOptions, corners, dense_tracks, start_of_flow
 from rsbench.vision.feature_matcher import find_correspondences, load_features
 

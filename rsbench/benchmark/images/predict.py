@@ -27,6 +27,7 @@ from rsbench.dataset.corrected_frames import write_origin
 from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import (
     Images,
     Pairs,
@@ -35,7 +36,7 @@ from rsbench.pipeline.frame_depth import (
     motion_disparities,
     pair_with_motion,
 )
-from rsbench.pipeline.frame_motion import body_motion, find_matches_of_rig
+from rsbench.pipeline.frame_motion import body_motion
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import SOLVERS, MotionEstimate, SolverEntry
 from rsbench.solvers.engine.robust_motion import RobustEstimate

@@ -42,8 +42,8 @@ from rsbench.core.rig import FRAMES, VIEWS, View
 from rsbench.dataset.layout import exposed_file, picture_file
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four, correct_known_rows
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.mono_correction import find_own_motion, flow_matches, refusal
 from rsbench.storage.files import write_bytes
 from rsbench.vision.corrector import CorrectorSpec, demand_corrected, load_corrector

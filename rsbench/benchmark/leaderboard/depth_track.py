@@ -37,8 +37,9 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given
+from rsbench.pipeline.frame_capture import know_matches, match_frames
 from rsbench.pipeline.frame_depth import CorrectionOptions, metres, motion_disparities
-from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.storage.files import write_depth
 from rsbench.vision.stereo_depth import depth_metrics
 from rsbench.vision.stereo_matcher import load_matcher, needs_motion, sensor_disparities
@@ -152,15 +153,14 @@ def _motion(work: SharedWork, chain: CorrectionOptions) -> Motion:
     """The motion that the default solver estimates, the same for all matchers.
 
     Raises:
-        RsbenchError: see ``match_frames`` and ``solve_frames``.
+        RsbenchError: see ``match_frames``, ``know_matches`` and ``solve_frames``.
     """
     rig, shutter, start = work.problem.rig, work.problem.shutter, time.perf_counter()
     if work.known.motion is None:
         matches = match_frames(work.images, rig, chain, shutter.scanning)
         matched = time.perf_counter()
         given = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning)
-        found = solve_frames(matches, rig, given, chain).found
-        assert found is not None
+        found = solve_frames(*know_matches(matches, rig, given, chain), chain)
         work.known = Given(motion=found.motion)
         work.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
     assert work.known.motion is not None

@@ -68,8 +68,8 @@ from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.views import FAR
 from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.answer import Extra, solve_problem
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import COLUMNS, Problem
 from rsbench.solvers.engine.base import SolverEntry, load_solver_entry

@@ -26,8 +26,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.imu import MEASURED, gyro_samples
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest, read_pairs
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.pipeline.problem import Problem
 from rsbench.storage.untrusted_files import check_name, read_text
 from rsbench.vision.feature_matcher import load_features

@@ -27,8 +27,9 @@ from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, View
 from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
+from rsbench.pipeline.frame_capture import find_matches
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_motion import FoundMotion, find_matches, find_motion, model_to_use
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
 from rsbench.pipeline.layered_scene import LayersCorrector
 from rsbench.pipeline.one_camera import (
     ZhuangCorrector,

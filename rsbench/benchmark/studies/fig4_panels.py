@@ -22,8 +22,9 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import correct_frames, uncorrected
+from rsbench.pipeline.frame_capture import find_matches
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs
-from rsbench.pipeline.frame_motion import find_matches, find_motion
+from rsbench.pipeline.frame_motion import find_motion
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.vision.correction import correct_frame

@@ -27,8 +27,9 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.card import CameraCard, DatasetCard
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.chain import correct_frames, find_depth
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs
-from rsbench.pipeline.frame_motion import FoundMotion, find_matches_of_rig, find_motion
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion
 from rsbench.vision.fusion import Origin
 from rsbench.vision.quality import psnr
 

@@ -13,8 +13,8 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.matches import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.sequence_views import View
+from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches_of_rig
 from rsbench.vision.feature_matcher import load_features
 
 _UNJUDGED, _RIGHT, _WRONG = (86, 180, 233), (0, 158, 115), (213, 94, 0)
