@@ -1,7 +1,7 @@
 """How often stated ellipsoids hold the true motion, by setting: python benchmarks/coverage_study.py SETTING...
 
 python benchmarks/coverage_study.py easy mid hard points [--seeds 0:60] [--model auto] [--out FILE.jsonl]
-python benchmarks/coverage_study.py rendered --data DATASET [--parts 4] [--cache FOLDER]
+python benchmarks/coverage_study.py rendered --data DATASET [--features dense] [--parts 4]
 python benchmarks/coverage_study.py --report FILE.jsonl...
 
 easy, mid and hard are tracks of random points (300, 60 and 30; 0.3, 1 and 1.5 px; 10, 30 and 40 % outliers)
@@ -46,6 +46,7 @@ from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
+from rsbench.vision.feature_matcher import load_features
 
 MODELS = ("linear", "twist", "inertial", "accelerated")
 SETTINGS = {
@@ -80,17 +81,18 @@ def points(seed: int) -> Case:
     return str(seed), simulated_problem(board, number, POINTS_2), motion, motion.name
 
 
-def rendered(data: Path, cache: Path, numbers: range, parts: int) -> Iterator[Case]:
+def rendered(data: Path, cache: Path, numbers: range, parts: int, features: str) -> Iterator[Case]:
     """Sequences of a dataset by their places in it, and random parts of their matches."""
     cache.mkdir(parents=True, exist_ok=True)
     names = sorted(read_dataset_manifest(data).sequences)
     for number in numbers:
         if number >= len(names):
             return
-        sequence, file = read_sequence(data / names[number]), cache / f"{names[number]}.npz"
+        sequence, file = read_sequence(data / names[number]), cache / f"{names[number]}-{features}.npz"
         if not file.exists():
             images = {view: sequence.image("rs", *view) for view in VIEWS}
-            found = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, CorrectionOptions())
+            options = CorrectionOptions(features=load_features(features))
+            found = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, options)
             sets = {name: getattr(found, name) for name in ("left", "right", "stereo_0", "stereo_1", "tracks")}
             np.savez_compressed(file, **sets)
         whole = Correspondences(**np.load(file))
@@ -107,7 +109,7 @@ def rendered(data: Path, cache: Path, numbers: range, parts: int) -> Iterator[Ca
 
 def cases(args: argparse.Namespace, setting: str) -> Iterator[Case]:
     if setting == "rendered":
-        yield from rendered(args.data, args.cache, args.numbers, args.parts)
+        yield from rendered(args.data, args.cache, args.numbers, args.parts, args.features)
         return
     for seed in args.numbers:
         try:
@@ -196,6 +198,7 @@ def main() -> None:
     parser.add_argument("--model", default="auto", help="auto, true, or a motion model")
     parser.add_argument("--data", type=Path)
     parser.add_argument("--cache", type=Path, default=Path("matches-of-coverage"))
+    parser.add_argument("--features", default="sift-refined", help="matcher of rendered frames: a name or a card")
     parser.add_argument("--parts", type=int, default=0)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--report", type=Path, nargs="+")
