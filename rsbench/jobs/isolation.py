@@ -36,10 +36,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.imports import end_with, ending, import_untried, start_child
+from rsbench.core.errors import RsbenchError
 from rsbench.storage.untrusted_files import unpack_arrays
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Environment variables that limit the threads of numerical libraries."""
+ONE_THREAD = dict.fromkeys(THREAD_VARIABLES, "1")
+"""Environment of a child process whose numerical libraries use one thread."""
 START_LIMIT_S = 300.0
 """Time to load a module and to compile what it needs."""
 NO_ANSWER = "gave no valid answer"
@@ -422,7 +425,7 @@ def serve_parent(lifeline: int) -> NoReturn:
                 server, value = value, None  # pyrefly: ignore[bad-assignment]
             message = ("answer", value, "")
             reply = encode(message)
-        except EntryFailure as error:
+        except (EntryFailure, RsbenchError) as error:
             reply = encode(("failed", None, _short(str(error))))
         except Exception:
             reply = encode(("bug", None, traceback.format_exc()))

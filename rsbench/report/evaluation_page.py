@@ -15,7 +15,7 @@ from rsbench.benchmark.images.evaluation import read_headings, read_scores
 from rsbench.benchmark.images.plan import SCORED, HashOf, hash_of_data
 from rsbench.benchmark.images.predict import depth_of, load_disparities
 from rsbench.benchmark.images.score import hash_of_prediction, scoring_version
-from rsbench.benchmark.images.store import identity_of, read_record
+from rsbench.benchmark.images.store import identity_of, keep, kept, read_record
 from rsbench.benchmark.statistics import median_and_quartiles
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, View
@@ -32,7 +32,6 @@ from rsbench.storage.files import (
     read_json,
     read_png,
     write_bytes,
-    write_json,
 )
 from rsbench.storage.work_folder import HIDDEN, files_below, listed, named
 from rsbench.vision.fusion import Origin
@@ -43,10 +42,6 @@ _SHOWN: View = ("left", 1)
 """The frame that is drawn."""
 _DEPTH_ERROR_M = 2.0
 """End of the scale of depth errors: the paper's limit of a good depth."""
-
-_NAMES = {"rolling", "global", "rolling-over-global", "corrected", "corrected-over-global", "matches"} | {
-    *("depth-truth", "depth", "depth-error"),
-}
 
 Drawn = dict[str, tuple[Image, str]]
 
@@ -61,35 +56,24 @@ def write_pictures(sequence: Sequence, out: Path, chosen: dict[str, str], hash_o
         hash_of: gives the SHA-256 of a file of the sequence.
     """
     predictions, folder = out / "predictions" / sequence.name, out / "pictures" / sequence.name
-    kept = out / HIDDEN / "pictures" / f"{sequence.name}.json"
-    key = identity_of(
+    record = out / HIDDEN / "pictures" / f"{sequence.name}.json"
+    identity = identity_of(
         code=scoring_version(),
         sequence=sequence.name,
         chosen=chosen,
         data=hash_of_data(sequence, SCORED, hash_of),
         predictions=hash_of_prediction(_files_drawn(predictions, chosen)),
     )
-    captions = _kept_captions(read_record(kept) or {}, key, folder)
-    if captions is not None:
-        return captions
+    there = kept(record, identity)
+    if there is not None and there["pictures"] == hash_of_prediction(_jpegs(folder, there["captions"])):
+        return there["captions"]
     drawn = draw_sequence(sequence, predictions, chosen)
     folder.mkdir(parents=True, exist_ok=True)
     for name, (image, _) in drawn.items():
         write_bytes(folder / f"{name}.jpg", pictures.encode_jpeg(pictures.shrink(image, _LONGEST)))
     captions = {name: caption for name, (_, caption) in drawn.items()}
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    made = hash_of_prediction(_jpegs(folder, captions))
-    write_json(kept, {"key": key, "pictures": made, "captions": captions})
+    keep(record, identity, {"pictures": hash_of_prediction(_jpegs(folder, captions)), "captions": captions})
     return captions
-
-
-def _kept_captions(record: dict[str, Any], key: str, folder: Path) -> dict[str, str] | None:
-    """Those of pictures that are as they were written, from what they would be drawn of today; else None."""
-    captions = record.get("captions")
-    if not isinstance(captions, dict) or not captions.keys() <= _NAMES:
-        return None
-    same = record.get("key") == key and record.get("pictures") == hash_of_prediction(_jpegs(folder, captions))
-    return {str(name): str(caption) for name, caption in captions.items()} if same else None
 
 
 def _jpegs(folder: Path, names: Any) -> list[Path]:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
-from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, KeptScores, Row, Scorer, kept_scores_file
+from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer, kept_scores
 from rsbench.benchmark.metric_plugins import (
     METRICS,
     Case,
@@ -31,7 +31,7 @@ from rsbench.benchmark.provenance import dataset_record, provenance
 from rsbench.benchmark.scoring import score
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
-from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
 from rsbench.pipeline.isolated_components import Caller, Isolation, SolverRunner, entrys_own
 from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
@@ -70,30 +70,27 @@ def _serve_metric(place: str) -> Callable[..., object]:
     return answer
 
 
-@dataclass(frozen=True, kw_only=True)
-class SequenceJob:
-    """What is to be done of one sequence."""
+class Job(NamedTuple):
+    """What one call of a child process does for a sequence: one more motion, or all predictions, or the scores."""
 
     sequence: str
-    predict: bool
-    score: bool
+    solver: str = ""
+    """Solver whose motion with the samples ``seed`` is estimated."""
+    seed: int = 0
+    predict: bool = False
+    score: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.sequence}, {self.solver}, seed {self.seed}" if self.solver else self.sequence
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scores:
+class Scores(NamedTuple):
     """Scores of one sequence."""
 
     rows: dict[str, list[Row]]
     """Rows of each table."""
     stale: list[str]
-    """Predictions on disk that are not current, and not scored."""
-
-    @classmethod
-    def of(cls, places: Places, plan: Plan, kept: KeptScores) -> Scores:
-        """What is stored and current; ``kept`` are those of the sequence that were computed before."""
-        scorer = Scorer(places, plan, kept)
-        scorer.score()
-        return cls(rows=scorer.rows, stale=scorer.stale)
+    """Stored predictions that are not current, and not scored."""
 
 
 def isolated(plan: Plan, isolation: Isolation) -> Plan:
@@ -101,81 +98,10 @@ def isolated(plan: Plan, isolation: Isolation) -> Plan:
     return replace(plan, chain=isolation.chain(plan.chain), metrics=isolated_metrics(isolation, plan.metrics))
 
 
-def done_apart(
-    dataset: Path,
-    out: Path,
-    options: EvaluationOptions,
-    jobs: list[SequenceJob],
-    workers: Workers,
-    hashes: FileHashes,
-) -> Iterator[tuple[SequenceJob, Scores | None]]:
-    """Jobs as they are done, each in a child process of one thread; with the scores that they ask for.
-
-    ``hashes`` gets those of the files that the children have read.
-
-    Raises:
-        RsbenchError: a dataset, a stored prediction or an entry is at fault.
-        LostJobsError: see ``finished_jobs``.
-    """
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    done = finished_jobs(
-        _serve_sequences, jobs, workers, one_thread, dataset, out, options, name=lambda job: job.sequence
-    )
-    with closing(done) as found:
-        for job, (scores, lines) in found:
-            hashes.append(lines)
-            yield job, None if scores is None else _collected(**scores)
-
-
-def _collected(rows: dict[str, list[Row]], stale: list[str]) -> Scores:
-    """A child's answer; its words are those of others, so that ten thousand answers hold each once."""
-
-    def once(value: Any) -> Any:
-        return sys.intern(value) if isinstance(value, str) else value
-
-    shared = {
-        table: [{once(k): once(v) for k, v in row.items()} for row in found] for table, found in rows.items()
-    }
-    return Scores(rows=shared, stale=stale)
-
-
-def _serve_sequences(
-    dataset: Path, out: Path, options: EvaluationOptions
-) -> Callable[[SequenceJob], tuple[dict[str, Any] | None, list[str]]]:
-    """What does the jobs, in a child: the fields of ``Scores``, and the hashes that are new."""
-    use_one_thread()
-    try:
-        sequences = {each.name: each for each in read_pairs(dataset)}
-        plan = make_plan(options, list(sequences.values()))
-    except RsbenchError as error:
-        raise EntryFailure(str(error)) from error
-    runner, plan = SolverRunner(single_thread=True), isolated(plan, Isolation())  # as long as this process
-    hashes = FileHashes(dataset, out / HASHES)  # empty after --force, which clears them in the parent
-
-    def run(job: SequenceJob) -> tuple[dict[str, Any] | None, list[str]]:
-        sequence, folder = sequences[job.sequence], out / "predictions" / job.sequence
-        scores = None
-        try:
-            if job.predict:
-                Bench(sequence, folder, plan, runner, hashes.sha256).predict(lambda word: None)
-            if job.score:
-                kept = KeptScores(kept_scores_file(out, job.sequence), options.rehash)
-                scores = vars(Scores.of(Places(sequence, folder, plan.chain, hashes.sha256), plan, kept))
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
-        return scores, hashes.taken()
-
-    return run
-
-
-Job = tuple[str, str, int]
-"""Names of sequence and solver, and the number of the samples."""
-
-
 def repeats_of(plan: Plan) -> list[Job]:
-    """What is planned beside the first motion of each solver; what takes long is begun early."""
+    """The motions that are planned beside the first one of each solver; what takes long is begun early."""
     return [
-        (sequence, solver.name, seed)
+        Job(sequence, solver.name, seed)
         for solver in sorted(plan.solvers, key=lambda entry: entry.name, reverse=True)
         if solver.name in plan.solver_names
         for sequence in sorted(plan.sequence_names)
@@ -183,66 +109,34 @@ def repeats_of(plan: Plan) -> list[Job]:
     ]
 
 
-def repeat(
-    dataset: Path,
-    out: Path,
-    options: EvaluationOptions,
-    plan: Plan,
-    sequences: list[Sequence],
-    hashes: FileHashes,
-    step: Step,
-    workers: Workers,
-) -> None:
-    """Make the motions of ``repeats_of`` that are not current, with the matches that are stored.
-
-    Raises:
-        RsbenchError: a solver cannot be loaded.
-        LostJobsError: see ``finished_jobs``.
-    """
-    with SolverRunner() as runner:
-        benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner, hashes.sha256) for s in sequences}
-        entries = {entry.name: entry for entry in plan.solvers}
-        todo = []
-        for sequence, solver, seed in repeats_of(plan):
-            bench = benches[sequence]
-            if bench.stands(bench.places.motion(entries[solver], seed)):
-                step(f"{sequence}: {solver}")
-            else:
-                todo.append((sequence, solver, seed))
-    if not todo:
-        return
-    hashes.flush()
-    processes = (os.cpu_count() or 1) if workers == 1 else workers
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(finished_jobs(_serve, todo, processes, one_thread, dataset, out, options, name=_name)) as found:
-        for (sequence, solver, _), _ in found:
-            step(f"{sequence}: {solver}")
+def _shared_words(value: Any) -> Any:
+    """JSON-ready data in which equal texts are one object, so that the rows of many sequences fit in memory."""
+    if isinstance(value, dict):
+        return {_shared_words(k): _shared_words(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_shared_words(each) for each in value]
+    return sys.intern(value) if isinstance(value, str) else value
 
 
-def _name(job: Job) -> str:
-    sequence, solver, seed = job
-    return f"{sequence}, {solver}, seed {seed}"
-
-
-def _serve(dataset: Path, out: Path, options: EvaluationOptions) -> Callable[[Job], None]:
-    """What repeats, in a child."""
+def _serve(
+    dataset: Path, out: Path, options: EvaluationOptions
+) -> Callable[[Job], tuple[dict[str, Any] | None, list[str]]]:
+    """Function that does the jobs in a child: the fields of ``Scores``, and the hashes that are new."""
     use_one_thread()
-    try:
-        sequences = read_pairs(dataset)
-        plan = make_plan(options, sequences)
-    except RsbenchError as error:
-        raise EntryFailure(str(error)) from error
-    runner = SolverRunner(single_thread=True)  # as long as this process
-    hashes = FileHashes(dataset, out / HASHES)
-    benches = {s.name: Bench(s, out / "predictions" / s.name, plan, runner, hashes.sha256) for s in sequences}
-    entries = {entry.name: entry for entry in plan.solvers}
+    evaluation = open_evaluation(dataset, out, options)
+    sequences = {each.name: each for each in evaluation.sequences}
+    entries = {entry.name: entry for entry in evaluation.plan.solvers}
+    runner, plan = SolverRunner(single_thread=True), isolated(evaluation.plan, Isolation())  # end with the process
+    hashes = FileHashes(dataset, out / HASHES)  # empty after --force, which clears them in the parent
 
-    def run(job: Job) -> None:
-        sequence, solver, seed = job
-        try:
-            benches[sequence].move(entries[solver], seed)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
+    def run(job: Job) -> tuple[dict[str, Any] | None, list[str]]:
+        bench = Bench(sequences[job.sequence], evaluation.folder(job.sequence), plan, runner, hashes.sha256)
+        if job.solver:
+            bench.move(entries[job.solver], job.seed)
+        if job.predict:
+            bench.predict(lambda word: None)
+        scores = evaluation.scored(bench.places, plan)._asdict() if job.score else None
+        return scores, hashes.taken()
 
     return run
 
@@ -298,12 +192,11 @@ class Evaluation:
             plan = isolated(self.plan, isolation)
             for sequence in self.sequences:
                 if sequence.name in plan.sequence_names:
-                    Bench(sequence, self._folder(sequence), plan, runner, hashes.sha256).predict(step)
-            self._repeat(hashes, step, 1)
+                    Bench(sequence, self.folder(sequence.name), plan, runner, hashes.sha256).predict(step)
+            self._repeat(hashes, step, os.cpu_count() or 1)
             for sequence in self.sequences:
-                places = Places(sequence, self._folder(sequence), plan.chain, hashes.sha256)
-                kept = KeptScores(kept_scores_file(self.out, sequence.name), self.options.rehash)
-                scored[sequence.name] = Scores.of(places, plan, kept)
+                places = Places(sequence, self.folder(sequence.name), plan.chain, hashes.sha256)
+                scored[sequence.name] = self.scored(places, plan)
                 step(f"{sequence.name}: scores")
         return scored
 
@@ -311,32 +204,59 @@ class Evaluation:
         """The same by ``workers``."""
         due = self.plan.sequence_names
         if repeats_of(self.plan):  # which need the matches, and are scored with the others
-            jobs = [SequenceJob(sequence=name, predict=True, score=False) for name in sorted(due)]
-            self._done(jobs, hashes, step, workers)
+            self._done([Job(name, predict=True) for name in sorted(due)], hashes, step, workers)
             self._repeat(hashes, step, workers)
             due = frozenset[str]()
-        jobs = [SequenceJob(sequence=each.name, predict=each.name in due, score=True) for each in self.sequences]
+        jobs = [Job(each.name, predict=each.name in due, score=True) for each in self.sequences]
         jobs.sort(key=lambda job: not job.predict)  # what takes long is begun early
         return self._done(jobs, hashes, step, workers)
 
-    def _done(
-        self, jobs: list[SequenceJob], hashes: FileHashes, step: Step, workers: Workers
-    ) -> dict[str, Scores]:
+    def _repeat(self, hashes: FileHashes, step: Step, workers: Workers) -> None:
+        """Estimate the motions of ``repeats_of`` that are not current, from the matches that are stored."""
+        entries, todo = {entry.name: entry for entry in self.plan.solvers}, list[Job]()
+        sequences = {each.name: each for each in self.sequences}
+        with SolverRunner() as runner:
+            for job in repeats_of(self.plan):
+                folder = self.folder(job.sequence)
+                bench = Bench(sequences[job.sequence], folder, self.plan, runner, hashes.sha256)
+                if bench.stands(bench.places.motion(entries[job.solver], job.seed)):
+                    step(f"{job.sequence}: {job.solver}")
+                else:
+                    todo.append(job)
+        if todo:
+            hashes.flush()
+            self._done(todo, hashes, step, workers)
+
+    def _done(self, jobs: list[Job], hashes: FileHashes, step: Step, workers: Workers) -> dict[str, Scores]:
+        """Do jobs in child processes of one thread; returns the scores of those that score.
+
+        Raises:
+            RsbenchError: a dataset, a stored prediction or an entry is at fault.
+            LostJobsError: see ``finished_jobs``.
+        """
         scored = {}
-        for job, scores in done_apart(self.dataset, self.out, self.options, jobs, workers, hashes):
-            if job.predict:
-                for _ in range(prediction_steps(self.plan)):
+        done = finished_jobs(_serve, jobs, workers, ONE_THREAD, self.dataset, self.out, self.options)
+        with closing(done) as found:
+            for job, (scores, lines) in found:
+                hashes.append(lines)
+                for _ in range(prediction_steps(self.plan) if job.predict else 0):
                     step(job.sequence)
-            if scores is not None:
-                scored[job.sequence] = scores
-                step(f"{job.sequence}: scores")
+                if job.solver:
+                    step(f"{job.sequence}: {job.solver}")
+                if scores is not None:
+                    scored[job.sequence] = Scores(**_shared_words(scores))
+                    step(f"{job.sequence}: scores")
         return scored
 
-    def _repeat(self, hashes: FileHashes, step: Step, workers: Workers) -> None:
-        repeat(self.dataset, self.out, self.options, self.plan, self.sequences, hashes, step, workers)
+    def scored(self, places: Places, plan: Plan) -> Scores:
+        """Scores of what is stored and current of a sequence."""
+        scorer = Scorer(places, plan, kept_scores(self.out, places.sequence.name), self.options.rehash)
+        scorer.score()
+        return Scores(scorer.rows, scorer.stale)
 
-    def _folder(self, sequence: Sequence) -> Path:
-        return self.out / "predictions" / sequence.name
+    def folder(self, sequence: str) -> Path:
+        """Folder of the predictions of a sequence."""
+        return self.out / "predictions" / sequence
 
     def _provenance(self, command: str) -> dict[str, object]:
         chain = self.plan.chain

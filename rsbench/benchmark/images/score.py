@@ -1,14 +1,12 @@
 """Scores of stored predictions against the truth; no solver runs here.
 
-Those of depth and of corrected frames are kept (``KeptScores``); those of motions take no time.
+Scores of depth and of corrected frames are stored and reused; those of motions take no time.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache, cached_property, partial
 from importlib import resources
 from pathlib import Path
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.plan import NONE, Places, Plan, stored_corrections, stored_depths, stored_motions
 from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pairs
-from rsbench.benchmark.images.store import Artefact, identity_of, read_seconds
+from rsbench.benchmark.images.store import Artefact, identity_of, keep, kept, read_seconds
 from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
 from rsbench.benchmark.provenance import numeric_version, package_version
 from rsbench.benchmark.scoring import answered, score
@@ -30,7 +28,7 @@ from rsbench.dataset.corrected_frames import read_origin
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs
-from rsbench.storage.files import read_json, read_png, sha256, write_bytes
+from rsbench.storage.files import read_png, sha256
 from rsbench.storage.work_folder import HIDDEN
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.fusion import Origin
@@ -41,9 +39,9 @@ _PACKAGES = ("flip-evaluator", "matplotlib", "OpenEXR")
 """Packages that scores and pictures come from, beside those that predictions come from."""
 
 
-def kept_scores_file(out: Path, sequence: str) -> Path:
-    """Where an evaluation in ``out`` keeps the scores of a sequence."""
-    return out / HIDDEN / "scores" / f"{sequence}.json"
+def kept_scores(out: Path, sequence: str) -> Path:
+    """Folder in which an evaluation in ``out`` stores the scores of a sequence."""
+    return out / HIDDEN / "scores" / sequence
 
 
 @cache
@@ -68,66 +66,6 @@ def hash_of_prediction(files: Iterable[Path]) -> str:
     return hashlib.sha256("\n".join(found).encode()).hexdigest()
 
 
-@dataclass(frozen=True)
-class ScoredPart:
-    """The scores of one prediction."""
-
-    rows: list[Row]
-    failures: list[Row]
-    """What the table of failures gets."""
-
-
-class KeptScores:
-    """Those of one sequence, by the name of the prediction, in one file; None as the file keeps nothing."""
-
-    def __init__(self, path: Path | None = None, forget: bool = False) -> None:
-        """
-        Args:
-            path: of the file; need not exist.
-            forget: what it holds is not used.
-        """
-        self._path = path
-        self._before = {} if path is None or forget else _read(path)
-        self._now: dict[str, Mapping[str, Any]] = {}
-
-    def find(self, name: str, key: str) -> ScoredPart | None:
-        """What is kept of a prediction under this key."""
-        found = self._before.get(name)
-        if found is None or found["key"] != key:
-            return None
-        self._now[name] = found
-        return ScoredPart(found["rows"], found["failures"])
-
-    def keep(self, name: str, key: str, part: ScoredPart) -> None:
-        self._now[name] = {"key": key, "rows": part.rows, "failures": part.failures}
-
-    def save(self) -> None:
-        """Write what was found or kept by this object; the rest is of predictions that are gone or stale."""
-        if self._path is None or self._now == self._before:
-            return
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        text = _text(self._now)
-        write_bytes(self._path, f'{{"sha256": "{_digest(text)}", "parts": {text}}}\n'.encode())
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """The parts that a file holds; none where it is not there, or not as it was written."""
-    try:
-        content = read_json(path)
-        parts = content["parts"]
-        return dict(parts) if _digest(_text(parts)) == content["sha256"] else {}
-    except (RsbenchError, KeyError, TypeError, ValueError):
-        return {}
-
-
-def _text(parts: Mapping[str, Any]) -> str:
-    return json.dumps(parts)  # with NaN and Infinity, which Python reads again
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 TABLES = ("pose", "depth", "correction", "failures", "seconds")
 KEYS = {
     "pose": ("sequence", "solver", "seed", "shutter", "data_model", "assumed_model", "uses", "success"),
@@ -146,9 +84,16 @@ _SEES = "single-view"
 class Scorer:
     """Rows of all tables for one sequence."""
 
-    def __init__(self, places: Places, plan: Plan, kept: KeptScores | None = None) -> None:
+    def __init__(self, places: Places, plan: Plan, kept: Path | None = None, rehash: bool = False) -> None:
+        """
+        Args:
+            places: of the predictions.
+            plan: of the evaluation.
+            kept: folder of scores that are reused and stored, see ``kept_scores``; None: nothing is stored.
+            rehash: whether stored scores are computed again.
+        """
         self.places, self.plan, self.sequence = places, plan, places.sequence
-        self.kept = KeptScores() if kept is None else kept
+        self._kept, self._rehash = kept, rehash
         self.rows: dict[str, list[Row]] = {table: [] for table in TABLES}
         self.stale: list[str] = []
         """Predictions on disk that are not current, and not scored."""
@@ -163,7 +108,6 @@ class Scorer:
         self._score_correction()
         seconds = read_seconds(self.places.folder).items()
         self._add("seconds", ({"prediction": name, "seconds": value} for name, value in seconds))
-        self.kept.save()
 
     def _add(self, table: str, rows: Iterable[Row]) -> None:
         self.rows[table] += [{"sequence": self.sequence.name, **row} for row in rows]
@@ -181,16 +125,17 @@ class Scorer:
             metrics=metric_keys(self.plan.metrics, case),
             visible=load_corrector(_SEES).key,
         )
-        part = self.kept.find(name, key)
+        path = None if self._kept is None else self._kept / f"{name}.json"
+        part = None if path is None or self._rehash else kept(path, key)
         if part is None:
             self._failing = []
-            part = ScoredPart(list(rows()), self._failing)
-            if all(row["kind"] != "metric" for row in self._failing):
-                self.kept.keep(name, key, part)
+            part = {"rows": list(rows()), "failures": self._failing}
+            if path is not None and all(row["kind"] != "metric" for row in self._failing):
+                keep(path, key, part)
         else:
-            for row in part.failures:
+            for row in part["failures"]:
                 self._fail(**row)
-        self._add(table, part.rows)
+        self._add(table, part["rows"])
 
     def _fail(self, kind: str, name: str, reason: str) -> None:
         about = {"kind": kind, "name": name, "reason": reason}

@@ -1,8 +1,8 @@
-"""Stored predictions: each artefact carries the identity of what it was made from, and is kept while that stands.
+"""Stored results, each with the identity of what it was made from: it is reused while that identity is current.
 
-An artefact is a record, ``NAME.json``, and the files beside it that begin with ``NAME``. The record is removed
-before the files change and written when all are complete, so an artefact with a record is whole and is what its
-record says.
+A prediction is an artefact: a record, ``NAME.json``, and the files beside it whose names begin with ``NAME``. The
+record is deleted before the files change and written after all of them, so an artefact that has a record is
+complete. Results that consist of JSON alone, such as scores, are stored by ``keep`` and read by ``kept``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.files import read_json, write_json
+from rsbench.storage.files import read_json, write_bytes, write_json
 from rsbench.storage.work_folder import listed
 
 _Vector = tuple[float, float, float]
@@ -141,6 +141,25 @@ class Artefact:
         if seconds is not None:
             write_json(self.folder / SECONDS, read_seconds(self.folder) | {self.name: round(seconds, 4)})
         write_json(self.file(".json"), {"identity": self.identity, **record})
+
+
+def keep(path: Path, identity: str, content: object) -> None:
+    """Store ``content``, JSON-ready but for NaN and infinity, for ``kept``."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    record = {"identity": identity, "sha256": _digest(content), "content": content}
+    write_bytes(path, (json.dumps(record) + "\n").encode())
+
+
+def kept(path: Path, identity: str) -> Any:
+    """What ``keep`` stored under this identity; None where there is no file, another identity, or damage."""
+    record = read_record(path) or {}
+    content = record.get("content")
+    current = record.get("identity") == identity and record.get("sha256") == _digest(content)
+    return content if current else None
+
+
+def _digest(content: object) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def read_record(path: Path) -> dict[str, Any] | None:

@@ -42,7 +42,7 @@ from rsbench.benchmark.leaderboard.track import (
 from rsbench.capture.model_choice import AUTO
 from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, decode, encode, use_one_thread
+from rsbench.jobs.isolation import ONE_THREAD, decode, encode, use_one_thread
 from rsbench.jobs.process_jobs import Workers, run_jobs
 from rsbench.pipeline.chain import Given
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
@@ -242,8 +242,7 @@ def _rows_of(
     if workers == 1:
         yield from ((name, picture_rows(split, name, submissions)) for name in names)
         return
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(run_jobs(_serve_rows, names, workers, one_thread, tuple(submissions), split)) as ready:
+    with closing(run_jobs(_serve_rows, names, workers, ONE_THREAD, tuple(submissions), split)) as ready:
         for name, outcome in ready:
             if not outcome.success:
                 raise RsbenchError(f"problem {name}: {outcome.reason}" if outcome.ended else outcome.reason)
@@ -252,14 +251,7 @@ def _rows_of(
 
 def _serve_rows(submissions: Sequence[Submission], split: Split) -> Callable[[str], list[Row | str]]:
     use_one_thread()
-
-    def run(name: str) -> list[Row | str]:
-        try:
-            return picture_rows(split, name, submissions)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
-
-    return run
+    return lambda name: picture_rows(split, name, submissions)
 
 
 def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> list[Row | str]:

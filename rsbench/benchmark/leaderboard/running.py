@@ -15,16 +15,16 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from rsbench.benchmark.images.store import identity_of, read_record
+from rsbench.benchmark.images.store import identity_of, keep, kept
 from rsbench.benchmark.leaderboard.pictures import PICTURES
 from rsbench.benchmark.leaderboard.submissions import method_header, submission_text
 from rsbench.benchmark.leaderboard.track import Job, Limits, Runnable, Split, Step, Target, Track
 from rsbench.benchmark.provenance import numeric_version, processor
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs, run_jobs
 from rsbench.solvers.refined import warm_up
-from rsbench.storage.files import sha256, write_bytes, write_json
+from rsbench.storage.files import sha256, write_bytes
 from rsbench.storage.untrusted_files import check_name
 from rsbench.storage.work_folder import remove
 
@@ -145,15 +145,11 @@ def _record(target: Target, problems: Sequence[str]) -> Path:
 
 def _stored(target: Target, problems: Sequence[str]) -> list[dict[str, Any]] | None:
     """The answers to some problems, when they are current."""
-    record = read_record(_record(target, problems)) or {}
-    answers = record.get("answers")
-    return answers if record.get("identity") == target.identity and isinstance(answers, list) else None
+    return kept(_record(target, problems), target.identity)
 
 
 def _keep(target: Target, problems: Sequence[str], answers: Sequence[dict[str, Any]]) -> None:
-    path = _record(target, problems)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"identity": target.identity, "answers": answers})
+    keep(_record(target, problems), target.identity, answers)
 
 
 def _done(
@@ -168,15 +164,11 @@ def _done(
     if workers == 0:
         run = serve(inputs, limits)
         for job in jobs:
-            try:
-                run(job)
-            except EntryFailure as error:
-                raise RsbenchError(str(error)) from error
+            run(job)
             yield job
         return
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
     if limits == Limits():
-        with closing(finished_jobs(serve, jobs, workers, one_thread, inputs, limits)) as found:
+        with closing(finished_jobs(serve, jobs, workers, ONE_THREAD, inputs, limits)) as found:
             yield from (job for job, _ in found)
         return
 
@@ -186,7 +178,7 @@ def _done(
         return limits.seconds if limits.seconds is not None and own else math.inf
 
     outcomes = run_jobs(
-        serve, jobs, workers, one_thread, inputs, limits, seconds_of=seconds_of, memory_mb=limits.memory_mb
+        serve, jobs, workers, ONE_THREAD, inputs, limits, seconds_of=seconds_of, memory_mb=limits.memory_mb
     )
     with closing(outcomes) as ready:
         for job, outcome in ready:
@@ -206,10 +198,7 @@ def _serve(track: Track, inputs: Path, limits: Limits) -> Any:
     def run(job: Job) -> None:
         for target in job.targets:
             remove(_record(target, job.problems))
-        try:
-            for target, answers in zip(job.targets, solve(job), strict=True):
-                _keep(target, job.problems, answers)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
+        for target, answers in zip(job.targets, solve(job), strict=True):
+            _keep(target, job.problems, answers)
 
     return run

@@ -26,7 +26,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset_manifest
-from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.renderers.backend import start_backend
 from rsbench.solvers.engine.base import BESIDE, SOLVERS, load_solver_entry
@@ -153,7 +153,7 @@ def run_smoke(
         use_one_thread()
         done = ((job, _rows_of(job, data, problems)) for job in jobs)
     else:
-        done = finished_jobs(_serve, jobs, workers, dict.fromkeys(THREAD_VARIABLES, "1"), data, problems)
+        done = finished_jobs(_serve, jobs, workers, ONE_THREAD, data, problems)
     with closing(done) as found:
         for job, scores in found:
             rows[job.track] += scores
@@ -167,14 +167,7 @@ def run_smoke(
 
 def _serve(data: Path | None, problems: int | None) -> Callable[[Job], list[Row]]:
     use_one_thread()
-
-    def run(job: Job) -> list[Row]:
-        try:
-            return _rows_of(job, data, problems)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
-
-    return run
+    return lambda job: _rows_of(job, data, problems)
 
 
 def _rows_of(job: Job, data: Path | None, problems: int | None) -> list[Row]:

@@ -67,16 +67,6 @@ class Bound:
         return float(np.linalg.norm(self.direction_axes))
 
     @property
-    def direction_observable(self) -> bool:
-        """Whether the direction of d is known better than to half a radian."""
-        return self.direction <= 0.5
-
-    @property
-    def scale_observable(self) -> bool:
-        """Whether the length of d is known better than to half of it."""
-        return self.scale <= 0.5
-
-    @property
     def covariance(self) -> FloatArray | None:
         """(6, 6) of (w, d); None where the data leave something open."""
         scale = _scale(self.root)

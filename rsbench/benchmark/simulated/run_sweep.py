@@ -36,7 +36,7 @@ from rsbench.components.motion_models import motion_model
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
-from rsbench.jobs.isolation import THREAD_VARIABLES, EntryFailure, use_one_thread
+from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entries
@@ -332,8 +332,7 @@ def _compile(card: SweepCard) -> None:
 
 def _run_all(todo: list[_Job], workers: Workers, time_limit_s: float | None) -> Iterator[_Part]:
     """Always in children, so that BLAS has one thread and one summation order whatever the parent has loaded."""
-    one_thread = dict.fromkeys(THREAD_VARIABLES, "1")
-    with closing(finished_jobs(_serve_jobs, todo, workers, one_thread, time_limit_s)) as found:
+    with closing(finished_jobs(_serve_jobs, todo, workers, ONE_THREAD, time_limit_s)) as found:
         for job, _ in found:
             yield job.part
 
@@ -343,14 +342,7 @@ def _serve_jobs(time_limit_s: float | None) -> Callable[[_Job], None]:
     use_one_thread()
     warm_up()
     runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
-
-    def run(job: _Job) -> None:
-        try:
-            run_job(job, runner)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
-
-    return run
+    return lambda job: run_job(job, runner)
 
 
 def run_job(job: _Job, runner: SolverRunner) -> None:

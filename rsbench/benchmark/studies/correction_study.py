@@ -20,22 +20,22 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.store import keep
+from rsbench.benchmark.images.store import kept as kept_rows
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.benchmark.statistics import median_interval
 from rsbench.benchmark.studies.correction_bench import (
     METHODS,
     Attempt,
     Bench,
-    ResumableRows,
     Row,
     Rows,
     methods_among,
+    rows_identity,
 )
-from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
-from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.vision.quality import flip, psnr, ssim_deepunroll, ssim_uniform, ssim_within
 
@@ -191,21 +191,20 @@ def study_dataset(
     """
     sequences = [sequence for sequence in read_dataset(dataset) if among(sequence.name)]
     found: dict[str, Rows] = {}
-    store = (
-        None
-        if kept is None
-        else ResumableRows(folder=kept, dataset=dataset, seed=seed, solver=solver, others=others)
-    )
-    if store is not None:
-        found = {one.name: rows for one in sequences if (rows := store.read(one.name)) is not None}
-    for name in found:
-        step(name)
+    stored: dict[str, tuple[Path, str]] = {}
+    if kept is not None:
+        options = {"seed": seed, "solver": solver, "others": others}
+        for each in sequences:
+            stored[each.name] = kept / f"{each.name}.json", rows_identity(dataset, each.name, **options)
+            if (rows := kept_rows(*stored[each.name])) is not None:
+                found[each.name] = rows
+                step(each.name)
     missing = [sequence for sequence in sequences if sequence.name not in found]
     with closing(_studied(missing, dataset, seed, solver, workers, others)) as outcomes:
         for name, rows in outcomes:
             found[name] = rows
-            if store is not None:
-                store.write(name, rows)
+            if kept is not None:
+                keep(*stored[name], rows)
             step(name)
     images, bands, motions = (
         [row for sequence in sequences for row in found[sequence.name][table]] for table in range(3)
@@ -232,14 +231,7 @@ def _studied(
 
 def _serve(dataset: Path, seed: int, solver: str, others: tuple[str, ...]) -> Callable[[str], Rows]:
     """What studies sequences by their names, in a child."""
-
-    def study(name: str) -> Rows:
-        try:
-            return study_sequence(read_sequence(dataset / name), seed, solver, others)
-        except RsbenchError as error:
-            raise EntryFailure(str(error)) from error
-
-    return study
+    return lambda name: study_sequence(read_sequence(dataset / name), seed, solver, others)
 
 
 def study_sequence(

@@ -16,9 +16,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.store import keep
+from rsbench.benchmark.images.store import kept as kept_rows
 from rsbench.benchmark.scoring import pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.studies.correction_bench import ResumableRows, Row
+from rsbench.benchmark.studies.correction_bench import Row, rows_identity
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
@@ -84,20 +86,15 @@ def study(
         for sequence in read_dataset(folder):
             scene, stratum, _ = sequence.name.rsplit("-", 2)
             key = {"camera": camera, "scene": scene, "stratum": stratum, "sequence": sequence.name}
-            found = _kept(sequence, seeds, folder, kept / camera)
+            file = kept / camera / f"{sequence.name}.json"
+            identity = rows_identity(folder, sequence.name, seed=seeds, solver=CorrectionOptions().solver.name)
+            if (found := kept_rows(file, identity)) is None:
+                found = study_sequence(sequence, seeds)
+                keep(file, identity, found)
             motions += [key | row for row in found[0]]
             views += [key | row for row in found[1]]
             step(f"{camera} {sequence.name}")
     return motions, views
-
-
-def _kept(sequence: Sequence, seeds: int, dataset: Path, folder: Path) -> tuple[list[Row], list[Row]]:
-    store = ResumableRows(folder=folder, dataset=dataset, seed=seeds, solver=CorrectionOptions().solver.name)
-    rows = store.read(sequence.name)
-    if rows is None:
-        rows = (*study_sequence(sequence, seeds), [])
-        store.write(sequence.name, rows)
-    return rows[0], rows[1]
 
 
 def study_sequence(sequence: Sequence, seeds: int) -> tuple[list[Row], list[Row]]:

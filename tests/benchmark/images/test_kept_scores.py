@@ -15,7 +15,7 @@ from evaluations import QUICK, contents, evaluate
 
 from rsbench.benchmark.images import score
 from rsbench.benchmark.images.plan import Places, Plan, make_plan
-from rsbench.benchmark.images.score import KeptScores, Row, Scorer, kept_scores_file
+from rsbench.benchmark.images.score import Row, Scorer, kept_scores
 from rsbench.benchmark.metric_plugins import DepthCase, ImageCase
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_dataset
@@ -36,9 +36,9 @@ class Bench:
         self.sequence: Sequence = read_dataset(data)[0]
         self.plan: Plan = make_plan(QUICK, [self.sequence])
         self.folder = out / "predictions" / self.sequence.name
-        self.file = kept_scores_file(out, self.sequence.name)
+        self.kept = kept_scores(out, self.sequence.name)
 
-    def rows(self, kept: KeptScores | None = None) -> dict[str, list[Row]]:
+    def rows(self, kept: Path | None = None) -> dict[str, list[Row]]:
         scorer = Scorer(Places(self.sequence, self.folder, self.plan.chain), self.plan, kept)
         scorer.score()
         return scorer.rows
@@ -108,11 +108,12 @@ def package(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
 
 
 def kept_file(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
-    text = bench.file.read_text()
+    file = bench.kept / "corrected" / "none.json"
+    text = file.read_text()
     number = text.index('"psnr": ') + len('"psnr": ')
     other = "1" if text[number] != "1" else "2"
-    bench.file.write_text(text[:number] + other + text[number + 1 :])
-    return ALL
+    file.write_text(text[:number] + other + text[number + 1 :])
+    return {ImageCase: 8}
 
 
 def nothing(bench: Bench, patch: pytest.MonkeyPatch) -> dict[type, int]:
@@ -141,7 +142,7 @@ def test_a_change_of_anything_computes_what_depends_on_it(
     try:
         due = change(bench, monkeypatch)
         computed.clear()
-        rows = bench.rows(KeptScores(bench.file))
+        rows = bench.rows(bench.kept)
         found = {kind: computed[kind] for kind in ALL if computed[kind]}
         assert found == due
         assert repr(rows) == repr(bench.rows())  # as text, in which NaN equals itself
@@ -163,12 +164,12 @@ def test_a_metric_that_failed_is_asked_again(bench: Bench, monkeypatch: pytest.M
     def failing(metric: Any, case: Any) -> dict[str, float]:
         raise RsbenchError("took too long")
 
-    bench.file.unlink()
+    shutil.rmtree(bench.kept)
     with monkeypatch.context() as patch:
         patch.setattr(score, "score", failing)
-        rows = bench.rows(KeptScores(bench.file))
+        rows = bench.rows(bench.kept)
     assert {row["reason"] for row in rows["failures"]} == {"took too long"}
-    assert bench.rows(KeptScores(bench.file))["failures"] == []
+    assert bench.rows(bench.kept)["failures"] == []
 
 
 def test_rehash_scores_again_to_the_same_bytes(

@@ -34,7 +34,7 @@ from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.cli import generate, reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import EntryFailure, Outcome, decode, encode
+from rsbench.jobs.isolation import Outcome, decode, encode
 from rsbench.storage.files import read_depth, read_png, write_depth, write_png
 
 RIG, _, _ = PLANES
@@ -306,7 +306,7 @@ def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_p
     changed = replace(first.pictures, files=dict.fromkeys(first.pictures.files, "0" * 64))
     broken = replace(split, truths=(replace(first, pictures=changed), second))
     run = _serve_rows([read_submission(write_truth(split, tmp_path), split)], broken)
-    with pytest.raises(EntryFailure, match=r"is not the file that dataset\.json names"):
+    with pytest.raises(RsbenchError, match=r"is not the file that dataset\.json names"):
         run(first.name)
     (row,) = run(second.name)
     assert isinstance(row, dict) and row["bad_1"] == 0.0
