@@ -16,6 +16,7 @@ from rsbench.benchmark.metric_plugins import METRICS, Case, MetricEntry
 from rsbench.components import plugins
 from rsbench.core.arguments import LARGEST
 from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import (
     WORST_ANGLE,
     WORST_SCALE,
@@ -80,6 +81,14 @@ def pose_errors(
     claimed = np.where(np.asarray(metric, dtype=np.bool_), scale_error(d, true_d), np.nan)
     e_s = np.where(good, claimed, WORST_SCALE)
     return dict(zip(WORST_POSE, (np.rad2deg(e_R), np.rad2deg(e_T), e_s), strict=True))
+
+
+def motion_errors(motion: Motion | None, truth: Motion, rig: StereoRig) -> dict[str, float]:
+    """e_R_deg and e_T_deg of an estimated motion of the body; None is a failure, which scores the worst values."""
+    nothing = np.full(3, np.nan)
+    w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
+    errors = pose_errors(w, d, true_w=truth.w, true_d=truth.d, rig=rig)
+    return {name: float(errors[name]) for name in ("e_R_deg", "e_T_deg")}
 
 
 def score(metric: MetricEntry, case: Case | None) -> dict[str, float]:

@@ -37,17 +37,17 @@ class Interval(NamedTuple):
     high: float
 
 
-def median_interval(values: ArrayLike, coverage: float = COVERAGE) -> Interval:
+def median_interval(values: ArrayLike) -> Interval:
     """Exact interval of the median of the distribution of independent values (n,).
 
-    The ends are order statistics x[k], x[n + 1 - k] with the largest k that still holds with ``coverage``; with
+    The ends are order statistics x[k], x[n + 1 - k] with the largest k that still holds with ``COVERAGE``; with
     fewer than six values no such k exists at 95 % and the interval is infinite. Nine values: x[2], x[8].
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     n = len(ordered)
     # P(x[k] <= median <= x[n+1-k]) = 1 - 2 P(Binomial(n, 1/2) <= k - 1)
     k = 0
-    while k + 1 <= n // 2 and 1.0 - 2.0 * float(bdtr(k, n, 0.5)) >= coverage:
+    while k + 1 <= n // 2 and 1.0 - 2.0 * float(bdtr(k, n, 0.5)) >= COVERAGE:
         k += 1
     if k == 0:
         return Interval(-np.inf, np.inf)

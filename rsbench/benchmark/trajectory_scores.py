@@ -8,7 +8,7 @@ does not know is NaN in it; it scores the worst value of everything.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -39,6 +39,14 @@ _INLIER_PX, _FEWEST, _DRAWS = 1.5, 6, 1000
 """Threshold, fewest inliers and samples of P3P in RANSAC."""
 
 
+_UNKNOWN = Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
+
+
+def _stacked(poses: list[Pose]) -> Pose:
+    """Poses (3, 3), (3,) as one with a leading axis (n, ...)."""
+    return Pose(np.stack([each.R for each in poses]), np.stack([each.t for each in poses]))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """The trajectory of an entry; poses are NaN where it has none."""
@@ -55,7 +63,7 @@ class Estimate:
         number = min(frame, len(self.windows) - 1)
         motion = self.windows[number]
         if motion is None:
-            return Pose(np.full((len(tau), 3, 3), np.nan), np.full((len(tau), 3), np.nan))
+            return _stacked([_UNKNOWN] * len(tau))
         moved = motion.body_from_world(tau - number)
         return compose(moved, inverse(motion.body_from_world(float(frame - number))))
 
@@ -66,8 +74,7 @@ class Estimate:
         if number == frame:
             return first
         motion = self.windows[number]
-        end = Pose(np.full((3, 3), np.nan), np.full(3, np.nan)) if motion is None else motion.body_from_world(1.0)
-        return compose(end, first)
+        return compose(_UNKNOWN if motion is None else motion.body_from_world(1.0), first)
 
 
 def along(motion: Motion, count: int, positions: bool = True) -> Estimate:
@@ -78,12 +85,10 @@ def along(motion: Motion, count: int, positions: bool = True) -> Estimate:
 
 def chained(windows: list[Motion | None]) -> Estimate:
     """Independent motions, each beginning where the one before ends; after a failure nobody knows where."""
-    unknown = Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
     starts = [Pose(np.eye(3), np.zeros(3))]
     for motion in windows[:-1]:
-        starts.append(compose(unknown if motion is None else motion.body_from_world(1.0), starts[-1]))
-    stacked = Pose(np.stack([each.R for each in starts]), np.stack([each.t for each in starts]))
-    return Estimate(windows=windows, starts=stacked, failed=sum(motion is None for motion in windows))
+        starts.append(compose(_UNKNOWN if motion is None else motion.body_from_world(1.0), starts[-1]))
+    return Estimate(windows=windows, starts=_stacked(starts), failed=sum(motion is None for motion in windows))
 
 
 # Methods
@@ -103,13 +108,6 @@ class Given:
 
 
 def _trajectory(given: Given) -> Estimate:
-    found = estimate_trajectory(given.matches, given.rig, given.shutter, seed=given.seed)
-    return along(found.motion, len(given.matches))
-
-
-def _trajectory_gyro(given: Given) -> Estimate | None:
-    if given.gyro is None:
-        return None
     found = estimate_trajectory(given.matches, given.rig, given.shutter, seed=given.seed, gyro=given.gyro)
     return along(found.motion, len(given.matches))
 
@@ -119,9 +117,7 @@ def _correct(given: Given) -> Estimate:
     windows = (Window(images={}, pairs=None, found=None, matches=each) for each in given.matches)
     found = list(on_one_trajectory(windows, given.rig, given.shutter, options, NO_ERRORS))
     motions = [None if each.found is None else each.found.motion for each in found]
-    unknown = Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
-    poses = [each.pose or unknown for each in found]
-    starts = Pose(np.stack([each.R for each in poses]), np.stack([each.t for each in poses]))
+    starts = _stacked([each.pose or _UNKNOWN for each in found])
     return Estimate(windows=motions, starts=starts, failed=sum(motion is None for motion in motions))
 
 
@@ -137,10 +133,6 @@ def _windows(model: str | None) -> Callable[[Given], Estimate]:
         return chained(motions)
 
     return solve
-
-
-def _global_shutter(given: Given) -> Estimate:
-    return chained([pnp_motion(each.tracks, given.rig) for each in given.matches])
 
 
 def pnp_motion(tracks: FloatArray, rig: StereoRig) -> Motion | None:
@@ -169,10 +161,6 @@ def _gyro(given: Given) -> Estimate | None:
     return along(GyroMotion(given.gyro, np.zeros(3)), len(given.matches), positions=False)
 
 
-def _rolling(given: Given) -> Estimate:
-    return along(LinearMotion(np.zeros(3), np.zeros(3)), len(given.matches))
-
-
 class Method(NamedTuple):
     """A method that estimates trajectories."""
 
@@ -188,7 +176,7 @@ class Method(NamedTuple):
 _MATCHES = ("left", "right", "links")
 METHODS: dict[str, Method] = {
     "rs-trajectory": Method(
-        _trajectory,
+        lambda given: _trajectory(replace(given, gyro=None)),
         (*_MATCHES, "readout"),
         "spline",
         "One spline through all windows, as rsbench.estimate_trajectory",
@@ -197,7 +185,7 @@ METHODS: dict[str, Method] = {
         _correct, (*_MATCHES, "readout"), "spline", "The same some windows at a time, as rsbench correct does"
     ),
     "rs-trajectory-gyro": Method(
-        _trajectory_gyro,
+        lambda given: None if given.gyro is None else _trajectory(given),
         (*_MATCHES, "readout", "gyro"),
         "spline",
         "The same spline through the samples of a gyroscope too, whose bias and clock are found",
@@ -212,7 +200,7 @@ METHODS: dict[str, Method] = {
         _windows(None), (*_MATCHES, "readout"), "linear", "Each window by itself, under the paper's motion model"
     ),
     "gs-vo": Method(
-        _global_shutter,
+        lambda given: chained([pnp_motion(each.tracks, given.rig) for each in given.matches]),
         _MATCHES,
         "none",
         "Stereo odometry of a global shutter: P3P in RANSAC of each window, refined; OpenCV",
@@ -220,7 +208,12 @@ METHODS: dict[str, Method] = {
     "gyro-integrated": Method(
         _gyro, ("gyro",), "spline", "The integral of the gyroscope, biases and all; no position"
     ),
-    "no-motion": Method(_rolling, ("readout",), "none", "A rig that stands still"),
+    "no-motion": Method(
+        lambda given: along(LinearMotion(np.zeros(3), np.zeros(3)), len(given.matches)),
+        ("readout",),
+        "none",
+        "A rig that stands still",
+    ),
 }
 """Methods by their names on a board."""
 
@@ -344,25 +337,15 @@ def trajectory_scores(truth: TrueTrajectory, estimate: Estimate) -> dict[str, fl
         "auc_way": float(np.mean(np.clip(1.0 - gone / AUC_DEG["auc_way"], 0.0, None))),
         "failed": float(estimate.failed),
     }
-    starts = [_starts(each, len(frames)) for each in (estimate, truth.estimate)]
+    starts = [_stacked([each.start(frame) for frame in frames]) for each in (estimate, truth.estimate)]
     metres, radians = relative_errors(*starts)
     found["rpe_deg"] = float(np.rad2deg(radians))
     known = {
         "ate_mm": 1e3 * absolute_error(*starts),
         "rpe_mm": 1e3 * metres,
-        "jitter_px": _jitter(truth, estimate),
+        "jitter_px": jitter(*(_corrected_places(truth, each) for each in (estimate, truth.estimate))),
     }
     return {**found, **(known if estimate.positions else dict.fromkeys(known, np.nan))}
-
-
-def _starts(estimate: Estimate, frames: int) -> Pose:
-    poses = [estimate.start(frame) for frame in range(frames)]
-    return Pose(np.stack([each.R for each in poses]), np.stack([each.t for each in poses]))
-
-
-def _jitter(truth: TrueTrajectory, estimate: Estimate) -> float:
-    both = [_corrected_places(truth, each) for each in (estimate, truth.estimate)]
-    return jitter(*both)
 
 
 def _corrected_places(truth: TrueTrajectory, estimate: Estimate) -> FloatArray:

@@ -31,8 +31,9 @@ def fig4(out: Path, data: Path) -> None:
 
     That by the paper's own components comes first, see ``fig4_literal``.
     """
+    import pandas as pd
+
     from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_study import numbers_table
     from rsbench.benchmark.studies.fig4_panels import load_panels, make_panels, save_panels
     from rsbench.cli.console import progress_bar
     from rsbench.dataset.sequence import read_sequence
@@ -42,7 +43,7 @@ def fig4(out: Path, data: Path) -> None:
     folder = out / "fig4"
     folder.mkdir(parents=True, exist_ok=True)
     fig4_literal(out, data)
-    numbers: dict[tuple[str, str], dict[str, Any]] = {}
+    numbers: list[dict[str, Any]] = []
     for card, ending in _FIG4:
         names = [f"{scene}{ending}" for scene in SCENES]
         _generate(card, data)
@@ -51,10 +52,10 @@ def fig4(out: Path, data: Path) -> None:
                 save_panels(data / "fig4" / card / name, make_panels(read_sequence(data / card / name)))
                 advance(name)
         rows = [(name, load_panels(data / "fig4" / card / name)) for name in names]
-        numbers |= {(card, name): panels.numbers for name, panels in rows}
+        numbers += [{"card": card, "sequence": name, **panels.numbers} for name, panels in rows]
         for path in draw_fig4(rows, folder / f"fig4-{card}"):
             echo(f"figure: {path}")
-    write_table(folder / "numbers.csv", numbers_table(numbers))
+    write_table(folder / "numbers.csv", pd.DataFrame(numbers))
     records = [dataset_record(data / card) for card, _ in _FIG4]
     write_json(folder / "provenance.json", provenance("rsbench reproduce fig4", datasets=records))
 

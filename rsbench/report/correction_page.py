@@ -20,10 +20,11 @@ from rsbench.benchmark.studies.correction_study import (
     masks,
     verdict,
 )
-from rsbench.benchmark.studies.real_cameras import BEYOND, kept_sequences
+from rsbench.benchmark.studies.real_cameras import BEYOND, within_stated
 from rsbench.benchmark.studies.sgm_timing import DELAYS
 from rsbench.report import pictures
 from rsbench.report.markup import rendered, table_lines
+from rsbench.storage.files import write_bytes
 
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
@@ -42,20 +43,22 @@ _LINES = {
 }
 
 
+def _page(folder: Path, text: str) -> Path:
+    """Write README.md; returns it."""
+    write_bytes(folder / "README.md", text.encode())
+    return folder / "README.md"
+
+
 def write_study(folder: Path) -> list[Path]:
     """README.md and rows.svg from the tables in ``folder``; returns the files."""
-    images, summary = pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")
-    page = folder / "README.md"
-    page.write_text(study_page(images, summary), "utf-8", newline="\n")
+    page = _page(folder, study_page(pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")))
     return [page, _draw_rows(pd.read_csv(folder / "rows.csv"), folder / "rows.svg")]
 
 
 def write_laws(folder: Path) -> Path:
     """README.md from the tables in ``folder``: ``by_law``, ``by_sequence``, and the errors of motions."""
-    page = folder / "README.md"
     tables = [pd.read_csv(folder / f"{name}.csv") for name in ("summary", "sequences", "motions")]
-    page.write_text(laws_page(*tables), "utf-8", newline="\n")
-    return page
+    return _page(folder, laws_page(*tables))
 
 
 def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
@@ -264,9 +267,7 @@ _LONGEST = 560
 def write_real_page(folder: Path, card: dict[str, Any]) -> Path:
     """README.md from motions.csv and summary.csv in ``folder``; ``card`` is that of the real camera's dataset."""
     summary, motions = pd.read_csv(folder / "summary.csv"), pd.read_csv(folder / "motions.csv")
-    page = folder / "README.md"
-    page.write_text(real_page(summary, motions, card), "utf-8", newline="\n")
-    return page
+    return _page(folder, real_page(summary, motions, card))
 
 
 def real_page(summary: pd.DataFrame, motions: pd.DataFrame, card: dict[str, Any]) -> str:
@@ -286,9 +287,9 @@ def real_page(summary: pd.DataFrame, motions: pd.DataFrame, card: dict[str, Any]
 
 
 def _kept(motions: pd.DataFrame, camera: str) -> str:
-    found = kept_sequences(motions, camera)
-    low, high = share_interval(found.kept, found.sequences)
-    return f"{found.kept} of {found.sequences} sequences (95 % interval of the share: {low:.2f} to {high:.2f})"
+    count, sequences = within_stated(motions, camera)
+    low, high = share_interval(count, sequences)
+    return f"{count} of {sequences} sequences (95 % interval of the share: {low:.2f} to {high:.2f})"
 
 
 def _pairs(summary: pd.DataFrame) -> list[tuple[str, pd.Series, pd.Series]]:
@@ -336,9 +337,7 @@ _STYLES = {"mild": ("#0072B2", "o"), "moderate": ("#D55E00", "s"), "aggressive":
 def write_sgm_page(folder: Path) -> list[Path]:
     """README.md and sgm.svg from sgm.csv in ``folder``; returns the files."""
     table = pd.read_csv(folder / "sgm.csv")
-    page = folder / "README.md"
-    page.write_text(sgm_page(table), "utf-8", newline="\n")
-    return [page, _draw(table, folder / "sgm.svg")]
+    return [_page(folder, sgm_page(table)), _draw(table, folder / "sgm.svg")]
 
 
 def sgm_page(table: pd.DataFrame) -> str:

@@ -57,15 +57,15 @@ _LABELS = {
 }
 
 
-def read_summaries(folder: Path, sweeps: tuple[str, ...], ending: str = "") -> dict[str, pd.DataFrame]:
-    """Stored summaries ``<sweep><ending>.csv`` by the name of the sweep.
+def read_summaries(folder: Path, sweeps: tuple[str, ...]) -> dict[str, pd.DataFrame]:
+    """Stored summaries ``<sweep>.csv`` by the name of the sweep.
 
     Raises:
         RsbenchError: one is missing or damaged.
     """
     tables = {}
     for name in sweeps:
-        path = folder / f"{name}{ending}.csv"
+        path = folder / f"{name}.csv"
         if not path.is_file():
             raise RsbenchError(f"{path}: no such summary; run: rsbench reproduce fig3")
         tables[name] = read_table(path)

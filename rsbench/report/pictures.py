@@ -43,11 +43,11 @@ def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis"
     return np.where(np.isfinite(v)[..., None], np.round(255 * coloured), INVALID).astype(np.uint8)
 
 
-def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_], most: int = 400) -> Image:
-    """Arrows of matches (n, 4) from frame 0 to frame 1 on the image of frame 0: inliers blue, outliers orange."""
+def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_]) -> Image:
+    """Arrows of at most 400 matches (n, 4) on the image of frame 0, to frame 1: inliers blue, outliers orange."""
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 2 + 64
     out = np.ascontiguousarray(grey.astype(np.uint8))
-    chosen = np.linspace(0, len(matches) - 1, min(most, len(matches))).astype(int)
+    chosen = np.linspace(0, len(matches) - 1, min(400, len(matches))).astype(int)
     for k in chosen:
         start, end = np.round(matches[k, :2]).astype(int), np.round(matches[k, 2:]).astype(int)
         colour = INLIER if inliers[k] else OUTLIER

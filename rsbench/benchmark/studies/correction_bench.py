@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
-from rsbench.benchmark.scoring import pose_errors
+from rsbench.benchmark.scoring import motion_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.imports import hash_of_files
-from rsbench.core.correspondences import Correspondences
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
@@ -164,68 +163,6 @@ def methods_among(keys: Collection[str]) -> list[Method]:
     return [method for method in (*METHODS, *ON_REQUEST) if method.key in keys]
 
 
-def asked_layers(
-    key: str, sequence: Sequence, images: Mapping[View, NDArray[Any]], matches: Correspondences, seed: int
-) -> dict[View, tuple[Fused, NDArray[np.float32]]]:
-    """Whole pictures, and where each pixel (H, W, 2) moves, px, of the cameras that did not fail.
-
-    Raises:
-        RsbenchError: there is no such card.
-        ValueError: the card is of another corrector.
-    """
-    corrector = load_corrector(key).component
-    if not isinstance(corrector, LayersCorrector):
-        raise ValueError(f"{key!r} is no corrector of layers")
-    corrector = replace(corrector, seed=seed)
-    problem = CorrectionProblem(
-        images=images,
-        rig=sequence.rig,
-        shutter=sequence.shutter,
-        target_row=0.0,
-        motion=None,
-        depth=None,
-        guess=None,
-        matches=matches,
-    )
-    found: dict[View, tuple[Fused, NDArray[np.float32]]] = {}
-    for side in SIDES:
-        scene = corrector.scene(problem, side)
-        if isinstance(scene, str):
-            continue
-        for frame in FRAMES:
-            fused = corrector.rendered(problem, (side, frame), scene)
-            rig, shutter, _, motion = scene.camera
-            flow = correction_flow(scene.depth(frame), FixedGeometry(rig, shutter, motion), (side, frame))
-            whole = inpaint(fused.image, fused.origin == Origin.NOBODY)
-            found[side, frame] = replace(fused, image=whole), flow
-    return found
-
-
-def asked_rotation(key: str, sequence: Sequence, images: Mapping[View, NDArray[Any]], view: View) -> Motion | None:
-    """The rotation of a frame by the gyroscope, or by the card of a corrector of one image; None when it fails.
-
-    Raises:
-        RsbenchError: the sequence has no channel imu, or no such card.
-        ValueError: the card is of a corrector that needs more than the image.
-    """
-    if key == "gyroscope":
-        return GyroMotion(gyro_samples(sequence.inertial(), sequence.frame_period_s), np.zeros(3))
-    corrector = load_corrector(key).component
-    if not isinstance(corrector, ImageRotationCorrector):
-        raise ValueError(f"{key!r} is no corrector of one image")
-    problem = CorrectionProblem(
-        images=images,
-        rig=sequence.rig,
-        shutter=sequence.shutter,
-        target_row=0.0,
-        motion=None,
-        depth=None,
-        guess=None,
-    )
-    motion = corrector.rotation(problem, view)
-    return motion if isinstance(motion, Motion) else None
-
-
 Depth = NDArray[np.float32]
 _SCALED, _MONOCULAR = "gs-stereo-tracks-scaled", "gs-poselib-scaled"
 _OF_LAW = {"linear": "rs-stereo-refined", "twist": "rs-stereo-refined-twist"}
@@ -283,13 +220,11 @@ class Bench:
 
     def motion_errors(self) -> Row:
         """e_R and e_T, degrees, of our motion and of the global-shutter ones; a failure scores the worst."""
-        true, nothing = self.sequence.motion, np.full(3, np.nan)
         row: Row = {}
         motions = {"ours": self.motion, "gs": self.gs_motion, "gs_scaled": _motion(self.scaled)}
         for name, motion in (motions | {law: _motion(found) for law, found in self.of_law.items()}).items():
-            w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
-            errors = pose_errors(w, d, true_w=true.w, true_d=true.d, rig=self.rig)
-            row |= {f"{error}_{name}": float(errors[error]) for error in ("e_R_deg", "e_T_deg")}
+            errors = motion_errors(motion, self.sequence.motion, self.rig)
+            row |= {f"{error}_{name}": value for error, value in errors.items()}
         return row
 
     def attempt(self, key: str) -> dict[View, Attempt] | None:
@@ -301,8 +236,7 @@ class Bench:
         if key in alone:
             return self._mono(alone[key])
         if key == "vasu-layers":
-            layered = asked_layers(key, self.sequence, self.images, self.matches, self._seed)
-            return {view: _attempt(fused, flow) for view, (fused, flow) in layered.items()}
+            return self._layers(key)
         if key in _ASKED:
             return self._turned(key)
         motions = {"gs": self.gs_motion, "gyro": true, "true-motion": true, "truth": true}
@@ -314,7 +248,9 @@ class Bench:
         frames, pairs = self.corrected(pairs, motion, _CORRECTORS.get(key, "fusion"))
         out = {}
         for (side, frame), fused in frames.items():
-            depth = _DEPTHS.get(key, _as_it_is)(pairs[frame].depth[side])
+            depth = pairs[frame].depth[side]
+            if key in _DEPTHS:
+                depth = _DEPTHS[key](depth)
             flow = correction_flow(depth, FixedGeometry(self.rig, self.shutter, motion), (side, frame))
             out[side, frame] = _attempt(fused, flow)
         return out
@@ -351,12 +287,56 @@ class Bench:
     def _zhuang(self, side: Side) -> Motion | None:
         return ZhuangCorrector(seed=self._seed).motion(self.matches, self.rig, self.shutter, side)
 
+    def _problem(self) -> CorrectionProblem:
+        """The frames and their matches, with nothing estimated from them."""
+        return CorrectionProblem(
+            images=self.images,
+            rig=self.rig,
+            shutter=self.shutter,
+            target_row=0.0,
+            motion=None,
+            depth=None,
+            guess=None,
+            matches=self.matches,
+        )
+
+    def _layers(self, key: str) -> dict[View, Attempt]:
+        """The views of the cameras for which the corrector of layers found a scene."""
+        corrector = load_corrector(key).component
+        assert isinstance(corrector, LayersCorrector)
+        corrector, problem, out = replace(corrector, seed=self._seed), self._problem(), dict[View, Attempt]()
+        for side in SIDES:
+            scene = corrector.scene(problem, side)
+            if isinstance(scene, str):
+                continue
+            for frame in FRAMES:
+                fused = corrector.rendered(problem, (side, frame), scene)
+                rig, shutter, _, motion = scene.camera
+                flow = correction_flow(scene.depth(frame), FixedGeometry(rig, shutter, motion), (side, frame))
+                whole = inpaint(fused.image, fused.origin == Origin.NOBODY)
+                out[side, frame] = _attempt(replace(fused, image=whole), flow)
+        return out
+
+    def _rotation(self, key: str, view: View) -> Motion | None:
+        """The rotation of a frame by the gyroscope or by a corrector of one image; None when that fails.
+
+        Raises:
+            RsbenchError: the sequence has no channel imu.
+        """
+        sequence = self.sequence
+        if key == "gyroscope":
+            return GyroMotion(gyro_samples(sequence.inertial(), sequence.frame_period_s), np.zeros(3))
+        corrector = load_corrector(key).component
+        assert isinstance(corrector, ImageRotationCorrector)
+        motion = corrector.rotation(self._problem(), view)
+        return motion if isinstance(motion, Motion) else None
+
     def _turned(self, key: str) -> dict[View, Attempt]:
         """Correct each view by a rotation, which may differ between views."""
         out: dict[View, Attempt] = {}
         far = _infinitely_far(self.true[0].depth["left"])
         for view in VIEWS:
-            motion = asked_rotation(key, self.sequence, self.images, view)
+            motion = self._rotation(key, view)
             if motion is not None:
                 frames, _ = self.corrected(self.sgm, motion, "rotation-only", (view,))
                 flow = correction_flow(far, FixedGeometry(self.rig, self.shutter, motion), view)
@@ -390,10 +370,6 @@ def _motion(found: FoundMotion | None) -> Motion | None:
 
 def _infinitely_far(depth: Depth) -> Depth:
     return np.full_like(depth, np.inf)
-
-
-def _as_it_is(depth: Depth) -> Depth:
-    return depth
 
 
 _ASKED = {method.key for method in ON_REQUEST}

@@ -53,11 +53,6 @@ SCORES = (
 )
 
 
-def numbers_table(numbers: dict[tuple[str, str], dict[str, Any]]) -> pd.DataFrame:
-    """One row per card and sequence, of numbers by their name."""
-    return pd.DataFrame([{"card": card, "sequence": name, **row} for (card, name), row in numbers.items()])
-
-
 def by_sequence(images: pd.DataFrame) -> pd.DataFrame:
     """Mean of the views: one row per stratum, sequence and method; ``success`` is the share of views."""
     keys = ["stratum", "sequence", "method"]
@@ -297,15 +292,14 @@ def worst_flow(image: NDArray[Any]) -> float:
 
 def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted: bool) -> dict[str, float]:
     """Slow scores, of one view per sequence and some methods: FLIP and SSIM by others' protocols."""
-    names = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
     if not wanted:
-        return dict.fromkeys(names, float("nan"))
+        return dict.fromkeys(EXTRA, float("nan"))
     errors = flip(image, truth)
     if errors is None:
         errors = np.full(common.shape, np.nan)
     covered = float(np.mean(errors[common])) if np.any(common) else float("nan")
     scores = covered, float(np.mean(errors)), ssim_deepunroll(image, truth), ssim_uniform(image, truth)
-    return dict(zip(names, scores, strict=True))
+    return dict(zip(EXTRA, scores, strict=True))
 
 
 def _band_rows(attempts: dict[str, Attempt | None]) -> list[Row]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.score import visible_pixels
-from rsbench.benchmark.scoring import pose_errors
+from rsbench.benchmark.scoring import motion_errors
 from rsbench.benchmark.studies.correction_bench import Bench
 from rsbench.benchmark.studies.correction_study import WORST
 from rsbench.capture.shutter_decision import NoMotionError
@@ -61,16 +61,16 @@ class Panels:
     numbers: dict[str, Any]
 
 
-def make_panels(sequence: Sequence, seed: int = 0) -> Panels:
+def make_panels(sequence: Sequence) -> Panels:
     """Match, solve, find depth and correct with the estimates; compare with the truth.
 
     Where no motion is found, the frame is shown as it was, and the numbers of the correction are the worst.
     """
-    bench = Bench(sequence, seed)
+    bench = Bench(sequence, seed=0)
     frames = uncorrected(bench.images, (VIEW,))
     if bench.motion is not None:
         frames, _ = bench.corrected(bench.sgm, bench.motion, views=(VIEW,))
-    return _compare(sequence, seed, bench.motion, frames[VIEW], bench.sgm)
+    return _compare(sequence, 0, bench.motion, frames[VIEW], bench.sgm)
 
 
 def literal_options(seed: int) -> CorrectionOptions:
@@ -106,10 +106,10 @@ def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tupl
             frames = correct_frames(images, pairs, rig, shutter, motion, options)
         except NoMotionError:
             motion, frames = None, uncorrected(images)
-        rows = []
+        errors, rows = motion_errors(motion, sequence.motion, rig), list[dict[str, Any]]()
         for view, fused in frames.items():
             drawn = fused.origin == Origin.HERE
-            row = {"sequence": sequence.name, "ransac_seed": seed, **LITERAL, **_motion_errors(sequence, motion)}
+            row = {"sequence": sequence.name, "ransac_seed": seed, **LITERAL, **errors}
             row |= {
                 "side": view[0],
                 "frame": view[1],
@@ -122,14 +122,6 @@ def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tupl
             rows.append(row)
         panels = _compare(sequence, seed, motion, frames[VIEW], pairs)
         yield rows, replace(panels, numbers={**panels.numbers, **LITERAL})
-
-
-def _motion_errors(sequence: Sequence, motion: Motion | None) -> dict[str, float]:
-    """e_R and e_T, degrees; the worst where there is no motion."""
-    true, nothing = sequence.motion, np.full(3, np.nan)
-    w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
-    errors = pose_errors(w, d, true_w=true.w, true_d=true.d, rig=sequence.rig)
-    return {name: float(errors[name]) for name in ("e_R_deg", "e_T_deg")}
 
 
 def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused, pairs: Pairs) -> Panels:
@@ -151,7 +143,7 @@ def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused,
         "rotation_deg": float(np.rad2deg(np.linalg.norm(true.w))),
         "translation": float(np.linalg.norm(true.d)),
         "readout_ratio": sequence.shutter.readout_ratio,
-        **_motion_errors(sequence, motion),
+        **motion_errors(motion, true, sequence.rig),
         "psnr_rolling": psnr(rolling, truth, here),
         "psnr_corrected": psnr(fused.image, truth, here) if success else WORST["psnr"],
         "psnr_oracle": psnr(oracle.image, truth, here & oracle.mask),
@@ -174,13 +166,11 @@ def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused,
     )
 
 
-_ARRAYS = ("rolling", "corrected", "known", "truth", "true_depth", "depth_error")
-
-
 def save_panels(folder: Path, panels: Panels) -> None:
     """panels.npz and numbers.json in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    save_arrays(folder / "panels.npz", {name: getattr(panels, name) for name in _ARRAYS})
+    arrays = {name: value for name, value in vars(panels).items() if name != "numbers"}
+    save_arrays(folder / "panels.npz", arrays)
     write_json(folder / "numbers.json", panels.numbers)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import keep
 from rsbench.benchmark.images.store import kept as kept_rows
-from rsbench.benchmark.scoring import pose_errors
+from rsbench.benchmark.scoring import motion_errors
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.studies.correction_bench import Row, rows_identity
 from rsbench.capture.shutter_decision import NoMotionError
@@ -39,7 +39,6 @@ FEWEST_SEEDS = 10
 BEYOND = 4.0
 """Stated standard deviations beyond which an error is not what was stated."""
 _CORRECTED: tuple[View, ...] = (("left", 0), ("left", 1))
-_FAILED = {"e_R_deg": 180.0, "e_T_deg": 180.0, "sigmas": math.nan}
 _LOST = {"psnr": 0.0, "psnr_clean": 0.0, "coverage": 0.0}
 
 
@@ -122,14 +121,13 @@ def study_sequence(sequence: Sequence, seeds: int) -> tuple[list[Row], list[Row]
 
 def _errors(sequence: Sequence, found: FoundMotion | None) -> Row:
     if found is None:
-        return {"success": False, **_FAILED, "inliers": 0}
+        errors = motion_errors(None, sequence.motion, sequence.rig)
+        return {"success": False, **errors, "sigmas": math.nan, "inliers": 0}
     motion, truth, covariance = found.motion, sequence.motion, found.robust.estimate.covariance
-    errors = pose_errors(motion.w, motion.d, true_w=truth.w, true_d=truth.d, rig=sequence.rig)
     off = np.concatenate([motion.w - truth.w, motion.d - truth.d])
     return {
         "success": True,
-        "e_R_deg": float(errors["e_R_deg"]),
-        "e_T_deg": float(errors["e_T_deg"]),
+        **motion_errors(motion, truth, sequence.rig),
         "sigmas": math.nan if covariance is None else largest_in_sigmas(off, covariance),
         "inliers": found.robust.inlier_count,
     }
@@ -180,19 +178,12 @@ def _corrected(
     return rows
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kept:
-    """Number of sequences in which every seed errs by no more than stated."""
-
-    kept: int
-    sequences: int
-
-
-def kept_sequences(motions: pd.DataFrame, camera: str) -> Kept:
-    """Sequences in which no seed fails or lands beyond ``BEYOND`` stated standard deviations."""
+def within_stated(motions: pd.DataFrame, camera: str) -> tuple[int, int]:
+    """How many sequences of a camera have no seed that fails or errs by more than ``BEYOND`` stated standard
+    deviations, and how many sequences there are."""
     own = motions[motions["camera"] == camera]
     worst = own["sigmas"].fillna(math.inf).groupby(own["sequence"]).max()
-    return Kept(kept=int(np.count_nonzero(worst <= BEYOND)), sequences=len(worst))
+    return int(np.count_nonzero(worst <= BEYOND)), len(worst)
 
 
 def summarise(motions: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:

@@ -60,12 +60,10 @@ class Timing:
 TIMINGS = (*(Timing(delay=delay) for delay in DELAYS), Timing(opposite=True))
 
 
-def right_row_poses(
-    rig: StereoRig, shutter: RollingShutter, motion: Motion, timing: Timing, frame: int = 0
-) -> Pose:
-    """``cam_from_world`` of every row of the right camera, (height, 3, 3) and (height, 3)."""
+def right_row_poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, timing: Timing) -> Pose:
+    """``cam_from_world`` of every row of the right camera in frame 0, (height, 3, 3) and (height, 3)."""
     rows = np.arange(shutter.height, dtype=np.float64)
-    return rig.cam_from_world(motion, timing.row_time(shutter, rows, frame), "right")
+    return rig.cam_from_world(motion, timing.row_time(shutter, rows, 0), "right")
 
 
 def predicted_shift(
@@ -74,16 +72,16 @@ def predicted_shift(
     shutter: RollingShutter,
     motion: Motion,
     timing: Timing,
-    frame: int = 0,
 ) -> FloatArray:
-    """Error of the disparity and rows by which the partner is off (H, W, 2), px, on the left frame's pixels.
+    """Error of the disparity and rows by which the partner is off (H, W, 2), px, on the pixels of the left
+    camera's frame 0.
 
     ``depth`` (H, W) is the true one of the left frame, metres; NaN where it is 0.
     """
     camera = rig.camera
     grid = camera.pixel_grid()
     z = np.where(depth > 0, depth, np.nan).astype(np.float64)[..., None]
-    tau = shutter.row_time(grid[:, :1, 1], frame)
+    tau = shutter.row_time(grid[:, :1, 1], 0)
     in_left = z * camera.unproject(grid)
     _, t = rig.cam_from_world(motion, tau, "left")
     w_rate, t_rate = motion.velocity(tau)
