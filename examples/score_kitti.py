@@ -33,7 +33,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import match_frames, solve_frames
+from rsbench.pipeline.frame_capture import know_matches, match_frames
+from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.pipeline.sequence_capture import camera_of_frames, estimate_sequence_capture, spread_windows
 from rsbench.vision.feature_matcher import load_features
 
@@ -215,8 +216,8 @@ def score(given: argparse.Namespace) -> list[str]:
         }
         try:
             inputs = KnownInputs(readout_ratio=ratio, calibration=calibration)
-            motion = solve_frames(match_frames(images, rig, options), rig, inputs, options).found
-            assert motion is not None
+            matches = match_frames(images, rig, options)
+            motion = solve_frames(*know_matches(matches, rig, inputs, options), options)
         except RsbenchError as error:
             refused += 1
             lines.append(f"{k:4d}  {error}")
