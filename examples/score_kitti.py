@@ -32,8 +32,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import FrameSource, read_frame
-from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_capture import know_matches, match_frames
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
 from rsbench.pipeline.sequence_capture import camera_of_frames, estimate_sequence_capture, spread_windows
 from rsbench.vision.feature_matcher import load_features

@@ -20,7 +20,6 @@ from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import match_pose, ray_depths
 from rsbench.core.motion import Motion
-from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.projection import back_project
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -126,18 +125,6 @@ def bound_from_root(root: FloatArray, w: FloatArray, d: FloatArray) -> Bound:
         scale=float(_marginal_axes(root, along)[0]) / length,
         root=root,
     )
-
-
-def bound_of_point(bound: Bound, motion: Motion, offset: FloatArray) -> Bound:
-    """The bound with another point's translation for the body's: the camera at ``x_cam = x_body + offset``.
-
-    Its translation is d + offset - R offset (``pose_errors.translation_of_offset``).
-    """
-    w, d = np.asarray(motion.w), translation_of_offset(motion.w, motion.d, offset)
-    turned = so3.exp(w) @ offset
-    to_body = np.eye(6)  # (w, d of the body) by (w, d of the point)
-    to_body[3:, :3] = -so3.hat(turned) @ so3.left_jacobian(w)
-    return bound_from_root(bound.root @ to_body, w, d)
 
 
 def _scale(root: FloatArray) -> FloatArray:
