@@ -6,7 +6,7 @@ Everything comes from a board's stored scores. Nothing is fetched, and what entr
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -608,6 +608,8 @@ def _problem_row(each: Board, line: Standing, k: int) -> dict[str, Any]:
 def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pages: bool = True) -> Path:
     """Write the site of a board into a folder; returns its first page.
 
+    Tables of other splits that the folder has already stay, on the first page too.
+
     Args:
         data: datasets, of which pages of their problems show pictures.
         problem_pages: without them the site is a tenth as large; the table of all problems has their errors too.
@@ -639,8 +641,23 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
             write(f"{each.id}--problems.html", "board_problems", matrix_context(each, album))
         for name, context in problem_contexts(each, album):
             write(f"{each.id}/problem/{name}.html", "board_problem", context)
-    write("index.html", "board", {"splits": [_section(each, each.track.id in secret) for each in boards]})
+    kept = _other_sections(out, {each.id for each in boards})
+    sections = [_section(each, each.track.id in secret) for each in boards]
+    write("index.html", "board", {"splits": sections, "kept": kept})
     return out / "index.html"
+
+
+def _other_sections(out: Path, names: Collection[str]) -> list[dict[str, Any]]:
+    """Sections of the first page in a folder, without those of these names and of tables that are gone."""
+    path = out / "index.html"
+    page = path.read_text("utf-8") if path.is_file() else ""
+    found = re.findall(r'<section class="split" id="([^"]+)".*?</section>', page, re.DOTALL)
+    texts = re.findall(r'(<section class="split" .*?</section>)', page, re.DOTALL)
+    return [
+        {"id": name, "protocol": name.partition("--")[0], "split": name.partition("--")[2], "html": text}
+        for name, text in zip(found, texts, strict=True)
+        if name not in names and (out / f"{name}.csv").is_file()
+    ]
 
 
 def _section(each: Board, ranked: bool) -> dict[str, Any]:

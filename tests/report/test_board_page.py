@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 import statistics
 from collections.abc import Iterator
 from dataclasses import replace
@@ -95,6 +96,17 @@ def test_where_there_is_a_secret_split_it_comes_first_and_ranks(tmp_path: Path) 
     assert not any(word in text for word in words)
     text = page(replace(SPLIT, public=False, label="secret", seed=12))
     assert 0 < text.index(words[0]) < text.index(words[1])
+
+
+def test_tables_that_the_folder_has_already_stay_on_the_first_page(site: Path, tmp_path: Path) -> None:
+    out, split = tmp_path / "out", replace(SPLIT, label="other", seed=12)
+    shutil.copytree(site, out)
+    add(tmp_path / "board", write(tmp_path / "x.jsonl", named(truth_lines(split), "mine", ("left",))), split, {})
+    for _ in range(2):  # written again, the page is the same
+        text = build_site(tmp_path / "board", out).read_text("utf-8")
+        assert text.count("<section ") == 2 and text.count(f'href="#{ID}"') == 1 and "best_one" in text
+    (out / f"{ID}.csv").unlink()
+    assert build_site(tmp_path / "board", out).read_text("utf-8").count("<section ") == 1
 
 
 class _Cells(HTMLParser):
