@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.core.camera import Lens, inverse_2x2
+from rsbench.core.camera import Lens, PinholeCamera, inverse_2x2
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig
 from rsbench.core.so3 import FloatArray
+from rsbench.vision.dense_matcher import stereo_by_flow
 from rsbench.vision.feature_matcher import undistorted
 from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match
 from rsbench.vision.images import eight_bit
@@ -183,6 +184,9 @@ _FEWEST = 30
 _FAR_OFF_PX, _ROUNDS, _SIGMAS, _LEAST_PX = 10.0, 8, 3.0, 0.05
 _SAME_ROW = 0.68
 """Share of matches on the same row: at least 0.80 in real rectified pairs, at most 0.56 in those of two times."""
+_MANY, _ON_ROWS = 200, 0.9
+"""Matches by dense flow, and the share of them on the same row and of disparities that are not negative, with which
+features are not looked for."""
 _OPPOSITE = 0.5
 """Share of negative disparities: at most 0.03 in real pairs in order, at least 0.86 in exchanged ones."""
 _BACK_PX = 1.0
@@ -260,21 +264,37 @@ def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: Stereo
     """
     options, reach = MatchOptions(), float(max(left.shape[:2]))
     eyes = [rig.eye(side) for side in SIDES]
-    levels = zip(eight_bit([left, right]), eyes, strict=True)
+    levels = list(zip(eight_bit([left, right]), eyes, strict=True))
+    straight = [undistorted(level, eye) for level, eye in levels]
+    if _agrees(_shown(stereo_by_flow(*straight), eyes), rig):
+        return
     if rig.aligned:
-        a, b = (detect(undistorted(level, eye), options) for level, eye in levels)
+        a, b = (detect(image, options) for image in straight)
     else:  # as matches will ask for them
         a, b = (detect(level, options, eye) for level, eye in levels)
     anywhere = Gate(dx=(-reach, reach), dy=(-reach, reach))
     pairs = match(a, b, anywhere, options)
-    ends = a.places[pairs[:, 0]], b.places[pairs[:, 1]]
-    # Beyond the borders of what the lens shows there is a mirror of it.
-    shown = np.logical_and.reduce(
-        [eye.contains(eye.lens_pixels(end)) for eye, end in zip(eyes, ends, strict=True)]
-    )
-    if np.count_nonzero(shown) < _FEWEST:
-        return
-    judge_stereo(np.concatenate(ends, axis=1)[shown], rig, ROW_TOLERANCE_PX)
+    stereo = _shown(np.concatenate([a.places[pairs[:, 0]], b.places[pairs[:, 1]]], axis=1), eyes)
+    if len(stereo) >= _FEWEST:
+        judge_stereo(stereo, rig, ROW_TOLERANCE_PX)
+
+
+def _shown(stereo: FloatArray, eyes: Sequence[PinholeCamera | AlignedCamera]) -> FloatArray:
+    """The matches (n, 4) that lenses show: beyond the borders of images there is a mirror of them."""
+    ends = zip(eyes, (stereo[:, :2], stereo[:, 2:]), strict=True)
+    return stereo[np.logical_and.reduce([eye.contains(eye.lens_pixels(end)) for eye, end in ends])]
+
+
+def _agrees(stereo: FloatArray, rig: StereoRig) -> bool:
+    """Whether matches (n, 4) by dense flow are beyond doubt those of a rectified pair in the right order."""
+    if len(stereo) < _MANY:
+        return False
+    pattern = row_pattern(stereo, rig) if rig.rectified else None
+    if pattern is not None and abs(pattern.distortion) > _DISTORTED:
+        return False
+    on_rows = np.abs(stereo[:, 1] - stereo[:, 3]) <= ROW_TOLERANCE_PX
+    back = stereo[:, 0] - stereo[:, 2] < -_BACK_PX
+    return float(np.mean(on_rows)) > _ON_ROWS and float(np.mean(back)) < 1.0 - _ON_ROWS
 
 
 def judge_stereo(stereo: FloatArray, rig: StereoRig, row_tolerance: float) -> None:

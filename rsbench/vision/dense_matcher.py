@@ -30,7 +30,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs
 from rsbench.core.rig import SIDES, VIEWS, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher, of_sensors, undistorted
-from rsbench.vision.features import BLUR_PX, ROW_TOLERANCE_PX, Aligned, SiftMatcher, align, refine_matches, still
+from rsbench.vision.features import BLUR_PX, ROW_TOLERANCE_PX, Aligned, Recent, SiftMatcher, align, content_key, refine_matches, still
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.images import grey_u8, halved
 
@@ -127,6 +127,8 @@ _FLOOR_PX = 0.02
 """Deviation of an end that no grey levels predict."""
 _SMALLEST, _SMALLEST_CELL = 64, 6
 """Width or height of a level, and of a cell, px."""
+_REMEMBERED, _LARGE = 4, 2_500_000
+"""Pairs of images whose flow is remembered, and pixels above which it is not."""
 
 
 def dense_tracks(images: Mapping[View, NDArray[Any]], options: DenseOptions | None = None) -> Correspondences:
@@ -182,16 +184,50 @@ class _Flows(NamedTuple):
 
 def _flows(grey: Mapping[View, U8], beside: bool) -> _Flows:
     """``beside``: whether both ends of a left-right match lie on one row."""
-    smooth = {view: np.asarray(cv2.GaussianBlur(image, (0, 0), _FLOW_BLUR_PX)) for view, image in grey.items()}
-    l0, r0, l1, r1 = (smooth[side, frame] for frame in (0, 1) for side in ("left", "right"))
-    tasks = list[tuple[U8, U8, F32 | None]]()
-    for (first, second), along in (((l0, l1), False), ((l0, r0), beside), ((l1, r1), beside)):
-        start = start_of_flow(first, second, along)
-        tasks.append((first, second, None if start is None else _field(start, first.shape)))
-        tasks.append((second, first, None if start is None else _field(_inverse(start), first.shape)))
+    l0, r0, l1, r1 = (grey[side, frame] for frame in (0, 1) for side in ("left", "right"))
+    tasks = ((l0, l1, False), (l0, r0, beside), (l1, r1, beside))
     with ThreadPoolExecutor() as pool:
-        found = list(pool.map(lambda task: dense_flow(*task, quick=True), tasks))
-    return _Flows(tuple(found[::2]), tuple(found[1::2]))
+        found = list(pool.map(lambda task: _both_ways(*task), tasks))
+    there, back = zip(*found, strict=True)
+    return _Flows(there, back)
+
+
+class _Pair(NamedTuple):
+    there: F32
+    back: F32
+
+
+_KEPT: Recent[_Pair] = Recent(_REMEMBERED)
+
+
+def _both_ways(first: U8, second: U8, along_rows: bool) -> _Pair:
+    """Flow from one grey image to another and back; remembered, for neighbouring windows share a frame."""
+    if first.size > _LARGE:
+        return _found_both_ways(first, second, along_rows)
+    key = content_key(first), content_key(second), along_rows
+    return _KEPT.get(key, lambda: _found_both_ways(first, second, along_rows))
+
+
+def _found_both_ways(first: U8, second: U8, along_rows: bool) -> _Pair:
+    a, b = (np.asarray(cv2.GaussianBlur(image, (0, 0), _FLOW_BLUR_PX)) for image in (first, second))
+    start = start_of_flow(a, b, along_rows)
+    there, back = (None, None) if start is None else (_field(each, a.shape) for each in (start, _inverse(start)))
+    return _Pair(dense_flow(a, b, there, quick=True), dense_flow(b, a, back, quick=True))
+
+
+def stereo_by_flow(left: NDArray[Any], right: NDArray[Any]) -> FloatArray:
+    """Matches (n, 4), px, of two images (H, W[, 3]) of one size wherever they lie, accurate to a fraction of a pixel.
+
+    They begin at corners and are ends of flows that return. ``dense_tracks`` of the same images uses the same flows.
+    """
+    a, b = grey_u8(left), grey_u8(right)
+    flows, points = _both_ways(a, b, True), corners(_reduced(a, a.shape), DenseOptions.points)
+    ends = points + _at(flows.there, points)
+    return np.concatenate([points, ends], axis=1)[_returns(flows.back, ends, points, 0.5 * _RETURN_PX)]
+
+
+def _returns(back: F32, ends: FloatArray, points: FloatArray, most: float) -> BoolArray:
+    return np.asarray(np.linalg.norm(ends + _at(back, ends) - points, axis=1) <= most)
 
 
 class _Found(NamedTuple):
@@ -215,7 +251,7 @@ def _of_level(grey: Mapping[View, U8], flows: _Flows, level: int, options: Dense
 
     def followed(points: FloatArray, number: int) -> tuple[FloatArray, BoolArray]:
         ends = points + _at(flows.there[number], points)
-        good = np.linalg.norm(ends + _at(flows.back[number], ends) - points, axis=1) <= _RETURN_PX * pixel
+        good = _returns(flows.back[number], ends, points, _RETURN_PX * pixel)
         if number and rows is not None:
             good &= np.abs(ends[:, 1] - points[:, 1]) <= rows * pixel
             ends[:, 1] = points[:, 1]
