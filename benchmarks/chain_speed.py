@@ -1,9 +1,9 @@
 """What the chain of frames and videos costs, in units of OpenCV's SIFT of four frames and SGBM of two pairs.
 
-Processor seconds of all threads, each row next to the anchor in the same run, so that other programs on the machine
-change the quotients little. A frame's quotient times ``SECONDS`` is its seconds on one core of the machine of issue
-figures; ``frames/s`` is what two such cores reach if both are busy. Videos are of ``phone_video.py``'s room, without
-noise, through a rig and through one of its cameras; PSNR (dB) is of left frames against the truth at their middle row.
+Processor seconds of all threads, each row next to the anchor in the same run, so that other programs on the
+machine change the quotients little. ``frames/s`` are of a machine whose anchor takes ``SECONDS`` by two threads, if
+a frame keeps both cores as busy as the anchor does. Videos are of ``phone_video.py``'s room, without noise, through
+a rig and through one of its cameras; PSNR (dB) is of left frames against the truth at their middle row.
 
     python benchmarks/chain_speed.py --data data/paper
     python benchmarks/chain_speed.py --data data/paper --only rig --profile
@@ -208,7 +208,7 @@ def command(sequence: Sequence, name: str, folder: Path) -> Callable[[], None]:
     return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=name == "correct") and None
 
 
-def command_of_video(shown: Video, folder: Path, *more: str) -> Callable[[], None]:
+def command_of_video(shown: Video, folder: Path) -> Callable[[], None]:
     """``correct`` of a video of one camera."""
     file = folder / "video.mp4"
     height, width = shown.left[0].shape[:2]
@@ -216,7 +216,17 @@ def command_of_video(shown: Video, folder: Path, *more: str) -> Callable[[], Non
     for image in shown.left:
         out.write(image[..., ::-1])
     out.release()
-    words = [sys.executable, "-m", "rsbench", "--quiet", "correct", str(file), "--out", str(folder / "out.mp4"), *more]
+    words = [
+        sys.executable,
+        "-m",
+        "rsbench",
+        "--quiet",
+        "correct",
+        str(file),
+        "--out",
+        str(folder / "out.mp4"),
+        *more,
+    ]
     return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=True) and None
 
 
@@ -230,7 +240,9 @@ def matched(sequence: Sequence) -> Callable[[], None]:
     return work
 
 
-def rows(sequence: Sequence, folder: Path, frames: int) -> Iterator[tuple[str, Limit, Callable[[], tuple[Any, ...]]]]:
+def rows(
+    sequence: Sequence, folder: Path, frames: int
+) -> Iterator[tuple[str, Limit, Callable[[], tuple[Any, ...]]]]:
     """Name, limit, and what makes the work, how many times it does its unit, and the video it is of."""
     chain = lambda: correct_chain.run(sequence, DENSE)  # noqa: E731
     yield "four frames 900 x 900: chain", Limit(most=2.0), lambda: (chain, 1, None)

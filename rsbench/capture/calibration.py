@@ -185,8 +185,8 @@ _FAR_OFF_PX, _ROUNDS, _SIGMAS, _LEAST_PX = 10.0, 8, 3.0, 0.05
 _SAME_ROW = 0.68
 """Share of matches on the same row: at least 0.80 in real rectified pairs, at most 0.56 in those of two times."""
 _MANY, _ON_ROWS = 200, 0.9
-"""Matches by dense flow, and the share of them on the same row and of disparities that are not negative, with which
-features are not looked for."""
+"""Matches by dense flow, and the share of them on the row and of disparities that are not negative, from which
+on features are not looked for."""
 _OPPOSITE = 0.5
 """Share of negative disparities: at most 0.03 in real pairs in order, at least 0.86 in exchanged ones."""
 _BACK_PX = 1.0

@@ -214,7 +214,7 @@ def find_steady_motion(
     seed: int = 0,
     most: int = _MATCHES,
 ) -> FoundOwnMotion:
-    """As of ``find_own_motion``, by the law ``inertial`` whatever the flow asks for, from at most so many matches."""
+    """As of ``find_own_motion``, by the law ``inertial`` whatever the flow asks for; ``most``: matches."""
     own = rig.about(side)
     nothing = OwnMotion(rig=own, shutter=shutter, side=side, motion=None)
     matches = flow_matches(flows, np.random.default_rng(seed))[:most]

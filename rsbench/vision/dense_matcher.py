@@ -30,7 +30,17 @@ from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs
 from rsbench.core.rig import SIDES, VIEWS, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher, of_sensors, undistorted
-from rsbench.vision.features import BLUR_PX, ROW_TOLERANCE_PX, Aligned, Recent, SiftMatcher, align, content_key, refine_matches, still
+from rsbench.vision.features import (
+    BLUR_PX,
+    ROW_TOLERANCE_PX,
+    Aligned,
+    Recent,
+    SiftMatcher,
+    align,
+    content_key,
+    refine_matches,
+    still,
+)
 from rsbench.vision.flow import dense_flow
 from rsbench.vision.images import grey_u8, halved
 
@@ -83,6 +93,9 @@ class DenseMatcher(DenseOptions, FeatureMatcher):
 
     def apart(self) -> Self:
         return replace(self, row_tolerance=None)
+
+    def with_enough(self, tracks: int) -> Self:
+        return replace(self, fewest=min(self.fewest, tracks))
 
     def faster(self) -> Self:
         return replace(self, half=True)
@@ -216,9 +229,9 @@ def _found_both_ways(first: U8, second: U8, along_rows: bool) -> _Pair:
 
 
 def stereo_by_flow(left: NDArray[Any], right: NDArray[Any]) -> FloatArray:
-    """Matches (n, 4), px, of two images (H, W[, 3]) of one size wherever they lie, accurate to a fraction of a pixel.
+    """Matches (n, 4), px, of two images (H, W[, 3]) of one size, on any rows, right to a fraction of a pixel.
 
-    They begin at corners and are ends of flows that return. ``dense_tracks`` of the same images uses the same flows.
+    They begin at corners and are ends of flows that return, those that ``dense_tracks`` of these images uses too.
     """
     a, b = grey_u8(left), grey_u8(right)
     flows, points = _both_ways(a, b, True), corners(_reduced(a, a.shape), DenseOptions.points)

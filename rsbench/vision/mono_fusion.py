@@ -259,7 +259,7 @@ class MonoFusion:
         return resample(self.images[frame], source_map, self.options.warp.interpolation)
 
     def _drawn(self, frame: int, target_tau: float, measured: bool = False) -> tuple[F32, F32, NDArray[np.uint8]]:
-        """Where a frame, or its ``measured`` pixels, shows each pixel of a time (H, W, 2); inverse depth and origin.
+        """Where a frame, or its ``measured`` pixels, shows each pixel of a time (H, W, 2), inverse depth, origin.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
         """
