@@ -1,9 +1,9 @@
 """What the chain of frames and videos costs, in units of OpenCV's SIFT of four frames and SGBM of two pairs.
 
 Processor seconds of all threads, each row next to the anchor in the same run, so that other programs on the
-machine change the quotients little. ``frames/s`` are of a machine whose anchor takes ``SECONDS`` by two threads, if
-a frame keeps both cores as busy as the anchor does. Videos are of ``phone_video.py``'s room, without noise, through
-a rig and through one of its cameras; PSNR (dB) is of left frames against the truth at their middle row.
+machine change the quotients little. ``frames/s`` are of a machine whose anchor takes ``SECONDS`` by two threads,
+if a frame keeps both cores as busy as the anchor does. Videos are of ``phone_video.py``'s room, without noise, of
+a rig and of one of its cameras; PSNR (dB) is of left frames against the truth at their middle row.
 
     python benchmarks/chain_speed.py --data data/paper
     python benchmarks/chain_speed.py --data data/paper --only rig --profile
@@ -225,7 +225,6 @@ def command_of_video(shown: Video, folder: Path) -> Callable[[], None]:
         str(file),
         "--out",
         str(folder / "out.mp4"),
-        *more,
     ]
     return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=True) and None
 

@@ -376,8 +376,8 @@ def _runs_backwards(
     models, start = models_asked(options.motion_model), None if shakes else found.motion
     search = options.robust, options.seed, start
     alone = found.motion.name  # for most frames the law that was found shows the given scans
-    if len(models) > 1 and alone in models:
-        if scans_by_laws(matches, rig, shutter, (alone,), *search) == scans_of(shutter):
-            return False
+    likely = len(models) > 1 and alone in models
+    if likely and scans_by_laws(matches, rig, shutter, (alone,), *search) == scans_of(shutter):
+        return False
     scans = scans_by_laws(matches, rig, shutter, models, *search)
     return scans != scans_of(shutter) if shakes else scans == opposite
