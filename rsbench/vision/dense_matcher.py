@@ -95,7 +95,8 @@ class DenseMatcher(DenseOptions, FeatureMatcher):
         return replace(self, row_tolerance=None)
 
     def with_enough(self, tracks: int) -> Self:
-        return replace(self, fewest=min(self.fewest, tracks))
+        points = min(self.points, max(int(_TRIED * tracks), 50))
+        return replace(self, points=points, fewest=min(self.fewest, tracks // 2))
 
     def faster(self) -> Self:
         return replace(self, half=True)
@@ -140,6 +141,8 @@ _FLOOR_PX = 0.02
 """Deviation of an end that no grey levels predict."""
 _SMALLEST, _SMALLEST_CELL = 64, 6
 """Width or height of a level, and of a cell, px."""
+_TRIED = 2.5
+"""Places that are tried for a track that is asked for."""
 _REMEMBERED, _LARGE = 4, 2_500_000
 """Pairs of images whose flow is remembered, and pixels above which it is not."""
 
