@@ -38,8 +38,8 @@ from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.footage import FrameSource
+from rsbench.pipeline.frame_capture import find_matches
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.frame_motion import find_matches
 from rsbench.pipeline.mono_sequence import options_of_camera
 from rsbench.pipeline.sequence_capture import KnownCapture
 from rsbench.pipeline.sequence_correction import correct_sequence

@@ -20,7 +20,14 @@ from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import Scanning
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.vision.dense_matcher import DenseMatcher, DenseOptions, corners, dense_tracks, start_of_flow
+from rsbench.vision.dense_matcher import (
+    DenseMatcher,
+    DenseOptions,
+    corners,
+    dense_tracks,
+    start_of_flow,
+    stereo_by_flow,
+)
 from rsbench.vision.feature_matcher import find_correspondences, load_features
 
 Build = Callable[..., Any]
@@ -221,3 +228,21 @@ def test_covariances_follow_the_lens(a: float, b: float, c: float, x: float, y: 
     np.testing.assert_allclose(found[0], full.ravel()[[0, 1, 3]], rtol=1e-5, atol=1e-9)
     back = without_lens(Correspondences(tracks=tracks, covariance=found), _rig())
     np.testing.assert_allclose(back.covariance, given, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("shift", [(-9.0, 0.0), (-6.0, 4.0), (7.0, 0.0)])
+def test_stereo_matches_by_flow_lie_on_any_row(shift: tuple[float, float]) -> None:
+    rng = np.random.default_rng(3)
+    noise = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (260, 360)).astype(np.float32), (0, 0), 2.0)
+    image = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    across, down = (int(each) for each in shift)
+    found = stereo_by_flow(image[10:250, 10:350], image[10 - down : 250 - down, 10 - across : 350 - across])
+    assert len(found) > 500
+    off = np.linalg.norm(found[:, 2:] - found[:, :2] - shift, axis=1)
+    assert np.quantile(off, 0.95) < 0.3  # DIS without refinement
+
+
+def test_enough_tracks_are_looked_for_at_fewer_places() -> None:
+    fewer = DenseMatcher().with_enough(400)
+    assert (fewer.points, fewer.fewest) == (1000, 200)
+    assert DenseMatcher(points=300, fewest=0).with_enough(400) == DenseMatcher(points=300, fewest=0)
