@@ -43,8 +43,8 @@ from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.mono_sequence import options_of_camera
 from rsbench.pipeline.sequence_capture import KnownCapture
 from rsbench.pipeline.sequence_correction import correct_sequence
+from rsbench.vision.dense_matcher import forget_matches
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.features import forget_features
 from rsbench.vision.fusion import finished
 
 ROOT = Path(__file__).parents[1]
@@ -167,7 +167,7 @@ def of_rig(shown: Video, options: CorrectionOptions) -> Callable[[], list[NDArra
     known = KnownCapture(rig=StereoRig(camera=shown.camera, baseline=BASELINE_M), shutter=shown.shutter)
 
     def work() -> list[NDArray[np.uint8]]:
-        forget_features()
+        forget_matches()
         with tempfile.TemporaryDirectory() as place:
             sources = [stored(Path(place) / side, getattr(shown, side)) for side in ("left", "right")]
             moments = correct_sequence(sources, known, replace(options, target_row=row))
@@ -233,7 +233,7 @@ def matched(sequence: Sequence) -> Callable[[], None]:
     images = {each: sequence.image("rs", *each) for each in VIEWS}
 
     def work() -> None:
-        forget_features()
+        forget_matches()
         find_matches(images, DENSE)
 
     return work

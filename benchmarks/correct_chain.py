@@ -30,7 +30,7 @@ from rsbench.pipeline.chain import correct_frames, find_depth
 from rsbench.pipeline.frame_capture import know_matches, match_frames
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.vision.features import forget_features
+from rsbench.vision.dense_matcher import forget_matches
 
 BOUND = 10.0
 """Times what OpenCV alone needs for features and disparities, in processor seconds: it was 5.4 to 6.7 on a busy
@@ -49,7 +49,7 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
         times[name] = (time.perf_counter() - wall, time.process_time() - cpu)
         return result
 
-    forget_features()
+    forget_matches()
     matches = timed("match", lambda: match_frames(images, rig, options))
     ratio = sequence.shutter.readout_ratio
     inputs, shutter = KnownInputs(readout_ratio=ratio), sequence.shutter

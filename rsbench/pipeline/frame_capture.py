@@ -35,8 +35,9 @@ from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.mono_gyro import Clock
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.refined import RefinedSolver
+from rsbench.vision.dense_matcher import forget_matches
 from rsbench.vision.feature_matcher import find_correspondences
-from rsbench.vision.features import ROW_TOLERANCE_PX, forget_features
+from rsbench.vision.features import ROW_TOLERANCE_PX
 from rsbench.vision.images import eight_bit
 
 BACKWARDS = (
@@ -97,7 +98,7 @@ def know_four(
         matches, capture = know_matches(matches, right, given, options, doubt)
         return matches, replace(capture, rig_found=found)
 
-    forget_features()
+    forget_matches()
     own, found, doubt = matches is None and rig.rows_together(inputs.reading, inputs.readout_ratio), None, None
     try:
         if matches is None and inputs.readout_ratio is None and inputs.scanning is None:

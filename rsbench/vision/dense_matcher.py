@@ -38,6 +38,7 @@ from rsbench.vision.features import (
     SiftMatcher,
     align,
     content_key,
+    forget_features,
     refine_matches,
     still,
 )
@@ -214,6 +215,12 @@ class _Pair(NamedTuple):
 
 
 _KEPT: Recent[_Pair] = Recent(_REMEMBERED)
+
+
+def forget_matches() -> None:
+    """Forget features and flows of all images, so that later calls compute them again: for timings."""
+    forget_features()
+    _KEPT.clear()
 
 
 def _both_ways(first: U8, second: U8, along_rows: bool) -> _Pair:

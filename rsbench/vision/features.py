@@ -386,9 +386,6 @@ def _step(J: F32, weights: FloatArray, residuals: FloatArray, inverse: FloatArra
 T = TypeVar("T")
 
 
-_CACHES: list[Recent[Any]] = []
-
-
 class Recent(Generic[T]):
     """At most so many results, the last requested ones; threads may share one cache.
 
@@ -397,7 +394,6 @@ class Recent(Generic[T]):
 
     def __init__(self, most: int) -> None:
         self._most, self._lock = most, threading.Lock()
-        _CACHES.append(self)
         self._kept = OrderedDict[Hashable, T]()
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
@@ -542,9 +538,9 @@ _REMEMBERED = 10_000
 
 
 def forget_features() -> None:
-    """Forget features and flows of all images, so that later calls compute them again: for timings."""
-    for each in _CACHES:
-        each.clear()
+    """Forget all features, so that later calls compute them again: for timings."""
+    _DETECTED.clear()
+    _PAIRED.clear()
 
 
 def detect(

@@ -208,20 +208,17 @@ class MonoFusion:
 
         ``beyond``: another pair that contains the frame, whose other frame may show what neither frame here does.
         """
-        source_map, buffer, origin = self._drawn(frame, target_tau)
-        image = self._shown(frame, source_map)
+        image, buffer, origin = self._drawn(frame, target_tau)
         others = [Beyond(self, frame, target_tau)] + ([] if beyond is None else [beyond])
         for pair, same, tau in others if self.options.fill else []:
             empty, stretched = origin == Origin.NOBODY, (origin == Origin.GUESSED) & (pair is self)
             if not np.any(empty | stretched):
                 continue
-            source_map, behind, how = pair._drawn(1 - same, tau, measured=True)
+            other, behind, how = pair._drawn(1 - same, tau, measured=True)
             behind *= _unit(self._layers[frame].rho, pair._layers[same].rho)
             # An edge uncovers what is farther than itself.
             take = (how == Origin.HERE) & (empty | (stretched & (behind <= _BEHIND * buffer)))
-            source_map[~take] = np.nan
-            image[take] = pair._shown(1 - same, source_map)[take]
-            buffer[take], origin[take] = behind[take], Origin.OTHER_FRAME
+            image[take], buffer[take], origin[take] = other[take], behind[take], Origin.OTHER_FRAME
         empty = origin == Origin.NOBODY
         if self.options.inpaint:
             image = inpaint(image, empty)
@@ -254,12 +251,10 @@ class MonoFusion:
         leaves = [_leaves(flow)[np.ix_(*pick)] for flow in self.flows.flow]
         return [_layer(swept[frame], offs[frame], *met[frame], leaves[frame], shape, same) for frame in FRAMES]
 
-    def _shown(self, frame: int, source_map: F32) -> NDArray[Any]:
-        """A frame at places (H, W, 2) of its own; 0 where these are NaN."""
-        return resample(self.images[frame], source_map, self.options.warp.interpolation)
-
-    def _drawn(self, frame: int, target_tau: float, measured: bool = False) -> tuple[F32, F32, NDArray[np.uint8]]:
-        """Where a frame, or its ``measured`` pixels, shows each pixel of a time (H, W, 2), inverse depth, origin.
+    def _drawn(
+        self, frame: int, target_tau: float, measured: bool = False
+    ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
+        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame, or of its ``measured`` pixels, at a time.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
         """
@@ -275,7 +270,7 @@ class MonoFusion:
             source_map, buffer = np.where(known[..., None], near, source_map), np.where(known, torn, buffer)
         origin = np.where(buffer >= 0.0, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
         origin[stretched] = Origin.GUESSED
-        return source_map, buffer, origin
+        return resample(self.images[frame], source_map, self.options.warp.interpolation), buffer, origin
 
     def places(self, frame: int, target_tau: float) -> FloatArray:
         """(H, W, 3) target x, y, px, and inverse depth there, of every pixel of a frame."""

@@ -436,23 +436,14 @@ def fill_holes(disparity: F32) -> F32:
 
 def known_beside(values: F32) -> tuple[F32, F32]:
     """Nearest finite value (H, W) at or left of each pixel, and at or right of it; NaN where there is none."""
-    found = np.empty_like(values, order="C"), np.empty_like(values, order="C")
-    _beside(np.ascontiguousarray(values), *found)
-    return found
-
-
-@compiled(error_model="numpy")
-def _beside(values: F32, left: F32, right: F32) -> None:
     height, width = values.shape
-    for y in range(height):
-        last = np.float32(np.nan)
-        for x in range(width):
-            last = values[y, x] if np.isfinite(values[y, x]) else last
-            left[y, x] = last
-        last = np.float32(np.nan)
-        for x in range(width - 1, -1, -1):
-            last = values[y, x] if np.isfinite(values[y, x]) else last
-            right[y, x] = last
+    known = np.isfinite(values)
+    columns = np.broadcast_to(np.arange(width), (height, width))
+    before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    after = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
+    left = np.where(before >= 0, np.take_along_axis(values, np.maximum(before, 0), axis=1), np.nan)
+    right = np.where(after < width, np.take_along_axis(values, np.minimum(after, width - 1), axis=1), np.nan)
+    return left, right
 
 
 def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig, side: Side) -> NDArray[np.bool_]:
