@@ -118,7 +118,7 @@ def again_over_first(folder: Path) -> tuple[Work, Work]:
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
     from rsbench.report.evaluation_page import write_report
-    from rsbench.vision.features import forget_features
+    from rsbench.vision.dense_matcher import forget_matches
 
     generate_dataset(load_dataset_card("smoke"), folder / "smoke")
 
@@ -127,7 +127,7 @@ def again_over_first(folder: Path) -> tuple[Work, Work]:
         write_report(folder / "smoke", out)
 
     def first() -> None:
-        forget_features()
+        forget_matches()
         evaluate(Path(tempfile.mkdtemp(dir=folder)))
 
     evaluate(folder / "kept")
@@ -160,13 +160,13 @@ def asked_over_matched(data: Path) -> tuple[Work, Work]:
     from rsbench.dataset.sequence import read_dataset
     from rsbench.pipeline.frame_capture import match_unknown
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.vision.features import forget_features
+    from rsbench.vision.dense_matcher import forget_matches
 
     sequence, options = next(iter(read_dataset(data))), CorrectionOptions()
     images = {view: sequence.image("rs", *view) for view in VIEWS}
 
     def match() -> Correspondences:
-        forget_features()
+        forget_matches()
         return match_unknown(images, sequence.rig, options)[0]
 
     def inspect() -> None:

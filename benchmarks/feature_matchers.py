@@ -40,8 +40,8 @@ from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import Problem
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.vision.dense_matcher import forget_matches
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.features import forget_features
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +100,7 @@ def foreign(folder: Path) -> Iterator[Case]:
 def row_of(case: Case, features: str, model: str, most: int, seed: int) -> dict[str, Any]:
     """Figures of one matcher on one case."""
     options = CorrectionOptions(features=load_features(features))
-    forget_features()
+    forget_matches()
     begin = time.process_time()
     matches = find_matches_of_rig(case.images, case.rig, case.shutter.scanning, options)
     matched = time.process_time()
