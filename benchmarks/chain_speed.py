@@ -38,10 +38,9 @@ from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_capture import find_matches
+from rsbench.pipeline.frame_capture import KnownCapture, find_matches
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.mono_sequence import options_of_camera
-from rsbench.pipeline.sequence_capture import KnownCapture
 from rsbench.pipeline.sequence_correction import correct_sequence
 from rsbench.vision.dense_matcher import forget_matches
 from rsbench.vision.feature_matcher import load_features
@@ -110,7 +109,7 @@ def video(width: int, height: int, frames: int, seed: int = 5, *, rig: bool) -> 
         times = (number + RATIO * rows) / FPS
         left.append(view(size, hand, times, walls))
         if rig:
-            right.append(view(size, Beside(hand), times, walls))  # pyrefly: ignore[bad-argument-type]
+            right.append(view(size, Beside(hand), times, walls))
         middle = (number + RATIO * 0.5 * (height - 1) / height) / FPS
         truth.append(view(size, hand, np.full(height, middle), walls))
     camera = PinholeCamera.centred(width, height, 0.5 * width / np.tan(np.deg2rad(0.5 * FOV_DEG)))
@@ -128,7 +127,7 @@ class Tally:
     """Processor seconds of functions that run one at a time."""
 
     def __init__(self) -> None:
-        self.seconds, self._depth = dict[str, float](), 0
+        self.seconds = dict[str, float]()
 
     def around(self, name: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*words: Any, **named: Any) -> Any:
@@ -196,7 +195,7 @@ def stored(folder: Path, frames: list[NDArray[np.uint8]]) -> FrameSource:
     return FrameSource.of_files(files)
 
 
-def command(sequence: Sequence, name: str, folder: Path) -> Callable[[], None]:
+def command(sequence: Sequence, name: str, folder: Path) -> Callable[[], object]:
     """``correct`` or ``inspect`` of four frames."""
     rig, camera = folder / "rig.toml", sequence.rig.camera
     inner = f"{{fx = {camera.fx}, fy = {camera.fy}, cx = {camera.cx}, cy = {camera.cy}}}"
@@ -205,10 +204,10 @@ def command(sequence: Sequence, name: str, folder: Path) -> Callable[[], None]:
     frames = [str(sequence.folder / "rs" / f"{side}_{frame}.png") for frame in FRAMES for side in SIDES]
     words = [sys.executable, "-m", "rsbench", "--quiet", name, *frames, "--rig", str(rig)]
     words += ["--out", str(folder / "out")] if name == "correct" else []
-    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=name == "correct") and None
+    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=name == "correct")
 
 
-def command_of_video(shown: Video, folder: Path) -> Callable[[], None]:
+def command_of_video(shown: Video, folder: Path) -> Callable[[], object]:
     """``correct`` of a video of one camera."""
     file = folder / "video.mp4"
     height, width = shown.left[0].shape[:2]
@@ -226,7 +225,7 @@ def command_of_video(shown: Video, folder: Path) -> Callable[[], None]:
         "--out",
         str(folder / "out.mp4"),
     ]
-    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=True) and None
+    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
 
 
 def matched(sequence: Sequence) -> Callable[[], None]:
