@@ -114,8 +114,6 @@ def error_px(
 
 _MATCHES = 1500
 """Of the dense flow, drawn at random: what a motion of six unknowns is solved from."""
-TO_BEGIN = 400
-"""Of these, where a trajectory begins with the motion."""
 _PIXELS = 600
 """Random pixels, the same in each frame, that are followed to the frames before and after it for a trajectory."""
 _FEWEST = 50
@@ -206,18 +204,12 @@ def find_own_motion(
 
 
 def find_steady_motion(
-    flows: Flows,
-    rig: StereoRig,
-    shutter: RollingShutter,
-    side: Side,
-    robust: RobustOptions,
-    seed: int = 0,
-    most: int = _MATCHES,
+    flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """As of ``find_own_motion``, by the law ``inertial`` whatever the flow asks for; ``most``: matches."""
+    """As of ``find_own_motion``, by the law ``inertial`` whatever the flow asks for."""
     own = rig.about(side)
     nothing = OwnMotion(rig=own, shutter=shutter, side=side, motion=None)
-    matches = flow_matches(flows, np.random.default_rng(seed))[:most]
+    matches = flow_matches(flows, np.random.default_rng(seed))
     if len(matches) < _FEWEST:
         return FoundOwnMotion(own=nothing, robust=None, reason=f"only {len(matches)} pixels have a certain flow")
     solver = RefinedSolver(motion_model=InertialMotion.name, one_camera=True)

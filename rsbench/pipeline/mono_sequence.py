@@ -28,17 +28,16 @@ from rsbench.pipeline.mono_correction import (
     CUT,
     PIXELS,
     STILL,
-    TO_BEGIN,
     FoundOwnMotion,
     MonoFusionCorrector,
     SeenPair,
     Turned,
-    find_own_motion,
     find_steady_motion,
     group_of,
     refusal,
     trajectory_matches,
     turned,
+    with_best_motion,
     with_selected_model,
     with_shared_trajectory,
 )
@@ -259,9 +258,9 @@ def _found(
             return None, reason
         return rotation_alone(rig, shutter, "left", gyro), ""
     search = options.robust, options.seed
-    if gyro is None:
-        return find_steady_motion(flows, rig, shutter, "left", *search, TO_BEGIN), ""
     found = find_steady_motion(flows, rig, shutter, "left", *search)
+    if gyro is None:
+        return found, ""
     return with_gyro(with_selected_model(found, flows, *search), flows, gyro, *search), ""
 
 
@@ -273,9 +272,7 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Cor
     corrector = options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
     if isinstance(found.own.motion, InertialMotion):  # on no trajectory
-        search = options.robust, options.seed
-        again = find_own_motion(flows, StereoRig.of_one(turn.camera), found.own.shutter, "left", *search)
-        found = replace(again, unused=found.unused)
+        found = with_best_motion(found, flows, options.robust, options.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 
