@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -176,9 +177,11 @@ def _correct_into(
                 advance(f"frame {len(entries) - 1}")
 
         copies()
-        for moment in correct_sequence(sources, known, options, len(entries)):
+        there, start = len(entries), time.monotonic()
+        for moment in correct_sequence(sources, known, options, there):
             entries.append(_write(folder, moment, close, given, known, sources[0].orientation))
-            advance(f"frame {moment.number}")
+            rate = (len(entries) - there) / max(time.monotonic() - start, 1e-9)
+            advance(f"frame {moment.number}, {rate:.2g} frames/s")
             copies()
     return entries
 

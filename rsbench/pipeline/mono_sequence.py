@@ -70,7 +70,7 @@ class _Seen(NamedTuple):
     """Of the first one."""
     images: tuple[NDArray[Any], NDArray[Any]]
     flows: Flows | None
-    """Of half precision where they are large; None where they are larger: then they are found again."""
+    """None where they are large: then they are found again."""
     found: FoundOwnMotion | None
     reason: str
     """Why they cannot be corrected; empty where they can."""
@@ -228,20 +228,8 @@ def _seen(
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
     matches = trajectory_matches(flows, options.seed, PIXELS) if gyro is None else np.zeros((0, 4))
-    return _Seen(number, images, _waiting(flows), found, reason, matches)
-
-
-def _waiting(flows: Flows) -> Flows | None:
-    """Flows as they wait for the pairs after them."""
-    taken = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns))
-    if taken <= _HELD_BYTES:
-        return flows
-    return _of_type(flows, np.float16) if 0.5 * taken <= _HELD_BYTES else None
-
-
-def _of_type(flows: Flows, dtype: type[np.floating[Any]]) -> Flows:
-    (a, b), (c, d) = ([each.astype(dtype, copy=False) for each in both] for both in flows[:2])
-    return Flows((a, b), (c, d), flows.scale)
+    small = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _HELD_BYTES
+    return _Seen(number, images, flows if small else None, found, reason, matches)
 
 
 def _found(
@@ -268,8 +256,7 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Cor
     if found is None:
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
-    flows = find_flows(images) if seen.flows is None else _of_type(seen.flows, np.float32)
-    corrector = options.corrector.component
+    flows, corrector = seen.flows or find_flows(images), options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
     if isinstance(found.own.motion, InertialMotion):  # on no trajectory
         found = with_best_motion(found, flows, options.robust, options.seed)
