@@ -374,10 +374,5 @@ def _runs_backwards(
         if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _BEYOND_DOUBT:
             return False
     models, start = models_asked(options.motion_model), None if shakes else found.motion
-    search = options.robust, options.seed, start
-    alone = found.motion.name  # for most frames the law that was found shows the given scans
-    likely = len(models) > 1 and alone in models
-    if likely and scans_by_laws(matches, rig, shutter, (alone,), *search) == scans_of(shutter):
-        return False
-    scans = scans_by_laws(matches, rig, shutter, models, *search)
+    scans = scans_by_laws(matches, rig, shutter, models, options.robust, options.seed, start)
     return scans != scans_of(shutter) if shakes else scans == opposite
