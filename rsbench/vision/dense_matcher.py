@@ -242,8 +242,11 @@ def stereo_by_flow(left: NDArray[Any], right: NDArray[Any]) -> FloatArray:
     """Matches (n, 4), px, of two images (H, W[, 3]) of one size, on any rows, right to a fraction of a pixel.
 
     They begin at corners and are ends of flows that return, those that ``dense_tracks`` of these images uses too.
+    There are none in small images.
     """
     a, b = grey_u8(left), grey_u8(right)
+    if min(a.shape) < _SMALLEST:
+        return np.zeros((0, 4))
     flows, points = _both_ways(a, b, True), corners(_reduced(a, a.shape), DenseOptions.points)
     ends = points + _at(flows.there, points)
     return np.concatenate([points, ends], axis=1)[_returns(flows.back, ends, points, 0.5 * _RETURN_PX)]

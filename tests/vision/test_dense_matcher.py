@@ -242,6 +242,11 @@ def test_stereo_matches_by_flow_lie_on_any_row(shift: tuple[float, float]) -> No
     assert np.quantile(off, 0.95) < 0.3  # DIS without refinement
 
 
+def test_images_that_show_nothing_have_no_stereo_matches_by_flow() -> None:
+    for shape in ((20, 30), (100, 120)):
+        assert stereo_by_flow(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)).shape == (0, 4)
+
+
 def test_enough_tracks_are_looked_for_at_fewer_places() -> None:
     fewer = DenseMatcher().with_enough(400)
     assert (fewer.points, fewer.fewest) == (1000, 200)
