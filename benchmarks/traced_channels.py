@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from traced_truth import truth
+from traced_truth import World, truth
 
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
@@ -156,8 +156,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             near, right = [], []
             for side, frame in VIEWS:
                 chosen = np.sort(rng.choice(size, count, replace=False))
-                hit = partial(first_hit, tree)
-                offset, classes = truth(sequence, hit, layer.channel, side, frame, layer.row, chosen)
+                world = World(partial(first_hit, tree))
+                offset, classes, _ = truth(sequence, world, layer.channel, side, frame, layer.row, chosen=chosen)
                 if layer.channel == "disparity":
                     offset = offset[:, :1] * (1 if side == "right" else -1)
                 view = layer.channel, side, frame, layer.row

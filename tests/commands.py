@@ -12,7 +12,7 @@ import io
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -20,6 +20,7 @@ import pytest
 from typer.main import get_command
 
 from rsbench.cli import console, exits, main
+from rsbench.core.errors import RsbenchError
 
 
 def run_here(*arguments: object, text: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
@@ -74,6 +75,17 @@ def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> Non
     assert result.returncode == 2, result.stderr
     assert "Traceback" not in result.stderr
     (line,) = [line for line in result.stderr.splitlines() if "rsbench: error:" in line]
+    for word in words:
+        assert word in line, line
+
+
+@contextlib.contextmanager
+def refused(*words: str, match: str | None = None) -> Iterator[None]:
+    """What is called inside raises an error of one line that holds the words and matches the pattern."""
+    with pytest.raises(RsbenchError, match=match) as caught:
+        yield
+    line = str(caught.value)
+    assert "\n" not in line
     for word in words:
         assert word in line, line
 

@@ -21,6 +21,8 @@ from rsbench.components.imports import import_untried
 from rsbench.storage.work_folder import temporary, user_cache
 
 if TYPE_CHECKING:
+    from rsbench.dataset.card import DatasetCard
+    from rsbench.dataset.sequence import Sequence
     from rsbench.scenes.model import Light, Scene
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -206,6 +208,42 @@ def smoke_dataset(tmp_path_factory: pytest.TempPathFactory, built_scene: Callabl
             patch.setattr(generation, "load_scene", built_scene)
             generation.generate_dataset(load_dataset_card("smoke"), folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def castle(smoke_dataset: Path) -> Sequence:
+    """Its first sequence: 128 x 96 px, 1.5 deg and 0.2 m per frame."""
+    from rsbench.dataset.sequence import read_dataset
+
+    return read_dataset(smoke_dataset)[0]
+
+
+@pytest.fixture(scope="session")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> DatasetCard:
+    """Two small sequences, a and b, each of a box."""
+    from small_scenes import write_box_scene, write_small_card
+
+    from rsbench.dataset.card import load_dataset_card
+
+    folder = tmp_path_factory.mktemp("card")
+    return load_dataset_card(str(write_small_card(folder, [write_box_scene(folder, name) for name in "ab"])))
+
+
+@pytest.fixture
+def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """An empty store in memory, and no memory of any other."""
+    import fsspec
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    store: Any = fsspec.filesystem("memory")
+
+    def empty() -> None:
+        store.store.clear()
+        store.pseudo_dirs[:] = [""]
+
+    empty()
+    yield store
+    empty()
 
 
 @contextlib.contextmanager

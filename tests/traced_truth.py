@@ -1,5 +1,7 @@
 """Where pixels of a rolling-shutter frame lie in another picture, by triangles traced in float64 and bisection.
 
+Things that move are traced at each ray's own time.
+
 Shares nothing with rsbench but the numbers of a sequence: the truth that channels are compared with. Lenses are
 OpenCV's.
 """
@@ -7,6 +9,7 @@ OpenCV's.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -38,6 +41,51 @@ def first_hit(triangles: Array, origins: Array, ways: Array) -> Array:
         hit = (np.abs(det) > 1e-14) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9)
         nearest = np.where(hit & (t < nearest), t, nearest)
     return nearest
+
+
+class Thing(NamedTuple):
+    """Triangles (m, 3, 3) at time 0, and how they turn about a pivot and are shifted in one frame period."""
+
+    triangles: Array
+    pivot: Array
+    w: Array
+    d: Array
+
+    def moved(self, X: Array, tau: Array) -> Array:
+        """Points (n, 3) of time 0 at times (n,)."""
+        return (
+            Rotation.from_rotvec(tau[:, None] * self.w).apply(X - self.pivot) + self.pivot + tau[:, None] * self.d
+        )
+
+    def back(self, X: Array, tau: Array) -> Array:
+        turn = Rotation.from_rotvec(tau[:, None] * self.w).inv()
+        return np.asarray(turn.apply(X - self.pivot - tau[:, None] * self.d) + self.pivot)
+
+
+class World(NamedTuple):
+    """What stands still, and what moves."""
+
+    still: FirstHit
+    things: tuple[Thing, ...] = ()
+
+    def hit(self, origins: Array, directions: Array, tau: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Parameter (n,) of the first triangle along rays at times (n,), and the number of its thing; 0: still."""
+        nearest = self.still(origins, directions)
+        owner = np.zeros(len(nearest), dtype=np.int64)
+        for number, thing in enumerate(self.things, start=1):
+            start = thing.back(origins, tau)
+            own = first_hit(thing.triangles, start, thing.back(origins + directions, tau) - start)
+            owner[own < nearest] = number
+            nearest = np.minimum(nearest, own)
+        return nearest, owner
+
+    def carried(self, X: Array, owner: NDArray[np.int64], tau: Array, to: Array) -> Array:
+        """Points (n, 3) at times ``tau`` (n,), at times ``to``."""
+        result = X.copy()
+        for number, thing in enumerate(self.things, start=1):
+            own = owner == number
+            result[own] = thing.moved(thing.back(X[own], tau[own]), to[own])
+        return result
 
 
 def pose_at(sequence: Sequence, side: Side, tau: Array) -> tuple[Array, Array]:
@@ -147,40 +195,74 @@ def within(sequence: Sequence, side: Side, pixels: Array) -> NDArray[np.bool_]:
 
 def truth(
     sequence: Sequence,
-    hit: FirstHit,
+    world: World,
     channel: PairChannel,
     side: Side,
     frame: int,
     row: int = 0,
+    *,
+    back: bool = False,
     chosen: NDArray[np.int64] | None = None,
-) -> tuple[Array, Array]:
-    """Offsets (n, 2) x_target - x_source and classes (n,) of pixels, in the order of their rows.
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Offsets (n, 2) x_target - x_source and classes (n,) of pixels, in the order of their rows, and their things.
 
-    ``row``: of a global-shutter twin; ``chosen`` (n,): numbers of pixels, all by default.
+    ``row``: of a global-shutter twin; ``back``: to the frame before; ``chosen`` (n,): numbers of pixels.
     """
     pixels = grid_of(sequence, side) if chosen is None else grid_of(sequence, side)[chosen]
     start = line_times(sequence, side, frame, pixels[:, axis_of(sequence, side)])
-    origins, ways = rays(sequence, side, start, pixels)
-    depth = hit(origins, ways)
+    origins, directions = rays(sequence, side, start, pixels)
+    depth, owner = world.hit(origins, directions, start)
     sky = np.isinf(depth)
-    X = origins + ways * np.where(sky, 1e8, depth)[:, None]
+    X = origins + directions * np.where(sky, 1e8, depth)[:, None]
+    to, there = frame, side
     if channel == "disparity":
-        side, tau = ("right" if side == "left" else "left"), start
+        there, tau = ("right" if side == "left" else "left"), start
     elif channel == "flow":
-        frame = 1 - frame
-        tau = line_times(sequence, side, frame, row_seeing(sequence, side, frame, X))
+        to = frame - 1 if back or frame == sequence.frames - 1 else frame + 1
+        lines = crossing(sequence, side, to, lambda time: world.carried(X, owner, start, time), len(X))
+        tau = line_times(sequence, side, to, lines)
     else:
         tau = np.full(len(X), line_times(sequence, side, frame, np.array(float(line_of(sequence, side, row)))))
     lost = np.isnan(tau)
     tau = np.where(lost, 0.0, tau)
-    landed = look(sequence, side, tau, X)
-    inside = ~lost & within(sequence, side, landed)
-    eyes, _ = rays(sequence, side, tau, pixels)
+    arrived = world.carried(X, owner, start, tau)
+    landed = look(sequence, there, tau, arrived)
+    inside = ~lost & within(sequence, there, landed)
+    eyes, _ = rays(sequence, there, tau, pixels)
     # The eye is off the surface that ends the segment by far more than rounding: 1e-6 of the way.
-    hidden = hit(eyes, X - eyes) < 1 - 1e-6
+    hidden = world.hit(eyes, arrived - eyes, tau)[0] < 1 - 1e-6
     classes = np.where(
         sky,
         np.where(hidden, PixelClass.SKY_OCCLUDED, PixelClass.SKY),
         np.where(hidden, PixelClass.OCCLUDED, PixelClass.VISIBLE),
     )
-    return landed - pixels, np.where(inside, classes, PixelClass.OUT_OF_VIEW)
+    return landed - pixels, np.where(inside, classes, PixelClass.OUT_OF_VIEW), owner
+
+
+class Agreement(NamedTuple):
+    """Of pixels (n,): both pictures have it, it is within 0.01 px of the truth, of the same class; its thing."""
+
+    both: NDArray[np.bool_]
+    near: NDArray[np.bool_]
+    alike: NDArray[np.bool_]
+    owner: NDArray[np.int64]
+
+
+def agreement(
+    sequence: Sequence,
+    world: World,
+    channel: PairChannel,
+    side: Side,
+    frame: int,
+    row: int = 0,
+    back: bool = False,
+) -> Agreement:
+    """Of a stored channel with the truth."""
+    offset, classes, owner = truth(sequence, world, channel, side, frame, row, back=back)
+    if channel == "disparity":
+        offset = offset[:, :1] * (1 if side == "right" else -1)
+    stored = sequence.offsets(channel, side, frame, row, back).reshape(offset.shape)
+    kinds = sequence.classes(channel, side, frame, row, back).ravel()
+    both = (kinds != PixelClass.OUT_OF_VIEW) & (classes != PixelClass.OUT_OF_VIEW)
+    near = np.max(np.abs(stored - offset), axis=1) <= 0.01
+    return Agreement(both, ~both | near, kinds == classes, owner)

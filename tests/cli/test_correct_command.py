@@ -27,7 +27,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset import corrected_frames
 from rsbench.dataset.corrected_frames import MASK_VALUES, fresh_folder
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence
 from rsbench.storage.files import read_depth, read_png, write_png
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
@@ -35,11 +35,6 @@ ORDER = ("left_0", "right_0", "left_1", "right_1")
 
 def correct(*arguments: object) -> subprocess.CompletedProcess[str]:
     return run_here("correct", *arguments)
-
-
-@pytest.fixture(scope="module")
-def castle(smoke_dataset: Path) -> Sequence:
-    return read_dataset(smoke_dataset)[0]
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from commands import assert_refused, run_here
 
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence
 from rsbench.storage.files import read_depth, read_png
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
@@ -96,11 +96,6 @@ known = strange_features:Known
 [rsbench.correctors]
 negative = strange_corrector:Negative
 """
-
-
-@pytest.fixture(scope="module")
-def castle(smoke_dataset: Path) -> Sequence:
-    return read_dataset(smoke_dataset)[0]
 
 
 @pytest.fixture(scope="module")

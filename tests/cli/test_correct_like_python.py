@@ -12,17 +12,12 @@ import pytest
 from commands import run_here
 
 import rsbench
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence
 from rsbench.interop.readers.gyro_log import read_gyro_log
 from rsbench.storage.files import read_png, write_png
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
 SIZE, FPS = (96, 128), 30.0
-
-
-@pytest.fixture(scope="module")
-def castle(smoke_dataset: Path) -> Sequence:
-    return read_dataset(smoke_dataset)[0]
 
 
 def _run(out: Path, *arguments: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, refused, run_here
 from small_scenes import write_small_card
 
 from rsbench.components.cards import (
@@ -88,12 +88,8 @@ def test_tables_become_nested_dataclasses() -> None:
     ],
 )
 def test_bad_cards_are_refused_in_one_line(change: dict[str, Any], parts: list[str]) -> None:
-    with pytest.raises(RsbenchError) as caught:
+    with refused(*parts, match="^dir/a.toml: "):
         parse_card(Card, {"name": "a", **change}, "dir/a.toml")
-    message = str(caught.value)
-    assert message.startswith("dir/a.toml: ") and "\n" not in message
-    for part in parts:
-        assert part in message
 
 
 def test_invalid_toml_names_the_line(tmp_path: Path) -> None:
@@ -194,9 +190,8 @@ def test_a_slower_frame_rate_keeps_the_readout_time() -> None:
     ],
 )
 def test_what_cannot_be_is_one_line(table: dict[str, object], words: str) -> None:
-    with pytest.raises(RsbenchError, match=words) as caught:
+    with refused(match=words):
         with_shutter(table, "card")
-    assert "\n" not in str(caught.value)
 
 
 def test_they_are_listed_and_shown() -> None:

@@ -14,7 +14,7 @@ import pytest
 from attack.planting import rehash
 from channel_faults import FAULTS
 from numpy.typing import NDArray
-from traced_truth import first_hit, grid_of, line_times, look, rays, row_seeing, truth, within
+from traced_truth import World, agreement, first_hit, grid_of, line_times, look, rays, row_seeing, within
 from yard_dataset import rounds, write_yard, yard_card
 
 from rsbench.components.cards import parse_card
@@ -96,6 +96,12 @@ def parts(yard: Path) -> list[str]:
     return [mesh.name for mesh in load_scene(yard.parent / "yard.toml").meshes for _ in mesh.faces]
 
 
+def _check(sequence: Sequence, triangles: Array, channel: PairChannel, row: int) -> None:
+    views = [agreement(sequence, World(partial(first_hit, triangles)), channel, *view, row) for view in VIEWS]
+    both, near, alike, _ = (np.concatenate(each) for each in zip(*views, strict=True))
+    assert np.mean(near[both]) >= 0.999 and np.mean(alike) >= 0.999
+
+
 @pytest.mark.parametrize(
     ("channel", "row"), [*((name, 0) for name in PAIR_CHANNELS), ("gs_flow", 24), ("gs_flow", 47)]
 )
@@ -104,21 +110,12 @@ def test_every_pixel_lies_where_rays_say(
 ) -> None:
     """The bounds of the issue: 99.9 % of the visible pixels within 0.01 px, and no other class on 99.9 %."""
     seen = np.zeros(len(PixelClass), dtype=int)
-    near, right = list[NDArray[np.bool_]](), list[NDArray[np.bool_]]()
     for side, frame in VIEWS:
-        offset, classes = truth(sequence, partial(first_hit, triangles), channel, side, frame, row)
-        if channel == "disparity":
-            offset = offset[:, :1] * (1 if side == "right" else -1)
-        stored = sequence.offsets(channel, side, frame, row).reshape(offset.shape)
-        kinds = sequence.classes(channel, side, frame, row).ravel()
+        stored, kinds = (read(channel, side, frame, row) for read in (sequence.offsets, sequence.classes))
         known = kinds != PixelClass.OUT_OF_VIEW
         assert np.all(np.isfinite(stored[known])) and np.all(np.isnan(stored[~known]))
-        both = known & (classes != PixelClass.OUT_OF_VIEW)
-        near.append(np.max(np.abs(stored - offset)[both], axis=1) <= 0.01)
-        right.append(kinds == classes)
-        seen += np.bincount(kinds, minlength=len(seen))
-    assert np.mean(np.concatenate(near)) >= 0.999
-    assert np.mean(np.concatenate(right)) >= 0.999
+        seen += np.bincount(kinds.ravel(), minlength=len(seen))
+    _check(sequence, triangles, channel, row)
     assert np.all(seen[PixelClass.VISIBLE :] >= 20) and seen[PixelClass.UNSOLVED] == 0, seen
 
 
@@ -126,15 +123,7 @@ def test_every_pixel_lies_where_rays_say(
 def test_every_pixel_of_another_rig_lies_where_rays_say(
     any_sequence: Sequence, triangles: Array, channel: PairChannel
 ) -> None:
-    near, right = list[NDArray[np.bool_]](), list[NDArray[np.bool_]]()
-    for side, frame in VIEWS:
-        offset, classes = truth(any_sequence, partial(first_hit, triangles), channel, side, frame)
-        stored = any_sequence.offsets(channel, side, frame).reshape(offset.shape)
-        kinds = any_sequence.classes(channel, side, frame).ravel()
-        both = (kinds != PixelClass.OUT_OF_VIEW) & (classes != PixelClass.OUT_OF_VIEW)
-        near.append(np.max(np.abs(stored - offset)[both], axis=1) <= 0.01)
-        right.append(kinds == classes)
-    assert np.mean(np.concatenate(near)) >= 0.999 and np.mean(np.concatenate(right)) >= 0.999
+    _check(any_sequence, triangles, channel, 0)
 
 
 def test_normals_and_instances_are_those_of_the_triangles_that_rays_hit(

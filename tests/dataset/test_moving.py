@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 import trimesh
 from attack.planting import rehash
-from moving_truth import Thing, World, truth
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from traced_truth import Array, axis_of, grid_of, line_times, rays
+from traced_truth import Array, Thing, World, agreement, axis_of, first_hit, grid_of, line_times, rays
 
 from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import LinearMotion
@@ -31,7 +30,7 @@ from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel
 from rsbench.dataset.generation import generate_dataset, seen_scene
 from rsbench.dataset.motion_cards import TAKEN, MovingCard
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.dataset.views import NUMBER, SHADED, PixelClass
+from rsbench.dataset.views import NUMBER, SHADED
 from rsbench.renderers.image import Sensor
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import LinePoses, render
@@ -139,7 +138,7 @@ def world_of(folder: Path, sequence: Sequence) -> World:
         Thing(triangles, np.array(card.position), np.array(record["w"]), np.array(record["d"]))
         for triangles, card, record in zip(own, (CART, BOX), records, strict=True)
     ]
-    return World(np.concatenate(list(meshes.values())), things)
+    return World(partial(first_hit, np.concatenate(list(meshes.values()))), tuple(things))
 
 
 @pytest.mark.parametrize(("channel", "row"), [*((name, 0) for name in PAIR_CHANNELS), ("gs_flow", 24)])
@@ -149,18 +148,8 @@ def test_every_pixel_lies_where_rays_say(sequence: Sequence, world: World, chann
 
 
 def _check_pairs(sequence: Sequence, world: World, channel: PairChannel, row: int) -> None:
-    near, right, owners = list[NDArray[np.bool_]](), list[NDArray[np.bool_]](), list[NDArray[np.intp]]()
-    for side, frame in VIEWS:
-        offset, classes, owner = truth(sequence, world, channel, side, frame, row)
-        if channel == "disparity":
-            offset = offset[:, :1] * (1 if side == "right" else -1)
-        stored = sequence.offsets(channel, side, frame, row).reshape(offset.shape)
-        kinds = sequence.classes(channel, side, frame, row).ravel()
-        both = (kinds != PixelClass.OUT_OF_VIEW) & (classes != PixelClass.OUT_OF_VIEW)
-        near.append(~both | (np.max(np.abs(stored - offset), axis=1) <= 0.01))
-        right.append(kinds == classes)
-        owners.append(owner)
-    close, alike, owner = (np.concatenate(each) for each in (near, right, owners))
+    views = [agreement(sequence, world, channel, *view, row) for view in VIEWS]
+    _, close, alike, owner = (np.concatenate(each) for each in zip(*views, strict=True))
     assert np.mean(close) >= 0.999 and np.mean(alike) >= 0.999
     for number in (1, 2):
         # At least 900 pixels each: two at edges may round to the other side.
@@ -185,7 +174,7 @@ def _check_surfaces(sequence: Sequence, world: World) -> None:
         for number in (1, 2):
             # From a little above the surface: a millimetre along the way back.
             above = X - 1e-3 * ways / np.linalg.norm(ways, axis=1, keepdims=True)
-            only = World(np.zeros((0, 3, 3)), [world.things[number - 1]])
+            only = World(partial(first_hit, np.zeros((0, 3, 3))), (world.things[number - 1],))
             dark |= np.isfinite(only.hit(above, np.broadcast_to(sun, X.shape), tau)[0])
         labels = sequence.labels("rs", side, frame).ravel()
         assert np.mean((labels & NUMBER) == np.where(seen, owner, 0)) >= 0.999

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,9 @@ import pytest
 import trimesh
 from attack.planting import rehash
 from channel_faults import values_of
-from moving_truth import Thing, World, row_times, truth
 from scipy.spatial.transform import Rotation
 from small_scenes import write_box_scene
-from traced_truth import Array, rays
+from traced_truth import Array, Thing, World, agreement, first_hit, line_times, rays
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import views_of
@@ -24,7 +24,7 @@ from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import Sequence, read_dataset
-from rsbench.dataset.views import NUMBER, PixelClass
+from rsbench.dataset.views import NUMBER
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset
@@ -114,7 +114,7 @@ def world(fair: Path, sequence: Sequence) -> World:
             (kite_triangles(fair.parent / "meshes"), slab), POSITIONS, records, strict=True
         )
     ]
-    return World(np.concatenate(still), things)
+    return World(partial(first_hit, np.concatenate(still)), tuple(things))
 
 
 @pytest.mark.parametrize(
@@ -131,13 +131,7 @@ def test_every_pixel_lies_where_rays_say(
     sequence: Sequence, world: World, channel: PairChannel, frame: int, row: int, back: bool
 ) -> None:
     """99.9 % of the visible pixels within 0.01 px, no other class on 99.9 %; of the objects by themselves too."""
-    offset, classes, owner = truth(sequence, world, channel, "left", frame, row, back=back)
-    offset = offset[:, :1] if channel == "disparity" else offset
-    stored = sequence.offsets(channel, "left", frame, row, back).reshape(offset.shape)
-    stored = -stored if channel == "disparity" else stored
-    kinds = sequence.classes(channel, "left", frame, row, back).ravel()
-    both = (kinds != PixelClass.OUT_OF_VIEW) & (classes != PixelClass.OUT_OF_VIEW)
-    close, alike = ~both | (np.max(np.abs(stored - offset), axis=1) <= 0.01), kinds == classes
+    _, close, alike, owner = agreement(sequence, world, channel, "left", frame, row, back)
     assert np.mean(close) >= 0.999 and np.mean(alike) >= 0.999
     for number in (1, 2):
         # Some 200 pixels or more each: one at an edge may round to the other side.
@@ -150,7 +144,7 @@ def test_depth_labels_and_instances_are_those_of_the_triangles(sequence: Sequenc
     assert [sum(own[number]) for number in (1, 2)] == [2, 1], "each part of a file is an instance"
     for side, frame in views_of(sequence.frames):
         grid = sequence.rig.camera.pixel_grid().reshape(-1, 2)
-        tau = row_times(sequence, frame, grid[:, 1])
+        tau = line_times(sequence, side, frame, grid[:, 1])
         depth, owner = world.hit(*rays(sequence, side, tau, grid), tau)
         assert np.mean((sequence.labels("rs", side, frame).ravel() & NUMBER) == owner) >= 0.999
         assert np.mean(np.isclose(sequence.depth("rs", side, frame).ravel(), depth, rtol=1e-5)) >= 0.999

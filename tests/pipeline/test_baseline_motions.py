@@ -6,20 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from solver_trials import RIG, SHUTTER
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.pose_errors import translation_of_offset
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, Side
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline.one_camera import global_shutter_motion, monocular_motion, solved_alone
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
 MOTION = LinearMotion(np.array([0.02, -0.03, 0.025]), np.array([0.2, -0.12, 0.18]))
 
 

@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from solver_trials import RIG
 
 from rsbench.components.motion_models import LinearMotion, TwistMotion
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig
 from rsbench.pipeline.frame_motion import body_motion
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.solvers.refined import RefinedSolver
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 BODY, LEFT = RefinedSolver().spec, EightPointSolver.spec
 vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 

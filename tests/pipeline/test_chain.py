@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from commands import refused
 
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.plugins import wrap
@@ -233,29 +234,18 @@ def test_an_unknown_readout_ratio_is_estimated_or_declared_open(castle: Sequence
         assert abs(best.ratio - castle.shutter.readout_ratio) < 4 * best.sigma
 
 
-def _refused(images: Images, rig: StereoRig, *words: str) -> None:
-    with pytest.raises(RsbenchError) as caught:
-        correct_four(images, rig, 0.8, CorrectionOptions())
-    assert "\n" not in str(caught.value)
-    for word in words:
-        assert word in str(caught.value)
+OTHER = {"left": "right", "right": "left"}
+WRONG: dict[str, Callable[[Images], Images]] = {
+    "no texture": lambda images: {view: np.full_like(image, 128) for view, image in images.items()},
+    "exchanged": lambda images: {(s, f): images[OTHER[s], f] for s, f in VIEWS},
+    "same row": lambda images: {(s, f): np.roll(images[s, f], 30 * (s == "right"), axis=0) for s, f in VIEWS},
+}
 
 
-def test_frames_without_texture_are_refused(castle: Sequence) -> None:
-    flat = {view: np.full_like(image, 128) for view, image in _frames(castle).items()}
-    _refused(flat, castle.rig, "no texture")
-
-
-def test_exchanged_sides_are_refused(castle: Sequence) -> None:
-    images = _frames(castle)
-    other = {"left": "right", "right": "left"}
-    _refused({(s, f): images[other[s], f] for s, f in VIEWS}, castle.rig, "exchanged")
-
-
-def test_frames_of_one_side_are_refused(castle: Sequence) -> None:
-    images = _frames(castle)
-    shifted = {(s, f): np.roll(images[s, f], 30 if s == "right" else 0, axis=0) for s, f in VIEWS}
-    _refused(shifted, castle.rig, "same row")
+@pytest.mark.parametrize("words", WRONG)
+def test_wrong_frames_are_refused(words: str, castle: Sequence) -> None:
+    with refused(words):
+        correct_four(WRONG[words](_frames(castle)), castle.rig, 0.8, CorrectionOptions())
 
 
 @dataclass(frozen=True)
@@ -272,9 +262,8 @@ def test_features_without_stereo_matches_are_no_sign_of_wrong_frames(castle: Seq
     images = _frames(castle)
     options = CorrectionOptions(features=wrap(FEATURE_MATCHERS, OverTimeOnly()))
     assert len(match_frames(images, castle.rig, options).stereo_0) == 0
-    other = {"left": "right", "right": "left"}
     with pytest.raises(RsbenchError, match="exchanged"):
-        match_frames({(s, f): images[other[s], f] for s, f in VIEWS}, castle.rig, options)
+        match_frames(WRONG["exchanged"](images), castle.rig, options)
     few = CorrectionOptions(features=options.features, solver=load_solver_entry("gs-stereo-tracks"))
     with pytest.raises(NoMotionError, match="tracks"):
         correct_four(images, castle.rig, castle.shutter.readout_ratio, few)

@@ -14,24 +14,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import refused
 from general_rigs import RIGS
+from solver_trials import RIG, SHUTTER, D, W
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
-from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.camera import Lens
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES, StereoRig
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.rig import SIDES
+from rsbench.core.shutter import Scanning
 from rsbench.pipeline.answer import EXTRAS, Answer, solve_problem
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.pipeline.problem import EXAMPLE, Problem, parse_problem, problem_record, read_problem, read_problems
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-MOTION = LinearMotion(np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18]))
+MOTION = LinearMotion(W, D)
 CORRESPONDENCES = simulate(
     RIG, SHUTTER, MOTION, SimulationOptions(pairs=40, tracks=30), np.random.default_rng(0)
 ).correspondences
@@ -97,12 +97,8 @@ REFUSED: list[tuple[str, list[str]]] = [
 
 @pytest.mark.parametrize(("text", "parts"), REFUSED)
 def test_a_wrong_file_is_refused_in_one_line(text: str, parts: list[str]) -> None:
-    with pytest.raises(RsbenchError) as caught:
+    with refused(*parts, match="^p.json: "):
         parse_problem(text, "p.json")
-    message = str(caught.value)
-    assert message.startswith("p.json: ") and "\n" not in message
-    for part in parts:
-        assert part in message
 
 
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
@@ -191,10 +187,8 @@ def test_arrays_are_the_same_problem_as_text(tmp_path: Path) -> None:
 )
 def test_wrong_arrays_are_refused_in_one_line(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     path = write_npz(tmp_path / "p.npz", **changes)
-    with pytest.raises(RsbenchError) as caught:
+    with refused(str(path), words):
         read_problem(path)
-    message = str(caught.value)
-    assert str(path) in message and words in message and "\n" not in message
 
 
 NPY = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (0,), }".ljust(127) + b"\n"
@@ -446,9 +440,5 @@ def test_equal_aligned_cameras_have_the_answers_of_format_1() -> None:
     ],
 )
 def test_a_wrong_rig_is_refused_in_one_line(changes: dict[str, Any], parts: list[str]) -> None:
-    with pytest.raises(RsbenchError) as caught:
+    with refused(*parts, match="^p.json: "):
         parse_problem(json.dumps(of_any_rig(**changes)), "p.json")
-    message = str(caught.value)
-    assert message.startswith("p.json: ") and "\n" not in message
-    for part in parts:
-        assert part in message

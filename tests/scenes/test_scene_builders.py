@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -92,9 +93,8 @@ def test_a_file_and_a_card_beside_it_make_a_scene(tmp_path: Path) -> None:
 def test_what_a_builder_does_wrong_is_one_line(tmp_path: Path, name: str, old: str, new: str, part: str) -> None:
     assert old in MODULE
     card = write(tmp_path, MODULE.replace(old, new), name, f"{name}:Heap")
-    with pytest.raises(RsbenchError) as caught:
+    with refused(part, str(card)):
         load_scene(card)
-    assert part in str(caught.value) and str(card) in str(caught.value) and "\n" not in str(caught.value)
 
 
 MESH = SceneMesh(
@@ -132,9 +132,8 @@ def test_a_sound_mesh_is_let_through() -> None:
     ],
 )
 def test_an_unsound_mesh_is_refused(spoil: Callable[[SceneMesh], SceneMesh], part: str) -> None:
-    with pytest.raises(RsbenchError) as caught:
+    with refused(part):
         _check_meshes((MESH, spoil(replace(MESH, name="spoilt"))), "here")
-    assert part in str(caught.value)
 
 
 KEY = "0123"

@@ -10,19 +10,17 @@ from typing import Literal
 import numpy as np
 import pytest
 from commands import run_here
+from solver_trials import CAMERA, RIG, SHUTTER, D, W
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import in_front
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.projection import back_project, rs_project
-from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
-from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
 from rsbench.solvers.engine.base import load_solver
@@ -46,11 +44,6 @@ from rsbench.solvers.free_velocities import (
 )
 from rsbench.solvers.linear import null_vector
 from rsbench.storage.files import load_matches
-
-CAMERA = PinholeCamera.centred(900, 900, 810.0)
-RIG = StereoRig(camera=CAMERA, baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
 
 
 def free_motion(turn: float = 0.0, seed: int = 0) -> FreeMotion:
@@ -312,7 +305,7 @@ def test_without_readout_or_with_too_few_matches_they_fail_by_value() -> None:
     assert not found.success and "more than one solution" in found.reason
 
 
-STEREO = StereoRig(camera=CAMERA, baseline=0.6).about("left")
+STEREO = RIG.about("left")
 
 
 def simulation(size: float = 1.0, seed: int = 0, pairs: int = 7, **noise: float) -> Simulation:

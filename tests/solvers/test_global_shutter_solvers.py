@@ -12,20 +12,21 @@ import numpy as np
 import poselib
 import pytest
 from scipy.optimize import least_squares
+from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, errors_deg, robust, trial
 
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import Simulation
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
-from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.camera import Lens
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.errors import RsbenchError
-from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.pose_errors import scale_error
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver, load_solver_entry
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.poselib import P3pSolver
 from rsbench.solvers.triplets import (
     PATTERNS,
@@ -42,18 +43,12 @@ from rsbench.solvers.triplets import (
 )
 from rsbench.solvers.zhuang import FlowScaledSolver, scale_flow
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 
-
-def trial(
+def hundred(
     seed: int, model: str, noise_px: float, shutter: RollingShutter = SHUTTER, tracks: bool = False
 ) -> Simulation:
-    rng = np.random.default_rng(seed)
-    motion = random_motion(rng, np.radians(2.0), 0.3, "twist" if model == "twist" else "linear")
-    options = SimulationOptions(pairs=0 if tracks else 100, tracks=100 if tracks else 0, noise_px=noise_px)
-    return simulate(RIG, shutter, motion, options, np.random.default_rng(seed))
+    pairs, of_tracks = (0, 100) if tracks else (100, 0)
+    return trial(seed, model=model, noise_px=noise_px, shutter=shutter, pairs=pairs, tracks=of_tracks)
 
 
 def medians(name: str, model: str, noise_px: float, trials: int = 30) -> tuple[float, float]:
@@ -61,14 +56,11 @@ def medians(name: str, model: str, noise_px: float, trials: int = 30) -> tuple[f
     solver = load_solver(name)
     errors = []
     for seed in range(trials):
-        s = trial(seed, model, noise_px, tracks="tracks" in solver.spec.needs)
+        s = hundred(seed, model, noise_px, tracks="tracks" in solver.spec.needs)
         estimate = solver.estimate(s.correspondences, RIG, SHUTTER)
         assert estimate.success, estimate.reason
-        d = s.motion.d
-        if solver.spec.reference_point == "left":
-            d = translation_of_offset(s.motion.w, d, RIG.offset("left"))
-        errors.append([float(rotation_error(estimate.w, s.motion.w)), float(translation_error(estimate.d, d))])
-    e_R, e_T = np.degrees(np.median(errors, axis=0))
+        errors.append(errors_deg(estimate, s.motion, solver.spec.reference_point))
+    e_R, e_T = np.median(errors, axis=0)
     return float(e_R), float(e_T)
 
 
@@ -111,7 +103,7 @@ def test_flow_scaling_removes_most_of_the_error_on_twist_data(name: str) -> None
 @pytest.mark.parametrize("name", ["gs-poselib-stereo", "gs-stereo-tracks", "gs-stereo-pnp"])
 def test_stereo_baselines_are_metric(name: str) -> None:
     solver = load_solver(name)
-    s = trial(0, "linear", 0.0, GLOBAL, tracks="tracks" in solver.spec.needs)
+    s = hundred(0, "linear", 0.0, GLOBAL, tracks="tracks" in solver.spec.needs)
     estimate = solver.estimate(s.correspondences, RIG, GLOBAL)
     assert estimate.metric and scale_error(estimate.d, s.motion.d) < 1e-6
 
@@ -125,10 +117,9 @@ def test_both_global_shutter_optima_agree(tmp_path: Path) -> None:
     ours, theirs = load_solver(card), load_solver("gs-poselib-stereo")
     assert ours.spec.shutter == "global"
     for seed in range(5):
-        s = trial(seed, "linear", 0.5)
+        s = hundred(seed, "linear", 0.5)
         first, second = (solver.estimate(s.correspondences, RIG, SHUTTER) for solver in (ours, theirs))
-        assert np.degrees(rotation_error(first.w, second.w)) < 1e-5
-        assert np.degrees(translation_error(first.d, second.d)) < 1e-4
+        assert_near(first, LinearMotion(second.w, second.d), 1e-5, 1e-4)
 
 
 def test_scaled_matches_took_one_frame_period() -> None:
@@ -149,7 +140,7 @@ def test_scaled_matches_took_one_frame_period() -> None:
 
 
 def test_without_readout_scaling_changes_nothing() -> None:
-    c = trial(0, "linear", 0.5, tracks=True).correspondences
+    c = hundred(0, "linear", 0.5, tracks=True).correspondences
     np.testing.assert_allclose(scale_flow(c, RIG, GLOBAL).tracks, c.tracks, atol=1e-9)
 
 
@@ -178,24 +169,21 @@ def test_scaled_solver_declares_what_its_inner_one_does(tmp_path: Path) -> None:
 
 
 def test_tracks_only_solver_wants_tracks() -> None:
-    motion = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, 0.2, 0.1]))
-    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=30), np.random.default_rng(0)).correspondences
+    c = trial(0, pairs=30).correspondences
     estimate = load_solver("rs-stereo-tracks").estimate(c, RIG, SHUTTER)
     assert not estimate.success and "tracks" in estimate.reason
     assert load_solver("rs-stereo-tracks").spec.needs == {"tracks"}
 
 
-def p3p_trial(seed: int, count: int = 100, noise_px: float = 0.0, outlier_ratio: float = 0.0) -> Simulation:
-    motion = random_motion(np.random.default_rng(seed), np.radians(2.0), 0.3)
-    options = SimulationOptions(tracks=count, noise_px=noise_px, outlier_ratio=outlier_ratio)
-    return simulate(RIG, GLOBAL, motion, options, np.random.default_rng(seed))
+def global_tracks(seed: int, count: int, noise_px: float = 0.0, outlier_ratio: float = 0.0) -> Simulation:
+    return trial(seed, shutter=GLOBAL, tracks=count, noise_px=noise_px, outlier_ratio=outlier_ratio)
 
 
 @pytest.mark.parametrize("cameras", ["left", "both"])
 @pytest.mark.parametrize("count", [4, 100])
 def test_the_pose_of_exact_points_is_exact(cameras: Literal["both", "left"], count: int) -> None:
     for seed in range(5):
-        s = p3p_trial(seed, count)
+        s = global_tracks(seed, count)
         found = P3pSolver(cameras_used=cameras).estimate(s.correspondences, RIG, GLOBAL)
         assert found.success and found.metric
         # The rows of the simulation are exact to 1e-7 px: 1e-10 of a ray, times what four points amplify.
@@ -206,7 +194,7 @@ def test_the_pose_of_exact_points_is_exact(cameras: Literal["both", "left"], cou
 def test_the_end_is_opencv_s_least_squares() -> None:
     camera = RIG.camera
     for seed in range(3):
-        s = p3p_trial(seed, noise_px=0.3)
+        s = global_tracks(seed, 100, 0.3)
         tracks, solver = s.correspondences.tracks, P3pSolver(cameras_used="left", threshold_px=50.0)
         found = solver.estimate(s.correspondences, RIG, GLOBAL)
         left = camera.fx * RIG.baseline / (tracks[:, :1] - tracks[:, 2:3]) * camera.unproject(tracks[:, :2])
@@ -220,24 +208,16 @@ def test_the_end_is_opencv_s_least_squares() -> None:
 
 
 def test_it_throws_outliers_out_by_itself() -> None:
-    entry, s = load_solver_entry("gs-p3p"), p3p_trial(1, 200, 0.3, 0.5)
+    entry, s = load_solver_entry("gs-p3p"), global_tracks(1, 200, 0.3, 0.5)
     assert entry.options.robust == "own"
     c = s.correspondences
-    rng = np.random.default_rng(0)
-    found = estimate_motion(c, RIG, GLOBAL, entry.solver, RobustOptions(), rng, "own")
+    found = robust(c, entry.solver, shutter=GLOBAL, loop="own")
     # Three times the noise-free optimum's scatter at 100 inliers: 0.01 and 0.12 degrees.
-    assert np.degrees(rotation_error(found.estimate.w, s.motion.w)) < 0.04
-    assert np.degrees(translation_error(found.estimate.d, s.motion.d)) < 0.5
+    assert_near(found.estimate, s.motion, 0.04, 0.5)
     right = ~s.outliers["tracks"]
     assert np.mean(found.inliers["tracks"][right]) > 0.9 and not np.any(found.inliers["tracks"][~right])
     wild = replace(c, tracks=np.random.default_rng(0).uniform(0, 899, (30, 8)))
     assert not entry.solver.estimate(replace(c, tracks=wild.tracks[:3]), RIG, GLOBAL).success
-
-
-def triplet_trial(seed: int, count: int = 3, noise_px: float = 0.0, outlier_ratio: float = 0.0) -> Simulation:
-    motion = random_motion(np.random.default_rng(seed), np.radians(2.0), 0.3)
-    options = SimulationOptions(tracks=count, noise_px=noise_px, outlier_ratio=outlier_ratio)
-    return simulate(RIG, GLOBAL, motion, options, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("known", [(0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)])
@@ -246,7 +226,7 @@ def test_every_kind_of_three_triplets_gives_the_exact_motion(known: tuple[int, i
     views: list[View] = [(0 if frame else 1, side) for frame, side in zip(known, sides, strict=True)]
     errors = []
     for seed in range(30):
-        s = triplet_trial(seed)
+        s = global_tracks(seed, 3)
         pose = newton(Triplets.of(s.correspondences.tracks, views, RIG))
         truth = s.motion.body_from_world(1.0)
         errors.append(max(np.abs(pose.R - truth.R).max(), np.abs(pose.t - truth.t).max()))
@@ -259,7 +239,7 @@ def test_points_known_in_frame_0_are_poselib_s_generalised_absolute_pose() -> No
     views: list[View] = [(1, "left"), (1, "right"), (1, "left")]
     apart = []
     for seed in range(10):
-        s = triplet_trial(seed, noise_px=0.5)
+        s = global_tracks(seed, 3, 0.5)
         triplets = Triplets.of(s.correspondences.tracks, views, RIG)
         pose = newton(triplets)
         seen = s.correspondences.tracks[[0, 1, 2], [[4, 6, 4], [5, 7, 5]]].T
@@ -272,19 +252,16 @@ def test_points_known_in_frame_0_are_poselib_s_generalised_absolute_pose() -> No
 
 
 def test_many_tracks_and_outliers() -> None:
-    s = triplet_trial(0, 40)
+    s = global_tracks(0, 40)
     found = TripletSolver().estimate(s.correspondences, RIG, GLOBAL)
     np.testing.assert_allclose(np.concatenate([found.w, found.d]), [*s.motion.w, *s.motion.d], atol=1e-12)
-    s = triplet_trial(3, 150, 0.3, 0.5)
-    rng = np.random.default_rng(0)
-    robust = estimate_motion(s.correspondences, RIG, GLOBAL, TripletSolver(), RobustOptions(), rng).estimate
+    s = global_tracks(3, 150, 0.3, 0.5)
     # Three times the median error of the optimum on 75 tracks, 0.01 and 0.08 degrees.
-    assert np.degrees(rotation_error(robust.w, s.motion.w)) < 0.03
-    assert np.degrees(translation_error(robust.d, s.motion.d)) < 0.4
+    assert_near(robust(s.correspondences, TripletSolver(), shutter=GLOBAL).estimate, s.motion, 0.03, 0.4)
 
 
 def test_samples_without_depth_are_told_and_leave_the_others_alone() -> None:
-    good, solver = triplet_trial(1).correspondences, TripletSolver()
+    good, solver = global_tracks(1, 3).correspondences, TripletSolver()
     far = Correspondences(tracks=good.tracks[:, [2, 3, 0, 1, 6, 7, 4, 5]])
     same = Correspondences(tracks=good.tracks[[0, 0, 0]])
     first, second, third = solver.propose_all([far, good, same], RIG, GLOBAL)
@@ -300,19 +277,14 @@ SOLVER = LineTripletSolver()
 def line_trial(
     seed: int, tracks: int, lines: int, noise_px: float = 0.0, outlier_ratio: float = 0.0, size: float = 1.0
 ) -> Simulation:
-    motion = random_motion(np.random.default_rng(seed), np.radians(2.0 * size), 0.3 * size)
-    options = SimulationOptions(tracks=tracks, lines=lines, noise_px=noise_px, outlier_ratio=outlier_ratio)
-    return simulate(RIG, GLOBAL, motion, options, np.random.default_rng(seed))
+    options = {"tracks": tracks, "lines": lines, "noise_px": noise_px, "outlier_ratio": outlier_ratio}
+    return trial(seed, degrees=2.0 * size, metres=0.3 * size, shutter=GLOBAL, **options)
 
 
 def steep(s: Simulation, count: int) -> Correspondences:
     """With the first lines that have depth."""
     lines = s.correspondences.lines
     return replace(s.correspondences, lines=lines[usable_lines(lines, RIG)][:count])
-
-
-def errors(w: FloatArray, d: FloatArray, s: Simulation) -> tuple[float, float]:
-    return float(np.degrees(rotation_error(w, s.motion.w))), float(np.degrees(translation_error(d, s.motion.d)))
 
 
 @pytest.mark.parametrize(("tracks", "lines"), [(3, 0), (2, 1), (1, 2), (0, 3)])
@@ -380,20 +352,17 @@ def test_errors_of_a_line_are_those_of_the_best_line() -> None:
 
 
 def test_with_points_alone_it_is_the_solver_of_points() -> None:
-    points, rng = load_solver("gs-stereo-triplets"), np.random.default_rng(0)
     for seed in range(6):
-        s = line_trial(seed, 100, 0, 0.3, 0.3)
-        one = estimate_motion(s.correspondences, RIG, GLOBAL, points, RobustOptions(), rng).estimate
+        c = line_trial(seed, 100, 0, 0.3, 0.3).correspondences
+        one = robust(c, "gs-stereo-triplets", shutter=GLOBAL, seed=seed).estimate
         same = LineTripletSolver(threshold_px=RobustOptions().threshold_px)
-        two = estimate_motion(s.correspondences, RIG, GLOBAL, same, RobustOptions(), rng, "own").estimate
+        two = robust(c, same, shutter=GLOBAL, loop="own", seed=seed).estimate
         # A fiftieth of the noise's error: either may keep a match at the threshold.
-        assert rotation_error(one.w, two.w) < np.radians(2e-3) and translation_error(one.d, two.d) < np.radians(
-            0.02
-        )
+        assert_near(one, LinearMotion(two.w, two.d), 2e-3, 0.02)
 
 
 def test_lines_help_points_and_do_alone() -> None:
-    kinds: dict[str, list[tuple[float, float]]] = {"points": [], "lines": [], "both": []}
+    kinds: dict[str, list[FloatArray]] = {"points": [], "lines": [], "both": []}
     for seed in range(12):
         s = line_trial(seed, 30, 30, 0.3, 0.3)
         c = s.correspondences
@@ -403,7 +372,7 @@ def test_lines_help_points_and_do_alone() -> None:
             ("both", c),
         ):
             found = SOLVER.estimate(given, RIG, GLOBAL)
-            kinds[kind].append(errors(found.w, found.d, s))
+            kinds[kind].append(errors_deg(found, s.motion))
     mean = {kind: np.sqrt(np.mean(np.square(each), axis=0)) for kind, each in kinds.items()}
     assert np.all(mean["both"] < mean["points"]) and np.all(mean["both"] < mean["lines"])
     assert np.all(mean["lines"] < [0.1, 1.5])
@@ -416,7 +385,7 @@ def test_noise_of_lines_other_than_that_of_points_is_weighed() -> None:
         s, noisy = line_trial(seed, 60, 60, 0.05), line_trial(seed, 60, 60, 0.5)
         c = replace(s.correspondences, lines=noisy.correspondences.lines)
         both, alone = (SOLVER.estimate(g, RIG, GLOBAL) for g in (c, replace(c, lines=c.lines[:0])))
-        apart.append((errors(both.w, both.d, s)[0], errors(alone.w, alone.d, s)[0]))
+        apart.append((errors_deg(both, s.motion)[0], errors_deg(alone, s.motion)[0]))
     both_error, alone_error = np.sqrt(np.mean(np.square(apart), axis=0))
     assert both_error < 1.1 * alone_error
 
@@ -442,7 +411,7 @@ def test_lines_without_depth_are_left_out_and_too_few_are_a_failure() -> None:
     s = line_trial(1, 60, 20)
     mixed = replace(s.correspondences, lines=np.concatenate([flat, s.correspondences.lines]))
     found = SOLVER.estimate(mixed, RIG, GLOBAL)
-    assert max(errors(found.w, found.d, s)) < 1e-6
+    assert max(errors_deg(found, s.motion)) < 1e-6
 
 
 def test_parallel_lines_leave_the_motion_open() -> None:
@@ -491,7 +460,7 @@ def test_lines_pass_the_lens_the_loop_and_the_runner() -> None:
     with SolverRunner() as runner:
         for given in (seen, Correspondences(lines=seen.lines)):
             found = runner.robust(entry, given, rig, GLOBAL, RobustOptions(), rng).estimate
-            assert found.success and max(errors(found.w, found.d, s)) < 1e-5
+            assert found.success and max(errors_deg(found, s.motion)) < 1e-5
 
 
 @pytest.mark.parametrize("wrong", [{"threshold_px": 0.0}, {"confidence": 1.0}, {"max_iterations": 3}])

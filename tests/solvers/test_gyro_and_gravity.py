@@ -8,35 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, errors_deg, robust, trial, true_d
 
 from rsbench.benchmark.simulated.bound import motion_bound
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.imu import GyroMotion
-from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_error
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.pipeline.problem import EXAMPLE, parse_problem, problem_record, read_problem
 from rsbench.solvers.engine.base import load_solver
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.gyro_and_gravity import GyroSolver, Uprights, UprightSolver
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
 MONO, STEREO = load_solver("rs-gyro-5pt"), load_solver("rs-gyro-stereo")
 
 
-def trial(seed: int, *, stereo: bool, **options: float) -> Simulation:
-    motion = random_motion(np.random.default_rng(seed), np.radians(3.0), 0.3)
+def turning(seed: int, *, stereo: bool, pairs: int = 60, **options: Any) -> Simulation:
     rig = RIG if stereo else RIG.about("left")
-    chosen = SimulationOptions(**{"pairs": 60, "gyro_rate": 20, **options})  # pyrefly: ignore[bad-argument-type]
-    return simulate(rig, SHUTTER, motion, chosen, np.random.default_rng(seed))
+    return trial(seed, degrees=3.0, rig=rig, pairs=pairs, gyro_rate=20, **options)
 
 
 def test_rotations_are_those_of_the_motion_that_was_sampled() -> None:
@@ -60,7 +52,7 @@ def test_rotations_are_those_of_the_motion_that_was_sampled() -> None:
 def test_the_descent_keeps_the_side_of_a_translation_without_a_length() -> None:
     """Its errors are the same for every length: a step may be as long as to the other side of zero."""
     for seed in range(40):
-        s = trial(seed, stereo=False)
+        s = turning(seed, stereo=False)
         found = GyroSolver().estimate(s.correspondences, RIG, SHUTTER)
         assert translation_error(found.d, s.motion.d) < 1e-8, seed
 
@@ -78,11 +70,11 @@ def test_points_give_the_side_of_a_translation_whose_length_is_open() -> None:
 @pytest.mark.parametrize("how", ["none", "sampson"])
 def test_the_translation_of_exact_data_is_exact_and_metric_on_the_rig(how: str) -> None:
     for seed in range(3):
-        s = trial(seed, stereo=False)
+        s = turning(seed, stereo=False)
         found = GyroSolver(refinement=how).estimate(s.correspondences, RIG, SHUTTER)  # pyrefly: ignore[bad-argument-type]
         assert found.success and not found.metric and rotation_error(found.w, s.motion.w) < 1e-12
         assert translation_error(found.d, s.motion.d) < 1e-8
-        s = trial(seed, stereo=True)
+        s = turning(seed, stereo=True)
         found = GyroSolver(cameras_used="both", refinement=how).estimate(  # pyrefly: ignore[bad-argument-type]
             s.correspondences, RIG, SHUTTER
         )
@@ -92,7 +84,7 @@ def test_the_translation_of_exact_data_is_exact_and_metric_on_the_rig(how: str) 
 
 @pytest.mark.parametrize("stereo", [False, True])
 def test_minimal_samples_suffice(stereo: bool) -> None:
-    s, solver = trial(1, stereo=stereo), STEREO if stereo else MONO
+    s, solver = turning(1, stereo=stereo), STEREO if stereo else MONO
     c = replace(s.correspondences, left=s.correspondences.left[:2], right=s.correspondences.right[: int(stereo)])
     (found,) = solver.propose(c, RIG, SHUTTER)
     assert found.success and found.metric == stereo
@@ -102,7 +94,7 @@ def test_minimal_samples_suffice(stereo: bool) -> None:
 def test_it_is_at_the_bound_of_a_known_rotation() -> None:
     distances = []
     for seed in range(25):
-        s, exact = trial(seed, stereo=False, noise_px=0.3), trial(seed, stereo=False)
+        s, exact = turning(seed, stereo=False, noise_px=0.3), turning(seed, stereo=False)
         rig, left = RIG.about("left"), Correspondences(left=exact.correspondences.left)
         F = motion_bound(left, rig, SHUTTER, s.motion, 0.3).information[3:, 3:]
         error = 0.3 * MONO.estimate(s.correspondences, RIG, SHUTTER).d - s.motion.d
@@ -113,46 +105,40 @@ def test_it_is_at_the_bound_of_a_known_rotation() -> None:
 
 def test_errors_grow_with_the_bias_and_the_delay_of_the_gyroscope() -> None:
     """A bias is an error of the rotation as it is; a delay none of a constant rotation."""
-    s = trial(2, stereo=False, gyro_bias_deg=0.1)
+    s = turning(2, stereo=False, gyro_bias_deg=0.1)
     assert np.degrees(rotation_error(MONO.estimate(s.correspondences, RIG, SHUTTER).w, s.motion.w)) == (
         pytest.approx(0.1, rel=0.1)
     )
-    s = trial(2, stereo=False, gyro_delay=0.2)
+    s = turning(2, stereo=False, gyro_delay=0.2)
     assert rotation_error(MONO.estimate(s.correspondences, RIG, SHUTTER).w, s.motion.w) < 1e-12
-    noisy = [trial(2, stereo=False, gyro_noise_deg=noise).correspondences.gyro for noise in (0.0, 1.0)]
+    noisy = [turning(2, stereo=False, gyro_noise_deg=noise).correspondences.gyro for noise in (0.0, 1.0)]
     assert 0.8 < np.std(np.degrees(noisy[1] - noisy[0])[:, 1:]) < 1.2
 
 
 @pytest.mark.parametrize("stereo", [False, True])
 def test_it_stands_outliers_in_the_loop(stereo: bool) -> None:
-    s = trial(3, stereo=stereo, pairs=150, noise_px=0.3, outlier_ratio=0.5)
+    s = turning(3, stereo=stereo, pairs=150, noise_px=0.3, outlier_ratio=0.5)
     solver = STEREO if stereo else MONO
-    found = estimate_motion(s.correspondences, RIG, SHUTTER, solver, RobustOptions(), np.random.default_rng(0))
+    found = robust(s.correspondences, solver)
     assert found.estimate.success and rotation_error(found.estimate.w, s.motion.w) < 1e-12
     assert np.degrees(translation_error(found.estimate.d, s.motion.d)) < 1.0
 
 
 def test_without_a_gyroscope_it_fails_by_value() -> None:
-    c = replace(trial(0, stereo=True).correspondences, gyro=np.zeros((0, 4)))
+    c = replace(turning(0, stereo=True).correspondences, gyro=np.zeros((0, 4)))
     assert "0 samples of a gyroscope, need 2" in MONO.estimate(c, RIG, SHUTTER).reason
     still = replace(c, gyro=np.array([[0.0, 0.1, 0.0, 0.0]] * 3))
     assert "one time" in STEREO.estimate(still, RIG, SHUTTER).reason
 
 
-GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 NAMES = ("gs-upright-3pt", "gs-upright-4pt")
 
 
-def upright_trial(seed: int, degrees: float = 3.0, **options: Any) -> Simulation:
-    motion = random_motion(np.random.default_rng(seed), np.radians(degrees), 0.3)
-    chosen = replace(SimulationOptions(pairs=60, gravity=True), **options)
-    return simulate(RIG, GLOBAL, motion, chosen, np.random.default_rng(seed))
+POINTS = dict(zip(NAMES, ("left", "body"), strict=True))
 
 
-def true_d(name: str, s: Simulation) -> FloatArray:
-    if name == "gs-upright-4pt":
-        return s.motion.d
-    return translation_of_offset(s.motion.w, s.motion.d, RIG.offset("left"))
+def upright_trial(seed: int, degrees: float = 3.0, pairs: int = 60, **options: Any) -> Simulation:
+    return trial(seed, degrees=degrees, shutter=GLOBAL, pairs=pairs, gravity=True, **options)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -161,7 +147,7 @@ def test_the_motion_of_exact_matches_is_exact(name: str) -> None:
         s = upright_trial(seed, 3.0 if seed else 40.0)
         found = load_solver(name).estimate(s.correspondences, RIG, GLOBAL)
         assert found.success and rotation_error(found.w, s.motion.w) < 1e-10
-        assert translation_error(found.d, true_d(name, s)) < 1e-9
+        assert translation_error(found.d, true_d(s.motion, POINTS[name])) < 1e-9
         assert not found.metric or scale_error(found.d, s.motion.d) < 1e-6  # from w x baseline, a hundredth
         assert found.metric == (name == "gs-upright-4pt")
 
@@ -178,11 +164,7 @@ def test_one_of_the_motions_of_a_minimal_sample_is_the_true_one(name: str, sizes
             side: size for side, size in zip(("left", "right"), sizes, strict=True) if size
         }
         found = load_solver(name).propose(sample, RIG, GLOBAL)
-        errors = [
-            max(float(rotation_error(each.w, s.motion.w)), float(translation_error(each.d, true_d(name, s))))
-            for each in found
-        ]
-        nearest.append(min(errors))
+        nearest.append(np.radians(min(max(errors_deg(each, s.motion, POINTS[name])) for each in found)))
     # The roots of PoseLib's polynomial for a rig have 5 to 7 digits on exact matches, those for a camera 12.
     assert np.max(nearest) < (1e-3 if sizes[1] else 1e-8)
 
@@ -207,7 +189,7 @@ def test_it_is_at_the_bound_of_two_known_angles(name: str) -> None:
     for seed in range(16):
         s, exact = upright_trial(seed, noise_px=0.3), upright_trial(seed)
         rig = RIG.about("left") if name == "gs-upright-3pt" else RIG
-        c, d = exact.correspondences, true_d(name, s)
+        c, d = exact.correspondences, true_d(s.motion, POINTS[name])
         sets = {"left": c.left, "right": c.right} if name == "gs-upright-4pt" else {"left": c.left}
         motion = type(s.motion)(s.motion.w, d)
         F = motion_bound(Correspondences(**sets), rig, GLOBAL, motion, 0.3).information
@@ -230,18 +212,15 @@ def test_wrong_gravity_stays_wrong_unless_all_angles_are_free() -> None:
         c = upright_trial(seed, noise_px=0.3, gravity_noise_deg=0.2).correspondences
         theirs = load_solver("gs-poselib-stereo").estimate(c, RIG, GLOBAL)
         ours, wrong = (solver.estimate(c, RIG, GLOBAL) for solver in (free, bound))
-        assert np.degrees(rotation_error(ours.w, theirs.w)) < 1e-5
-        assert np.degrees(translation_error(ours.d, theirs.d)) < 1e-4
+        assert_near(ours, LinearMotion(theirs.w, theirs.d), 1e-5, 1e-4)
         assert np.degrees(rotation_error(wrong.w, theirs.w)) > 0.02
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_known_gravity_stands_outliers_in_the_loop(name: str) -> None:
     s = upright_trial(3, pairs=150, noise_px=0.3, outlier_ratio=0.5)
-    rng = np.random.default_rng(0)
-    found = estimate_motion(s.correspondences, RIG, GLOBAL, load_solver(name), RobustOptions(), rng)
-    assert found.estimate.success and np.degrees(rotation_error(found.estimate.w, s.motion.w)) < 0.05
-    assert np.degrees(translation_error(found.estimate.d, true_d(name, s))) < 1.0
+    found = robust(s.correspondences, name, shutter=GLOBAL)
+    assert_near(found.estimate, s.motion, 0.05, 1.0, POINTS[name])
 
 
 def test_gravity_turns_with_the_camera_and_has_its_noise() -> None:

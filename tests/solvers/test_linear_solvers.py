@@ -9,14 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, errors_deg, matches_of, trial
 
-from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import LinearMotion
-from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.pose_errors import rotation_error, translation_error
+from rsbench.core.rig import Side
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.solvers.engine.base import Solver
@@ -34,9 +32,6 @@ from rsbench.solvers.linear import (
     system_rows,
 )
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 SWAP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -96,8 +91,7 @@ def test_rows_vanish_to_third_order_on_exact_data() -> None:
     sizes = []
     for scale in (1.0, 0.1):
         motion = LinearMotion(scale * np.array([0.02, -0.03, 0.025]), scale * np.array([0.2, 0.1, -0.2]))
-        options = SimulationOptions(pairs=50)
-        c = simulate(RIG, SHUTTER, motion, options, np.random.default_rng(0)).correspondences
+        c = matches_of(motion, pairs=50)
         rows = system_rows(c.left, "left", RIG, SHUTTER)
         sizes.append(np.max(np.abs(rows @ unknowns(motion.w, motion.d))))
     assert sizes[0] / sizes[1] == pytest.approx(1000.0, rel=0.3)
@@ -105,20 +99,13 @@ def test_rows_vanish_to_third_order_on_exact_data() -> None:
 
 def median_errors(solver: Solver, pairs: int, noise_px: float, trials: int = 40) -> tuple[float, float]:
     """Median e_R, e_T in degrees over random motions of 2 degrees and 0.3 m."""
-    errors = []
-    for trial in range(trials):
-        rng = np.random.default_rng(trial)
-        motion = random_motion(rng, np.radians(2.0), 0.3)
-        options = SimulationOptions(pairs=pairs, noise_px=noise_px)
-        estimate = solver.estimate(simulate(RIG, SHUTTER, motion, options, rng).correspondences, RIG, SHUTTER)
-        d = motion.d
-        if solver.spec.reference_point == "left":
-            d = translation_of_offset(motion.w, d, RIG.offset("left"))
-        if estimate.success:
-            errors.append([float(rotation_error(estimate.w, motion.w)), float(translation_error(estimate.d, d))])
-        else:
-            errors.append([np.pi, np.pi])
-    e_R, e_T = np.degrees(np.median(errors, axis=0))
+    errors = list[FloatArray]()
+    for seed in range(trials):
+        s = trial(np.random.default_rng(seed), pairs=pairs, noise_px=noise_px)
+        found = solver.estimate(s.correspondences, RIG, SHUTTER)
+        point = solver.spec.reference_point
+        errors.append(errors_deg(found, s.motion, point) if found.success else np.array([180.0, 180.0]))
+    e_R, e_T = np.median(errors, axis=0)
     return float(e_R), float(e_T)
 
 
@@ -150,11 +137,9 @@ def test_accuracy_is_the_known_one(
 @given(seed=st.integers(0, 10**6), sign=st.sampled_from([-1.0, 1.0]))
 def test_tracks_hold_the_length_of_a_known_direction(seed: int, sign: float) -> None:
     """Exact for exact matches, with the sign, whatever the motion; rounding of the tracks is all that remains."""
-    rng = np.random.default_rng(seed)
-    motion = random_motion(rng, np.radians(2.0), 0.3)
-    tracks = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=12), rng).correspondences.tracks
-    packed = pack(Correspondences(tracks=tracks), RIG, SHUTTER)
-    length = length_from_tracks(packed.tracks, packed, motion.w, sign * motion.d / 0.3)
+    s = trial(np.random.default_rng(seed), tracks=12)
+    packed = pack(Correspondences(tracks=s.correspondences.tracks), RIG, SHUTTER)
+    length = length_from_tracks(packed.tracks, packed, s.motion.w, sign * s.motion.d / 0.3)
     assert length == pytest.approx(0.3 * sign, rel=1e-8)
 
 
@@ -162,10 +147,7 @@ def test_left_right_matches_give_what_the_baseline_columns_cannot() -> None:
     """At 0.3 px and 100 tracks the length is off by 1 % with the disparities, by 4 % without."""
     errors = []
     for seed in range(20):
-        rng = np.random.default_rng([9, seed])
-        motion = random_motion(rng, np.radians(2.0), 0.3)
-        options = SimulationOptions(tracks=100, noise_px=0.3)
-        c = simulate(RIG, SHUTTER, motion, options, rng).correspondences
+        c = trial(np.random.default_rng([9, seed]), tracks=100, noise_px=0.3).correspondences
         for scale in ("pairs", "tracks"):
             estimate = IteratedSolver(scale=scale).estimate(c, RIG, SHUTTER)
             errors.append(abs(float(np.linalg.norm(estimate.d)) / 0.3 - 1.0) if estimate.metric else 1.0)
@@ -182,9 +164,7 @@ def test_the_symmetric_extraction_is_better_with_minimal_samples() -> None:
 
 def test_with_nine_matches_no_scaling_changes_the_solution() -> None:
     """Eighteen equations in 19 unknowns have one solution, whatever is minimised."""
-    rng = np.random.default_rng(4)
-    motion = random_motion(rng, np.radians(2.0), 0.3)
-    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=9, noise_px=0.3), rng).correspondences
+    c = trial(np.random.default_rng(4), pairs=9, noise_px=0.3).correspondences
     literal = LinearSolver().estimate(c, RIG, SHUTTER)
     others = [LinearSolver(scaling="unit-columns"), LinearSolver(baseline_unit="half-baseline")]
     for solver in others:
@@ -196,11 +176,9 @@ def test_with_nine_matches_no_scaling_changes_the_solution() -> None:
 
 def test_all_unknowns_need_more_matches_and_leave_less_error() -> None:
     """Without noise, what remains of the 27 is the small-angle approximation; refused below 13 + 13."""
-    rng = np.random.default_rng(0)
-    motion = random_motion(rng, np.radians(2.0), 0.3)
-    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=100), rng).correspondences
-    found = LinearSolver(terms="third").estimate(c, RIG, SHUTTER)
-    assert found.success and rotation_error(found.w, motion.w) < np.radians(0.2)
+    s = trial(np.random.default_rng(0), pairs=100)
+    c, found = s.correspondences, LinearSolver(terms="third").estimate(s.correspondences, RIG, SHUTTER)
+    assert found.success and rotation_error(found.w, s.motion.w) < np.radians(0.2)
     few = Correspondences(left=c.left[:12], right=c.right[:12])
     assert "need 13" in LinearSolver(terms="third").estimate(few, RIG, SHUTTER).reason
 
@@ -221,20 +199,18 @@ def test_chosen_matches_stand_apart(seed: int, n: int) -> None:
 def test_nine_far_apart_solve_better_than_any_nine() -> None:
     errors = []
     for seed in range(30):
-        rng = np.random.default_rng([7, seed])
-        motion = random_motion(rng, np.radians(2.0), 0.3)
-        c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=100, noise_px=1e-3), rng).correspondences
+        s = trial(np.random.default_rng([7, seed]), pairs=100, noise_px=1e-3)
+        c = s.correspondences
         nine = Correspondences(left=c.left[:9], right=c.right[:9])
         estimates = [LinearSolver(sampling="nine-apart").estimate(c, RIG, SHUTTER)]
         estimates.append(LinearSolver().estimate(nine, RIG, SHUTTER))
-        errors.append([rotation_error(found.w, motion.w) for found in estimates])
+        errors.append([rotation_error(found.w, s.motion.w) for found in estimates])
     apart, any_nine = np.median(errors, axis=0)
     assert apart < any_nine
 
 
 def estimate_linear(w: FloatArray, d: FloatArray, shutter: RollingShutter = SHUTTER, noise_px: float = 0.0) -> str:
-    options = SimulationOptions(pairs=100, noise_px=noise_px)
-    c = simulate(RIG, shutter, LinearMotion(w, d), options, np.random.default_rng(1)).correspondences
+    c = matches_of(LinearMotion(w, d), seed=1, shutter=shutter, pairs=100, noise_px=noise_px)
     return LinearSolver().estimate(c, RIG, shutter).reason
 
 
@@ -292,9 +268,7 @@ def test_scaling_columns_costs_the_rotation_at_a_tenth_of_a_pixel() -> None:
 @given(seed=st.integers(0, 10**6))
 def test_choices_left_open_agree_without_noise(seed: int) -> None:
     """The null space of exact data of the paper's own truncated model has one dimension, however A is scaled."""
-    rng = np.random.default_rng(seed)
-    motion = random_motion(rng, np.radians(0.2), 0.3)
-    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=100), rng).correspondences
+    c = trial(np.random.default_rng(seed), degrees=0.2, pairs=100).correspondences
     literal = LinearSolver(scaling="none").estimate(c, RIG, SHUTTER)
     others = [
         LinearSolver(scaling="unit-columns"),
@@ -321,8 +295,7 @@ def test_reduced_rows_vanish_to_third_order_on_exact_data() -> None:
     for scale in (1.0, 0.1):
         motion = LinearMotion(scale * np.array([0.02, -0.03, 0.025]), scale * np.array([0.2, 0.1, -0.2]))
         w, d = motion.w, motion.d
-        options = SimulationOptions(pairs=50)
-        c = simulate(RIG, SHUTTER, motion, options, np.random.default_rng(0)).correspondences
+        c = matches_of(motion, pairs=50)
         by_d, shifted, rest = reduced_blocks(pack(c, RIG, SHUTTER).pairs)
         E = hat(d) @ hat(w)
         E = 0.5 * (E + E.T)
@@ -333,9 +306,8 @@ def test_reduced_rows_vanish_to_third_order_on_exact_data() -> None:
 
 
 def test_scaled_translation_is_exact_for_the_true_rotation() -> None:
-    rng = np.random.default_rng(5)
     motion = LinearMotion(np.array([0.02, -0.03, 0.025]), np.array([0.2, 0.1, -0.2]))
-    c = simulate(RIG, SHUTTER, motion, SimulationOptions(pairs=20), rng).correspondences
+    c = matches_of(motion, seed=5, pairs=20)
     d = scaled_translation(pack(c, RIG, SHUTTER).pairs, motion.w, limit=50.0)
     assert d is not None
     np.testing.assert_allclose(d, motion.d, atol=1e-9)
@@ -363,19 +335,14 @@ def test_eight_point_on_exact_global_shutter_data(
 
 def test_eight_point_gives_the_left_camera_s_motion() -> None:
     motion = LinearMotion(np.array([0.01, 0.05, -0.02]), np.array([0.2, 0.1, -0.2]))
-    c = simulate(RIG, GLOBAL, motion, SimulationOptions(pairs=30), np.random.default_rng(0)).correspondences
-    estimate = EightPointSolver().estimate(c, RIG, GLOBAL)
-    t = translation_of_offset(motion.w, motion.d, RIG.offset("left"))
-    assert rotation_error(estimate.w, motion.w) < 1e-8
-    assert translation_error(estimate.d, t) < 1e-7
-    assert translation_error(estimate.d, motion.d) > 1e-3
-    assert not estimate.metric
-    np.testing.assert_allclose(so3.exp(estimate.w), so3.exp(motion.w), atol=1e-8)
+    estimate = EightPointSolver().estimate(matches_of(motion, shutter=GLOBAL, pairs=30), RIG, GLOBAL)
+    assert_near(estimate, motion, 5e-7, 5e-6, "left")
+    assert translation_error(estimate.d, motion.d) > 1e-3 and not estimate.metric
 
 
 def test_tracks_count_as_pairs_once() -> None:
     motion = LinearMotion(np.array([0.01, 0.02, -0.02]), np.array([0.2, 0.1, -0.2]))
-    c = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=30), np.random.default_rng(0)).correspondences
+    c = matches_of(motion, tracks=30)
     tracks = c.tracks
     pairs = Correspondences(left=tracks[:, [0, 1, 4, 5]], right=tracks[:, [2, 3, 6, 7]])
     both = Correspondences(left=pairs.left, right=pairs.right, tracks=tracks)

@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
+from solver_trials import CAMERA, GLOBAL, RIG, SHUTTER, D, W, assert_near, errors_deg, matches_of, robust, trial
 
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.pose_errors import rotation_error, translation_error
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.base import load_solver
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.r6p import R6pSolver, Resection, RowPose, errors
 
-CAMERA = PinholeCamera.centred(900, 900, 810.0)
-RIG = StereoRig(camera=CAMERA, baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
 SPIN, SPEED = np.array([-0.03, 0.04, 0.05]), np.array([0.1, 0.3, -0.2])
 """Within the frame, of no kin to the motion between them: the method ties nothing."""
 
@@ -73,17 +63,12 @@ def test_samples_of_a_camera_that_turns_by_thirty_degrees_in_the_frame_are_exact
     assert np.mean(found) > 0.8  # with v alone frozen 0.17 after six steps
 
 
-def trial(seed: int, size: float = 1.0, **options: Any) -> Simulation:
-    chosen = replace(SimulationOptions(tracks=40), **options)
-    return simulate(RIG, SHUTTER, LinearMotion(size * W, size * D), chosen, np.random.default_rng(seed))
-
-
 def medians(solver: R6pSolver, size: float) -> FloatArray:
-    found = []
+    """Of rotation and direction, rad."""
+    motion, found = LinearMotion(size * W, size * D), list[FloatArray]()
     for seed in range(8):
-        s = trial(seed, size)
-        one = solver.estimate(s.correspondences, RIG, SHUTTER)
-        found.append([rotation_error(one.w, s.motion.w), translation_error(one.d, s.motion.d)])
+        one = solver.estimate(matches_of(motion, seed=seed, tracks=40), RIG, SHUTTER)
+        found.append(np.radians(errors_deg(one, motion)))
     return np.median(found, axis=0)
 
 
@@ -118,22 +103,22 @@ def test_derivatives_are_those_of_finite_differences() -> None:
 
 @pytest.mark.parametrize("name", ["rs-r6p", "rs-r6p-single"])
 def test_it_stands_outliers_in_the_loop(name: str) -> None:
-    s = trial(3, tracks=150, noise_px=0.3, outlier_ratio=0.3)
-    solver, rng = load_solver(name), np.random.default_rng(0)
-    found = estimate_motion(s.correspondences, RIG, SHUTTER, solver, RobustOptions(), rng, "own")
+    options = SimulationOptions(tracks=150, noise_px=0.3, outlier_ratio=0.3)
+    s = simulate(RIG, SHUTTER, LinearMotion(W, D), options, np.random.default_rng(3))
+    found = robust(s.correspondences, name, loop="own")
     # Its free velocities cost two to three times the bound's 0.008 and 0.08 degrees.
-    assert np.degrees(rotation_error(found.estimate.w, s.motion.w)) < 0.06
-    assert np.degrees(translation_error(found.estimate.d, s.motion.d)) < 0.6
+    assert_near(found.estimate, s.motion, 0.06, 0.6)
     assert np.mean(found.inliers["tracks"] == ~s.outliers["tracks"]) > 0.95
 
 
 def of_six(solver: R6pSolver) -> float:
     """Median error of the direction, degrees, of six exact points each, where the body turns by 8 degrees."""
-    found = []
+    size, found = np.radians(8.0) / float(np.linalg.norm(W)), list[float]()
+    motion = LinearMotion(size * W, size * D)
     for seed in range(30):
-        s = trial(seed, np.radians(8.0) / float(np.linalg.norm(W)), tracks=6, depth=(4.0, 10.0))
-        found.append(translation_error(solver.estimate(s.correspondences, RIG, SHUTTER).d, s.motion.d))
-    return float(np.degrees(np.median(found)))
+        c = matches_of(motion, seed=seed, tracks=6, depth=(4.0, 10.0))
+        found.append(errors_deg(solver.estimate(c, RIG, SHUTTER), motion)[1])
+    return float(np.median(found))
 
 
 def test_p3p_takes_the_double_linearisation_where_the_single_one_is() -> None:
@@ -173,12 +158,10 @@ def test_the_search_is_by_its_own_velocities() -> None:
 
 
 def test_without_readout_it_is_absolute_pose_and_little_is_told_by_value() -> None:
-    still = RollingShutter(height=900, readout_ratio=0.0)
-    motion = random_motion(np.random.default_rng(1), 0.03, 0.3)
-    c = simulate(RIG, still, motion, SimulationOptions(tracks=20), np.random.default_rng(1)).correspondences
-    found = R6pSolver().estimate(c, RIG, still)
-    np.testing.assert_allclose(np.concatenate([found.w, found.d]), [*motion.w, *motion.d], atol=1e-9)
+    s = trial(1, degrees=np.degrees(0.03), shutter=GLOBAL, tracks=20)
+    c, found = s.correspondences, R6pSolver().estimate(s.correspondences, RIG, GLOBAL)
+    np.testing.assert_allclose(np.concatenate([found.w, found.d]), [*s.motion.w, *s.motion.d], atol=1e-9)
     far = Correspondences(tracks=c.tracks[:, [2, 3, 0, 1, 6, 7, 4, 5]])
-    assert "positive disparity" in R6pSolver().estimate(far, RIG, still).reason
+    assert "positive disparity" in R6pSolver().estimate(far, RIG, GLOBAL).reason
     same = Correspondences(tracks=c.tracks[[0] * 6])
-    assert "open" in R6pSolver().estimate(same, RIG, still).reason
+    assert "open" in R6pSolver().estimate(same, RIG, GLOBAL).reason

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
+from solver_trials import GLOBAL, RIG, SHUTTER, D, W, assert_near, errors_deg, matches_of, robust, trial
 
 from rsbench.benchmark.simulated.bound import motion_bound
-from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.benchmark.simulated.simulation import Simulation, random_motion
 from rsbench.components.cards import list_cards
 from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core import so3
@@ -24,30 +25,11 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MotionEstimate, SolverSpec, load_solver, load_solver_entry
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
-
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
-W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
 
 
 def solver_of(model: str, use_tracks: bool = True) -> RefinedSolver:
     return RefinedSolver(motion_model=model, use_tracks=use_tracks)
-
-
-def data(
-    motion: Motion,
-    pairs: int = 0,
-    tracks: int = 0,
-    noise_px: float = 0.0,
-    shutter: RollingShutter = SHUTTER,
-    seed: int = 0,
-    plane: bool = False,
-) -> Correspondences:
-    options = SimulationOptions(pairs=pairs, tracks=tracks, noise_px=noise_px, shape="plane" if plane else "box")
-    return simulate(RIG, shutter, motion, options, np.random.default_rng(seed)).correspondences
 
 
 def assert_motion(estimate: MotionEstimate, motion: Motion, tolerance: float) -> None:
@@ -67,7 +49,7 @@ def test_exact_on_exact_data(model: str, sets: str, seed: int, angle: float, dis
     # Pairs hold the length of d through w x baseline alone.
     assume(sets != "pairs" or np.linalg.norm(motion.w[1:]) > 0.3 * np.linalg.norm(motion.w))
     try:
-        c = data(motion, pairs=0 if sets == "tracks" else 40, tracks=0 if sets == "pairs" else 15, seed=seed)
+        c = matches_of(motion, pairs=0 if sets == "tracks" else 40, tracks=0 if sets == "pairs" else 15, seed=seed)
     except ValueError:
         assume(False)
     estimate = solver_of(model).estimate(c, RIG, SHUTTER)
@@ -79,7 +61,7 @@ def test_exact_on_exact_data(model: str, sets: str, seed: int, angle: float, dis
 def test_three_tracks_suffice(model: str) -> None:
     motion = make_motion(model, W, D)
     for seed in range(10):
-        c = data(motion, tracks=3, seed=seed)
+        c = matches_of(motion, tracks=3, seed=seed)
         assert_motion(solver_of(model).estimate(c, RIG, SHUTTER), motion, 1e-7)
         (proposal,) = solver_of(model).propose(c, RIG, SHUTTER)
         assert_motion(proposal, motion, 1e-5)
@@ -98,7 +80,9 @@ def test_three_tracks_suffice(model: str) -> None:
 )
 def test_tracks_solve_what_pairs_cannot(w: list[float], d: list[float], plane: bool) -> None:
     motion = LinearMotion(np.array(w), np.array(d))
-    estimate = RefinedSolver().estimate(data(motion, tracks=40, plane=plane), RIG, SHUTTER)
+    estimate = RefinedSolver().estimate(
+        matches_of(motion, tracks=40, shape="plane" if plane else "box"), RIG, SHUTTER
+    )
     assert_motion(estimate, motion, 1e-7)
     assert estimate.metric
 
@@ -106,17 +90,15 @@ def test_tracks_solve_what_pairs_cannot(w: list[float], d: list[float], plane: b
 @pytest.mark.parametrize("d", [[0.2, 0.1, 0.3], [0.0, 0.0, 0.3], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0]])
 def test_pure_translation_of_pairs_gives_the_direction_without_length(d: list[float]) -> None:
     motion = LinearMotion(np.zeros(3), np.array(d))
-    estimate = RefinedSolver().estimate(data(motion, pairs=100, noise_px=0.1), RIG, SHUTTER)
+    estimate = RefinedSolver().estimate(matches_of(motion, pairs=100, noise_px=0.1), RIG, SHUTTER)
     assert estimate.success and not estimate.metric and "length" in estimate.reason
-    # The bound is 0.05 degrees here.
-    assert np.degrees(translation_error(estimate.d, motion.d)) < 0.5
-    assert np.degrees(rotation_error(estimate.w, motion.w)) < 0.05
+    assert_near(estimate, motion, 0.05, 0.5)  # the bound is 0.05 degrees here
 
 
 def test_yaw_and_forward_of_pairs_has_no_length() -> None:
     """w x baseline is parallel to d: a car in a curve."""
     motion = LinearMotion(np.array([0.0, 0.03, 0.0]), np.array([0.0, 0.0, 0.3]))
-    estimate = RefinedSolver().estimate(data(motion, pairs=100, noise_px=0.5), RIG, SHUTTER)
+    estimate = RefinedSolver().estimate(matches_of(motion, pairs=100, noise_px=0.5), RIG, SHUTTER)
     assert estimate.success and not estimate.metric
     assert np.linalg.norm(estimate.d) <= RefinedSolver().max_translation_m * 1.001
 
@@ -127,9 +109,9 @@ def test_pairs_on_a_plane_are_solved_from_the_motions_of_their_homography() -> N
     lost = 0
     for seed in range(30):
         motion = random_motion(np.random.default_rng([5, seed]), np.radians(2.0), 0.3)
-        exact = RefinedSolver().estimate(data(motion, pairs=100, plane=True, seed=seed), RIG, SHUTTER)
+        exact = RefinedSolver().estimate(matches_of(motion, pairs=100, shape="plane", seed=seed), RIG, SHUTTER)
         assert_motion(exact, motion, 1e-6)
-        c = data(motion, pairs=100, plane=True, seed=seed, noise_px=0.3)
+        c = matches_of(motion, pairs=100, shape="plane", seed=seed, noise_px=0.3)
         estimate = RefinedSolver().estimate(c, RIG, SHUTTER)
         lost += int(np.degrees(rotation_error(estimate.w, motion.w)) > 0.3)
     assert lost <= 3
@@ -141,12 +123,12 @@ def test_a_second_motion_that_a_plane_allows_is_told() -> None:
     wrong = 0
     for seed in range(20):
         motion = random_motion(np.random.default_rng([5, seed]), 0.0, 0.3)
-        c = data(motion, pairs=100, plane=True, seed=seed, noise_px=0.3)
+        c = matches_of(motion, pairs=100, shape="plane", seed=seed, noise_px=0.3)
         estimate = RefinedSolver().estimate(c, RIG, SHUTTER)
         if np.degrees(rotation_error(estimate.w, motion.w)) > 0.5:
             wrong += 1
             assert not estimate.direction_known and "another motion" in estimate.reason
-        scattered = RefinedSolver().estimate(data(motion, pairs=100, seed=seed, noise_px=0.3), RIG, SHUTTER)
+        scattered = RefinedSolver().estimate(matches_of(motion, pairs=100, seed=seed, noise_px=0.3), RIG, SHUTTER)
         assert scattered.direction_known and "another motion" not in scattered.reason
     assert wrong > 0
 
@@ -154,7 +136,7 @@ def test_a_second_motion_that_a_plane_allows_is_told() -> None:
 def test_pure_rotation_has_no_direction() -> None:
     motion = LinearMotion(np.array([0.01, -0.03, 0.02]), np.zeros(3))
     for use_tracks in (True, False):
-        c = data(motion, tracks=60, noise_px=0.5)
+        c = matches_of(motion, tracks=60, noise_px=0.5)
         estimate = RefinedSolver(use_tracks=use_tracks).estimate(c, RIG, SHUTTER)
         assert estimate.success and not estimate.direction_known and "direction" in estimate.reason
         assert np.degrees(rotation_error(estimate.w, motion.w)) < 0.2
@@ -188,11 +170,10 @@ def test_without_readout_it_is_the_global_shutter_optimum_of_poselib() -> None:
     """To 1e-6 degrees; at 0.5 px PoseLib stops where rounding hides the fall of its cost, up to 1.4e-6 away."""
     motion = LinearMotion(W, D)
     for seed in range(20):
-        c = data(motion, pairs=60, noise_px=0.3, shutter=GLOBAL, seed=seed)
+        c = matches_of(motion, pairs=60, noise_px=0.3, shutter=GLOBAL, seed=seed)
         estimate = RefinedSolver().estimate(c, RIG, GLOBAL)
         R, t = poselib_generalised(c)
-        assert np.degrees(rotation_error(estimate.w, so3.log(R))) < 1e-6
-        assert np.degrees(translation_error(estimate.d, t)) < 1e-6
+        assert_near(estimate, LinearMotion(so3.log(R), t), 1e-6, 1e-6)
         assert scale_error(estimate.d, t) < 1e-6
 
 
@@ -201,7 +182,7 @@ def test_sign_is_that_of_points_in_front() -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         motion = random_motion(rng, np.radians(2.0), 0.3)
-        estimate = RefinedSolver().estimate(data(motion, pairs=20, noise_px=0.5, seed=seed), RIG, SHUTTER)
+        estimate = RefinedSolver().estimate(matches_of(motion, pairs=20, noise_px=0.5, seed=seed), RIG, SHUTTER)
         assert translation_error(estimate.d, motion.d) < np.pi / 2
 
 
@@ -237,7 +218,7 @@ def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:
         # Rotation about the vertical and the optical axis keeps the length of d observable from pairs.
         motion = LinearMotion(W + 0.004 * rng.standard_normal(3), D + 0.02 * rng.standard_normal(3))
         pairs, tracks = (80, 0) if sets == "pairs" else (0, 80)
-        c = data(motion, pairs=pairs, tracks=tracks, noise_px=noise_px, seed=seed)
+        c = matches_of(motion, pairs=pairs, tracks=tracks, noise_px=noise_px, seed=seed)
         estimate = RefinedSolver().estimate(c, RIG, SHUTTER)
         if not estimate.metric:
             continue
@@ -251,7 +232,7 @@ def test_covariance_predicts_the_errors(sets: str, noise_px: float) -> None:
 
 def test_repeated_matches_do_not_determine_a_rotation() -> None:
     motion = LinearMotion(W, D)
-    c = data(motion, pairs=20, tracks=20)
+    c = matches_of(motion, pairs=20, tracks=20)
     for repeated in (
         Correspondences(tracks=c.tracks[[0] * 20]),
         Correspondences(left=c.left[[0] * 20], right=c.right[[0] * 20]),
@@ -264,15 +245,15 @@ def test_the_wrong_motion_model_costs_what_is_known() -> None:
     errors = []
     for seed in range(20):
         motion = random_motion(np.random.default_rng(seed), np.radians(2.0), 0.3, "twist")
-        estimate = RefinedSolver().estimate(data(motion, pairs=100, seed=seed), RIG, SHUTTER)
-        errors.append([rotation_error(estimate.w, motion.w), translation_error(estimate.d, motion.d)])
-    e_R, e_T = np.degrees(np.median(errors, axis=0))
+        estimate = RefinedSolver().estimate(matches_of(motion, pairs=100, seed=seed), RIG, SHUTTER)
+        errors.append(errors_deg(estimate, motion))
+    e_R, e_T = np.median(errors, axis=0)
     assert 0.015 < e_R < 0.08 and 0.35 < e_T < 1.5
 
 
 def test_tracks_that_the_pairs_repeat_count_once() -> None:
     motion = LinearMotion(W, D)
-    c = data(motion, tracks=30, noise_px=0.3)
+    c = matches_of(motion, tracks=30, noise_px=0.3)
     both = Correspondences(left=c.tracks[:, [0, 1, 4, 5]], right=c.tracks[:, [2, 3, 6, 7]], tracks=c.tracks)
     alone, repeated = (RefinedSolver().estimate(each, RIG, SHUTTER) for each in (c, both))
     np.testing.assert_allclose(alone.w, repeated.w, atol=1e-10)
@@ -284,16 +265,14 @@ LEFT = RIG.about("left")
 SOLVER = load_solver("rs-mono-refined")
 
 
-def trial(seed: int, noise_px: float, pairs: int = 100, outliers: float = 0.0) -> Simulation:
+def alone(seed: int, noise_px: float, pairs: int = 100, outliers: float = 0.0) -> Simulation:
     """The left camera itself moves as the paper's body does: what a single camera's solver assumes."""
-    motion = random_motion(np.random.default_rng(seed), np.radians(2.0), 0.3)
-    options = SimulationOptions(pairs=pairs, noise_px=noise_px, outlier_ratio=outliers)
-    return simulate(LEFT, SHUTTER, motion, options, np.random.default_rng(seed))
+    return trial(seed, rig=LEFT, pairs=pairs, noise_px=noise_px, outlier_ratio=outliers)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_exact_matches_give_the_exact_motion_with_a_unit_translation(seed: int) -> None:
-    s = trial(seed, 0.0, pairs=20)
+    s = alone(seed, 0.0, pairs=20)
     estimate = SOLVER.estimate(s.correspondences, RIG, SHUTTER)
     assert estimate.success and not estimate.metric
     assert np.linalg.norm(estimate.d) == pytest.approx(1.0, abs=1e-12)
@@ -305,7 +284,7 @@ def test_it_is_at_the_bound_of_one_camera() -> None:
     """The error, by the information of the same matches, is chi-squared with five degrees of freedom."""
     noise, distances, stated = 0.3, list[float](), list[float]()
     for seed in range(40):
-        s, exact = trial(seed, noise), trial(seed, 0.0)
+        s, exact = alone(seed, noise), alone(seed, 0.0)
         left = Correspondences(left=exact.correspondences.left)
         F = motion_bound(left, LEFT, SHUTTER, s.motion, noise).information
         estimate = SOLVER.estimate(s.correspondences, RIG, SHUTTER)
@@ -322,10 +301,10 @@ def test_it_is_at_the_bound_of_one_camera() -> None:
 
 
 def test_the_baseline_and_the_right_camera_say_nothing() -> None:
-    s = trial(0, 0.3)
+    s = alone(0, 0.3)
     first = SOLVER.estimate(s.correspondences, RIG, SHUTTER)
-    alone = Correspondences(left=s.correspondences.left)
-    second = SOLVER.estimate(alone, replace(RIG, baseline=0.1), SHUTTER)
+    left = Correspondences(left=s.correspondences.left)
+    second = SOLVER.estimate(left, replace(RIG, baseline=0.1), SHUTTER)
     # The length that a descent starts with is another: equal up to where it stops.
     np.testing.assert_allclose(second.w, first.w, atol=1e-9)
     np.testing.assert_allclose(second.d, first.d, atol=1e-8)
@@ -333,12 +312,11 @@ def test_the_baseline_and_the_right_camera_say_nothing() -> None:
 
 @pytest.mark.parametrize("outliers", [0.3, 0.5])
 def test_it_stands_outliers(outliers: float) -> None:
-    s = trial(1, 0.3, pairs=200, outliers=outliers)
+    s = alone(1, 0.3, pairs=200, outliers=outliers)
     left = Correspondences(left=s.correspondences.left)
-    found = estimate_motion(left, RIG, SHUTTER, SOLVER, RobustOptions(), np.random.default_rng(0)).estimate
+    found = robust(left, SOLVER).estimate
     # Six times the bound of 100 matches (0.024 and 0.2 degrees at 0.3 px).
-    assert found.success and np.degrees(rotation_error(found.w, s.motion.w)) < 0.15
-    assert np.degrees(translation_error(found.d, s.motion.d)) < 1.2
+    assert_near(found, s.motion, 0.15, 1.2)
     assert found.covariance is not None and np.degrees(np.sqrt(np.trace(found.covariance[:3, :3]))) < 0.1
 
 
@@ -352,20 +330,11 @@ ANGLE = 0.04
 
 @pytest.mark.parametrize("name", sorted(list_cards("solvers")))
 def test_every_shipped_solver_takes_a_lens_or_says_why_not(name: str) -> None:
-    rng = np.random.default_rng(3)
-    motion = random_motion(rng, ANGLE, 0.2, "linear")
-    s = simulate(
-        REAL_RIG,
-        REAL_SHUTTER,
-        motion,
-        SimulationOptions(tracks=40, pairs=40, noise_px=0.1, gyro_rate=20, gravity=True),
-        rng,
-    )
+    options = {"tracks": 40, "pairs": 40, "noise_px": 0.1, "gyro_rate": 20, "gravity": True}
+    size = {"degrees": float(np.degrees(ANGLE)), "metres": 0.2}
+    s = trial(np.random.default_rng(3), rig=REAL_RIG, shutter=REAL_SHUTTER, **size, **options)
     solver = load_solver_entry(name).solver
-    options = RobustOptions(max_iterations=20)
-    found = estimate_motion(
-        s.correspondences, REAL_RIG, REAL_SHUTTER, solver, options, np.random.default_rng(0)
-    ).estimate
+    found = robust(s.correspondences, solver, rig=REAL_RIG, shutter=REAL_SHUTTER, max_iterations=20).estimate
     if solver.spec.refusal(REAL_RIG, REAL_SHUTTER):
         assert not found.success
         assert found.reason == "it does not take a lens, and the cameras have one (brown-conrady)"
@@ -373,7 +342,7 @@ def test_every_shipped_solver_takes_a_lens_or_says_why_not(name: str) -> None:
     assert found.success, found.reason
     # Without the lens, whose ends of matches are off by up to 60 px, none comes near.
     exact = isinstance(solver, RefinedSolver) and solver.spec.shutter == "rolling" and "twist" not in name
-    assert so3.angle(so3.exp(found.w) @ so3.exp(-motion.w)) < (5e-4 if exact else ANGLE)
+    assert so3.angle(so3.exp(found.w) @ so3.exp(-s.motion.w)) < (5e-4 if exact else ANGLE)
 
 
 def test_those_that_take_no_lens_are_few() -> None:
@@ -417,14 +386,7 @@ def test_matches_where_a_lens_shows_nothing_are_named() -> None:
     matches = Correspondences(left=np.repeat(left, 5, axis=0))
     with pytest.raises(ValueError, match=r"left\[5\] = \[10.0, 20.0, 3000.0, 40.0\]: the lens shows no ray"):
         without_lens(matches, rig)
-    found = estimate_motion(
-        matches,
-        rig,
-        REAL_SHUTTER,
-        load_solver("rs-stereo-refined"),
-        RobustOptions(),
-        np.random.default_rng(0),
-    )
+    found = robust(matches, "rs-stereo-refined", rig=rig, shutter=REAL_SHUTTER)
     assert "left[5]" in found.estimate.reason and not found.estimate.success
 
 
@@ -434,8 +396,7 @@ def test_disparities_below_their_noise_state_no_deviation() -> None:
     shutter = RollingShutter(height=480, readout_ratio=0.8)
     motion = make_motion("linear", [0.0, 0.03, 0.0], [0.1, 0.0, 0.2])
     for noise, refused in ((1.5, True), (0.1, False)):
-        options = SimulationOptions(tracks=40, noise_px=noise)
-        data = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
-        found = RefinedSolver().estimate(data, rig, shutter)
+        c = matches_of(motion, rig=rig, shutter=shutter, tracks=40, noise_px=noise)
+        found = RefinedSolver().estimate(c, rig, shutter)
         assert found.success and (found.covariance is None) == refused
         assert ("smaller than their noise" in found.reason) == refused

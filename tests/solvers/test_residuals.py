@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+import solver_trials
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -179,16 +180,6 @@ def test_no_motion_explains_only_matches_that_stay(model: str) -> None:
     assert np.max(pack(Correspondences(left=still), RIG, SHUTTER, model).pair_residuals(np.zeros(6))) < 1e-9
 
 
-WIDE_RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-WIDE_SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-
-
-def trial(model: str, noise_px: float) -> Simulation:
-    rng = np.random.default_rng(3)
-    motion = random_motion(rng, np.radians(2.0), 0.3, model)
-    return simulate(WIDE_RIG, WIDE_SHUTTER, motion, SimulationOptions(tracks=60, noise_px=noise_px), rng)
-
-
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10**6), damping=st.sampled_from([0.0, 1e-4, 1.0]))
 def test_step_solves_the_damped_normal_equations(seed: int, damping: float) -> None:
@@ -209,8 +200,8 @@ def test_no_step_from_a_singular_matrix() -> None:
 
 @pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
 def test_exact_samples_give_the_motion(model: str) -> None:
-    s = trial(model, 0.0)
-    packed = pack(s.correspondences, WIDE_RIG, WIDE_SHUTTER, model)
+    s = solver_trials.trial(np.random.default_rng(3), model=model, tracks=60)
+    packed = pack(s.correspondences, solver_trials.RIG, solver_trials.SHUTTER, model)
     samples = np.arange(60).reshape(20, 3)
     thetas = solve_triples(packed, samples, iterations=20)
     truth = packed.theta(s.motion.w, s.motion.d)
@@ -220,12 +211,14 @@ def test_exact_samples_give_the_motion(model: str) -> None:
 
 
 def test_a_sample_ends_where_the_general_descent_does() -> None:
-    s = trial("linear", 0.3)
-    packed = pack(s.correspondences, WIDE_RIG, WIDE_SHUTTER)
+    s = solver_trials.trial(np.random.default_rng(3), tracks=60, noise_px=0.3)
+    packed = pack(s.correspondences, solver_trials.RIG, solver_trials.SHUTTER)
     samples = np.arange(60).reshape(20, 3)
     thetas = solve_triples(packed, samples, iterations=60)
     for theta, sample in zip(thetas, samples, strict=True):
-        alone = pack(Correspondences(tracks=s.correspondences.tracks[sample]), WIDE_RIG, WIDE_SHUTTER)
+        alone = pack(
+            Correspondences(tracks=s.correspondences.tracks[sample]), solver_trials.RIG, solver_trials.SHUTTER
+        )
         minimum = levenberg_marquardt(alone.normal_equations, np.zeros(6), 60, 50.0)
         cost, _, _ = alone.normal_equations(theta)
         assert cost == pytest.approx(minimum.cost, rel=1e-6, abs=1e-9)
@@ -341,15 +334,13 @@ def test_stated_deviations_hold(case: str) -> None:
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
 
 
-TAILS_RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-TAILS_SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-MOTION = LinearMotion(np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18]))
+MOTION = LinearMotion(solver_trials.W, solver_trials.D)
 TRUTH = MotionEstimate(w=MOTION.w, d=MOTION.d, success=True)
 
 
 def exact(pairs: int, tracks: int, seed: int = 0, depth: tuple[float, float] = (2.0, 10.0)) -> Simulation:
     options = SimulationOptions(pairs=pairs, tracks=tracks, depth=depth)
-    return simulate(TAILS_RIG, TAILS_SHUTTER, MOTION, options, np.random.default_rng(seed))
+    return simulate(solver_trials.RIG, solver_trials.SHUTTER, MOTION, options, np.random.default_rng(seed))
 
 
 def heavy(points: FloatArray, scale: float, nu: float, rng: np.random.Generator) -> FloatArray:
@@ -361,7 +352,7 @@ def heavy(points: FloatArray, scale: float, nu: float, rng: np.random.Generator)
 def tailed_problem(noise: float = 0.3, pairs: int = 30, tracks: int = 40) -> tuple[Packed, FloatArray]:
     rng, c = np.random.default_rng(1), exact(pairs, tracks).correspondences
     sets = {name: heavy(getattr(c, name), noise, 3.0, rng) for name in ("left", "right", "tracks")}
-    packed = pack(Correspondences(**sets), TAILS_RIG, TAILS_SHUTTER)
+    packed = pack(Correspondences(**sets), solver_trials.RIG, solver_trials.SHUTTER)
     return packed, packed.theta(MOTION.w, MOTION.d)
 
 
@@ -432,11 +423,11 @@ def test_covariance_holds_whatever_the_errors(kind: str) -> None:
     squares, plain = list[float](), list[float]()
     for seed in range(40):
         c = with_errors(kind, seed)
-        found = RefinedSolver().weigh(TRUTH, c, TAILS_RIG, TAILS_SHUTTER, 0.3)
+        found = RefinedSolver().weigh(TRUTH, c, solver_trials.RIG, solver_trials.SHUTTER, 0.3)
         assert found is not None and found.success
         squares.append(normalised(found))
         if kind == "shared":
-            plain.append(normalised(RefinedSolver().improve(TRUTH, c, TAILS_RIG, TAILS_SHUTTER)))
+            plain.append(normalised(RefinedSolver().improve(TRUTH, c, solver_trials.RIG, solver_trials.SHUTTER)))
     low, high = np.asarray(chi2.ppf([0.0005, 0.9995], 6 * len(squares))) / len(squares)
     assert low / 2.0 < np.mean(squares) < 1.1 * high
     assert kind == "heavy" or low / 2.0 < np.mean(plain) < 1.1 * high
@@ -450,7 +441,7 @@ def test_wrong_matches_nearby_are_no_tails() -> None:
     rng, c = np.random.default_rng(1), exact(0, 300).correspondences
     tracks = c.tracks + 0.3 * rng.standard_normal(c.tracks.shape)
     tracks[:60, 4:] += rng.uniform(-4.0, 4.0, (60, 4))
-    packed = pack(Correspondences(tracks=tracks), TAILS_RIG, TAILS_SHUTTER)
+    packed = pack(Correspondences(tracks=tracks), solver_trials.RIG, solver_trials.SHUTTER)
     tailed = heavy_tailed(packed, packed.theta(MOTION.w, MOTION.d), 0.5)
     assert tailed is not None and tailed.doubt is not None
     assert tailed.scale == pytest.approx(0.3, rel=0.08)
@@ -468,7 +459,7 @@ def bent() -> tuple[Correspondences, Packed, FloatArray]:
     near = exact(1, 0, seed=3, depth=(3.0, 3.0)).correspondences.left + np.array([0.0, 0.0, 0.0, 8.0])
     tracks = c.tracks + 0.2 * rng.standard_normal(c.tracks.shape)
     matches = Correspondences(tracks=tracks, left=near)
-    packed = pack(matches, TAILS_RIG, TAILS_SHUTTER)
+    packed = pack(matches, solver_trials.RIG, solver_trials.SHUTTER)
     start = packed.theta(MOTION.w, MOTION.d)
     return matches, packed, levenberg_marquardt(packed.normal_equations, start, 60, 50.0).theta
 
@@ -480,8 +471,8 @@ def test_a_wrong_pair_of_great_leverage_does_not_bend_the_motion(
     assert np.abs(packed.pair_residuals(theta)[0]) < 0.5  # an inlier, among 300
     w, d = packed.motion(theta)
     start = MotionEstimate(w=w, d=d, success=True)
-    assert normalised(RefinedSolver().improve(start, matches, TAILS_RIG, TAILS_SHUTTER)) > 100.0
-    found = RefinedSolver().weigh(start, matches, TAILS_RIG, TAILS_SHUTTER, 0.2)
+    assert normalised(RefinedSolver().improve(start, matches, solver_trials.RIG, solver_trials.SHUTTER)) > 100.0
+    found = RefinedSolver().weigh(start, matches, solver_trials.RIG, solver_trials.SHUTTER, 0.2)
     assert found is not None and found.covariance is not None
     error = np.concatenate([found.w - MOTION.w, found.d - MOTION.d])
     assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)))
@@ -504,7 +495,7 @@ def test_leverages_are_bounded(bent: tuple[Correspondences, Packed, FloatArray])
 
 def test_few_measurements_are_left_to_least_squares() -> None:
     c = exact(0, 29).correspondences
-    assert RefinedSolver().weigh(TRUTH, c, TAILS_RIG, TAILS_SHUTTER, 0.3) is None
+    assert RefinedSolver().weigh(TRUTH, c, solver_trials.RIG, solver_trials.SHUTTER, 0.3) is None
 
 
 @pytest.mark.parametrize("shutter", [SHUTTER, replace(SHUTTER, right_delay=0.05)])

@@ -6,26 +6,26 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import final
+from typing import Any, Literal, final
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
+from solver_trials import RIG, SHUTTER, assert_near, robust, trial
 
 from rsbench.benchmark.simulated.simulation import (
     GYRO_RATE,
     Simulation,
     SimulationOptions,
-    random_motion,
     simulate,
 )
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.epipolar import rs_sampson_error
-from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
+from rsbench.core.pose_errors import rotation_error, scale_error, translation_of_offset
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -48,35 +48,19 @@ from rsbench.solvers.engine.ransac import (
     ransac,
     required_iterations,
 )
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, _moment, _quantile, estimate_motion
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, _moment, _quantile
 from rsbench.solvers.refined import RefinedSolver
-
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
 
 
 def simulation(
     pairs: int = 0, tracks: int = 0, outliers: float = 0.3, noise: float = 0.5, seed: int = 1
 ) -> Simulation:
-    rng = np.random.default_rng(seed)
-    motion = random_motion(rng, np.radians(2.0), 0.3)
-    options = SimulationOptions(
-        pairs=pairs,
-        tracks=tracks,
-        noise_px=noise,
-        outlier_ratio=outliers,
-        gyro_rate=GYRO_RATE,
-        gravity=True,
-        affine=True,
-    )
-    return simulate(RIG, SHUTTER, motion, options, rng)
+    sets = {"pairs": pairs, "tracks": tracks, "gyro_rate": GYRO_RATE, "gravity": True, "affine": True}
+    return trial(np.random.default_rng(seed), noise_px=noise, outlier_ratio=outliers, **sets)
 
 
-def run(s: Simulation, name: str = "rs-stereo-refined", seed: int = 0, **options: float) -> RobustEstimate:
-    robust = RobustOptions(**options)  # pyrefly: ignore[bad-argument-type]
-    return estimate_motion(
-        s.correspondences, s.rig, s.shutter, load_solver(name), robust, np.random.default_rng(seed)
-    )
+def run(s: Simulation, name: str = "rs-stereo-refined", seed: int = 0, **options: Any) -> RobustEstimate:
+    return robust(s.correspondences, name, seed=seed, **options)
 
 
 # Degrees; a few times the error of the same solver on the inliers alone.
@@ -89,10 +73,7 @@ def test_refined_withstands_outliers(sets: str, outliers: float, e_R: float, e_T
         pairs, tracks = (0 if sets == "tracks" else 300), (0 if sets == "pairs" else 200)
         s = simulation(pairs, tracks, outliers, seed=seed)
         result = run(s)
-        estimate = result.estimate
-        assert estimate.success, estimate.reason
-        assert np.degrees(rotation_error(estimate.w, s.motion.w)) < e_R
-        assert np.degrees(translation_error(estimate.d, s.motion.d)) < e_T
+        assert_near(result.estimate, s.motion, e_R, e_T)
         for name in ("left", "right", "tracks"):
             inliers, wrong = result.inliers[name], s.outliers[name]
             assert inliers.shape == wrong.shape
@@ -111,19 +92,6 @@ def test_the_threshold_rejects_as_many_tracks_as_pairs() -> None:
         assert 1 - np.mean(inliers[name]) == pytest.approx(0.0124, abs=0.012)
 
 
-def test_tracks_whose_halves_are_repeated_change_nothing() -> None:
-    s = simulation(tracks=200)
-    tracks = s.correspondences.tracks
-    repeated = Correspondences(left=tracks[:, [0, 1, 4, 5]], right=tracks[:, [2, 3, 6, 7]], tracks=tracks)
-    alone = run(s)
-    both = estimate_motion(
-        repeated, RIG, SHUTTER, load_solver("rs-stereo-refined"), RobustOptions(), np.random.default_rng(0)
-    )
-    np.testing.assert_allclose(both.estimate.w, alone.estimate.w, atol=1e-12)
-    np.testing.assert_array_equal(both.inliers["left"], both.inliers["tracks"])
-    np.testing.assert_array_equal(both.inliers["tracks"], alone.inliers["tracks"])
-
-
 @pytest.mark.parametrize(
     ("name", "matches"),
     [  # 40 pairs per camera, and 70 points in all four images of which 50 are repeated as left pairs
@@ -139,8 +107,8 @@ def test_each_match_counts_once(name: str, matches: dict[MatchSet, int]) -> None
     left = np.concatenate([c.left, c.tracks[:50, [0, 1, 4, 5]]])
     given = Correspondences(left=left, right=c.right, tracks=c.tracks)
     # A rolling shutter's matches miss a global motion by pixels: 100 px let all of these in.
-    options = RobustOptions(threshold_px=100.0 if name.startswith("gs") else 1.0, adapt_threshold=False)
-    result = estimate_motion(given, RIG, SHUTTER, load_solver(name), options, np.random.default_rng(0))
+    threshold = 100.0 if name.startswith("gs") else 1.0
+    result = robust(given, name, threshold_px=threshold, adapt_threshold=False)
     assert {key: count.matches for key, count in result.counts.items()} == matches
     assert {key: count.inliers for key, count in result.counts.items()} == matches
     assert result.inlier_count == result.match_count == sum(matches.values())
@@ -153,13 +121,7 @@ def test_every_solver_runs_in_the_loop(name: str) -> None:
     solver = load_solver(name)
     threshold = 0.3 if solver.spec.shutter == "rolling" else 3.0
     result = run(s, name, threshold_px=threshold, max_iterations=300)
-    estimate = result.estimate
-    assert estimate.success, estimate.reason
-    d = s.motion.d
-    if solver.spec.reference_point == "left":
-        d = translation_of_offset(s.motion.w, d, RIG.offset("left"))
-    assert np.degrees(rotation_error(estimate.w, s.motion.w)) < 0.5
-    assert np.degrees(translation_error(estimate.d, d)) < 4.0
+    assert_near(result.estimate, s.motion, 0.5, 4.0, solver.spec.reference_point)
     assert set(result.inliers) == {"left", "right", "tracks"}
     assert result.iterations >= 1 and result.seconds > 0.0
 
@@ -188,19 +150,15 @@ class SpoiledByMany(Solver):
 @pytest.mark.parametrize("adapt", [False, True])
 def test_a_solver_that_more_matches_make_worse_keeps_what_the_search_found(adapt: bool) -> None:
     """Refits that RANSAC has refused must not come back at its end: the paper's linear solver is like that."""
-    motion = random_motion(np.random.default_rng(1), np.radians(2.0), 0.3)
     slow = RollingShutter(height=900, readout_ratio=1e-6)  # hardly rolls: the eight-point algorithm fits
-    given = simulate(
-        RIG, slow, motion, SimulationOptions(pairs=200, noise_px=0.1, outlier_ratio=0.2), np.random.default_rng(0)
-    ).correspondences
-    options = RobustOptions(adapt_threshold=adapt)
-    found = estimate_motion(given, RIG, slow, SpoiledByMany(), options, np.random.default_rng(0))
+    s = trial(1, shutter=slow, pairs=200, noise_px=0.1, outlier_ratio=0.2)
+    found = robust(s.correspondences, SpoiledByMany(), shutter=slow, adapt_threshold=adapt)
     assert found.estimate.success
-    assert found.inlier_count > 0.7 * len(given.left)  # 160 of 200 are right
-    assert np.degrees(rotation_error(found.estimate.w, motion.w)) < 1.0
+    assert found.inlier_count > 0.7 * 200  # 160 of 200 are right
+    assert np.degrees(rotation_error(found.estimate.w, s.motion.w)) < 1.0
     # Not when it alone knows the length: minimal samples of some solvers do not, and a scaled one is no better.
     solver = SpoiledByMany(off_deg=0.3, metric_of_many=True)
-    knowing = estimate_motion(given, RIG, slow, solver, options, np.random.default_rng(0))
+    knowing = robust(s.correspondences, solver, shutter=slow, adapt_threshold=adapt)
     assert knowing.estimate.success and knowing.estimate.metric
 
 
@@ -228,8 +186,7 @@ def test_wrong_tracks_do_not_hide_right_pairs() -> None:
     s = simulation(pairs=150, outliers=0.2)
     tracks = np.random.default_rng(0).uniform(0, 899, (12, 8))
     c = Correspondences(left=s.correspondences.left, right=s.correspondences.right, tracks=tracks)
-    solver = load_solver("rs-stereo-refined")
-    result = estimate_motion(c, RIG, SHUTTER, solver, RobustOptions(max_iterations=200), np.random.default_rng(0))
+    result = robust(c, "rs-stereo-refined", max_iterations=200)
     assert result.estimate.success
     assert np.degrees(rotation_error(result.estimate.w, s.motion.w)) < 0.1
     assert not np.any(result.inliers["tracks"]) and np.mean(result.inliers["left"]) > 0.7
@@ -264,18 +221,13 @@ def test_too_few_matches_is_a_failure_with_a_reason(name: str) -> None:
     result = run(s, name)
     assert not result.estimate.success and result.estimate.reason
     assert not any(np.any(mask) for mask in result.inliers.values())
-    empty = estimate_motion(
-        Correspondences(), RIG, SHUTTER, load_solver(name), RobustOptions(), np.random.default_rng(0)
-    )
+    empty = robust(Correspondences(), name)
     assert not empty.estimate.success and empty.estimate.reason
 
 
 def test_no_consensus_is_a_failure_with_a_reason() -> None:
-    rng = np.random.default_rng(0)
-    noise = Correspondences(tracks=rng.uniform(0, 899, (40, 8)))
-    result = estimate_motion(
-        noise, RIG, SHUTTER, load_solver("rs-stereo-refined"), RobustOptions(max_iterations=50), rng
-    )
+    noise = Correspondences(tracks=np.random.default_rng(0).uniform(0, 899, (40, 8)))
+    result = robust(noise, "rs-stereo-refined", max_iterations=50)
     assert not result.estimate.success and "no consensus" in result.estimate.reason
 
 
@@ -315,10 +267,9 @@ def test_every_seed_finds_the_same_motion_in_noisy_frames(noisy_castle: Correspo
     """Least squares on the inliers ends up to 12 stated deviations off: in one of two optima, by a single pair."""
     rig = StereoRig(camera=PinholeCamera.centred(900, 900, 1384.6), baseline=0.5)
     w, d = [-0.00563216, -0.01827359, 0.02920316], [-0.17881409, 0.0446896, 0.23670311]
-    solver, found = load_solver("rs-stereo-refined"), list[FloatArray]()
+    found = list[FloatArray]()
     for seed in range(5):
-        rng = np.random.default_rng(seed)
-        estimate = estimate_motion(noisy_castle, rig, SHUTTER, solver, RobustOptions(), rng).estimate
+        estimate = robust(noisy_castle, "rs-stereo-refined", rig=rig, seed=seed).estimate
         assert estimate.covariance is not None
         sigma = np.sqrt(np.diag(estimate.covariance))
         found.append(np.concatenate([estimate.w, estimate.d]))
@@ -390,15 +341,12 @@ class OwnLoopSolver(Solver):
 
 
 def simulated(pairs: int, tracks: int, outliers: float = 0.3, seed: int = 1) -> Simulation:
-    rng = np.random.default_rng(seed)
-    motion = random_motion(rng, np.radians(2.0), 0.3)
-    options = SimulationOptions(pairs=pairs, tracks=tracks, noise_px=0.5, outlier_ratio=outliers)
-    return simulate(RIG, SHUTTER, motion, options, rng)
+    generator = np.random.default_rng(seed)
+    return trial(generator, pairs=pairs, tracks=tracks, noise_px=0.5, outlier_ratio=outliers)
 
 
-def run_loop(solver: Solver, c: Correspondences, **keywords: object) -> RobustEstimate:
-    options = RobustOptions(max_iterations=200)
-    return estimate_motion(c, RIG, SHUTTER, solver, options, np.random.default_rng(0), **keywords)  # pyrefly: ignore[bad-argument-type]
+def run_loop(solver: Solver, c: Correspondences, loop: Literal["ransac", "own"] = "ransac") -> RobustEstimate:
+    return robust(c, solver, loop=loop, max_iterations=200)
 
 
 def pairwise(c: Correspondences, shift: float = 0.0) -> Correspondences:
@@ -424,8 +372,7 @@ def test_left_right_matches_reach_the_solver_that_needs_them(left: int, linked: 
         assert len(c.left) == left
         assert len(c.stereo_0) == len(c.stereo_1) == linked
         assert len(c.right) == len(c.tracks) == 0
-    assert np.degrees(rotation_error(result.estimate.w, s.motion.w)) < 0.1
-    assert np.degrees(translation_error(result.estimate.d, s.motion.d)) < 1.5
+    assert_near(result.estimate, s.motion, 0.1, 1.5)
     assert scale_error(result.estimate.d, s.motion.d) < 0.05
     wrong = s.outliers["tracks"]
     halves = result.inliers["left"][60:]

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from solver_trials import CAMERA, RIG, SHUTTER, W, assert_near, errors_deg, matches_of, robust
+from solver_trials import D as V
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.motion_models import make_motion
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.pose_errors import rotation_error, translation_error, translation_of_offset
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.so3 import FloatArray
-from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.zhuang import Flow, Velocity, ZhuangSolver, accelerations, reprojection
 
-CAMERA = PinholeCamera.centred(900, 900, 810.0)
-LEFT = StereoRig(camera=CAMERA, baseline=0.6).about("left")
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
-W, V = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
+LEFT = RIG.about("left")
 UNIT = V / np.linalg.norm(V)
 SOLVERS = {
     (kind, how): ZhuangSolver(acceleration=kind, refinement=how)
@@ -92,12 +87,12 @@ def test_a_translation_along_an_axis_is_exact(kind: str, axis: int) -> None:
     solver = SOLVERS[kind, "reprojection"]
     d = 0.3 * np.eye(3)[axis]
     motion = make_motion(solver.spec.motion_model, np.zeros(3), d, solver.spec.motion_parameters)
-    c = simulate(LEFT, SHUTTER, motion, SimulationOptions(pairs=60), np.random.default_rng(0)).correspondences
+    c = matches_of(motion, rig=LEFT, pairs=60)
     found = solver.estimate(c, LEFT, SHUTTER)
     assert found.success, found.reason
     assert rotation_error(found.w, motion.w) < 1e-8 and translation_error(found.d, d) < 1e-8
     still = make_motion(solver.spec.motion_model, np.zeros(3), np.zeros(3), solver.spec.motion_parameters)
-    c = simulate(LEFT, SHUTTER, still, SimulationOptions(pairs=60), np.random.default_rng(0)).correspondences
+    c = matches_of(still, rig=LEFT, pairs=60)
     assert "more than one solution" in solver.estimate(c, LEFT, SHUTTER).reason
 
 
@@ -106,10 +101,9 @@ def errors(solver: ZhuangSolver, size: float) -> FloatArray:
     found = []
     for seed in range(10):
         motion = make_motion(solver.spec.motion_model, size * W, size * V, solver.spec.motion_parameters)
-        options, rng = SimulationOptions(pairs=60), np.random.default_rng(seed)
-        c = simulate(LEFT, SHUTTER, motion, options, rng).correspondences
+        c = matches_of(motion, seed=seed, rig=LEFT, pairs=60)
         estimate = solver.estimate(Correspondences(left=c.left), LEFT, SHUTTER)
-        found.append([float(rotation_error(estimate.w, motion.w)), float(translation_error(estimate.d, motion.d))])
+        found.append(np.radians(errors_deg(estimate, motion)))
     return np.median(found, axis=0)
 
 
@@ -137,13 +131,11 @@ def test_derivatives_are_those_of_finite_differences() -> None:
 
 def test_the_robust_loop_judges_matches_by_the_acceleration_that_was_found() -> None:
     """With that of the spec, 0.2, half of these matches would be outliers."""
-    rig, solver = LEFT.about("middle"), SOLVERS["constant", "reprojection"]
+    solver = SOLVERS["constant", "reprojection"]
     motion = make_motion("accelerated", 0.5 * W, 0.5 * V, {"acceleration": 1.5})
     options = SimulationOptions(pairs=150, noise_px=0.1, outlier_ratio=0.2)
-    s = simulate(rig, SHUTTER, motion, options, np.random.default_rng(3))
-    found = estimate_motion(s.correspondences, rig, SHUTTER, solver, RobustOptions(), np.random.default_rng(0))
+    s = simulate(RIG, SHUTTER, motion, options, np.random.default_rng(3))
+    found = robust(s.correspondences, solver)
     assert found.estimate.motion_parameters["acceleration"] == pytest.approx(1.5, abs=0.5)
     assert np.mean(found.inliers["left"]) > 0.7
-    d = translation_of_offset(motion.w, motion.d, rig.offset("left"))
-    assert np.degrees(rotation_error(found.estimate.w, motion.w)) < 0.1
-    assert np.degrees(translation_error(found.estimate.d, d)) < 3.0
+    assert_near(found.estimate, motion, 0.1, 3.0, "left")

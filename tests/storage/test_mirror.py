@@ -35,18 +35,6 @@ TIMES = ("provenance.json", "seconds.json", "seconds.csv")
 
 
 @pytest.fixture
-def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """An empty store, and no memory of any other."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    store = fsspec.filesystem("memory")
-    for _ in range(2):
-        store.store.clear()
-        store.pseudo_dirs[:] = [""]
-        if _ == 0:
-            yield store
-
-
-@pytest.fixture
 def open_mirrors(monkeypatch: pytest.MonkeyPatch) -> queue.Queue[Any]:
     """Mirrors that upload only on request."""
     found: queue.Queue[Any] = queue.Queue()

@@ -15,11 +15,10 @@ from typing import Any
 
 import pytest
 from commands import assert_refused, bytes_below, run_here
-from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset import generation
-from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.destinations import store_destination
 from rsbench.dataset.generation import Built, generate_dataset
 from rsbench.renderers import scene, visibility
@@ -31,27 +30,11 @@ URL = "memory://bucket/small"
 
 
 @pytest.fixture(scope="module")
-def card(tmp_path_factory: pytest.TempPathFactory) -> DatasetCard:
-    folder = tmp_path_factory.mktemp("card")
-    return load_dataset_card(str(write_small_card(folder, [write_box_scene(folder, name) for name in "ab"])))
-
-
-@pytest.fixture(scope="module")
-def dataset(card: DatasetCard, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def dataset(boxes: DatasetCard, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The files of a dataset that was rendered to a folder."""
     out = tmp_path_factory.mktemp("stores") / "dataset"
-    generate_dataset(card, out)
+    generate_dataset(boxes, out)
     return bytes_below(out, HIDDEN)
-
-
-@pytest.fixture
-def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """An empty store, and no memory of any other."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    store = fsspec.filesystem("memory")
-    store.store.clear()
-    yield store
-    store.store.clear()
 
 
 @pytest.fixture
@@ -97,36 +80,36 @@ def stored(memory: Any) -> dict[str, bytes]:
 # What is there, and what is read
 
 
-def test_a_store_gets_the_bytes_of_a_folder(card: DatasetCard, dataset: dict[str, bytes], memory: Any) -> None:
-    assert generate_dataset(card, URL) == ["a", "b"]
+def test_a_store_gets_the_bytes_of_a_folder(boxes: DatasetCard, dataset: dict[str, bytes], memory: Any) -> None:
+    assert generate_dataset(boxes, URL) == ["a", "b"]
     assert len(dataset) == 44 and stored(memory) == dataset
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_second_run_lists_and_reads_one_object(card: DatasetCard, memory: Any, read: list[str]) -> None:
-    generate_dataset(card, URL)
+def test_a_second_run_lists_and_reads_one_object(boxes: DatasetCard, memory: Any, read: list[str]) -> None:
+    generate_dataset(boxes, URL)
     read.clear()
-    assert generate_dataset(card, URL) == [] and read == ["dataset.json"]
-    assert generate_dataset(card, URL, rehash=True) == [] and len(set(read)) == 43
+    assert generate_dataset(boxes, URL) == [] and read == ["dataset.json"]
+    assert generate_dataset(boxes, URL, rehash=True) == [] and len(set(read)) == 43
 
 
 @pytest.mark.usefixtures("quick")
 def test_another_machine_reads_each_sequence_once(
-    card: DatasetCard, dataset: dict[str, bytes], memory: Any, read: list[str], tmp_path: Path
+    boxes: DatasetCard, dataset: dict[str, bytes], memory: Any, read: list[str], tmp_path: Path
 ) -> None:
-    generate_dataset(card, URL)
+    generate_dataset(boxes, URL)
     shutil.rmtree(tmp_path / "cache")
     read.clear()
-    assert generate_dataset(card, URL) == []
+    assert generate_dataset(boxes, URL) == []
     assert sorted(read) == ["a/sequence.json", "b/sequence.json", "dataset.json", "dataset.json"]
     shutil.rmtree(tmp_path / "cache")
     memory.pipe("/bucket/small/a/rs/left_0.png", b"half")  # dataset.json knows its size
-    assert generate_dataset(card, URL) == ["a"] and stored(memory) == dataset
+    assert generate_dataset(boxes, URL) == ["a"] and stored(memory) == dataset
 
 
 @pytest.mark.usefixtures("quick", "memory")
-def test_nothing_but_what_a_later_run_can_use_stays_here(card: DatasetCard, tmp_path: Path) -> None:
-    generate_dataset(card, URL)
+def test_nothing_but_what_a_later_run_can_use_stays_here(boxes: DatasetCard, tmp_path: Path) -> None:
+    generate_dataset(boxes, URL)
     kept = [path.name for path in (tmp_path / "cache/rsbench/stores").rglob("*") if path.is_file()]
     assert sorted(kept) == ["lock", "objects.jsonl"]
 
@@ -140,7 +123,7 @@ class _Stop(BaseException):
 
 @pytest.mark.usefixtures("quick")
 def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
-    card: DatasetCard, dataset: dict[str, bytes], memory: Any, monkeypatch: pytest.MonkeyPatch
+    boxes: DatasetCard, dataset: dict[str, bytes], memory: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each operation of a run that also mends a sequence; where a sequence.json is, all of its files are."""
     kind, left = type(memory), [0]
@@ -158,11 +141,11 @@ def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
         monkeypatch.setattr(kind, name, counted(getattr(kind, name)))
     for stop in itertools.count(1):
         memory.store.clear()
-        generate_dataset(card.only(["a"]), URL)
+        generate_dataset(boxes.only(["a"]), URL)
         memory.pipe("/bucket/small/a/rs/left_0.png", b"half")
         left[0] = stop
         try:
-            assert generate_dataset(card, URL) == ["a", "b"]
+            assert generate_dataset(boxes, URL) == ["a", "b"]
         except _Stop:
             there = stored(memory)
             for name in "ab":
@@ -170,18 +153,18 @@ def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
                     assert {path for path in dataset if path.startswith(name)} <= set(there)
         else:
             break
-        generate_dataset(card, URL)
+        generate_dataset(boxes, URL)
         assert stored(memory) == dataset
     assert stop > 40
 
 
 @pytest.mark.usefixtures("quick")
-def test_two_commands_do_not_send_to_one_store(card: DatasetCard, memory: Any) -> None:
+def test_two_commands_do_not_send_to_one_store(boxes: DatasetCard, memory: Any) -> None:
     with (
         store_destination(URL, 1, False),
         pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work"),
     ):
-        generate_dataset(card, URL)
+        generate_dataset(boxes, URL)
 
 
 # What is damaged, or of others
@@ -190,47 +173,47 @@ def test_two_commands_do_not_send_to_one_store(card: DatasetCard, memory: Any) -
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("what", ["gone", "cut", "changed"])
 def test_what_is_damaged_is_made_again(
-    what: str, card: DatasetCard, dataset: dict[str, bytes], memory: Any
+    what: str, boxes: DatasetCard, dataset: dict[str, bytes], memory: Any
 ) -> None:
-    generate_dataset(card, URL)
+    generate_dataset(boxes, URL)
     path = "/bucket/small/b/poses/right_1.csv"
     data = memory.cat(path)
     memory.rm(path)
     if what != "gone":
         memory.pipe(path, data[:-7] if what == "cut" else data.replace(b"1", b"2"))
-    assert generate_dataset(card, URL, rehash=what == "changed") == ["b"]
+    assert generate_dataset(boxes, URL, rehash=what == "changed") == ["b"]
     assert stored(memory) == dataset
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_dataset_of_another_card_is_refused(card: DatasetCard, memory: Any) -> None:
-    generate_dataset(card, URL)
+def test_a_dataset_of_another_card_is_refused(boxes: DatasetCard, memory: Any) -> None:
+    generate_dataset(boxes, URL)
     before = stored(memory)
     with pytest.raises(
         RsbenchError, match=r"^memory://bucket/small/a: holds a sequence of another card \(differs in"
     ):
-        generate_dataset(replace(card, baseline=0.4), URL)
+        generate_dataset(replace(boxes, baseline=0.4), URL)
     assert stored(memory) == before
 
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("whole", [True, False])
-def test_objects_of_others_are_not_written_over(whole: bool, card: DatasetCard, memory: Any) -> None:
+def test_objects_of_others_are_not_written_over(whole: bool, boxes: DatasetCard, memory: Any) -> None:
     if whole:
-        generate_dataset(card, URL)
+        generate_dataset(boxes, URL)
     memory.pipe("/bucket/small/a/thesis.tex", b"mine")
     memory.pipe("/bucket/small/a/rs/left_0.png", b"mine")
     before = stored(memory)
     with pytest.raises(RsbenchError, match=r"small/a: .*thesis\.tex"):
-        generate_dataset(card, URL)
+        generate_dataset(boxes, URL)
     assert stored(memory) == before
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_manifest_that_cannot_be_read_is_named(card: DatasetCard, memory: Any) -> None:
+def test_a_manifest_that_cannot_be_read_is_named(boxes: DatasetCard, memory: Any) -> None:
     memory.pipe("/bucket/small/a/sequence.json", b'{"files": [')
     with pytest.raises(RsbenchError, match=r"small/a/sequence\.json: damaged, or not rsbench's: remove it"):
-        generate_dataset(card, URL)
+        generate_dataset(boxes, URL)
 
 
 # What is no store
@@ -272,6 +255,6 @@ def test_without_its_packages_a_store_is_one_line(monkeypatch: pytest.MonkeyPatc
     assert_refused(result, "s3://bucket/other: needs fsspec: pip install 'rsbench[cloud]'")
 
 
-def test_a_store_in_memory_is_of_one_process(card: DatasetCard) -> None:
+def test_a_store_in_memory_is_of_one_process(boxes: DatasetCard) -> None:
     with pytest.raises(RsbenchError, match="lives in one process: without --workers and --scheduler"):
-        generate_dataset(card, URL, workers=2)
+        generate_dataset(boxes, URL, workers=2)

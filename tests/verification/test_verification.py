@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic_dataset import write_analytic_dataset
+from commands import refused
 
 from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.core import so3
@@ -173,9 +174,8 @@ def test_a_flaw_of_a_few_hundredths_of_the_picture_is_found(dataset: Path, size:
 def test_damaged_depth_file_is_one_clear_line(dataset: Path, damage: bytes | None) -> None:
     path = dataset / "planes/rs_depth/left_0.exr"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if damage is None else damage)
-    with pytest.raises(RsbenchError, match=r"left_0\.exr: damaged or not an EXR file") as caught:
+    with refused("left_0.exr: damaged or not an EXR file"):
         read_dataset(dataset)[0].depth("rs", "left", 0)
-    assert "\n" not in str(caught.value)
 
 
 def test_pose_file_round_trip_is_exact_to_rounding(dataset: Path) -> None:
@@ -200,9 +200,8 @@ def test_pose_file_round_trip_is_exact_to_rounding(dataset: Path) -> None:
 def test_bad_manifest_is_named(dataset: Path, key: str, value: object, message: str) -> None:
     path = dataset / "planes/sequence.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
-    with pytest.raises(RsbenchError, match=r"sequence\.json") as caught:
+    with refused("sequence.json", message):
         read_dataset(dataset)
-    assert message in str(caught.value)
 
 
 def test_folder_without_a_dataset_is_named(tmp_path: Path) -> None:

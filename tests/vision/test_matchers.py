@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import refused
 
 from rsbench.components.cards import list_cards
 from rsbench.components.motion_models import LinearMotion
@@ -67,9 +68,8 @@ def test_the_default_cards_state_the_defaults() -> None:
 def test_a_wrong_value_is_named(tmp_path: Path, line: str, message: str) -> None:
     card = tmp_path / "wrong.toml"
     card.write_text(f'class = "rsbench.vision.stereo_depth:SgmMatcher"\n[parameters]\n{line}\n', "utf-8")
-    with pytest.raises(RsbenchError, match=message) as caught:
+    with refused(match=message):
         load_matcher(card)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -184,11 +184,8 @@ def matches_of(answer: Any) -> Any:
     ],
 )
 def test_wrong_answers_are_refused_in_one_line(found: Any, answer: Any, words: tuple[str, ...]) -> None:
-    with pytest.raises(RsbenchError) as caught:
+    with refused("matcher 'mine'", *words):
         found(answer)
-    text = str(caught.value)
-    assert "matcher 'mine'" in text and "\n" not in text
-    assert all(word in text for word in words), text
 
 
 def test_sub_pixel_positions_at_the_border_pass() -> None:

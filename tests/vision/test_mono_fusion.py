@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -40,8 +40,8 @@ from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, 
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.storage.files import read_json, read_png, write_png
 from rsbench.vision.corrector import CorrectionProblem, load_corrector
-from rsbench.vision.fusion import Origin, finished
-from rsbench.vision.mono_fusion import MonoFusion, OwnMotion, continued, find_flows
+from rsbench.vision.fusion import Fused, Origin, finished
+from rsbench.vision.mono_fusion import Flows, MonoFusion, OwnMotion, continued, find_flows
 
 Build = Callable[..., Any]
 SIZE = {"size": (240, 320), "focal": 300.0, "readout_ratio": 1.0, "shortest": 0.5}
@@ -55,8 +55,27 @@ def scene(world: Build, shapes: Any) -> Any:
     return replace(made, rig=made.rig.about("left"))
 
 
-def _frames(scene: Any, u8: Any, side: Any = "left") -> list[np.ndarray]:
-    return [u8(scene.rolling(side, frame)[0]) for frame in (0, 1)]
+class Seen(NamedTuple):
+    """The left frames, their flow, and the motion that it shows."""
+
+    images: list[np.ndarray]
+    flows: Flows
+    own: OwnMotion
+
+    def fused(self, frame: int, target: float, **changes: Any) -> Fused:
+        return MonoFusion(self.images, replace(self.own, **changes), self.flows).corrected(frame, target)
+
+
+@pytest.fixture(scope="module")
+def seen(scene: Any, u8: Any) -> Seen:
+    images = [u8(scene.rolling("left", frame)[0]) for frame in (0, 1)]
+    flows = find_flows(images)
+    return Seen(images, flows, find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions()).own)
+
+
+def _inside(truth: Any) -> np.ndarray:
+    """Pixels around which the frame shows everything."""
+    return cv2.erode(truth.visible.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
 
 
 def _rms(a: Any, b: Any, mask: Any) -> float:
@@ -64,31 +83,24 @@ def _rms(a: Any, b: Any, mask: Any) -> float:
 
 
 @pytest.mark.parametrize("frame", [0, 1])
-def test_a_frame_becomes_the_global_shutter_image(scene: Any, u8: Any, truth: Any, frame: int) -> None:
-    images = _frames(scene, u8)
-    flows = find_flows(images)
-    found = find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions())
-    target = frame + 0.5
-    fused = MonoFusion(images, found.own, flows).corrected(frame, target)
-    true = truth(scene, "left", frame, target)
-    seen = cv2.erode(true.visible.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+def test_a_frame_becomes_the_global_shutter_image(scene: Any, seen: Seen, truth: Any, frame: int) -> None:
+    fused = seen.fused(frame, frame + 0.5)
+    true = truth(scene, "left", frame, frame + 0.5)
+    inside, shown = _inside(true), 255.0 * true.image
     # Away from what the frame does not show, a wrong time or sign would leave most of the uncorrected error; the
     # flow's own error of a tenth of a pixel leaves less than a quarter.
-    assert _rms(fused.image, 255.0 * true.image, seen) < 0.25 * _rms(images[frame], 255.0 * true.image, seen)
+    assert _rms(fused.image, shown, inside) < 0.25 * _rms(seen.images[frame], shown, inside)
     assert np.mean(fused.origin == Origin.HERE) > 0.85
 
 
-def test_motion_and_depth_have_the_unit_of_the_translation(scene: Any, u8: Any, truth: Any) -> None:
-    images = _frames(scene, u8)
-    flows = find_flows(images)
-    found = find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions())
-    motion, length = found.own.motion, float(np.linalg.norm(scene.motion.d))
+def test_motion_and_depth_have_the_unit_of_the_translation(scene: Any, seen: Seen, truth: Any) -> None:
+    motion, length = seen.own.motion, float(np.linalg.norm(scene.motion.d))
     assert motion is not None and np.linalg.norm(motion.d) == pytest.approx(1.0)
     # 0.1 px of flow over 1500 matches and 30 px of parallax; the scene's linear motion is not quite inertial.
     assert np.rad2deg(np.arccos(motion.d @ scene.motion.d / length)) < 3.0
     assert np.rad2deg(np.linalg.norm(motion.w - scene.motion.w)) < 0.1
     true = truth(scene, "left", 1, 1.5)
-    depth = MonoFusion(images, found.own, flows).corrected(1, 1.5).depth * length
+    depth = seen.fused(1, 1.5).depth * length
     ratio = (depth / true.depth)[true.visible & np.isfinite(depth)]
     assert np.median(np.abs(ratio - 1.0)) < 0.05
 
@@ -116,29 +128,23 @@ def test_what_moves_by_itself_goes_its_own_flow(world: Build, shapes: Any, u8: A
 
 @pytest.mark.parametrize("frame", [0, 1])
 def test_where_no_law_explains_the_flow_the_flow_moves_everything(
-    scene: Any, u8: Any, truth: Any, frame: int
+    scene: Any, seen: Seen, truth: Any, frame: int
 ) -> None:
     """A motion that is wrong by 0.3 deg about each axis, 1.6 px: geometry alone would be off by as much."""
-    images = _frames(scene, u8)
-    flows = find_flows(images)
-    found = find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions()).own
-    assert found.motion is not None
-    wrong = found.motion.with_endpoint(found.motion.w + np.deg2rad([0.3, -0.3, 0.3]), found.motion.d)
+    motion = seen.own.motion
+    assert motion is not None
+    wrong = motion.with_endpoint(motion.w + np.deg2rad([0.3, -0.3, 0.3]), motion.d)
     true = truth(scene, "left", frame, frame + 0.5)
-    seen = cv2.erode(true.visible.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
     with_wrong, with_flow = (
-        MonoFusion(images, replace(found, motion=motion), flows).corrected(frame, frame + 0.5)
-        for motion in (wrong, None)
+        _rms(seen.fused(frame, frame + 0.5, motion=each).image, 255.0 * true.image, _inside(true))
+        for each in (wrong, None)
     )
-    assert _rms(with_wrong.image, 255.0 * true.image, seen) < 1.1 * _rms(with_flow.image, 255.0 * true.image, seen)
+    assert with_wrong < 1.1 * with_flow
 
 
-def test_holes_are_not_filled_by_pixels_whose_place_is_a_guess(scene: Any, u8: Any) -> None:
+def test_holes_are_not_filled_by_pixels_whose_place_is_a_guess(seen: Seen) -> None:
     """Flow that does not return, and no search that agrees: the other frame fills nothing by such pixels."""
-    images = _frames(scene, u8)
-    flows = find_flows(images)
-    found = find_own_motion(flows, scene.rig, scene.shutter, "left", RobustOptions()).own
-    fusion = MonoFusion(images, found, flows)
+    fusion = MonoFusion(seen.images, seen.own, seen.flows)
     filled = fusion.corrected(1, 1.5).origin == Origin.OTHER_FRAME
     guessed = np.zeros(filled.shape, dtype=bool)
     fusion._layers[0] = fusion._layers[0]._replace(measured=guessed)
@@ -147,17 +153,15 @@ def test_holes_are_not_filled_by_pixels_whose_place_is_a_guess(scene: Any, u8: A
     assert np.all(np.isin(unfilled[filled], [Origin.NOBODY, Origin.GUESSED]))
 
 
-def test_without_a_motion_everything_is_scaled_flow(scene: Any, u8: Any) -> None:
+def test_without_a_motion_everything_is_scaled_flow(scene: Any, seen: Seen) -> None:
     """At the time of a row, the pixels of that row stay where they are."""
-    images = _frames(scene, u8)
-    flows = find_flows(images)
     own = OwnMotion(rig=scene.rig.about("left"), shutter=scene.shutter, side="left", motion=None)
-    fusion = MonoFusion(images, own, flows)
+    fusion = MonoFusion(seen.images, own, seen.flows)
     places = fusion.places(1, float(scene.shutter.row_time(100, 1)))
     np.testing.assert_allclose(places[100, :, 0], np.arange(320), atol=1e-9)  # rounding
     # The whole flow leads to the other frame: at the time of its end a pixel is at its end.
     x, y = 160, 120
-    end = np.array([x, y]) + flows.flow[1][y, x]
+    end = np.array([x, y]) + seen.flows.flow[1][y, x]
     there = fusion.places(1, float(scene.shutter.row_time(end[1], 0)))[y, x, :2]
     np.testing.assert_allclose(there, end, atol=1e-4)  # float32 of the flow
 

@@ -12,19 +12,14 @@ from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, Recip
 from rsbench.benchmark.images.predict import Bench
 from rsbench.benchmark.images.score import Row, Scorer
 from rsbench.core.rig import VIEWS
-from rsbench.dataset.sequence import Sequence, read_dataset
+from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.storage.files import MATCH_SETS, save_arrays
 
 
 @pytest.fixture(scope="module")
-def sequence(smoke_dataset: Path) -> Sequence:
-    return read_dataset(smoke_dataset)[0]
-
-
-@pytest.fixture(scope="module")
-def plan(sequence: Sequence) -> Plan:
-    return make_plan(EvaluationOptions(solvers=("gs-8pt",)), [sequence])
+def plan(castle: Sequence) -> Plan:
+    return make_plan(EvaluationOptions(solvers=("gs-8pt",)), [castle])
 
 
 def store_truth(places: Places, plan: Plan, **changes: Any) -> None:
@@ -62,20 +57,20 @@ def store_truth(places: Places, plan: Plan, **changes: Any) -> None:
     artefact.finish({"matcher": "sgm", "entry": "sgm", "timed": False, "success": True, "reason": ""})
 
 
-def scored(sequence: Sequence, plan: Plan, folder: Path, **changes: Any) -> dict[str, list[Row]]:
+def scored(castle: Sequence, plan: Plan, folder: Path, **changes: Any) -> dict[str, list[Row]]:
     with SolverRunner() as runner:
-        bench = Bench(sequence, folder, plan, runner)
+        bench = Bench(castle, folder, plan, runner)
         store_truth(bench.places, plan, **changes)
         for recipe in Recipe(chain=plan.chain).variants():
             bench._correct(recipe)
-    scorer = Scorer(Places(sequence, folder, plan.chain), plan)
+    scorer = Scorer(Places(castle, folder, plan.chain), plan)
     scorer.score()
     assert scorer.stale == []
     return scorer.rows
 
 
-def test_truth_scores_the_best_of_everything(sequence: Sequence, plan: Plan, tmp_path: Path) -> None:
-    rows = scored(sequence, plan, tmp_path)
+def test_truth_scores_the_best_of_everything(castle: Sequence, plan: Plan, tmp_path: Path) -> None:
+    rows = scored(castle, plan, tmp_path)
     (pose,) = rows["pose"]
     assert max(pose["e_R_deg"], pose["e_T_deg"], pose["e_s"]) < 1e-12
     assert (pose["inliers"], pose["data_model"], pose["assumed_model"]) == (9, "linear", "linear")
@@ -100,8 +95,8 @@ def test_truth_scores_the_best_of_everything(sequence: Sequence, plan: Plan, tmp
     assert rows["failures"] == []
 
 
-def test_failure_scores_the_worst_and_is_told_apart(sequence: Sequence, plan: Plan, tmp_path: Path) -> None:
-    rows = scored(sequence, plan, tmp_path, success=False, w=None, d=None, reason="no consensus")
+def test_failure_scores_the_worst_and_is_told_apart(castle: Sequence, plan: Plan, tmp_path: Path) -> None:
+    rows = scored(castle, plan, tmp_path, success=False, w=None, d=None, reason="no consensus")
     (pose,) = rows["pose"]
     assert (pose["e_R_deg"], pose["e_T_deg"], pose["e_s"]) == (180.0, 180.0, np.inf)
     assert not pose["success"]

@@ -7,19 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from solver_trials import RIG, SHUTTER
 
 from rsbench.benchmark.simulated import simulation
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import LinearMotion, make_motion
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.motion import Motion
 from rsbench.core.projection import ProjectionStatus, back_project, rs_project
-from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.rig import SIDES
 from rsbench.core.shutter import RollingShutter
 
-RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-SHUTTER = RollingShutter(height=900, readout_ratio=0.8)
 MOTION = LinearMotion(w=np.deg2rad([0.8, -1.5, 1.0]), d=np.array([0.2, -0.1, 0.25]))
 OPTIONS = SimulationOptions(pairs=40, tracks=30)
 
