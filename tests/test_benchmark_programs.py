@@ -222,7 +222,6 @@ def test_the_rotation_of_a_biased_gyroscope_errs_by_its_bias() -> None:
     np.testing.assert_allclose(rows["median"], rows["value"] / 30.0, rtol=1e-3, atol=1e-9)
 
 
-CHECKOUT = Path(__file__).parents[1]
 F, BASELINE, DEPTH, STEP = 200.0, 0.5, 10.0, 6
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -169,10 +168,3 @@ def test_depths_that_no_point_can_have_are_the_fault_of_depth(calls: dict[str, A
     simulate, arguments = calls["simulate"]
     with pytest.raises(ValueError, match="depth = "):
         simulate(**{**arguments, "depth": (0.05, 0.05)})
-
-
-def test_long_names_are_shortened(tmp_path: Path) -> None:
-    for make in (rsbench.load_solver, rsbench.read_dataset, lambda name: rsbench.generate(name, tmp_path)):
-        with pytest.raises((rsbench.RsbenchError, ValueError)) as caught:
-            make("a" * 100_000)
-        assert "aaaa" in str(caught.value) and len(str(caught.value)) < LONGEST

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,35 +63,38 @@ def test_options_of_a_rig_are_refused_for_one_camera(option: str, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("option", sorted(ONE_CAMERA))
-def test_options_of_one_camera_reach_its_correction(
-    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """What a call of the command would correct, with which options."""
     calls: list[Any] = []
     monkeypatch.setattr(command, "_correct_given", lambda *known: calls.append(known))
+
+    def called(*arguments: object) -> str:
+        calls.clear()
+        run_here("correct", *arguments)
+        (call,) = calls
+        return repr(call)
+
+    return called
+
+
+@pytest.mark.parametrize("option", sorted(ONE_CAMERA))
+def test_options_of_one_camera_reach_its_correction(
+    option: str, tmp_path: Path, given: Callable[..., str]
+) -> None:
     write_png(tmp_path / "0.png", np.zeros((48, 64, 3), np.uint8))
-    given = ["--frames", tmp_path, "--out", tmp_path / "out"]
-    with_log = given if option == "gyro" else [*given, *OTHER["gyro"]]
-    run_here("correct", *with_log)
-    run_here("correct", *with_log, *OTHER[option])
-    default, other = calls
-    assert repr(default) != repr(other)
+    log = [] if option == "gyro" else OTHER["gyro"]
+    frames = ["--frames", tmp_path, "--out", tmp_path / "out", *log]
+    assert given(*frames) != given(*frames, *OTHER[option])
 
 
 @pytest.mark.parametrize("option", sorted(OTHER.keys() - {"rig", "left", "right", "row_poses", "gyro", "fov"}))
-def test_options_of_a_rig_reach_its_correction(
-    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[Any] = []
-    monkeypatch.setattr(command, "_correct_given", lambda *known: calls.append(known))
+def test_options_of_a_rig_reach_its_correction(option: str, tmp_path: Path, given: Callable[..., str]) -> None:
     (tmp_path / "rig.toml").write_text(RIG)
-    sides = ["--left", "left"] if option == "side_by_side" else ["--left", "left", "--right", "right"]
-    given = [*sides, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out"]
-    with_log = [*given, *OTHER["gyro"]]
-    run_here("correct", *with_log, *(["--right", "right"] if option == "side_by_side" else []))
-    run_here("correct", *with_log, *OTHER[option])
-    default, other = calls
-    assert repr(default) != repr(other)
+    right = ["--right", "right"]
+    frames = ["--left", "left", "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out", *OTHER["gyro"]]
+    other = frames if option == "side_by_side" else [*frames, *right]
+    assert given(*frames, *right) != given(*other, *OTHER[option])
 
 
 @pytest.mark.parametrize("option", ["row_poses", "gyro", "fps", "gyro_offset"])

@@ -138,27 +138,12 @@ def test_memory_does_not_grow_with_the_scenes(tmp_path: Path) -> None:
     assert max(peaks[name] for name in "cd") - peaks["b"] < 9
 
 
-def test_other_card_in_the_same_folder_is_refused(small: Small) -> None:
-    card = load_dataset_card(str(small.card))
-    before = bytes_of(small.dataset)
-    with pytest.raises(RsbenchError, match=r"another card \(differs in readout_ratio"):
-        generate_dataset(replace(card, readout_ratio=0.5), small.dataset)
-    assert bytes_of(small.dataset) == before
-
-
 def test_progress_counts_every_step_of_a_finished_dataset(small: Small, tmp_path: Path) -> None:
     card, out = load_dataset_card(str(small.card)), tmp_path / "out"
     for _ in ("rendered", "found"):
         steps: list[str] = []
         generate_dataset(card, out, progress=steps.append)
         assert steps == ["a"] * steps_of(card) + ["b"] * steps_of(card)
-
-
-def test_unwritable_folder_is_named(small: Small, tmp_path: Path) -> None:
-    blocker = tmp_path / "file"
-    blocker.write_text("")
-    with pytest.raises(RsbenchError, match="cannot be written"):
-        generate_dataset(load_dataset_card(str(small.card)), blocker / "below")
 
 
 @pytest.mark.parametrize(

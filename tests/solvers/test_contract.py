@@ -6,10 +6,8 @@ import json
 import re
 import sys
 import time
-from dataclasses import dataclass, replace
-from importlib import metadata
+from dataclasses import replace
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import pytest
@@ -25,16 +23,11 @@ from rsbench.benchmark.simulated.contract import (
     degenerate_cases,
     misreading,
 )
-from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import (
-    SOLVERS,
     MotionEstimate,
-    Solver,
     SolverEntry,
     SolverSpec,
     list_solvers,
@@ -271,33 +264,6 @@ OTHER_SPEC = SolverSpec(
 )
 
 
-class _Nothing(Solver):
-    spec = OTHER_SPEC
-
-    def estimate(
-        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
-    ) -> MotionEstimate:
-        return MotionEstimate.failed("never tries")
-
-
-@final
-@dataclass(frozen=True, kw_only=True)
-class Patient(_Nothing):
-    patience: int = 3
-
-    def __post_init__(self) -> None:
-        if self.patience < 0:
-            raise ValueError(f"patience cannot be negative, got {self.patience}")
-
-
-@final
-class Plain(_Nothing):
-    """A solver that is no dataclass."""
-
-    def __init__(self, mood: str = "calm") -> None:
-        self.mood = mood
-
-
 def card(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "mine.toml"
     path.write_text(text)
@@ -329,39 +295,6 @@ def test_a_card_may_name_the_module_that_a_class_was_in_before(tmp_path: Path) -
 def test_a_wrong_card_is_refused_in_one_line(tmp_path: Path, text: str, parts: list[str]) -> None:
     with refused("mine.toml", *parts):
         load_solver(card(tmp_path, text))
-
-
-def entry(name: str, target: str) -> metadata.EntryPoint:
-    return metadata.EntryPoint(name=name, value=target, group=SOLVERS.group)
-
-
-def install(monkeypatch: pytest.MonkeyPatch, solver: object, *names: str) -> None:
-    entries = [entry(name, f"package{k}:Solver") for k, name in enumerate(names)]
-    monkeypatch.setattr("rsbench.components.imports.points_of", lambda group, folders: entries)
-    monkeypatch.setattr(metadata.EntryPoint, "load", lambda self: solver)
-
-
-def test_a_name_clash_is_an_error_of_that_name_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, Patient, "gs-8pt", "twice", "twice")
-    assert list_solvers().count("twice") == 1
-    assert load_solver_entry("rs-stereo-linear").built_in
-    with pytest.raises(RsbenchError, match=r"gs-8pt.*card gs-8pt.toml of rsbench and of package0:Solver"):
-        load_solver("gs-8pt")
-    with pytest.raises(RsbenchError, match=r"twice.*package1:Solver.* and of package2:Solver"):
-        load_solver("twice")
-
-
-def test_a_card_finds_the_module_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "moody_solver.py").write_text(PLAIN, "utf-8")
-    text = 'class = "moody_solver:Plain"\ntime_limit_s = 5\nrobust = "own"\n[parameters]\nmood = "wild"'
-    loaded = load_solver_entry(card(tmp_path, text))
-    assert vars(loaded.solver)["mood"] == "wild"
-    assert loaded.options.time_limit_s == 5.0 and loaded.options.robust == "own"
-    with pytest.raises(RsbenchError, match=r"unknown key 'moood'.*mood"):
-        load_solver(card(tmp_path, 'class = "moody_solver:Plain"\n[parameters]\nmoood = "wild"'))
-    with pytest.raises(RsbenchError, match=r"unknown key 'time_limit'.*did you mean 'time_limit_s'"):
-        load_solver(card(tmp_path, 'class = "moody_solver:Plain"\ntime_limit = 5'))
-    sys.modules.pop("moody_solver")
 
 
 def test_a_solver_must_say_what_it_is(tmp_path: Path) -> None:

@@ -399,13 +399,6 @@ def test_left_right_matches_a_hair_off_hold_the_scale() -> None:
     assert scale_error(off.estimate.d, s.motion.d) < 0.01
 
 
-def test_what_did_not_join_is_said() -> None:
-    s = simulated(pairs=0, tracks=80)
-    c = pairwise(s.correspondences)
-    c = replace(c, stereo_0=np.concatenate([c.stereo_0, [[1.0, 2.0, 0.5, 2.0]] * 7]))
-    assert "7 of 87 stereo_0 matches join no match over time" in run_loop(RefinedSolver(), c).estimate.reason
-
-
 def test_the_reason_of_the_solver_is_in_that_of_the_loop() -> None:
     s = simulated(pairs=40, tracks=0)
     solver = StubbornSolver()

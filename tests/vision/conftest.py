@@ -152,6 +152,13 @@ def world() -> Callable[..., World]:
     return build
 
 
+@pytest.fixture(scope="session")
+def scene() -> World:
+    """A leaning wall and a ball before it."""
+    surfaces = Plane((0.2, 0.3, 1), 8), Sphere((0.2, 0.1, 4), 0.6)
+    return build(surfaces, size=(240, 320), focal=400, shortest=0.12)
+
+
 def to_u8(image: FloatArray) -> np.ndarray:
     return np.clip(np.rint(255.0 * image), 0, 255).astype(np.uint8)
 

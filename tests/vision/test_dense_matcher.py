@@ -35,12 +35,6 @@ Images = dict[View, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def scene(world: Build, shapes: Any) -> Any:
-    Plane, Sphere = shapes
-    return world((Plane((0.2, 0.3, 1), 8), Sphere((0.2, 0.1, 4), 0.6)), size=(240, 320), focal=400, shortest=0.12)
-
-
-@pytest.fixture(scope="module")
 def images(scene: Any, u8: Build) -> Images:
     return {view: u8(scene.rolling(*view)[0]) for view in VIEWS}
 

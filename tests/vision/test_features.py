@@ -37,12 +37,6 @@ Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def scene(world: Build, shapes: Any) -> Any:
-    Plane, Sphere = shapes
-    return world((Plane((0.2, 0.3, 1), 8), Sphere((0.2, 0.1, 4), 0.6)), size=(240, 320), focal=400, shortest=0.12)
-
-
-@pytest.fixture(scope="module")
 def images(scene: Any, u8: Build) -> Four:
     left_0, right_0, left_1, right_1 = (scene.rolling(side, k)[0] for k in (0, 1) for side in ("left", "right"))
     return u8(left_0), u8(right_0), u8(left_1), u8(right_1)

@@ -26,12 +26,6 @@ from rsbench.vision.stereo_depth import SgmOptions, depth_metrics, stereo_dispar
 Build = Callable[..., Any]
 
 
-@pytest.fixture(scope="module")
-def scene(world: Build, shapes: Any) -> Any:
-    Plane, Sphere = shapes
-    return world((Plane((0.2, 0.3, 1), 8), Sphere((0.2, 0.1, 4), 0.6)), size=(240, 320), focal=400, shortest=0.12)
-
-
 @pytest.mark.parametrize("shape", [(300, 300), (299, 301), (1, 2)])
 def test_a_halved_ramp_has_the_values_of_the_places_that_it_stands_for(shape: tuple[int, int]) -> None:
     y, x = np.indices(shape, dtype=np.float64)
