@@ -54,7 +54,7 @@ def robust(
     rig: StereoRig = RIG,
     shutter: RollingShutter = SHUTTER,
     loop: Literal["ransac", "own"] = "ransac",
-    seed: int = 0,
+    seed: int | np.random.Generator = 0,
     **options: Any,
 ) -> RobustEstimate:
     """What the robust loop finds; ``options`` are those of ``RobustOptions``."""
