@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,6 @@ from rsbench.benchmark.metric_plugins import (
     DepthCase,
     ImageCase,
     Metric,
-    MetricEntry,
     PoseCase,
     load_metrics,
 )
@@ -36,11 +35,6 @@ from rsbench.jobs.process_jobs import Workers, finished_jobs
 from rsbench.pipeline.isolated_components import Caller, Isolation, SolverRunner, entrys_own
 from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
 from rsbench.storage.work_folder import work_folder
-
-
-def isolated_metrics(isolation: Isolation, metrics: tuple[MetricEntry, ...]) -> tuple[MetricEntry, ...]:
-    """The same metrics, those of other packages answering from a child."""
-    return tuple(isolation.wrap(METRICS, metric, _serve_metric, (), _Isolated) for metric in metrics)
 
 
 class _Isolated(Metric):
@@ -95,7 +89,8 @@ class Scores(NamedTuple):
 
 def isolated(plan: Plan, isolation: Isolation) -> Plan:
     """The plan with other packages' components in child processes."""
-    return replace(plan, chain=isolation.chain(plan.chain), metrics=isolated_metrics(isolation, plan.metrics))
+    metrics = (isolation.wrap(METRICS, metric, _serve_metric, (), _Isolated) for metric in plan.metrics)
+    return replace(plan, chain=isolation.chain(plan.chain), metrics=tuple(metrics))
 
 
 def repeats_of(plan: Plan) -> list[Job]:
@@ -179,7 +174,9 @@ class Evaluation:
             found = [scored[sequence.name] for sequence in self.sequences]
             for table in TABLES:
                 rows = [row for scores in found for row in scores.rows[table]]
-                write_table(self.out / "scores" / f"{table}.csv", _frame(table, rows, self.plan))
+                write_table(
+                    self.out / "scores" / f"{table}.csv", pd.DataFrame(rows, columns=columns_of(table, self.plan))
+                )
             hashes.flush()
             write_json(self.out / "scores" / "columns.json", described_columns(self.plan))
             write_json(self.out / "provenance.json", self._provenance(command))
@@ -312,10 +309,6 @@ def columns_of(table: str, plan: Plan) -> list[str]:
     """Columns of a score file, in their order."""
     found = [c.name for m in plan.metrics if m.component.case is _CASES.get(table) for c in m.component.columns]
     return [*KEYS[table], *found, *AFTER.get(table, ())]
-
-
-def _frame(table: str, rows: Iterable[Row], plan: Plan) -> pd.DataFrame:
-    return pd.DataFrame(list(rows), columns=columns_of(table, plan))
 
 
 def read_headings(out: Path, table: str) -> dict[str, str]:

@@ -55,11 +55,6 @@ def scoring_version() -> dict[str, str]:
     }
 
 
-def metric_keys(metrics: Iterable[MetricEntry], case: type[Case]) -> list[list[str]]:
-    """Names and keys of the metrics that read such cases, in their order."""
-    return [[metric.name, metric.key] for metric in metrics if metric.component.case is case]
-
-
 def hash_of_prediction(files: Iterable[Path]) -> str:
     """Hash of the bytes of a prediction's files; a missing one counts too."""
     found = [f"{path.name} {sha256(path) if path.is_file() else 'is not there'}" for path in files]
@@ -122,7 +117,7 @@ class Scorer:
             table=table,
             truth=self.places.scored_truth,
             prediction=hash_of_prediction(files),
-            metrics=metric_keys(self.plan.metrics, case),
+            metrics=[[each.name, each.key] for each in self.plan.metrics if each.component.case is case],
             visible=load_corrector(_SEES).key,
         )
         path = None if self._kept is None else self._kept / f"{name}.json"

@@ -219,7 +219,7 @@ class SolverTrack(Track):
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
         """Scores of each problem."""
-        rows = [self.row(truth, submission.answers.get(truth.name)) for truth in split.truths]
+        rows = [self.row(each, submission.answers.get(each.name)) | self.part_of(each) for each in split.truths]
         if self.more_columns is not None:
             self.more_columns(rows, submission, split)
         return rows
@@ -482,13 +482,12 @@ def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) ->
     numbers = [int(truth.name[1:]) for truth in split.truths]
     bounds = bound_medians(split.track.inputs.draws, split.seed, max(numbers) + 1, "links")
     at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
-    for row, truth, R, T in zip(rows, split.truths, at_R, at_T, strict=True):
+    for row, R, T in zip(rows, at_R, at_T, strict=True):
         over_R, over_T = row["e_R_deg"] / R, row["e_T_deg"] / T
         over = over_R, over_T if T <= OPEN_DEG else over_R
         near = nearness(np.array(over)) if row["success"] else np.zeros(2)
         row |= {"near_bound": float(np.mean(near)), "near_R": float(near[0]), "near_T": float(near[1])}
         row |= {"over_bound": math.sqrt(over[0] * over[1]), "over_R": over_R, "over_T": over_T}
-        row |= {"motion": truth.facts["motion"]}
 
 
 def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:

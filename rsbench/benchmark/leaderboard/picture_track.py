@@ -269,7 +269,8 @@ def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> 
         answer = submission.answers.get(truth.name)
         success = answer is not None and answer.success
         try:
-            rows.append(score_row(truth, answer, success, scores_of(submission, success)))
+            scores = scores_of(submission, success)
+            rows.append(score_row(truth, answer, success, scores) | track.part_of(truth))
         except RsbenchError as error:
             rows.append(str(error))
     return rows

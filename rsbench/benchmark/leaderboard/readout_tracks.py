@@ -125,14 +125,8 @@ class ReadoutTrack(SolverTrack):
         return score_row(truth, answer, ratio is not None, {"e_readout": error, **areas})
 
 
-def _add_motion_column(rows: list[Row], submission: Submission, split: Split) -> None:
-    for row, truth in zip(rows, split.truths, strict=True):
-        row |= {"motion": truth.motion.name}
-
-
 def _add_skill_columns(rows: list[Row], submission: Submission, split: Split) -> None:
     """readout-3: a refusal is never worse than a guess."""
-    _add_motion_column(rows, submission, split)
     spread = spread_of([truth.shutter.readout_ratio for truth in split.truths])
     for row, truth in zip(rows, split.truths, strict=True):
         answer = submission.answers.get(truth.name)
@@ -228,7 +222,6 @@ TRACKS: tuple[Track, ...] = (
         id="readout-2",
         title="Readout ratio, drawn for each sequence, from given matches of rendered frames",
         scores=_READOUT,
-        more_columns=_add_motion_column,
     ),
     ReadoutTrack(
         **_SHARED,

@@ -8,28 +8,25 @@ moves.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from rsbench.benchmark.leaderboard.correction_tracks import OF_SENSORS, SensorTrack
 from rsbench.benchmark.leaderboard.motion_tracks import MotionTrack, add_area_columns, motion_row, pose_fields
-from rsbench.benchmark.leaderboard.splits import FEATURES, Frames, matched, unmatched
-from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Step, Submission, Track, Truth
+from rsbench.benchmark.leaderboard.splits import FEATURES, Frames, find_problem
+from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Track, Truth
 from rsbench.benchmark.seeds import generator
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_pairs
-from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.problem import Problem
 from rsbench.vision.feature_matcher import load_features
@@ -75,7 +72,7 @@ class RigFrames(Frames):
         for sequence in self.pairs(track, data)[: count // 2]:
             loose = replace(sequence, name=sequence.name + LOOSE, rig=loose_of(sequence.name, sequence.rig))
             for each in (sequence, loose):
-                yield unmatched(each) if track.gives_images else matched(each, options)
+                yield find_problem(each, None if track.gives_images else options)
 
     def pairs(self, track: Track, folder: Path) -> list[Rendered]:
         """Pairs of frames; where pictures of the left camera are scored, only rigs whose left camera rolls."""
@@ -135,42 +132,20 @@ class RigMotionTrack(MotionTrack):
         return motion_row(truth, answer)
 
 
-def _add_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    add_area_columns(rows, submission, split)
-    for row, truth in zip(rows, split.truths, strict=True):
-        row |= {"calibration": truth.facts["calibration"]}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RigCorrectionTrack(SensorTrack):
-    """Frames of the left of any two cameras, as a global shutter of its sensor would have taken them."""
-
-    rows: tuple[str, ...] = ("first",)
-
-    def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
-    ) -> list[pd.DataFrame | RsbenchError]:
-        tables = super().mark(submissions, split, workers, step, kept)
-        named = {truth.name: truth.facts["calibration"] for truth in split.truths}
-        for table in tables:
-            if isinstance(table, pd.DataFrame):
-                table["calibration"] = table["problem"].map(named)
-        return tables
-
-
 TRACKS: tuple[Track, ...] = (
     RigMotionTrack(
         **pose_fields(RigFrames()) | {"parting": "calibration"},
         name="pose-rigs",
         id="pose-rigs-1",
         title="Motion from given matches of rigs as they are, with true and with loose calibrations",
-        more_columns=_add_columns,
+        more_columns=add_area_columns,
     ),
-    RigCorrectionTrack(
+    SensorTrack(
         **OF_SENSORS
         | {
             "inputs": RigFrames(),
             "parting": "calibration",
+            "rows": ("first",),
             "scores": tuple(score for score in OF_SENSORS["scores"] if score.key != "psnr_middle"),
         },
         name="correction-rigs",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -48,10 +49,6 @@ FEWEST_FRAMES, MOST_FRAMES = 4, 250
 # Simulated points
 
 
-def _no_kinds(seed: int, number: int) -> dict[str, float | str]:
-    return {}
-
-
 @dataclass(frozen=True, kw_only=True)
 class Draws:
     """The problems of a protocol, by a seed and their numbers."""
@@ -62,7 +59,7 @@ class Draws:
     setting: Callable[[int, int], Setting]
     """Setting of a problem by seed and number."""
     outlier_images: OutlierImages
-    kinds: Callable[[int, int], dict[str, float | str]] = _no_kinds
+    kinds: Callable[[int, int], dict[str, float | str]] = lambda seed, number: {}
     """Other facts than sizes that scores may be drawn against, by seed and number."""
 
     def rng(self, seed: int, what: str, number: int) -> np.random.Generator:
@@ -324,10 +321,10 @@ class Frames(Inputs):
         pairs = self.pairs(track, data)[:count]
         if not track.gives_images:
             options = CorrectionOptions(features=load_features(FEATURES))
-            yield from (matched(sequence, options) for sequence in pairs)
+            yield from (find_problem(sequence, options) for sequence in pairs)
             return
         for sequence in pairs:
-            problem = unmatched(sequence)
+            problem = find_problem(sequence, None)
             yield with_gyro(problem, sequence) if "gyro" in track.allowed else problem
 
     def pairs(self, track: Track, folder: Path) -> list[Sequence]:
@@ -361,7 +358,7 @@ class WholeSequences(Inputs):
         options = CorrectionOptions(features=load_features(FEATURES))
         for sequence in read_dataset(data)[:count]:
             for number, pair in enumerate(sequence.pairs()):
-                problem = matched(pair, options)
+                problem = find_problem(pair, options)
                 if number == 0 and _GYRO in sequence.channels:
                     gyro = gyro_samples(sequence.inertial(), sequence.frame_period_s)
                     problem = replace(problem, correspondences=replace(problem.correspondences, gyro=gyro))
@@ -439,23 +436,18 @@ def _true_pictures(
     return found
 
 
-def matched(sequence: Sequence, options: CorrectionOptions) -> Problem:
-    """Two frames with their matches; without any where the frames show no texture, so that every method fails."""
-    images = {view: sequence.image("rs", *view) for view in VIEWS}
-    try:
-        matches = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, options)
-    except RsbenchError:
-        matches = Correspondences()
-    return _problem(sequence, matches)
+def find_problem(sequence: Sequence, options: CorrectionOptions | None) -> Problem:
+    """Two frames as a problem, with matches by the matcher of ``options``.
 
-
-def _problem(sequence: Sequence, matches: Correspondences) -> Problem:
+    There are none without ``options``, where methods find their own, and where the frames show no texture, so that
+    every method fails.
+    """
+    matches = Correspondences()
+    if options is not None:
+        images = {view: sequence.image("rs", *view) for view in VIEWS}
+        with contextlib.suppress(RsbenchError):
+            matches = find_matches_of_rig(images, sequence.rig, sequence.shutter.scanning, options)
     return Problem(name=sequence.name, correspondences=matches, rig=sequence.rig, known_shutter=sequence.shutter)
-
-
-def unmatched(sequence: Sequence) -> Problem:
-    """Two frames whose matches a method finds itself."""
-    return _problem(sequence, Correspondences())
 
 
 def with_gyro(problem: Problem, sequence: Sequence) -> Problem:

@@ -541,6 +541,10 @@ class Track(ABC):
         """
         return {}
 
+    def part_of(self, truth: Truth) -> Row:
+        """The column ``parting`` of a problem, if the track has one: a fact of it, or its motion model."""
+        return {self.parting: truth.facts.get(self.parting, truth.motion.name)} if self.parting else {}
+
     @property
     def primary(self) -> Score:
         """The score by which methods are ranked."""
