@@ -1,6 +1,6 @@
-"""The one scorer: predictions and the truth into scores, and the only rule of what a failure scores.
+"""Scores of predictions against the ground truth, and the rule for failures.
 
-Simulated trials, image sequences and the studies all score here. A failure is a prediction that says so, that is
+Simulated trials, image sequences and the studies all use it. A failure is a prediction that says so, that is
 not finite, or that is not there: it scores the worst value of everything, is counted, and is never replaced by "no
 motion".
 """
@@ -29,7 +29,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 
 WORST_POSE = {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": WORST_SCALE}
-"""What a failed motion scores, by the name of each error."""
+"""Scores of a failed motion, by the name of the error."""
 
 
 def answered(w: ArrayLike, d: ArrayLike, success: ArrayLike = True) -> NDArray[np.bool_]:
@@ -55,9 +55,9 @@ def pose_errors(
     Args:
         w, d: (..., 3) estimated motion over one frame period, rad and m (or any length where not ``metric``).
         true_w, true_d: (..., 3) true motion of the body, rad and m.
-        rig: whose left camera ``reference_point`` may mean.
-        success: (...) what the estimates say of themselves; see ``answered``.
-        metric: (...) whether the length of ``d`` claims metres.
+        rig: rig whose left camera is meant by ``reference_point = "left"``.
+        success: (...) whether the estimates are marked as successful; see ``answered``.
+        metric: (...) whether the length of ``d`` is in metres.
         reference_point: ``body`` or ``left``, the point whose translation ``d`` is; the truth is moved there.
 
     Returns:

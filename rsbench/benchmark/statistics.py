@@ -31,7 +31,7 @@ Statistic = Callable[[FloatArray], FloatArray]
 
 
 class Interval(NamedTuple):
-    """Ends of an interval; infinite where the values bound nothing."""
+    """Ends of an interval; infinite if there are too few values."""
 
     low: float
     high: float
@@ -73,7 +73,7 @@ def scene_means(values: FloatArray, scenes: Sequence[str]) -> FloatArray:
 
 
 def mean_interval(means: FloatArray) -> Interval:
-    """Interval of the mean of independent means (k,) of scenes; without bounds for a single scene."""
+    """Student's interval of the mean of independent scene means (k,); infinite for a single scene."""
     k = len(means)
     if k < 2:
         return Interval(-np.inf, np.inf)
@@ -85,9 +85,9 @@ def mean_interval(means: FloatArray) -> Interval:
 def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True) -> tuple[float, float, float]:
     """The mean over scenes of values (n,), and the ends of its interval.
 
-    A ``share`` lies in [0, 1], and so does its interval. Of yes or no of problems that are independent the
-    interval is exact; of those that share scenes it has that one inside: scenes that all say no do not bound the
-    share to 0.
+    A ``share`` and its interval lie in [0, 1]. For values 0 and 1 of independent problems the interval is the
+    exact binomial one. If problems share scenes, the interval contains the exact one, so that it does not shrink
+    to a point when all values are equal.
     """
     means = scene_means(values, scenes)
     low, high = mean_interval(means)
@@ -185,7 +185,7 @@ def _counts(n: int, seed: int) -> FloatArray:
 
 @lru_cache(maxsize=4)
 def _middle_ranks(n: int, seed: int) -> NDArray[np.intp]:
-    """Ranks (resamples, 2), from 0, of the middle one or two of n values drawn from n."""
+    """Ranks (resamples, 2), counted from 0, of the one or two middle values of n values drawn from n."""
     drawn = np.cumsum(_counts(n, seed), axis=1)
     return np.stack([np.argmax(drawn > k, axis=1) for k in ((n - 1) // 2, n // 2)], axis=1)
 
@@ -216,10 +216,10 @@ def rounded(value: float, digits: int) -> str:
 
 
 def median_and_quartiles(values: ArrayLike) -> str:
-    """``median [lower, upper]`` with as many digits as their distance allows, at most three; one if they agree.
+    """``median [lower, upper]`` with digits that fit their distance, at most three; one number if they agree.
 
-    NaN is left out. The quartiles are values that there are: between one that is infinite and one that is not lies
-    nothing.
+    NaN is left out. The quartiles are elements of ``values``, because a finite and an infinite value cannot be
+    interpolated.
     """
     numbers = np.asarray(values, dtype=np.float64)
     found = numbers[~np.isnan(numbers)]
@@ -237,7 +237,7 @@ def median_and_quartiles(values: ArrayLike) -> str:
 
 
 def _exponent(value: float) -> int:
-    """The place of the first digit that counts: 0 for ones, -1 for tenths."""
+    """Decimal exponent of the first significant digit: 0 for ones, -1 for tenths."""
     return math.floor(math.log10(abs(value))) if value else 0
 
 

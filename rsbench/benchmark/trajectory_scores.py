@@ -1,8 +1,8 @@
-"""How far a trajectory is from the true one: rotation of rows, drift, and what a viewer sees of it.
+"""Errors of a trajectory against the true one: rotation of rows, drift, and visible jitter.
 
 ATE and RPE are those of evo (M. Grupp, github.com/MichaelGrupp/evo): root mean squares of the distance after the
-rigid motion that fits best (S. Umeyama, PAMI 1991), and of the relative motion over one frame. What a trajectory
-does not know is NaN in it; it scores the worst value of everything.
+rigid motion that fits best (S. Umeyama, PAMI 1991), and of the relative motion over one frame. Poses that a method
+did not estimate are NaN and get the worst score.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def _stacked(poses: list[Pose]) -> Pose:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """The trajectory of an entry; poses are NaN where it has none."""
+    """An estimated trajectory; unknown poses are NaN."""
 
     windows: list[Motion | None]
     """Motions of each two successive frames, seen from the body at the start of the first one."""
@@ -84,7 +84,7 @@ def along(motion: Motion, count: int, positions: bool = True) -> Estimate:
 
 
 def chained(windows: list[Motion | None]) -> Estimate:
-    """Independent motions, each beginning where the one before ends; after a failure nobody knows where."""
+    """Independent motions, each starting at the end pose of the one before; poses after a failure are unknown."""
     starts = [Pose(np.eye(3), np.zeros(3))]
     for motion in windows[:-1]:
         starts.append(compose(_UNKNOWN if motion is None else motion.body_from_world(1.0), starts[-1]))
@@ -96,7 +96,7 @@ def chained(windows: list[Motion | None]) -> Estimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Given:
-    """What methods are given."""
+    """Inputs of the methods."""
 
     rig: StereoRig
     shutter: RollingShutter
@@ -136,7 +136,7 @@ def _windows(model: str | None) -> Callable[[Given], Estimate]:
 
 
 def pnp_motion(tracks: FloatArray, rig: StereoRig) -> Motion | None:
-    """The motion that tracks (n, 8) show to a global shutter; None where there is none."""
+    """The motion estimated from tracks (n, 8) as if the shutter were global; None on failure."""
     tracks = with_depth(rig.camera.ideal_pixels(tracks.reshape(-1, 4, 2)).reshape(-1, 8))
     rig = rig.ideal
     if len(tracks) < _FEWEST:
@@ -165,9 +165,9 @@ class Method(NamedTuple):
     """A method that estimates trajectories."""
 
     solve: Callable[[Given], Estimate | None]
-    """None where it is not given what it needs."""
+    """Returns None if an input that it needs is missing."""
     uses: tuple[str, ...]
-    """What it uses of the inputs of the leaderboard."""
+    """The inputs of the leaderboard that it uses."""
     motion_model: str
     """Motion model that it assumes, as the header of a submission states it."""
     description: str
@@ -215,19 +215,20 @@ METHODS: dict[str, Method] = {
         "A rig that stands still",
     ),
 }
-"""Methods by their names on a board."""
+"""Methods by their name on a leaderboard."""
 
 
 LINES = 9
 """Lines of a frame that are scored."""
 AUC_DEG = {"auc_way": 0.1, "auc_rows": 0.02}
-"""Thresholds of the areas under the curves of errors of lines against the sequence's and the frame's first one."""
+"""Thresholds, degrees, of the areas under the curves of rotation errors relative to the first line of the
+sequence (``auc_way``) and of the frame (``auc_rows``)."""
 _POINTS_PX = 16
 """Distance between the points of the middle frame whose image paths are followed."""
 
 
 def turn_errors(estimate: FloatArray, truth: FloatArray) -> FloatArray:
-    """Angles (n,), radians, by which rotations (n, 3, 3) body_from_world are off, each against the first one."""
+    """Rotation errors (n,), radians, of rotations (n, 3, 3) body_from_world relative to the first one."""
     apart = estimate @ estimate[0].T @ truth[0] @ np.swapaxes(truth, 1, 2)
     known = np.all(np.isfinite(apart), axis=(1, 2))
     return np.where(known, so3.angle(np.where(known[:, None, None], apart, np.eye(3))), WORST_ANGLE)
@@ -253,7 +254,7 @@ def relative_errors(estimate: Pose, truth: Pose) -> tuple[float, float]:
 
 
 def _steps(poses: Pose) -> Pose:
-    """Each pose seen from the one before: (n - 1, 3, 3), (n - 1, 3)."""
+    """Relative poses of successive poses: (n - 1, 3, 3), (n - 1, 3)."""
     return compose(Pose(poses.R[1:], poses.t[1:]), inverse(Pose(poses.R[:-1], poses.t[:-1])))
 
 
@@ -262,11 +263,11 @@ def _root_mean_square(values: FloatArray) -> float:
 
 
 def jitter(estimate: FloatArray, truth: FloatArray) -> float:
-    """Mean acceleration, px per squared frame period, by which points shake in corrected frames.
+    """Mean acceleration of the error of points in corrected frames, px per squared frame period.
 
     Args:
-        estimate: (frames, n, 2) places of points in corrected frames; NaN where the trajectory is not known.
-        truth: likewise in frames of a global shutter; NaN where a point is not seen.
+        estimate: (frames, n, 2) pixels of points in corrected frames; NaN where the trajectory is unknown.
+        truth: (frames, n, 2) pixels in global-shutter frames; NaN where a point is not visible.
     """
     seen = np.all(np.isfinite(truth), axis=-1)
     counted = seen[:-2] & seen[1:-1] & seen[2:]
@@ -281,11 +282,11 @@ def jitter(estimate: FloatArray, truth: FloatArray) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueTrajectory:
-    """What trajectories of a sequence are compared with."""
+    """The ground truth of a sequence for trajectories."""
 
     sequence: Sequence
     points: FloatArray
-    """(n, 3) of the world."""
+    """(n, 3) points in world coordinates."""
     estimate: Estimate
 
     @classmethod
@@ -299,7 +300,7 @@ class TrueTrajectory:
 
     @cached_property
     def seen(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Points (n, 3) of each left frame, in the body when they are seen, NaN where not, and these times."""
+        """Per left frame, points (n, 3) in body axes at the times (n,) of their rows; NaN if not visible."""
         sequence, found = self.sequence, list[tuple[FloatArray, FloatArray]]()
         for frame in range(sequence.frames):
             seen = rs_project(sequence.rig, sequence.shutter, sequence.motion, "left", frame, self.points)
@@ -310,13 +311,13 @@ class TrueTrajectory:
 
 
 def scored_times(shutter: RollingShutter, frame: int, count: int = LINES) -> FloatArray:
-    """Times (count,) of lines of the left camera, even from the first to the last one."""
+    """Times (count,) of lines of the left camera, evenly spaced from the first to the last line."""
     tau = np.sort(shutter.line_times(frame, "left"))
     return tau[np.round(np.linspace(0.0, len(tau) - 1.0, count)).astype(np.int64)]
 
 
 def trajectory_scores(truth: TrueTrajectory, estimate: Estimate) -> dict[str, float]:
-    """Scores of a trajectory; NaN where it says nothing of it."""
+    """Scores of a trajectory; NaN for scores of positions if it has none."""
     sequence, frames = truth.sequence, range(truth.sequence.frames)
     rows, both = list[FloatArray](), [list[Pose](), list[Pose]()]
     for frame in frames:
@@ -349,7 +350,7 @@ def trajectory_scores(truth: TrueTrajectory, estimate: Estimate) -> dict[str, fl
 
 
 def _corrected_places(truth: TrueTrajectory, estimate: Estimate) -> FloatArray:
-    """Where points (frames, n, 2) stand in left frames corrected with a trajectory and their true depth, px."""
+    """Pixels (frames, n, 2) of points in left frames that are corrected with a trajectory and the true depth."""
     rig, places = truth.sequence.rig, list[FloatArray]()
     for frame, (x, tau) in enumerate(truth.seen):
         at_start = transform(inverse(estimate.within(frame, tau)), x) + rig.offset("left")

@@ -41,7 +41,7 @@ _SEEDS = "seeds"
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationOptions:
-    """What a user asks for, apart from the dataset; components by name or by the path of a card."""
+    """Options of an evaluation beside the dataset; components are given by name or by the path of a card."""
 
     solvers: tuple[str, ...]
     correction_solver: str = "rs-stereo-refined"
@@ -50,16 +50,17 @@ class EvaluationOptions:
     matcher: str = "sgm"
     corrector: str = "fusion"
     metrics: tuple[str, ...] = ()
-    """Metrics beside ``STANDARD_METRICS``."""
+    """Metrics that are computed in addition to ``STANDARD_METRICS``."""
     only: tuple[str, ...] = ()
     """Names of solvers and sequences to which predicting is limited; all when empty."""
     force: bool = False
-    """Make again what is current."""
+    """Whether predictions that are current are made again."""
     seeds: int = 1
     """How often each solver's robust loop is run, with other samples; the correction uses the first motion."""
     seed: int = 0
     rehash: bool = False
-    """Read all files of the dataset again, also those of the size and times that they had, and score again."""
+    """Whether all files of the dataset are hashed again, even those with unchanged size and times, and all scores
+    are computed again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,7 +79,7 @@ class Plan:
 
     @property
     def corrects(self) -> bool:
-        """Whether depth and correction are to be predicted too."""
+        """Whether depth and corrected frames are predicted too."""
         return self.chain.solver.name in self.solver_names
 
 
@@ -159,7 +160,7 @@ def reference_of(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recipe:
-    """What a correction is made of."""
+    """The components of a correction, and which of its inputs are the true ones."""
 
     chain: CorrectionOptions
     true_motion: bool = False
@@ -178,7 +179,7 @@ class Recipe:
         }
 
     def variants(self) -> list[Recipe]:
-        """This one, and the oracles that have its motion, its depth or both replaced by the truth."""
+        """This recipe and its oracles, in which the true motion, the true depth or both replace the estimates."""
         needs = self.chain.corrector.component.spec.needs
         motions = (False, True) if "motion" in needs else (False,)
         depths = (False, True) if "depth" in needs else (False,)
@@ -192,10 +193,10 @@ def hash_of_data(sequence: Sequence, folders: tuple[str, ...], hash_of: HashOf) 
 
 
 class Places:
-    """Where the predictions on a sequence are, with the identity that each must have to be current.
+    """Paths of the predictions on a sequence, with the identity that each must have to be current.
 
-    Components other than those of ``chain`` may be given; ``chain`` says everything else that decides. ``hash_of``
-    gives the SHA-256 of a file of the sequence.
+    Methods take the component in question; all other options come from ``chain``. ``hash_of`` returns the SHA-256
+    of a file of the sequence.
     """
 
     def __init__(
@@ -205,17 +206,17 @@ class Places:
 
     @cached_property
     def data(self) -> str:
-        """Identity of what predictions may know: rig, shutter and rolling-shutter images."""
+        """Identity of the inputs of predictions: rig, shutter and rolling-shutter images."""
         return hash_of_data(self.sequence, ("rs",), self._file_hash)
 
     @cached_property
     def truth(self) -> str:
-        """Identity of what oracles know."""
+        """Identity of the inputs of oracles, which include the true depth."""
         return hash_of_data(self.sequence, ("rs", "rs_depth"), self._file_hash)
 
     @cached_property
     def scored_truth(self) -> str:
-        """Identity of what scores of depth and of images compare with."""
+        """Identity of the ground truth of depth and images."""
         return hash_of_data(self.sequence, SCORED, self._file_hash)
 
     def matches(self) -> Artefact:
@@ -258,7 +259,7 @@ class Places:
 
 
 class Stored(NamedTuple):
-    """A record that is on disk, and the entries that made it."""
+    """A stored record and the components that made it."""
 
     record: dict[str, Any]
     made_by: Any
@@ -306,14 +307,14 @@ def _recipe(chain: CorrectionOptions, record: Mapping[str, Any]) -> Recipe:
 
 
 def _named(load: Callable[[str], Component], source: str) -> Component:
-    """An entry that a record names. Cards run code, and a record may be anybody's: no path in one is followed."""
+    """The component that a record names. Cards run code and records are untrusted, so paths are refused."""
     if not isinstance(source, str) or source.endswith(".toml") or "/" in source or os.sep in source:
         raise RsbenchError(f"{source!r}: a card that this command does not name")
     return load(source)
 
 
 def _again(load: Callable[[Any], Component], source: Any) -> Component | None:
-    """What made a record, as it is today; None when it is gone."""
+    """The component that made a record, in its present version; None when it no longer exists."""
     try:
         return load(source)
     except (RsbenchError, KeyError, TypeError):

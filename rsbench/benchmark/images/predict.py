@@ -1,8 +1,8 @@
 """Predictions on image sequences: matches, motions, disparity and corrected frames, stored before any scoring.
 
-Nothing here reads the truth of a sequence, but for the oracles, which are given it instead of a motion or a depth.
-Each prediction is an artefact of its own (see ``store``): what is current is kept, and one more solver redoes
-nothing else. What a component of another package does wrong is a failed prediction with the reason.
+Only the oracles read the ground truth of a sequence: they use it in place of an estimated motion or depth. Each
+prediction is an artefact (see ``store``). Current artefacts are reused, so adding a solver repeats nothing else.
+An error in a component of another package is recorded as a failed prediction with the reason.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Bench:
         return {view: self.sequence.image("rs", *view) for view in VIEWS}
 
     def predict(self, step: Step) -> None:
-        """Make what is planned and not current."""
+        """Make the planned predictions that are not current."""
         if self.plan.force and len(self.plan.solver_names) == len(self.plan.solvers):
             self.places.matches().forget()
         self._match()
@@ -96,7 +96,7 @@ class Bench:
                 step(f"{self.sequence.name}: correction")
 
     def stands(self, artefact: Artefact) -> bool:
-        """Whether it need not be made."""
+        """Whether an artefact is current and need not be made again."""
         return not self.plan.force and artefact.record() is not None
 
     # Matches
@@ -122,7 +122,7 @@ class Bench:
 
     @cached_property
     def _matches(self) -> Correspondences | str:
-        """The matches, or why there are none."""
+        """The matches, or the reason why there are none."""
         artefact = self.places.matches()
         record = artefact.record() or {"success": False, "reason": "not made"}
         return load_matches(artefact.file(".npz")) if record["success"] else str(record["reason"])
@@ -130,7 +130,7 @@ class Bench:
     # Motion
 
     def move(self, entry: SolverEntry, seed: int = 0) -> None:
-        """Estimate the motion with the samples number ``seed``; of the first, time and inliers are kept too."""
+        """Estimate the motion with RANSAC seed ``seed``; for seed 0, run time and inliers are stored too."""
         artefact = self.places.motion(entry, seed)
         if self.stands(artefact):
             return
@@ -153,7 +153,7 @@ class Bench:
         artefact.finish(record, robust.seconds if seed == 0 else None)
 
     def _refuse_another(self, entry: SolverEntry, artefact: Artefact) -> None:
-        """Another entry of the same name must not be overwritten in silence."""
+        """Raises RsbenchError instead of overwriting the prediction of another solver of the same name."""
         stored = read_record(artefact.file(".json")) or {}
         other, own = stored.get("entry", ""), reference_of(SOLVERS, entry)
         if not self.plan.force and other not in ("", own) and stored.get("key") != entry.key:
@@ -231,7 +231,7 @@ class Bench:
         artefact.finish(record, seconds)
 
     def _given(self, recipe: Recipe) -> Given | str:
-        """What the recipe says to be known, or why it is not."""
+        """The known inputs of a recipe, or the reason why one of them is missing."""
         motion: Motion | str | None = None
         pairs: Pairs | str | None = None
         if recipe.names["solver"] != NONE:
@@ -252,7 +252,7 @@ class Bench:
         return Given(matches=matches, motion=motion, pairs=pairs, gyro=gyro)
 
     def _pairs(self, recipe: Recipe) -> Pairs | str | None:
-        """Those of the matcher; None where they are found with the motion that the recipe has."""
+        """The frame pairs with the matcher's depth; None if the correction computes depth with its own motion."""
         moved = needs_motion(recipe.chain.matcher)
         if recipe.true_motion if moved else not self.sequence.shutter.rows_together:
             return None
@@ -318,7 +318,7 @@ def _references(recipe: Recipe) -> dict[str, str]:
 
 
 def read_motion(places: Places, solver: SolverEntry) -> Motion | str:
-    """The body's motion in metres that a solver predicted, or why there is none."""
+    """The body's motion in metres that a solver predicted, or the reason why there is none."""
     record = places.motion(solver).record()
     if record is None:
         return "not made"
@@ -346,7 +346,7 @@ def load_disparities(path: Path, rig: StereoRig) -> dict[str, NDArray[np.float32
 
 
 def true_pairs(sequence: Sequence, images: Images) -> Pairs:
-    """Rolling-shutter frames with their true depth; what has no surface is infinitely far."""
+    """Rolling-shutter frames with their true depth, which is infinite where there is no surface."""
     truth = {view: sequence.depth("rs", *view) for view in VIEWS}
     return known_depth(images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in truth.items()})
 
@@ -356,8 +356,9 @@ def depth_of(
 ) -> NDArray[np.float32]:
     """Depth (H, W), metres, 0 where the disparity is not known: the depth convention of the dataset.
 
-    ``timed``: a motion is in the disparities already. Else, with a lens, the true motion says where the rig was at
-    both ends of a disparity: a matcher is scored, no motion.
+    ``timed``: whether the disparities already account for the motion. If not, and the camera has a lens, the two
+    ends of a disparity are read at different times; the true motion then gives both poses, because the matcher is
+    scored and not the motion.
     """
     rig = sequence.rig
     depth = np.nan_to_num(rig.depth(disparity), nan=0.0).astype(np.float32)

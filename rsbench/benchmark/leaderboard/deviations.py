@@ -1,4 +1,4 @@
-"""What stated deviations are worth: how often their ellipsoids hold the truth, and a log score of them.
+"""Calibration of stated covariances: coverage of their ellipsoids, and a log score.
 
 **Coverage.** The squared error by the stated covariance (NEES) is chi-squared where the covariance is right, with
 six degrees of freedom for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with
@@ -12,9 +12,9 @@ logarithm of the density that an answer states at the true motion x = (w, d), ov
 
 v knows of a split only how large its motions are: a Cauchy density in three dimensions about 0 for w, and one for
 d, whose scales are the median lengths of the true w and d. So units cancel, and the score counts nats (1.44 bits)
-that an answer tells beyond v. A failure, or an answer without a covariance, states v and has 0. The share e makes
+of information beyond v. A failure, or an answer without a covariance, states v and has 0. The share e makes
 the score robust: a truth that the Gaussian excludes costs ln e = -4.6, however far away it is. It is proper within
-0.01: nobody gains more than -ln(1 - e) on average by stating another density than the one that he believes. (By
+0.01: stating another density than the believed one gains at most -ln(1 - e) on average. (By
 Gibbs' inequality no mixture beats the true density p, and (1 - e) p + e v is at least (1 - e) p.) See Gneiting and
 Raftery, Strictly proper scoring rules, JASA 2007, section 4.1.
 """
@@ -35,13 +35,13 @@ from rsbench.core.so3 import FloatArray
 
 LEVELS = (0.5, 0.9, 0.95)
 VAGUE = 0.01
-"""Share of the vague density in what an answer states, e above."""
+"""Weight e of the vague density in the mixture above."""
 NOT_STATED = math.nan, math.nan
 _SEED = 0
 Triple = tuple[float, float, float]
 
 
-# Of one answer
+# Scores of one answer
 
 
 def stated(error: FloatArray, covariance: FloatArray) -> tuple[float, float]:
@@ -73,21 +73,21 @@ def log_score(log_density: float, vague: float) -> float:
     return float(np.logaddexp(math.log1p(-VAGUE) + log_density - vague, math.log(VAGUE)))
 
 
-# Of an entry
+# Calibration of an entry
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """How well stated covariances fit the errors; each triple is a value with the ends of its interval."""
+    """Agreement of stated covariances with the errors; each triple is a value and the ends of its interval."""
 
     stated: int
     """Number of answers with a covariance."""
     spread: Triple
     """Median of NEES over that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
     covers: tuple[Triple, ...]
-    """For each of ``LEVELS``, the share of truths within the ellipsoid of that level."""
+    """For each of ``LEVELS``, the share of problems whose true value lies within the ellipsoid of that level."""
     mean: float
-    """NEES over its degrees of freedom, without an interval."""
+    """Mean NEES divided by its degrees of freedom, without an interval."""
     log_score: Triple | None
     """Mean over scenes, nats; None on tracks that have none."""
 
@@ -121,9 +121,9 @@ def _chi_squared(level: float, unknowns: int) -> float:
 
 
 def named_numbers(found: Calibration | None, scored: bool) -> dict[str, Triple]:
-    """The triples by the names of their columns; NaN where nothing was stated.
+    """The triples by the names of their columns; NaN if no covariance was stated.
 
-    ``scored``: with the log score.
+    ``scored``: whether the log score is included.
     """
     nothing = (np.nan, np.nan, np.nan)
     covers = found.covers if found else (nothing,) * len(LEVELS)

@@ -1,10 +1,11 @@
-"""Entries nearer to the truth than their data allow are in doubt: they have no rank until the board's keeper
-accepts.
+"""Entries that are more accurate than their data allow are in doubt: they are not ranked until the board's keeper
+accepts them.
 
-Two signs: an error that is exact in a tenth of the problems, and errors below what the Cramer-Rao bound of the
-data that a method names allows. An unbiased method errs by less than the median at the bound in at most half of
-the problems. Each error of a track is judged by itself. Where no bound is known, as for rendered frames, the truth
-with a small error shows neither sign: a keeper who wants to be sure runs the method.
+Two things put an entry in doubt: an error that is zero but for rounding in a tenth of the problems, and errors
+below the Cramer-Rao bound of the data that the method states to use. The error of an unbiased method is below the
+median at the bound in at most half of the problems. Each error of a track is tested separately. Where no bound is
+known, as for rendered frames, a submission of the true values with a small error is not detected; the keeper has
+to run the method to be sure.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rsbench.components.cards import list_cards
 from rsbench.core.errors import RsbenchError
 
 COVERAGE = 0.999
-"""Coverage of the interval that must exclude one half: it puts one honest method in 2000 at the bound in doubt."""
+"""Coverage of the interval that must exclude one half: 1 of 2000 unbiased methods at the bound is put in doubt."""
 _EXACT_SHARE = 0.1
 """Largest share of problems in which an error may be zero but for rounding."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
@@ -31,12 +32,12 @@ _BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
 
 
 def outline(name: str) -> str:
-    """A name as it reads at a glance: without case, with one separator, 0 as o, and 1 and i as l."""
+    """A name without differences that are easily overlooked: case, separators, 0 and o, 1, i and l."""
     return re.sub("[._-]+", "-", name.lower()).strip("-").translate(str.maketrans("01i", "oll"))
 
 
 def refuse_reserved(header: Header, where: str) -> None:
-    """A submission uses neither the name of a method of rsbench nor the truth.
+    """Refuse a submission with the name of a method of rsbench, or one that uses the ground truth.
 
     Raises:
         RsbenchError: the name reads like one of rsbench's own, or ``uses`` names the truth.
@@ -56,7 +57,7 @@ def refuse_reserved(header: Header, where: str) -> None:
 
 
 def doubt_about(scores: pd.DataFrame, header: Header, split: Split) -> str:
-    """Why an entry is in doubt, in a line; empty where it is not."""
+    """The reason why an entry is in doubt, in one line; empty if it is not."""
     if ORACLE in header.uses:
         return ""
     track = split.track

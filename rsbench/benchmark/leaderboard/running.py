@@ -1,8 +1,8 @@
-"""Running cards on exported inputs: each answer is kept as soon as it is made, and scored only afterwards.
+"""Run cards on exported inputs; answers are stored as soon as they are made and scored afterwards.
 
-A method sees what is exported, and nothing else. Each answer has an identity made of method, inputs, options and
-code: current ones are kept, so an interrupted run resumes. Cards of other packages run in processes of their own
-with limits; what they do wrong is a failure with its reason.
+A method reads nothing but the exported inputs. Each answer has an identity made of method, inputs, options and
+code; answers whose identity is current are reused, so that an interrupted run resumes. Cards of other packages run
+in separate processes with limits, and their errors are recorded as failures with the reason.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rsbench.storage.work_folder import remove
 
 
 def load_cards(track: Track, cards: Sequence[str]) -> dict[str, Runnable]:
-    """What a track can run, by card.
+    """The components that a track can run, by card.
 
     Raises:
         RsbenchError: a card is wrong or does not fit the track, or two of them have one name.
@@ -50,7 +50,7 @@ def load_cards(track: Track, cards: Sequence[str]) -> dict[str, Runnable]:
 
 
 def count_steps(split: Split, cards: Sequence[str], limits: Limits) -> int:
-    """How often ``run_cards`` reports progress."""
+    """Number of progress reports of ``run_cards``."""
     problems = len(split.truths)
     matching = problems if split.track.own_matches else 0
     return len(cards) * -(-problems // split.track.chunk(limits)) + matching
@@ -144,7 +144,7 @@ def _record(target: Target, problems: Sequence[str]) -> Path:
 
 
 def _stored(target: Target, problems: Sequence[str]) -> list[dict[str, Any]] | None:
-    """The answers to some problems, when they are current."""
+    """The stored answers to some problems; None if they are not current."""
     return kept(_record(target, problems), target.identity)
 
 
@@ -155,7 +155,7 @@ def _keep(target: Target, problems: Sequence[str], answers: Sequence[dict[str, A
 def _done(
     track: Track, jobs: Sequence[Job], workers: Workers, inputs: Path, limits: Limits, built_in: set[str]
 ) -> Iterator[Job]:
-    """Jobs as they are done in child processes of one thread; one that breaks its limits is a failure.
+    """Jobs as they are done in child processes of one thread; a job that exceeds its limits is a failure.
 
     Raises:
         RsbenchError: see ``finished_jobs``; only without limits.
@@ -173,7 +173,7 @@ def _done(
         return
 
     def seconds_of(job: Job) -> float:
-        """Components of others are limited in processes of their own, whose start takes a while."""
+        """Time limit of a job; components of other packages are limited in processes of their own."""
         own = all(target.card in built_in for target in job.targets)
         return limits.seconds if limits.seconds is not None and own else math.inf
 
@@ -190,7 +190,7 @@ def _done(
 
 
 def _serve(track: Track, inputs: Path, limits: Limits) -> Any:
-    """Function that runs jobs, in the child process."""
+    """Function that runs jobs in the child process."""
     use_one_thread()
     warm_up()
     solve = track.solver_of_jobs(inputs, limits)

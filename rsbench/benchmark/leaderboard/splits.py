@@ -54,13 +54,13 @@ class Draws:
     """The problems of a protocol, by a seed and their numbers."""
 
     scope: tuple[str, ...]
-    """Names of its generators: no two protocols share a draw."""
+    """Names that seed its random generators, so that no two protocols share a draw."""
     problems: int
     setting: Callable[[int, int], Setting]
     """Setting of a problem by seed and number."""
     outlier_images: OutlierImages
     kinds: Callable[[int, int], dict[str, float | str]] = lambda seed, number: {}
-    """Other facts than sizes that scores may be drawn against, by seed and number."""
+    """Further properties, beside sizes, against which scores are plotted, by seed and number."""
 
     def rng(self, seed: int, what: str, number: int) -> np.random.Generator:
         return generator(seed, *self.scope, what, number)
@@ -80,7 +80,7 @@ def _log_uniform(rng: np.random.Generator, sizes: Range) -> float:
 
 
 def points_setting(seed: int, number: int) -> Setting:
-    """points-1: every size at random, within ranges of our choice; the camera is the paper's."""
+    """points-1: all sizes are drawn at random from fixed ranges; the camera is the paper's."""
     rng = generator(seed, "leaderboard", "setting", number)
     return Setting(
         width=900,
@@ -117,7 +117,7 @@ class RigKind:
     shake: str
     """Preset of its spline motion."""
     drives: bool = False
-    """Whether it moves forward and turns about the vertical, up to a few degrees."""
+    """Whether it moves forward and turns about the vertical axis, both within a few degrees."""
 
 
 KINDS = {
@@ -132,15 +132,15 @@ _READOUT: Range = (0.1, 0.95)
 _CELLS = tuple((kind, model) for kind in KINDS for model in MODELS_DRAWN)
 _OF_A_CELL = 12
 _ACCELERATION = 0.4
-"""k of ``accelerated`` lies evenly within this distance of 0."""
+"""k of ``accelerated`` is uniform within this distance of 0."""
 _SLANT = 0.1
-"""Standard deviation by which a car's direction and axis leave forward and vertical, in shares of their length."""
+"""Relative standard deviation of a car's direction from forward and of its axis from vertical."""
 _SCOPE = ("leaderboard", "points-2")
 
 
 @lru_cache(maxsize=8)
 def _order(seed: int) -> NDArray[Any]:
-    """The cell of each problem: no name reveals its motion model."""
+    """The cell of each problem, shuffled so that names do not reveal the motion model."""
     return generator(seed, *_SCOPE, "order").permutation(len(_CELLS) * _OF_A_CELL) % len(_CELLS)
 
 
@@ -150,7 +150,7 @@ def _cell(seed: int, number: int) -> tuple[str, str]:
 
 @lru_cache(maxsize=512)
 def setting_by_kind(seed: int, number: int) -> Setting:
-    """points-2: a kind of rig under a motion model, as many problems of each pair."""
+    """points-2: a kind of rig with a motion model, equally many problems for each combination."""
     name, model = _cell(seed, number)
     kind, rng = KINDS[name], generator(seed, *_SCOPE, "setting", number)
     ahead = np.array([0.0, 0.0, 1.0]) + _SLANT * rng.standard_normal(3)
@@ -242,7 +242,7 @@ def seed_of(path: Path | None) -> int:
 
 
 def simulated_problem(seed: int, number: int, draws: Draws = POINTS_1) -> Problem:
-    """The matches of one problem: tracks alone, of which a method takes what it uses.
+    """The matches of one problem: tracks only, of which a method uses what it needs.
 
     Raises:
         RsbenchError: the motion leaves too few points in view; another seed is needed.
@@ -295,12 +295,12 @@ def _sizes(motion: Motion, rig: StereoRig, shutter: RollingShutter) -> dict[str,
 
 @dataclass(frozen=True)
 class Frames(Inputs):
-    """Each two frames of the sequences of a dataset: with given matches, or where frames are given, without."""
+    """Pairs of frames of the sequences of a dataset, with given matches unless the frames are given."""
 
     distinct_ratios: bool = False
-    """Whether each sequence must have its own readout ratio, so that no constant wins."""
+    """Whether all sequences must have different readout ratios, so that a constant answer cannot win."""
     any_rig: bool = False
-    """Whether pictures may be of cameras with lenses, scans and sizes of their own."""
+    """Whether the two cameras may have lenses and may differ in scan and size."""
 
     def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
         folder = _dataset_of(track, data, seed_file)
@@ -328,7 +328,7 @@ class Frames(Inputs):
             yield with_gyro(problem, sequence) if "gyro" in track.allowed else problem
 
     def pairs(self, track: Track, folder: Path) -> list[Sequence]:
-        """The sequences that the track asks about."""
+        """The pairs of frames that are problems of the track."""
         return read_pairs(folder)
 
 
@@ -387,7 +387,7 @@ def label_of(folder: Path) -> str:
 
 
 def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
-    """The truth of a sequence, with what pictures are compared with."""
+    """The ground truth of a sequence, with the true pictures on tracks of pictures."""
     scene = sequence.manifest.get("scene")
     named = scene.get("name") if isinstance(scene, dict) else None
     facts = {
@@ -409,7 +409,7 @@ def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
 def _true_pictures(
     folder: Path, sequences: Iterable[Sequence], track: Track, any_rig: bool
 ) -> dict[str, TruePictures]:
-    """By the names of the sequences of a dataset.
+    """True pictures by the names of the sequences of a dataset.
 
     Raises:
         RsbenchError: dataset.json lists no such file; the cameras have a lens or other scans, or objects move.

@@ -1,7 +1,7 @@
-"""Submitted predictions: JSON lines, a header and an answer for each problem. A fault is a line.
+"""Submitted predictions: JSON lines with a header and an answer for each problem; a fault is one line.
 
-Nothing in it is trusted: sizes are limited before anything is decoded, names are looked up among
-those of the split and are never paths, and numbers are finite. docs/how-to/submit.md is the format.
+Nothing in the file is trusted: sizes are limited before decoding, names are looked up in the split and never used
+as paths, and numbers must be finite. The format is described in docs/how-to/submit.md.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _NAMED = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Findings:
-    """What a check found."""
+    """Result of checking a submission."""
 
     submission: Submission | None
-    """None where there are faults."""
+    """None if there are faults."""
     faults: tuple[str, ...]
-    """Each a line with file, line, field, value and remedy."""
+    """One line each, with file, line, field, value and remedy."""
     notes: tuple[str, ...]
     """Likely mistakes: the file is scored as it is."""
 
@@ -48,7 +48,7 @@ def read_submission(path: Path, split: Split) -> Submission:
     """A file of predictions.
 
     Raises:
-        RsbenchError: it is at fault; the line says how often.
+        RsbenchError: the file has faults; the message has the first one and their number.
     """
     found = check_submission(path, split, hints=False)
     if found.submission is None:
@@ -59,7 +59,7 @@ def read_submission(path: Path, split: Split) -> Submission:
 
 
 def check_submission(path: Path, split: Split, *, hints: bool = True) -> Findings:
-    """Everything that is wrong with a file of predictions, and where ``hints`` are wanted what looks so."""
+    """All faults of a file of predictions and, with ``hints``, likely mistakes."""
     faults: list[str] = []
     header: Header | None = None
     answers: dict[str, Answer] = {}
@@ -96,7 +96,7 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
 
 
 def protocol_of(path: Path) -> tuple[str, str]:
-    """The protocol that the first line of a file names, and where it does.
+    """The protocol named in the first line of a file, and the place ``file:line``.
 
     Raises:
         RsbenchError: the file cannot be read, or its first line names none.
@@ -198,7 +198,7 @@ def method_header(split: Split, method: str, uses: Sequence[str], description: s
 
 
 def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
-    """All keys of a header, to be filled in."""
+    """All keys of a header, for users to fill in."""
     return {
         "protocol": split.track.id,
         "split": split.name,
@@ -209,7 +209,7 @@ def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
 
 
 def write_template(split: Split, path: Path) -> None:
-    """Write an example without a fault: an answer to the first problem, and a failure for every other."""
+    """Write a valid example: an answer to the first problem, and a failure for every other one."""
     first, *rest = (truth.name for truth in split.truths)
     failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
     split.track.draw_example(split, path.parent)
@@ -218,7 +218,7 @@ def write_template(split: Split, path: Path) -> None:
 
 
 def write_truth(split: Split, folder: Path, file: str = "predictions.jsonl") -> Path:
-    """Write the truth as a submission, which scores the best value of everything; returns its file of answers."""
+    """Write the ground truth as a submission, which gets the best scores; returns its file of answers."""
     folder.mkdir(parents=True, exist_ok=True)
     split.track.draw_truth(split, folder)
     write_bytes(folder / file, truth_text(split).encode())
@@ -232,7 +232,7 @@ def truth_text(split: Split) -> str:
 
 
 def write_oracles(split: Split, folder: Path) -> Iterator[Path]:
-    """Write the truth, and others that show how much there is to gain; yields their files of answers."""
+    """Write the ground truth and the other oracles of the track; yields their files of answers."""
     yield write_truth(split, folder / ORACLE)
     for name, make in split.track.oracles:
         path = folder / name / "predictions.jsonl"

@@ -46,7 +46,7 @@ KNOWLEDGE = {
     "affine": "the affine frames of matches over time of the left camera",
     "truth": "the truth: an oracle, which has no rank",
 }
-"""What methods use, in the order of tables."""
+"""Inputs that methods may use, in the order of tables."""
 ORACLE = "truth"
 CHUNK = 10
 """Problems of one job of a solver."""
@@ -66,8 +66,8 @@ _ANNOUNCED = {
         "382c1320481b8b75aae3ba87190f80b7d671d73c323961e95e6bee131c507e77"
     ),
 }
-"""Announced fingerprints, of the public points and of the motions of ``laws``, by the hash of the truth rounded to
-nine digits, which is equal on all processors."""
+"""Announced fingerprints of the public points and of the motions of ``laws``. The key is the hash of the ground
+truth rounded to nine digits, which is the same on all processors."""
 Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Numbers = dict[str, float]
@@ -77,20 +77,20 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Score:
-    """A column of scores.csv that tables show."""
+    """A column of scores.csv that is shown in tables."""
 
     key: str
     title: str
     hint: str
-    """What it is, in a line."""
+    """Explanation in one line."""
     kind: Kind
-    """How problems are summarised: a ``share`` lies in [0, 1], a ``mean`` anywhere; both are means over scenes
-    with an interval. A ``median`` is taken over problems."""
+    """How the values of all problems are summarised: ``share`` (values in [0, 1]) and ``mean`` are means over
+    scenes with an interval; ``median`` is the median over problems."""
     better: Literal["lower", "higher"] = "lower"
 
     @property
     def sign(self) -> float:
-        """Factor that makes larger values better."""
+        """Factor after which larger values are better."""
         return 1.0 if self.better == "higher" else -1.0
 
 
@@ -99,7 +99,7 @@ SECONDS = Score("seconds", "s", "median time of a problem, as stated", "median")
 
 
 class Limits(NamedTuple):
-    """What a method may take for one problem, in a process that ends when it takes more; None: no limit."""
+    """Time and memory of a method for one problem; its process is ended when it exceeds them. None: no limit."""
 
     seconds: float | None = None
     memory_mb: float | None = None
@@ -155,7 +155,7 @@ class Header:
                 raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
 
     def check_uses(self, track: Track, where: str) -> None:
-        """Raises RsbenchError when the method uses what its track does not give."""
+        """Raises RsbenchError when the method uses an input that its track does not give."""
         try:
             track.check_uses(self.uses)
         except ValueError as error:
@@ -214,14 +214,14 @@ class Answer:
             raise ValueError("covariance: must be symmetric: give both halves of it")
 
     def refuse_numbers(self, instead: str) -> None:
-        """Raises ValueError where an answer made of something else has a motion, a ratio or a covariance."""
+        """Raises ValueError if the answer contains a motion, a readout ratio or a covariance."""
         for name in ("w", "d", "readout_ratio", "covariance"):
             if getattr(self, name) is not None:
                 raise ValueError(f"{name}: does not belong here; {instead}")
 
 
 def _symmetric(covariance: FloatArray) -> bool:
-    """Whether it is symmetric to 0.001 of its standard deviations: rounded numbers are, a triangle is not."""
+    """Whether a covariance is symmetric to 0.001 of its standard deviations, which allows for rounded numbers."""
     sizes = np.sqrt(np.abs(np.diag(covariance)))
     with np.errstate(over="ignore"):
         return bool(np.all(np.abs(covariance - covariance.T) <= 1e-3 * np.outer(sizes, sizes)))
@@ -229,13 +229,13 @@ def _symmetric(covariance: FloatArray) -> bool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Submission:
-    """A file of predictions without faults."""
+    """A valid file of predictions."""
 
     header: Header
     answers: Mapping[str, Answer]
     """Answers by the name of the problem."""
     folder: Path
-    """Folder of the file, and of the pictures and matches of its answers."""
+    """Folder that contains the file and the pictures and matches of its answers."""
 
 
 # Problems with their truth
@@ -243,22 +243,22 @@ class Submission:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """One problem: its true motion, and what is known of it."""
+    """One problem with its ground truth."""
 
     name: str
     rig: StereoRig
     shutter: RollingShutter
     motion: Motion
     scene: str
-    """Problems of one scene are not independent: intervals count scenes."""
+    """Problems of one scene are not independent, so intervals are over scenes."""
     facts: dict[str, float | str]
-    """What scores may be drawn against."""
+    """Properties of the problem against which figures plot the scores."""
     sequence: Rendered | None = None
-    """Where the truth of rendered frames lies."""
+    """The sequence with the ground truth of rendered frames."""
     pictures: TruePictures | None = None
     """Pictures, on tracks whose answers are pictures."""
     given_rig: StereoRig | None = None
-    """What methods are given of the rig, where that is not the true one."""
+    """The rig that methods are given, if it is not the true one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -276,16 +276,16 @@ class Split:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the protocol, the rigs, the true motions, and the files that pictures are compared with.
+        """SHA-256 of the protocol, the rigs, the true motions, and the true pictures.
 
-        It can be announced before a competition: whoever gets the seed or the dataset afterwards finds the same.
+        It can be announced before a competition; with the seed or the dataset, anyone can verify it afterwards.
         """
         content = [self.track.id, *(_identity(truth) for truth in self.truths)]
         return _ANNOUNCED.get(_hash_of(_rounded(content))) or _hash_of(content)
 
     @property
     def name(self) -> str:
-        """The label, and enough of the fingerprint that no two splits are confused."""
+        """The label and the first eight digits of the fingerprint."""
         return f"{self.label}-{self.fingerprint[:8]}"
 
     @cached_property
@@ -298,7 +298,7 @@ def _hash_of(content: object) -> str:
 
 
 def _rounded(content: Any) -> Any:
-    """Numbers to nine digits: exp and sin differ in the last bit between processors."""
+    """Numbers rounded to nine digits, because exp and sin differ in the last bit between processors."""
     if isinstance(content, float):
         return f"{content:.9g}"
     if isinstance(content, dict):
@@ -324,7 +324,7 @@ def _identity(truth: Truth) -> dict[str, Any]:
 
 
 class Inputs(ABC):
-    """Where the problems of a track come from."""
+    """The source of the problems of a track."""
 
     rendered: ClassVar[bool] = True
     """Whether they are rendered frames."""
@@ -341,17 +341,17 @@ class Inputs(ABC):
 
 
 class Runnable(NamedTuple):
-    """A card that a track can run."""
+    """A component that a track can run, loaded from its card."""
 
     name: str
     """Name of its entry."""
     built_in: bool
     key: object
-    """JSON-ready: what decides its answers beside the inputs."""
+    """Everything that determines its answers apart from the inputs; JSON-ready."""
     header: Mapping[str, Any]
-    """What the first line of its predictions says of the method."""
+    """Fields of the header of its predictions."""
     model: str = "linear"
-    """Motion model whose code is compiled before it runs."""
+    """Motion model whose code is compiled before the run."""
 
 
 class Target(NamedTuple):
@@ -365,7 +365,7 @@ class Target(NamedTuple):
 
 
 class Job(NamedTuple):
-    """Problems that one process solves by one card, or by several that share what they find."""
+    """Problems that one process solves with one card, or with several cards that share intermediate results."""
 
     problems: tuple[str, ...]
     targets: tuple[Target, ...]
@@ -381,9 +381,9 @@ Solve = Callable[[Job], Iterator[list[dict[str, Any]]]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track(ABC):
-    """A question with its inputs, its answers, their scores, and its columns on a board.
+    """A task of the leaderboard: its inputs, the type of its answers, their scores, and the columns of its tables.
 
-    The fields are its data; a subclass is what several tracks with one type of answer have in common.
+    A track is described by the fields; a subclass implements what tracks with the same type of answer share.
     """
 
     name: str
@@ -392,23 +392,23 @@ class Track(ABC):
     """Name of its protocol, which submissions state."""
     title: str
     allowed: tuple[str, ...]
-    """What of ``KNOWLEDGE`` it gives."""
+    """The inputs of ``KNOWLEDGE`` that it gives."""
     given: str
     """The inputs, in words."""
     inputs: Inputs
     scores: tuple[Score, ...]
     """Columns of its tables; methods are ranked by the first."""
     error: str
-    """The column of scores.csv that decides about the primary score."""
+    """The column of scores.csv from which the primary score is computed."""
     error_title: str
     """Its name in figures."""
     exact: Mapping[str, float]
-    """Error columns, each with the value below which the truth itself was submitted: no method is so near. Each is
-    judged alone, so that a wrong part of an answer does not hide an exact one."""
+    """Error columns with a value that no method reaches: smaller errors mean that the ground truth was submitted.
+    Each column is tested separately, so that a wrong part of an answer does not hide an exact one."""
     beside: tuple[str, ...] = ("failure",)
-    """Shares and means that short tables show beside the primary score."""
+    """Shares and means that short tables show next to the primary score."""
     parting: str = ""
-    """A column of scores.csv by whose values tables divide the primary score; empty: none."""
+    """A column of scores.csv; tables show the primary score separately for each of its values. Empty: none."""
     unknowns: int = 6
     """Degrees of freedom of the column ``nees``, where answers state deviations."""
     oracles: tuple[tuple[str, Callable[[Split, Path], str]], ...] = ()
@@ -427,7 +427,7 @@ class Track(ABC):
     at_rows: ClassVar[bool] = False
     """Whether each picture shows the time of one row."""
     shares_work: ClassVar[bool] = False
-    """Whether cards share what they find of a problem, so that one job runs them all."""
+    """Whether cards share intermediate results of a problem, so that one job runs all of them."""
 
     # Inputs
 

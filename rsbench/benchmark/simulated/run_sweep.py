@@ -1,11 +1,11 @@
-"""Running a sweep: chunks of trials over processes, each complete or absent, the same bytes whatever their number.
+"""Run a sweep in chunks of trials; results do not depend on the number of workers.
 
 A folder holds
 
     sweep.json           the card, the solvers, the cells
     trials/NNN.npz       truth and predictions of a cell (see ``trials.run_trials``; reasons as codes)
     bounds/NNN.npz       Cramer-Rao bounds of all cells with the exact matches of NNN (see ``trials.run_bounds``)
-    seconds/NNN.npz      how long the solvers took: no two runs agree on that
+    seconds/NNN.npz      run times of the solvers, which differ between runs
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class _Job(NamedTuple):
 
 
 def sweep_steps(card: SweepCard) -> int:
-    """Number of chunks, for a progress bar."""
+    """Number of chunks, for the progress bar."""
     return len(_parts(card)) * len(_firsts(card))
 
 
@@ -100,7 +100,7 @@ def _parts(card: SweepCard) -> list[_Part]:
 
 
 def geometry_of(card: SweepCard, cell: Cell) -> Cell:
-    """The first cell with the same exact matches: noise and what solvers are given may differ."""
+    """The first cell with the same exact matches; noise and the inputs of solvers may differ."""
     exact = cell.setting.exact()
     return next(other for other in card.cells() if other.setting.exact() == exact)
 
@@ -114,9 +114,9 @@ def run_sweep(
     time_limit_s: float | None = None,
     force: bool = False,
 ) -> None:
-    """Run what ``out`` does not hold yet.
+    """Run the chunks that are not yet in ``out``.
 
-    An exception that passes through, such as Ctrl-C, ends all processes at once; what is done stays.
+    An exception such as Ctrl-C ends all processes at once; finished chunks are kept.
 
     Args:
         card: the experiment.
@@ -124,7 +124,7 @@ def run_sweep(
         workers: processes, each with one thread.
         progress: see ``Progress``.
         time_limit_s: for one problem of another package's solver, instead of what its card says.
-        force: whether to do all again, whatever ``out`` holds.
+        force: whether to run all chunks again.
 
     Raises:
         RsbenchError: no such solver, or two of one name; ``out`` holds another sweep; a motion leaves too few
@@ -179,7 +179,7 @@ def read_bounds(out: Path, card: SweepCard, cell: Cell) -> Arrays:
 
 
 _SAID = ("name", "information", "shutter", "motion_model", "reference_point")
-"""What sweep.json must state of every solver."""
+"""Required keys of each solver in sweep.json."""
 _REMAKE = "delete the file, and the same command makes it again"
 _TRIALS = {
     "w": ("f", (3,)),
@@ -232,13 +232,13 @@ def entrants(card: SweepCard) -> list[Entrant]:
     """The solvers of a card.
 
     Raises:
-        RsbenchError: no such solver, or two of one name, which tables and seeds could not tell apart.
+        RsbenchError: no such solver, or two solvers of one name, which tables and seeds cannot distinguish.
     """
     return [enter(entry) for entry in load_solver_entries(card.solvers)]
 
 
 def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
-    """All that decides the bytes of a run."""
+    """Everything that determines the results of a run."""
     content = {
         "format": FORMAT,
         "rsbench": __version__,
@@ -253,7 +253,7 @@ def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
 
 
 def _rigs(card: SweepCard) -> dict[str, Any]:
-    """What the rig cards say that the sweep names; nothing where it names none."""
+    """Contents of the rig cards that the sweep names; empty if it names none."""
     named = {cell.setting.rig_card: cell.setting.tables for cell in card.cells()}
     found = {
         name: asdict(tables) for name, tables in named.items() if isinstance(name, str) and tables is not None
@@ -280,7 +280,7 @@ def _identity(e: Entrant) -> dict[str, Any]:
 
 
 def simulator_version() -> str:
-    """Hash of the sources that decide what is simulated: the keys of solvers hold the rest."""
+    """Hash of the sources of the simulation; the sources of solvers are in their keys."""
     package = resources.files("rsbench.benchmark")
     files = [package / "seeds.py", *(package / "simulated" / name for name in _SIMULATOR)]
     return hashlib.sha256(b"\n".join(file.read_bytes() for file in files)).hexdigest()
@@ -309,7 +309,7 @@ def _open_folder(plan: dict[str, Any], out: Path, force: bool) -> None:
 
 
 def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
-    """What keeps a stored run from being continued, in words."""
+    """Differences to a stored run because of which it cannot be continued, in words."""
     fields = [key for key in plan["card"] if stored.get("card", {}).get(key) != plan["card"][key]]
     if fields:
         return [f"differs in {', '.join(fields)}"]
@@ -326,19 +326,19 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
 
 
 def _compile(card: SweepCard) -> None:
-    """Once, before the workers would each do it."""
+    """Compile once, so that the workers need not."""
     warm_up(_motions(card, entrants(card)))
 
 
 def _run_all(todo: list[_Job], workers: Workers, time_limit_s: float | None) -> Iterator[_Part]:
-    """Always in children, so that BLAS has one thread and one summation order whatever the parent has loaded."""
+    """Run jobs in child processes, in which BLAS has one thread and therefore a fixed order of summation."""
     with closing(finished_jobs(_serve_jobs, todo, workers, ONE_THREAD, time_limit_s)) as found:
         for job, _ in found:
             yield job.part
 
 
 def _serve_jobs(time_limit_s: float | None) -> Callable[[_Job], None]:
-    """What does jobs, in a child."""
+    """Function that does jobs, in a child process."""
     use_one_thread()
     warm_up()
     runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
@@ -375,7 +375,7 @@ def _collect(card: SweepCard, part: _Part, out: Path, folder: Path) -> None:
 
 
 def _coded(arrays: Arrays) -> Arrays:
-    """Reasons as numbers into a list of them."""
+    """Replace reasons by their indices in a list of distinct reasons."""
     reasons, codes = np.unique(arrays.pop("reason"), return_inverse=True)
     shape = arrays["success"].shape
     return {**arrays, "reason_code": codes.reshape(shape).astype(np.int32), "reasons": reasons}
@@ -384,7 +384,7 @@ def _coded(arrays: Arrays) -> Arrays:
 SUCCESS_DEG = (1.0, 5.0)
 """A trial counts as solved when e_R and e_T are below these."""
 OBSERVABLE = 0.5
-"""Standard deviation of the direction of d (radians), or of its relative length, above which it is not known."""
+"""Standard deviation of the direction of d (radians), or of its relative length, that makes it unobservable."""
 SHOWN_REASONS = 3
 _IDEAL_DRAWS = 100
 
@@ -435,7 +435,7 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
 
 
 def _scaled(bounds: FloatArray, noise_px: float) -> FloatArray:
-    """Bounds at a noise; what the matches do not tell stays unknown without noise too."""
+    """Bounds at a noise level; unobservable quantities stay infinite, also without noise."""
     known = np.isfinite(bounds)
     return np.where(known, noise_px * np.where(known, bounds, 0.0), np.inf)
 

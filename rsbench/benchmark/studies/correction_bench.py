@@ -1,4 +1,4 @@
-"""What the methods of the correction study share on one sequence: frames, matches, motions and depths."""
+"""Inputs that the methods of the correction study share on one sequence: frames, matches, motions and depths."""
 
 from __future__ import annotations
 
@@ -170,18 +170,18 @@ _OF_LAW = {"linear": "rs-stereo-refined", "twist": "rs-stereo-refined-twist"}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
-    """What a method made of one view."""
+    """One view as corrected by a method."""
 
     image: NDArray[Any]
     """(H, W, C), every pixel."""
     covered: NDArray[np.bool_]
     """(H, W) pixels drawn from the frame itself at a depth that was not guessed."""
     flow: NDArray[np.float32]
-    """(H, W, 2) where it moves the pixels of the rolling-shutter frame, px; NaN where it does not know."""
+    """(H, W, 2) displacement of the pixels of the rolling-shutter frame, px; NaN where unknown."""
 
 
 class Bench:
-    """Everything the methods share on one sequence."""
+    """Inputs and intermediate results that all methods share on one sequence."""
 
     def __init__(self, sequence: Sequence, seed: int, solver: str = "rs-stereo-refined") -> None:
         self.sequence = sequence
@@ -203,7 +203,7 @@ class Bench:
         )
 
     def _own_law(self, solver: str) -> CorrectionOptions:
-        """Options with a solver that assumes its own law of motion, whatever the matches prefer."""
+        """Options with a solver that keeps its own motion model, whichever model fits the matches best."""
         return replace(self.options, solver=load_solver_entry(solver), motion_model=None)
 
     def _found(self, name: str, options: CorrectionOptions) -> FoundMotion | None:
@@ -215,11 +215,11 @@ class Bench:
 
     @property
     def motion(self) -> Motion | None:
-        """Ours, of the law that the matches prefer; None when there is none."""
+        """The estimated motion under the selected motion model; None if the estimation failed."""
         return _motion(self.found)
 
     def motion_errors(self) -> Row:
-        """e_R and e_T, degrees, of our motion and of the global-shutter ones; a failure scores the worst."""
+        """e_R and e_T, degrees, of our motion and of the global-shutter motions; failures get the worst scores."""
         row: Row = {}
         motions = {"ours": self.motion, "gs": self.gs_motion, "gs_scaled": _motion(self.scaled)}
         for name, motion in (motions | {law: _motion(found) for law, found in self.of_law.items()}).items():
@@ -228,7 +228,7 @@ class Bench:
         return row
 
     def attempt(self, key: str) -> dict[View, Attempt] | None:
-        """What one method makes of the views, but those in which it found no motion; None when in none."""
+        """The views corrected by one method, without those that lack a motion; None if all do."""
         true = self.sequence.motion
         if key == "none":
             return self._nothing()
@@ -258,7 +258,7 @@ class Bench:
     def corrected(
         self, pairs: Pairs, motion: Motion, corrector: str = "fusion", views: tuple[View, ...] = VIEWS
     ) -> tuple[dict[View, Fused], Pairs]:
-        """Frames by the chain from a depth and a motion, and the depth that the corrector was given."""
+        """Frames corrected with a depth and a motion, and the depth that the corrector used."""
         # Simpler corrections know one camera's frame, and no depth from two of them.
         options = replace(
             self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
@@ -344,7 +344,7 @@ class Bench:
         return out
 
     def _mono(self, motion_of: Callable[[Side], Motion | None]) -> dict[View, Attempt] | None:
-        """Each camera by itself: its motion from its own matches, depth from its own flow in the same unit."""
+        """Correct each camera separately, with motion and depth from its own matches and flow."""
         motions: dict[str, Motion] = {}
         for side in SIDES:
             motion = motion_of(side)
@@ -379,7 +379,7 @@ _DEPTHS: dict[str, Callable[[Depth], Depth]] = {
     "rotation": _infinitely_far,
     "plane": plane_depth,
 }
-"""The depth with which a method's corrector moves pixels, from the depth that it is given."""
+"""Depth that a method's corrector uses to move pixels, as a function of the given depth."""
 
 
 def _attempt(fused: Fused, flow: NDArray[np.float32]) -> Attempt:

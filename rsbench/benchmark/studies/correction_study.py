@@ -1,11 +1,10 @@
 """The correction study: all correctors on the same frames, matches and pixels.
 
-A method is a depth, a motion and a corrector of the chain that users have. Those that know a scene fill what a
-frame did not see from the other frames; what remains is invented (inpainted), so that every method gives a whole
-picture, which 'all' scores. 'Covered' scores the pixels that every method of a view draws from the frame itself:
-nothing there is filled or invented. A method that finds no motion has failed: it scores the worst values, and
-takes no pixels from the others. Nor do methods on request, which are compared when they are
-asked for: what they do not cover is invented.
+A method combines a depth, a motion and a corrector of the chain. Methods that know the scene fill pixels that a
+frame did not see from the other frames; the remaining pixels are inpainted, so that every method gives a
+complete image. 'All' scores the complete image. 'Covered' scores the pixels that every method draws from the frame
+itself, without filling or inpainting. A method that finds no motion gets the worst scores and does not reduce the
+covered pixels of the others; neither do the optional methods (``ON_REQUEST``).
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.vision.quality import flip, psnr, ssim_deepunroll, ssim_uniform, ssim_within
 
 EXTRA = ("flip_covered", "flip_all", "ssim_deepunroll", "ssim_uniform")
-"""Scores of the first view of a sequence only."""
+"""Scores that are computed for the first view of a sequence only."""
 SCORES = (
     "psnr_covered",
     "ssim_covered",
@@ -83,7 +82,7 @@ def summarise(images: pd.DataFrame) -> pd.DataFrame:
 
 
 def masks(images: pd.DataFrame) -> pd.DataFrame:
-    """Per stratum, the median and the least share of a view's pixels that every method covers."""
+    """Per stratum, the median and the minimum over views of the share of pixels that every method covers."""
     common = images.groupby(["stratum", "sequence", "side", "frame"], sort=False)["common"].first()
     shares = common.groupby("stratum", sort=False)
     return pd.DataFrame({"median": shares.median(), "least": shares.min()}).reset_index()
@@ -117,7 +116,7 @@ def law_and_size(table: pd.DataFrame) -> pd.Series:
 
 
 def _interval(name: str, values: FloatArray) -> dict[str, float]:
-    """Median and its interval; NaN where nothing is known."""
+    """Median and its interval; NaN if no value is finite."""
     known = values[np.isfinite(values)]
     if len(known) == 0:
         return {name: np.nan, f"{name}_low": np.nan, f"{name}_high": np.nan}
@@ -156,7 +155,7 @@ def verdict(summary: pd.DataFrame) -> pd.DataFrame:
 
 Mask = NDArray[np.bool_]
 ROW_BANDS = 9
-"""Bands of rows in which the flow error is reported; their distance from row 0 is the distance in time."""
+"""Number of bands of rows for which the flow error is reported; later bands are farther from the time of row 0."""
 WORST = {column.name: column.worst for metric in (Psnr, Ssim, Flip) for column in metric.columns}
 """Scores of a failure, as in the score tables."""
 _PUBLISHED = {method.key for method in METHODS}
@@ -225,14 +224,14 @@ def _studied(
 
 
 def _serve(dataset: Path, seed: int, solver: str, others: tuple[str, ...]) -> Callable[[str], Rows]:
-    """What studies sequences by their names, in a child."""
+    """Function that scores a sequence by its name, in a child process."""
     return lambda name: study_sequence(read_sequence(dataset / name), seed, solver, others)
 
 
 def study_sequence(
     sequence: Sequence, seed: int = 0, solver: str = "rs-stereo-refined", others: tuple[str, ...] = ()
 ) -> Rows:
-    """What ``study_dataset`` says of one sequence."""
+    """The rows of ``study_dataset`` for one sequence."""
     bench = Bench(sequence, seed, solver)
     attempts = {key: bench.attempt(key) for key in (*(method.key for method in METHODS), *others)}
     images: list[Row] = []
@@ -277,7 +276,7 @@ def _found(attempts: dict[str, Attempt | None]) -> dict[str, Attempt]:
 
 
 def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
-    """What a failed method scores on an image: the rule of failures of docs/explanation/conventions.md."""
+    """Scores of a failed method on an image, by the rule of docs/explanation/conventions.md."""
     scores = {f"{name}_{part}": WORST[name] for part in ("covered", "all") for name in ("psnr", "ssim")}
     scores |= {name: worst_flow(image) for name in ("flow_mean_px", "flow_median_px")}
     slow = {"flip_covered": "flip", "flip_all": "flip", "ssim_deepunroll": "ssim", "ssim_uniform": "ssim"}
@@ -286,7 +285,7 @@ def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
 
 
 def worst_flow(image: NDArray[Any]) -> float:
-    """The diagonal of an image (H, W[, C]), px: a pixel that stays in the image cannot be farther off."""
+    """The diagonal of an image (H, W[, C]), px: the largest error of a pixel that stays in the image."""
     return float(np.hypot(*image.shape[:2]))
 
 
@@ -316,5 +315,5 @@ def _band_rows(attempts: dict[str, Attempt | None]) -> list[Row]:
 
 
 def flow_error(flow: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.float64]:
-    """End-point error (H, W), px; NaN where either flow is not known."""
+    """End-point error (H, W), px; NaN where one of the flows is unknown."""
     return np.linalg.norm(flow.astype(np.float64) - truth, axis=-1)
