@@ -1,4 +1,4 @@
-"""Provenance of results, by which they can be made again: versions, machine, seed, inputs, date."""
+"""Provenance of results, with which they can be reproduced: versions, machine, seed, inputs, date."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "mitsuba", "drjit", "nu
 
 
 def provenance(command: str, **inputs: Any) -> dict[str, Any]:
-    """JSON-ready record of how a result came about."""
+    """JSON-ready record of the origin of a result."""
     return {
         "command": command,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -42,14 +42,14 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
 
 
 def numeric_version() -> dict[str, str]:
-    """What decides predictions beside the components and the data: our own source and the packages below it."""
+    """Versions that affect predictions beside components and data: our source and numerical packages."""
     return {"source": own_source_version(), **{name: package_version(name) for name in _NUMERIC}}
 
 
 def commit() -> str:
     """Commit of the checkout that this code lies in, with ``-dirty`` when a file differs from it; else empty.
 
-    Results and the page that shows them do not count: they are what is being made.
+    Changes of results and of README.md are ignored, because the run makes them.
     """
     root = Path(str(resources.files("rsbench"))).parent
     if not (root / ".git").exists():
@@ -65,7 +65,7 @@ def commit() -> str:
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells."""
+    """The processor's name, if the system provides it."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:  # not Linux

@@ -1,12 +1,12 @@
-"""A board: a folder of scored entries, kept with their predictions, that two people can merge.
+"""A board: a folder of scored entries with their predictions; two boards can be merged.
 
-    board.json                                    the format <protocol>/<split>/split.json                 which
-    split it is; facts of its problems where those are public
-    <protocol>/<split>/entries/<method>/predictions.jsonl, scores.csv, entry.json
-    <protocol>/<split>/entries/<method>/pictures/<problem>/NAME   depth maps or corrected frames, on tracks of
-    pictures <protocol>/<split>/entries/<method>/matches/NAME              matches of its own, where it has some
+    board.json                                 format of the board
+    <protocol>/<split>/split.json              identity of the split, and properties of public problems
+    <protocol>/<split>/entries/<method>/       predictions.jsonl, scores.csv, entry.json
+        pictures/<problem>/NAME                depth maps or corrected frames, on tracks of pictures
+        matches/NAME                           matches of the method, on tracks where it finds its own
 
-An entry is written under another name and renamed, so that it is there whole or not at all.
+An entry is written under another name and then renamed, so that it is never incomplete.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
 RUN = "rsbench leaderboard run"
-"""Its entries may be made again; submitted ones are never replaced silently."""
+"""Entries of this command may be replaced; submitted entries are never replaced silently."""
 ORACLES = "rsbench leaderboard oracles"
 OWN = (RUN, ORACLES)
-"""Commands that make entries without a submission."""
+"""Commands whose entries rsbench makes itself."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
-"""Files of an entry; the last one describes the others."""
+"""Files of an entry; the last one is the record of the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +62,9 @@ class Recorded:
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
     doubt: str = ""
-    """Why it is in doubt, see ``doubt.doubt_about``; empty where it is not."""
+    """Reason why it is in doubt, see ``doubt.doubt_about``; empty if it is not."""
     accepted: str = ""
-    """Why the keeper of the board ranks it although it is in doubt."""
+    """Reason why the keeper of the board accepted an entry in doubt."""
     made: dict[str, Any] = field(default_factory=dict)
     """Its provenance: ``command``, version, machine."""
 
@@ -77,7 +77,7 @@ class About:
     split: str
     fingerprint: str
     facts: dict[str, dict[str, float | str]]
-    """Facts of each problem; none where they are secret."""
+    """Properties of each problem; empty for a secret split."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,13 +92,13 @@ class Scored:
     files: dict[str, str]
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
     doubt: str
-    """Why it has no rank; empty where it has one."""
+    """Reason why it is not ranked; empty if it is ranked."""
     handed_in: bool
-    """Whether the answers were submitted as a file; otherwise the board ran the method itself."""
+    """Whether the answers were submitted as a file; if not, this board ran the method."""
 
 
 def made_by(board: Path, split: Split, method: str) -> str:
-    """The command that made an entry; ``RUN`` where there is none."""
+    """The command that made an entry; ``RUN`` if there is no such entry."""
     path = place(board, split.track.id, split.name) / "entries" / method / FILES[2]
     if not path.is_file():
         return RUN
@@ -120,7 +120,7 @@ def place(board: Path, protocol: str, split: str) -> Path:
 
 
 def open_board(board: Path) -> None:
-    """Make a board of a folder that is empty or is one.
+    """Make a board of an empty folder; an existing board is checked.
 
     Raises:
         RsbenchError: the folder holds something else.
@@ -143,7 +143,7 @@ def _check_board(board: Path) -> None:
 
 
 def write_split(board: Path, split: Split) -> None:
-    """The split.json of a board, with facts of the problems where those are public."""
+    """Write split.json, with properties of the problems if the split is public."""
     path = place(board, split.track.id, split.name) / "split.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     facts = {truth.name: truth.facts for truth in split.truths} if split.public else {}
@@ -151,7 +151,7 @@ def write_split(board: Path, split: Split) -> None:
 
 
 def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
-    """Raises RsbenchError where an entry is there that has other predictions."""
+    """Raises RsbenchError if the folder holds an entry with other predictions."""
     if not folder.is_dir():
         return
     there = read_json(folder / FILES[2])
@@ -163,7 +163,7 @@ def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
 
 
 def refuse_same_but_case(entries: Path, method: str) -> None:
-    """Raises RsbenchError where an entry has the name in other case: one folder on some systems, two on others."""
+    """Raises RsbenchError if a name differs from an entry in case only: some file systems ignore case."""
     for folder in _folders(entries):
         if folder.name != method and folder.name.lower() == method.lower():
             raise RsbenchError(
@@ -188,7 +188,7 @@ def splits_of(board: Path) -> list[tuple[str, str]]:
 
 
 def about_split(folder: Path) -> About:
-    """What the split.json of a folder of a board says.
+    """Read the split.json of a folder of a board.
 
     Raises:
         RsbenchError: it is not there, or damaged.
@@ -309,7 +309,7 @@ def rescore(
 
 
 def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> str:
-    """Rank an entry that is in doubt, by decision of the board's keeper; returns the doubt.
+    """Accept an entry in doubt, so that it is ranked; returns the reason of the doubt.
 
     Raises:
         RsbenchError: there is no such entry, or nothing speaks against it.
@@ -326,7 +326,7 @@ def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> 
 
 
 def _stored(folder: Path, split: Split) -> Submission:
-    """The predictions of an entry, which must be those that were handed in."""
+    """The predictions of an entry, checked against their recorded hashes."""
     record, path = _read_record(folder), folder / FILES[0]
     found = {name: hashlib.sha256(file_bytes(folder, name)).hexdigest() for name in record.files}
     check_files(folder, record.files, found)
@@ -340,7 +340,7 @@ def _stored(folder: Path, split: Split) -> Submission:
 
 
 class _Taken(NamedTuple):
-    """A file of predictions that becomes an entry."""
+    """A file of predictions that is being added to a board."""
 
     submission: Submission
     """Its copy in the folder where the entry is made."""
@@ -350,7 +350,7 @@ class _Taken(NamedTuple):
 
     @property
     def identity(self) -> list[Any]:
-        """What decides its scores, but for the split."""
+        """Everything that determines its scores apart from the split."""
         return [hashlib.sha256(self.data).hexdigest(), sorted(self.files.items())]
 
 
@@ -429,7 +429,7 @@ def add_all(
 
 
 def _kept(hidden: Path, taken: Sequence[_Taken], split: Split) -> Path:
-    """Folder for scores of these predictions by this code; those of others, whose run was cut off, are removed."""
+    """Folder for scores of these predictions by this code; scores of other interrupted runs are removed."""
     of = [split.fingerprint, numeric_version(), *(each.identity for each in taken)]
     kept = hidden / "scoring" / hashlib.sha256(json.dumps(of).encode()).hexdigest()
     if not kept.is_dir():
@@ -438,7 +438,7 @@ def _kept(hidden: Path, taken: Sequence[_Taken], split: Split) -> Path:
 
 
 def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submission, bytes]], list[RsbenchError]]:
-    """Submissions with the content of their files, and what is wrong with the others."""
+    """Valid submissions with the content of their files, and the errors of the others."""
     read, faults = list[tuple[Submission, bytes]](), list[RsbenchError]()
     for file in files:
         try:
@@ -449,7 +449,7 @@ def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submissio
 
 
 def _record(taken: _Taken, split: Split, made: dict[str, Any]) -> dict[str, Any]:
-    """What entry.json says."""
+    """Content of entry.json."""
     return {
         "format": FORMAT,
         "header": asdict(taken.submission.header),
@@ -508,7 +508,7 @@ def merge(other: Path, board: Path) -> list[str]:
 
 
 def _copy(scored: Scored, new: Path) -> None:
-    """An entry of another board, and nothing else that lies in its folder."""
+    """Copy an entry of another board, without unknown files in its folder."""
     new.mkdir(parents=True)
     for name in FILES:
         write_bytes(new / name, read_bytes(scored.folder / name))

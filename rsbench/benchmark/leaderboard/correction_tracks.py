@@ -1,7 +1,7 @@
 """Tracks of corrected frames: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
 
-What a method did not draw is black: nobody gains by leaving out what is difficult. Entries that the board makes
-itself close narrow holes, as the command does.
+Pixels that a method did not draw are black, so that leaving out difficult pixels does not pay. Entries that the
+board makes itself close narrow holes, as the command does.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ from rsbench.vision.quality import (
 )
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.bool_]]
-"""An image (H, W, 3) and where something was drawn (H, W)."""
+"""An image (H, W, 3) and the mask (H, W) of drawn pixels."""
 _PIXELS = ("", "_covered", "_all")
-"""Ends of columns: of the common pixels, of what was drawn, of all."""
+"""Suffixes of columns: common pixels, drawn pixels, all pixels."""
 _WORST_FRAME: Numbers = {
     **{f"{name}{end}": 0.0 for name in ("ssim", "psnr") for end in _PIXELS},
     **{f"flip_{part}": 1.0 for part in ("common", "covered", "all")},
@@ -76,7 +76,7 @@ _WORST_FRAME: Numbers = {
     "ssim_uniform": 0.0,
 }
 _SMALLER = 0.25
-"""A mistake is noted where undoing it reduces the squared error below this share."""
+"""A likely mistake is reported if undoing it reduces the squared error below this share."""
 _FRAMES = (
     Score("ssim", "SSIM", "of the common pixels, at least 0", "share", "higher"),
     Score("ssim_covered", "SSIM covered", "of what it drew itself", "share", "higher"),
@@ -119,7 +119,7 @@ def _uncorrected(pictures: TruePictures, place: Path) -> None:
 
 
 def _best(pictures: TruePictures, place: Path) -> None:
-    """Our default corrector with the true motion and depth."""
+    """The default corrector with the true motion and depth."""
     sequence = pictures.sequence
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     given = Given(motion=sequence.motion, pairs=true_pairs(sequence, images))
@@ -231,7 +231,7 @@ class CorrectionTrack(PictureTrack):
 
 
 def _share(work: SharedWork, found: CorrectedFrames) -> None:
-    """What need not be found again, and how long it took."""
+    """Store intermediate results and their run time for the other entries of the job."""
     if work.known.motion is None and found.motion is not None:
         work.spent["motion"] = found.seconds["motion"]
     if work.known.pairs is None and found.pairs is not None:
@@ -245,7 +245,7 @@ def _share(work: SharedWork, found: CorrectedFrames) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueFrame:
-    """What a corrected frame is compared with."""
+    """Ground truth of a corrected frame."""
 
     name: str
     """Name of the row: ``first``, ``middle`` or ``last``."""
@@ -308,7 +308,7 @@ def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, 
 
 
 def _flips(image: NDArray[np.uint8], truth: NDArray[np.uint8], masks: dict[str, Any]) -> Numbers:
-    """NaN where the package that computes it has no wheel."""
+    """Mean FLIP per mask; NaN where the package flip-evaluator is not installed."""
     errors, names = flip(image, truth), ("flip_common", "flip_covered", "flip_all")
     if errors is None:
         return dict.fromkeys(names, math.nan)
@@ -344,7 +344,7 @@ def _mistakes(
 
 
 def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
-    """Mean squared difference of the pixels that are not black, but for the rim, which a shift brings in."""
+    """Mean squared difference of the pixels that are not black, without the border, which shifts fill in."""
     counted = np.any(image > 0, axis=-1)
     counted[[0, -1]] = counted[:, [0, -1]] = False
     difference = image[counted].astype(np.float32) - truth[counted]
@@ -359,19 +359,19 @@ def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
 # by as much as a corrected frame is off; nor would phase correlation, which undoes the blur.
 
 LIMIT_PX = 2.0
-"""A window that is farther off scores 0."""
+"""Displacement from which on a window scores 0."""
 WINDOW_PX, _STEP_PX, _REACH_PX = 64, 32, 4
-"""Side of a window, from one to the next, and how far it is looked for."""
+"""Side of a window, distance between windows, and radius of the search, px."""
 _BLUR_PX = 3.0
 """Standard deviation of the blur of both pictures."""
 _LOOK_PX = 2.0
-"""Standard deviation of the blur under which pictures are compared: white noise is left with a seventh."""
+"""Standard deviation of the blur before pictures are compared; it reduces white noise to a seventh."""
 _LOOK_CONSTANTS = 0.1
-"""Factor of SSIM's constants: the blur takes contrast away, and beside the whole ones a tenth of it would do."""
+"""Factor of SSIM's constants, because the blur reduces contrast."""
 _TEXTURE = 5.0
-"""Grey levels by which the truth must deviate around a pixel that counts: elsewhere its place cannot be found."""
+"""Smallest local standard deviation of the true image, grey levels, of the pixels that count."""
 _LEAST = 0.25
-"""Share of a window's pixels that must count."""
+"""Smallest share of pixels that count in a window."""
 
 
 class PlacedTrack(CorrectionTrack):
@@ -470,7 +470,7 @@ def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float
 
 
 def _top(three: NDArray[np.float32]) -> float:
-    """Where the parabola through three neighbours is largest, from the middle one."""
+    """Position of the maximum of the parabola through three neighbours, relative to the middle one."""
     before, middle, after = map(float, three)
     bend = before - 2.0 * middle + after
     return 0.5 * (before - after) / bend if bend < 0.0 else 0.0

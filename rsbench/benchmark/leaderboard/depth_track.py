@@ -1,6 +1,6 @@
 """The track of depth maps: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
 
-Where depth is unknown it counts as wrong: nobody gains by leaving out what is difficult.
+Unknown depth counts as wrong, so that leaving out difficult pixels does not pay.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ _WORST_PART: Numbers = {
     "rmse_m": math.inf,
 }
 _NEAR = 0.1
-"""Relative error of depth below which another reading is near to the truth."""
+"""Relative error of depth below which another interpretation matches the ground truth."""
 _RIGHT = 0.01
-"""Depth that is so near needs no other reading."""
+"""Relative error below which no likely mistake is reported."""
 _SMALLER = 0.25
-"""A mistake is noted where undoing it reduces the error below this share."""
+"""A likely mistake is reported if undoing it reduces the error below this share."""
 _FAR_M = 300.0
-"""A larger median depth is hardly in metres."""
+"""A larger median depth is probably not in metres."""
 _DEPTH = (
     Score("bad_1", "bad@1", "share of surface wrong by over 1 px of disparity or unknown", "share"),
     *(Score(f"bad_{limit}", f"bad@{limit}", f"the same beyond {limit} px", "share") for limit in (2, 3)),
@@ -172,7 +172,7 @@ def _motion(work: SharedWork, chain: CorrectionOptions) -> Motion:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueDepth:
-    """What depth maps of a problem are compared with."""
+    """Ground truth of the depth maps of a problem."""
 
     rig: StereoRig
     depth: NDArray[np.float32]
@@ -205,7 +205,7 @@ def depth_scores(true: TrueDepth, depth: NDArray[np.float32] | None) -> Numbers:
 
 
 def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRig) -> NDArray[np.bool_]:
-    """(H, W) where the disparity is off by more than 1 px, or not known; of a surface."""
+    """(H, W) pixels of a surface whose disparity is unknown or wrong by more than 1 px."""
     found, true = (rig.disparity(np.where(each > 0.0, each, 1.0).astype(np.float64)) for each in (depth, truth))
     return (depth <= 0.0) | (np.abs(found - true) > 1.0)
 
@@ -213,7 +213,7 @@ def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRi
 def part_scores(
     depth: NDArray[np.float32] | None, truth: NDArray[np.float32], rig: StereoRig, part: NDArray[np.bool_]
 ) -> Numbers:
-    """Scores of some pixels. Without a surface there nothing is wrong, and errors in metres do not exist."""
+    """Scores of some pixels. Without a surface among them no pixel is wrong, and errors in metres are NaN."""
     if depth is None:
         return _WORST_PART
     surface = part & (truth > 0.0)

@@ -1,8 +1,8 @@
-"""Pictures of a submission: which are requested, the truth they are compared with, and reading them safely.
+"""Pictures of a submission: which are requested, their ground truth, and safe reading.
 
-They show frame 1 of the left camera, the later one, so that a method may use the frame before. They lie beside the
-file of answers as ``pictures/PROBLEM/NAME.png``. Names are looked up, never taken from a submission, and no link
-is followed. The size of an image is read from its header before anything is decoded.
+They show frame 1 of the left camera, so that a method can use the frame before. They are stored next to the file
+of answers as ``pictures/PROBLEM/NAME.png``. File names are never taken from a submission, and links are not followed.
+The size of an image is read from its header before decoding.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ VIEW: View = ("left", 1)
 
 
 class RequestedPicture(NamedTuple):
-    """A picture that an answer must have."""
+    """A picture that an answer must contain."""
 
     stem: str
     """Name of its file without suffix, such as ``left_1_middle``."""
     row: int
-    """Row whose time it shows, counted as rows are read; 0 of depth, where each pixel has its own row's time."""
+    """Row whose time it shows, in order of readout; 0 for depth, where each pixel has the time of its own row."""
     file: str
     """Path of the true picture below the folder of the sequence."""
     suffixes: tuple[str, ...] = (".png",)
@@ -58,7 +58,7 @@ class TruePictures:
     sequence: Sequence
     requested: tuple[RequestedPicture, ...]
     files: Mapping[str, str]
-    """SHA-256 by path below the sequence's folder: what methods see, and what scores are computed from."""
+    """SHA-256 by path below the sequence's folder, for the inputs of methods and the ground truth."""
 
     def check(self) -> None:
         """Raises RsbenchError when a file is not the one of the split."""
@@ -82,16 +82,16 @@ class TruePictures:
         return self.sequence.depth("rs", *VIEW)
 
     def frame(self, row: int) -> NDArray[np.uint8]:
-        """(H, W, 3) what a global shutter sees from the pose of a requested row."""
+        """(H, W, 3) global-shutter image at the pose of a requested row."""
         (file,) = (each.file for each in self.requested if each.row == row)
         return read_png(inside(self.sequence.folder, file), self.size)
 
     def rolling(self) -> NDArray[np.uint8]:
-        """(H, W, 3) the frame as it is."""
+        """(H, W, 3) the rolling-shutter frame."""
         return self.sequence.image("rs", *VIEW)
 
     def seen_by_both(self, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(H, W) pixels of the frame, of true ``depth`` (H, W), whose point the right camera sees too."""
+        """(H, W) pixels of the frame, with true ``depth`` (H, W), whose point is visible in the right camera."""
         return seen_by_other(depth, self.sequence.depth("rs", "right", 1), self.sequence.rig, "left")
 
     def commons(self) -> list[NDArray[np.bool_]]:
@@ -106,7 +106,7 @@ class TruePictures:
 PICTURES = "pictures"
 """Folder of pictures, beside the file of answers."""
 FARTHEST = 1e9
-"""m: no surface is farther."""
+"""Largest valid depth, m."""
 _FILE = re.compile(
     rf"pictures/{NAME.pattern}/left_1(_first|_middle|_last)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
 )
@@ -116,7 +116,7 @@ _COLOURS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 """Colour types of a PNG header."""
 _BYTES_OF_PIXEL = 16
 _BYTES = 1 << 16
-"""A file has at most so many, and so many for each pixel."""
+"""Largest size of a file: these bytes, and ``_BYTES_OF_PIXEL`` for each pixel."""
 
 
 def find_picture(folder: Path, problem: str, picture: RequestedPicture) -> Path:
@@ -262,21 +262,21 @@ def _read_png(path: Path, size: tuple[int, int], bits: int, colours: tuple[str, 
 
 # Scores of pictures by parts of their pixels: by distance from the reference row, and by texture.
 #
-# What a part is decides the truth alone, so that all entries are scored on the same pixels.
+# The parts depend on the ground truth only, so that all entries are scored on the same pixels.
 
 WINDOW = 9
-"""Pixels, of the square over which texture is measured."""
+"""Side of the square window over which texture is measured, px."""
 _MOST = 255.0
 BoolArray = NDArray[np.bool_]
 
 
 class Parting(NamedTuple):
-    """A number of each pixel, and by which of its values pixels make up parts."""
+    """A division of the pixels into parts by a quantity of each pixel."""
 
     name: str
     title: str
     starts: tuple[float, ...]
-    """Least value of each part, which figures write at it."""
+    """Smallest value of each part, which is its label in figures."""
 
 
 PARTINGS = (
@@ -348,5 +348,5 @@ def shares(parts: Parts, wrong: BoolArray) -> dict[str, float]:
 
 
 def _mean(image: FloatArray) -> FloatArray:
-    """(H, W) of the colours of an image (H, W, 3) of whole numbers; numpy's mean takes far longer over so few."""
+    """Mean (H, W) over the colours of an image (H, W, 3); np.mean is much slower over an axis of three."""
     return (image[..., 0] + image[..., 1] + image[..., 2]) / 3.0
