@@ -1,8 +1,8 @@
 """Pictures of a submission: which are requested, their ground truth, and safe reading.
 
 They show frame 1 of the left camera, so that a method can use the frame before. They are stored next to the file
-of answers as ``pictures/PROBLEM/NAME.png``. File names are never taken from a submission, and links are not followed.
-The size of an image is read from its header before decoding.
+of answers as ``pictures/PROBLEM/NAME.png``. File names are never taken from a submission, and links are not
+followed. The size of an image is read from its header before decoding.
 """
 
 from __future__ import annotations
