@@ -52,16 +52,37 @@ _CONTRADICTED = 3.0
 """Times as many points in front of the cameras for -d as for d, beyond which d has no length."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SensorSolver(Solver):
+    """Of one camera or of both, whose rotation another sensor shows in part."""
+
+    cameras_used: Literal["left", "both"] = "left"
+    """The left camera's own motion without a length, or the rig's in metres."""
+
+    @property
+    def _stereo(self) -> bool:
+        return self.cameras_used == "both"
+
+    def _matches(self, correspondences: Correspondences) -> dict[Side, FloatArray]:
+        sides: tuple[Side, ...] = SIDES if self._stereo else ("left",)
+        return {side: temporal_pairs(correspondences, side) for side in sides}
+
+    def _shortage(self, correspondences: Correspondences, sensor: MatchSet) -> MotionEstimate | None:
+        """A failed estimate where there are too few matches or samples; None when there are enough."""
+        counts: dict[MatchSet, int] = {sensor: len(getattr(correspondences, sensor))}
+        for side, matches in self._matches(correspondences).items():
+            counts[side] = len(matches)
+        return self.spec.shortage(counts)
+
+
 @final
 @dataclass(frozen=True, kw_only=True)
-class GyroSolver(Solver):
+class GyroSolver(SensorSolver):
     """Linear least squares for d, then those of the exact Sampson error; the rotation comes from the samples.
 
     Errors of the gyroscope stay: w is its integral.
     """
 
-    cameras_used: Literal["left", "both"] = "left"
-    """The left camera's own translation without a length, or the rig's in metres."""
     refinement: Literal["none", "sampson"] = "sampson"
     """``sampson``: least squares of the Sampson errors of all matches at the end; ``none``: without."""
 
@@ -82,10 +103,6 @@ class GyroSolver(Solver):
             assumes="a gyroscope without bias and delay, aligned with the cameras; constant linear velocity",
         )
 
-    @property
-    def _stereo(self) -> bool:
-        return self.cameras_used == "both"
-
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return {"left": 2, "right": 1} if self._stereo else {"left": 2}
 
@@ -100,12 +117,7 @@ class GyroSolver(Solver):
     def _solved(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, descend: bool
     ) -> MotionEstimate:
-        sides: tuple[Side, ...] = SIDES if self._stereo else ("left",)
-        matches = {side: temporal_pairs(correspondences, side) for side in sides}
-        counts: dict[MatchSet, int] = {"gyro": len(correspondences.gyro)}
-        for side in sides:
-            counts[side] = len(matches[side])
-        short = self.spec.shortage(counts)
+        matches, short = self._matches(correspondences), self._shortage(correspondences, "gyro")
         if short is not None:
             return short
         if not np.ptp(correspondences.gyro[:, 0]) > 0.0:
@@ -235,8 +247,6 @@ _ANGLES = 90
 _UPRIGHT_QUICK, _UPRIGHT_FULL = 8, 50
 _LONGEST = 100.0
 """Metres: pairs whose length is open run there."""
-_MAX_SCALE_SIGMA = 0.5
-"""Relative standard deviation of the length of d above which it does not count as metric, as in ``refined``."""
 
 
 class Uprights(NamedTuple):
@@ -300,11 +310,9 @@ def best_angle(x: FloatArray, y: FloatArray) -> tuple[float, FloatArray]:
 
 @final
 @dataclass(frozen=True, kw_only=True)
-class UprightSolver(Solver):
+class UprightSolver(SensorSolver):
     """PoseLib's minimal solvers of known vertical; least squares in what gravity leaves open."""
 
-    cameras_used: Literal["left", "both"] = "left"
-    """The left camera's own motion without a length, or the rig's in metres."""
     refinement: Literal["upright", "free"] = "upright"
     """Whether errors of gravity stay in the estimate, or the last least squares refine all three angles."""
 
@@ -326,25 +334,13 @@ class UprightSolver(Solver):
             + ("; rotation that moves the baseline, for the scale" if self._stereo else ""),
         )
 
-    @property
-    def _stereo(self) -> bool:
-        return self.cameras_used == "both"
-
-    @property
-    def _sides(self) -> tuple[Side, ...]:
-        return SIDES if self._stereo else ("left",)
-
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return {"left": 2, "right": 2} if self._stereo else {"left": 3}
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        matches, up = self._given(correspondences)
-        counts: dict[MatchSet, int] = {"gravity": len(correspondences.gravity)}
-        for side in self._sides:
-            counts[side] = len(matches[side])
-        short = self.spec.shortage(counts)
+        matches, up, short = *self._given(correspondences), self._shortage(correspondences, "gravity")
         if short is not None:
             return short
         if up is None:
@@ -380,9 +376,9 @@ class UprightSolver(Solver):
             return [MotionEstimate.failed("no direction of gravity near the start of either frame")]
         places: list[list[FloatArray]] = [[], []]
         rays: list[list[FloatArray]] = [[], []]
-        for side in self._sides:
+        for side, pairs in matches.items():
             for k, turn in enumerate(up):
-                x = rig.camera.unproject(matches[side][:, 2 * k : 2 * k + 2]) @ turn.T
+                x = rig.camera.unproject(pairs[:, 2 * k : 2 * k + 2]) @ turn.T
                 rays[k].append(x / np.linalg.norm(x, axis=1, keepdims=True))
                 places[k].append(np.tile(-turn @ rig.offset(side), (len(x), 1)))
         (x, y), (p, q) = [np.concatenate(each) for each in rays], [np.concatenate(each) for each in places]
@@ -399,8 +395,7 @@ class UprightSolver(Solver):
         return found
 
     def _given(self, correspondences: Correspondences) -> tuple[dict[Side, FloatArray], Uprights | None]:
-        matches = {side: temporal_pairs(correspondences, side) for side in self._sides}
-        return matches, Uprights.of(correspondences.gravity)
+        return self._matches(correspondences), Uprights.of(correspondences.gravity)
 
     def _refined(
         self, up: Uprights, R: FloatArray, d: FloatArray, matches: Correspondences, rig: StereoRig, most: int

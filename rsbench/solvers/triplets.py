@@ -34,12 +34,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import product
 from typing import Literal, NamedTuple, final
 
 import numpy as np
-import scipy
 
 from rsbench.core import so3
 from rsbench.core.arguments import check_number, check_whole
@@ -52,6 +50,7 @@ from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, Solver
 from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, inverse_definite, pack
 from rsbench.solvers.engine.ransac import IntArray, RansacOptions, ransac
+from rsbench.solvers.engine.robust_motion import SIGMAS, quantile, truncated
 
 View = tuple[Literal[0, 1], Side]
 """The frame that sees a point which the other one knows, and its camera."""
@@ -377,11 +376,9 @@ def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
     return np.linalg.solve(N, At @ b).astype(np.float64)
 
 
-_LEAST = 3
 _SAMPLES = 10
 """Fewest samples, as in rsbench's robust loop."""
-_LINE_QUICK, _FULL = 5, 50
-_SIGMAS = 2.5
+_LINE_QUICK = 5
 _TRACK_FREEDOM = 5
 _SECOND_TRY = 3.0
 _REFITS = 5
@@ -473,9 +470,9 @@ class _Problem:
         return np.where(tracks >= 0.0, tracks, np.inf), lines  # a point next to a camera's plane overflows
 
     def residuals(self, model: MotionEstimate) -> FloatArray:
-        """In standard deviations: an inlier's is within ``_SIGMAS``, whichever it is."""
+        """In standard deviations: an inlier's is within ``SIGMAS``, whichever it is."""
         squares = self.squares(model)
-        scales = _SIGMAS / (self.noise * np.sqrt([_quantile(_TRACK_FREEDOM), _quantile(FREEDOM)]))
+        scales = SIGMAS / (self.noise * np.sqrt([quantile(_TRACK_FREEDOM), quantile(FREEDOM)]))
         return np.concatenate([np.sqrt(each) * scale for each, scale in zip(squares, scales, strict=True)])
 
     def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
@@ -510,10 +507,10 @@ class _Problem:
         noise = self.noise.copy()
         for k, (squares, freedom) in enumerate(zip(self.squares(model), (_TRACK_FREEDOM, FREEDOM), strict=True)):
             for _ in range(_NOISE_STEPS):
-                below = squares <= noise[k] ** 2 * _quantile(freedom)
+                below = squares <= noise[k] ** 2 * quantile(freedom)
                 if np.count_nonzero(below) < _MANY:
                     break
-                shown = np.sqrt(np.mean(squares[below]) / _truncated(freedom))
+                shown = np.sqrt(np.mean(squares[below]) / truncated(freedom))
                 noise[k] = np.clip(shown, least, most)
         return replace(self, noise=noise)
 
@@ -558,14 +555,14 @@ class LineTripletSolver(Solver):
             return MotionEstimate.failed(
                 f"{len(tracks)} tracks with positive disparities and {len(lines)} lines with depth, need {_LEAST}"
             )
-        problem = _Problem.of(tracks, lines, rig, self.threshold_px / _SIGMAS)
+        problem = _Problem.of(tracks, lines, rig, self.threshold_px / SIGMAS)
         if count == _LEAST:  # none to spare: a consensus would prove nothing
             return self._of_all(problem)
         reason = ""
         for factor in (1.0, _SECOND_TRY):
             wider = replace(problem, noise=factor * problem.noise)
             options = RansacOptions(
-                threshold=_SIGMAS,
+                threshold=SIGMAS,
                 confidence=self.confidence,
                 min_iterations=_SAMPLES,
                 max_iterations=self.max_iterations,
@@ -585,11 +582,11 @@ class LineTripletSolver(Solver):
 
     def _concluded(self, problem: _Problem, model: MotionEstimate) -> MotionEstimate:
         """Least squares of all inliers, until these stay the same, of the noise that they show."""
-        least, most = (factor * self.threshold_px / _SIGMAS for factor in _RANGE)
+        least, most = (factor * self.threshold_px / SIGMAS for factor in _RANGE)
         before = np.zeros(problem.num_data, dtype=np.bool_)
         for _ in range(_REFITS):
             problem = problem.with_noise_of(model, least, most)
-            inliers = problem.residuals(model) <= _SIGMAS
+            inliers = problem.residuals(model) <= SIGMAS
             if np.count_nonzero(inliers) < _LEAST or np.array_equal(inliers, before):
                 break
             found = problem.descent(model, inliers, _FULL)
@@ -610,16 +607,3 @@ def _with_direction(motion: MotionEstimate, covariance: FloatArray, distance: fl
         return motion
     why = f"d is {length:.2g} m long and known to {sigma:.2g} m"
     return replace(motion, direction_known=False, reason=f"the direction of d is not determined: {why}")
-
-
-@cache
-def _quantile(freedom: int) -> float:
-    """Quantile of chi-squared at the probability that a normal variable lies within ``_SIGMAS``."""
-    return float(scipy.special.chdtri(freedom, scipy.special.chdtrc(1, _SIGMAS**2)))
-
-
-@cache
-def _truncated(freedom: int) -> float:
-    """Mean of chi-squared below that."""
-    quantile = _quantile(freedom)
-    return freedom * float(scipy.special.chdtr(freedom + 2, quantile) / scipy.special.chdtr(freedom, quantile))

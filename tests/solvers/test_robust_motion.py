@@ -48,7 +48,7 @@ from rsbench.solvers.engine.ransac import (
     ransac,
     required_iterations,
 )
-from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, _moment, _quantile
+from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, _moment, quantile
 from rsbench.solvers.refined import RefinedSolver
 
 
@@ -247,10 +247,10 @@ def test_options_refuse_nonsense(bad: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("freedom", [1, 5])
 def test_quantile_and_truncated_mean_are_those_of_chi_squared(freedom: int) -> None:
-    quantile = chi2.ppf(chi2.cdf(2.5**2, 1), freedom)
-    assert _quantile(freedom) == pytest.approx(quantile, rel=1e-12)
-    mean = chi2.expect(args=(freedom,), lb=0.0, ub=quantile, conditional=True)  # by numerical integration
-    assert _moment(freedom) == pytest.approx(mean * 2.5**2 / quantile, rel=1e-6)
+    limit = chi2.ppf(chi2.cdf(2.5**2, 1), freedom)
+    assert quantile(freedom) == pytest.approx(limit, rel=1e-12)
+    mean = chi2.expect(args=(freedom,), lb=0.0, ub=limit, conditional=True)  # by numerical integration
+    assert _moment(freedom) == pytest.approx(mean * 2.5**2 / limit, rel=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -265,7 +265,7 @@ class RobustProblem:
 
 
 @functools.cache
-def _quantile(freedom: int) -> float:
+def quantile(freedom: int) -> float:
     """Quantile of chi-squared at the probability that a normal variable lies within 2.5 standard deviations."""
     return float(2.0 * scipy.special.gammaincinv(0.5 * freedom, float(scipy.special.chdtr(1, SIGMAS**2))))
 
@@ -273,16 +273,19 @@ def _quantile(freedom: int) -> float:
 @functools.cache
 def _track_scale() -> float:
     """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
-    return SIGMAS / float(np.sqrt(_quantile(_TRACK_FREEDOM)))
+    return SIGMAS / float(np.sqrt(quantile(_TRACK_FREEDOM)))
 
 
 @functools.cache
+def truncated(freedom: int) -> float:
+    """Mean of chi-squared below ``quantile``."""
+    chdtr = scipy.special.chdtr
+    return float(freedom * chdtr(freedom + 2, quantile(freedom)) / chdtr(freedom, quantile(freedom)))
+
+
 def _moment(freedom: int) -> float:
     """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
-    quantile = _quantile(freedom)
-    chdtr = scipy.special.chdtr
-    truncated = freedom * chdtr(freedom + 2, quantile) / chdtr(freedom, quantile)
-    return float(truncated) * SIGMAS**2 / quantile
+    return truncated(freedom) * SIGMAS**2 / quantile(freedom)
 
 
 _SECOND_TRY = 3.0
