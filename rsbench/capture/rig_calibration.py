@@ -18,7 +18,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from rsbench.core.rig import RigCamera, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import clustered, larger, variance_factor
+from rsbench.solvers.engine.levenberg_marquardt import Damping, descend
 from rsbench.solvers.engine.packed import Packed, heavy_tailed, inverse_definite, pack
 from rsbench.solvers.engine.residuals import add_tracks
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
@@ -59,6 +60,7 @@ _LEAST = np.array([np.deg2rad(0.2)] * 5 + [0.005, 0.005])
 _TIMES_FOUND = 1.5
 """Prior standard deviations of what rows do not show, over what they do: both come from one calibration."""
 _ITERATIONS, _STILL = 15, 1e-4
+_DAMPING = Damping(least=1e-8, first=1e-7, largest=1e6)
 _MOST = 400
 """Tracks of a window: more would not be what limits the estimate."""
 _LEAST_NOISE_PX = 0.3
@@ -204,16 +206,16 @@ def refine_rig(
     starts = [start]
     if start[_CONVERGENCE] != 0.0:
         starts.append(np.where(np.arange(len(ERRORS)) == _CONVERGENCE, 0.0, start))
-    options = robust or RobustOptions()
-    tried = [_moving(windows, rig, shutter, each, options, seed, motion_model) for each in starts]
+    search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
+    tried = [search.moving(each) for each in starts]
     # Rows hardly show the convergence: under a wrong one, what moves in the scene may agree on a motion.
     best = int(np.argmax([agreeing for *_, agreeing in tried]))
     start, (found, thetas, _) = starts[best], tried[best]
     if not found:
         return None
-    problem = _Problem(found, rig, shutter, prior, motion_model)
-    errors, thetas, H = problem.solved(start.copy(), thetas)
-    sigma = problem.sigma(H, problem.pulls(errors, thetas))
+    problem = _Problem(found, search, prior)
+    end = descend(problem, problem.place(start, thetas), _ITERATIONS, _DAMPING)
+    errors, sigma = end.errors, problem.sigma(end.H, problem.pulls(end.errors, end.thetas))
     if sigma is None:
         return None
     count = sum(len(each.tracks) for each in found)
@@ -237,16 +239,16 @@ def agrees(
     It is a fifth of the work. One step is enough of errors that move rows by a fraction of a pixel: what it leaves
     out is their square.
     """
-    start = np.zeros(len(ERRORS))
-    found, thetas, _ = _moving(windows, rig, shutter, start, robust or RobustOptions(), seed, motion_model)
+    search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
+    found, thetas, _ = search.moving(np.zeros(len(ERRORS)))
     if not found:
         return False
-    problem = _Problem(found, rig, shutter, prior, motion_model)
-    _, g, H, _ = problem.local(start, thetas)
-    sigma = problem.sigma(H)
+    problem = _Problem(found, search, prior)
+    here = problem.place(np.zeros(len(ERRORS)), thetas)
+    sigma = problem.sigma(here.H)
     if sigma is None:
         return False
-    return bool(np.all(np.abs(np.linalg.solve(H, g)) <= deviations * sigma[problem.free]))
+    return bool(np.all(np.abs(np.linalg.solve(here.H, here.g)) <= deviations * sigma[problem.free]))
 
 
 def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
@@ -258,36 +260,38 @@ def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
     return camera.fx * float(np.sqrt(np.mean(moved**2)))
 
 
-def _moving(
-    windows: Sequence[Correspondences],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    start: FloatArray,
-    robust: RobustOptions,
-    seed: int,
-    motion_model: str,
-) -> tuple[list[_Window], list[FloatArray], int]:
-    """Windows that have a motion under these errors, their motions, and how many tracks agree with them."""
-    solver, agreeing = RefinedSolver(motion_model=motion_model, use_pairs=False), 0
-    found, thetas = list[_Window](), list[FloatArray]()
-    first, read = with_errors(rig, start), _read(shutter, start)
-    for matches in windows:
-        tracks = Correspondences(tracks=matches.tracks)
-        result = estimate_motion(tracks, first, read, solver, robust, np.random.default_rng(seed))
-        if not result.estimate.success:
-            continue
-        packed = pack(tracks, first, read, motion_model)
-        theta = packed.theta(result.estimate.w, result.estimate.d)
-        chosen = matches.tracks[result.inliers["tracks"]]
-        some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST, 1)])
-        noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
-        tailed = heavy_tailed(pack(some, first, read, motion_model), theta, noise)
-        if tailed is None:
-            continue
-        found.append(_Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale))
-        thetas.append(theta)
-        agreeing += len(chosen)
-    return found, thetas, agreeing
+class _Search(NamedTuple):
+    """Windows of cameras whose calibration is in question, and how their motions are searched for."""
+
+    windows: Sequence[Correspondences]
+    rig: StereoRig
+    shutter: RollingShutter
+    robust: RobustOptions
+    seed: int
+    motion_model: str
+
+    def moving(self, start: FloatArray) -> tuple[list[_Window], list[FloatArray], int]:
+        """Windows that have a motion under errors (8,), their motions, and how many tracks agree with them."""
+        solver, agreeing = RefinedSolver(motion_model=self.motion_model, use_pairs=False), 0
+        found, thetas = list[_Window](), list[FloatArray]()
+        first, read = with_errors(self.rig, start), _read(self.shutter, start)
+        for matches in self.windows:
+            tracks, rng = Correspondences(tracks=matches.tracks), np.random.default_rng(self.seed)
+            result = estimate_motion(tracks, first, read, solver, self.robust, rng)
+            if not result.estimate.success:
+                continue
+            packed = pack(tracks, first, read, self.motion_model)
+            theta = packed.theta(result.estimate.w, result.estimate.d)
+            chosen = matches.tracks[result.inliers["tracks"]]
+            some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST, 1)])
+            noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
+            tailed = heavy_tailed(pack(some, first, read, self.motion_model), theta, noise)
+            if tailed is None:
+                continue
+            found.append(_Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale))
+            thetas.append(theta)
+            agreeing += len(chosen)
+        return found, thetas, agreeing
 
 
 def _read(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
@@ -295,19 +299,25 @@ def _read(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
     return shutter if errors[_DELAY] == 0.0 else replace(shutter, right_delay=float(np.clip(late, -1.0, 1.0)))
 
 
+class _Place(NamedTuple):
+    """Where the descent is: errors (8,), motions of the windows, and the cost with its derivatives."""
+
+    errors: FloatArray
+    thetas: list[FloatArray]
+    cost: float
+    g: FloatArray
+    """(k,) gradient by the free errors, the motions left out; H (k, k) likewise."""
+    H: FloatArray
+    backs: list[tuple[FloatArray, FloatArray]]
+    """What gives the motions' steps."""
+
+
 class _Problem:
     """Tracks of all windows as a function of the errors and of the windows' motions; the motions are left out."""
 
-    def __init__(
-        self,
-        windows: Sequence[_Window],
-        rig: StereoRig,
-        shutter: RollingShutter,
-        prior: FloatArray,
-        motion_model: str,
-    ) -> None:
-        self.windows, self.rig, self.shutter, self.prior, self.model = windows, rig, shutter, prior, motion_model
-        self.free = np.flatnonzero(prior > 0.0)
+    def __init__(self, windows: Sequence[_Window], search: _Search, prior: FloatArray) -> None:
+        self.windows, self.rig, self.shutter, self.model = windows, search.rig, search.shutter, search.motion_model
+        self.prior, self.free = prior, np.flatnonzero(prior > 0.0)
 
     def pulls(self, errors: FloatArray, thetas: Sequence[FloatArray]) -> FloatArray:
         """(windows, k) gradient of each window's cost by the free errors, its motion fitted."""
@@ -315,7 +325,7 @@ class _Problem:
         for window, theta in zip(self.windows, thetas, strict=True):
             alone = copy.copy(self)
             alone.windows = [window]
-            out.append(alone.local(errors, [theta])[1] - weight * errors[self.free])
+            out.append(alone.place(errors, [theta]).g - weight * errors[self.free])
         return np.array(out)
 
     def sigma(self, H: FloatArray, pulls: FloatArray | None = None) -> FloatArray | None:
@@ -336,10 +346,8 @@ class _Problem:
         matches = Correspondences(tracks=window.tracks)
         return pack(matches, with_errors(self.rig, errors), _read(self.shutter, errors), self.model)
 
-    def local(
-        self, errors: FloatArray, thetas: Sequence[FloatArray]
-    ) -> tuple[float, FloatArray, FloatArray, list[tuple[FloatArray, FloatArray]]]:
-        """Negative log-likelihood, its gradient and Hessian by the free errors, and what gives the motions' steps.
+    def place(self, errors: FloatArray, thetas: list[FloatArray]) -> _Place:
+        """Negative log-likelihood at errors (8,) and motions, its gradient and Hessian.
 
         The Hessian has the derivatives of rays and times; the gradient is the cost's own central difference: noisy
         rays in the derivatives would pull the focal lengths to smaller values, five deviations of 1200 tracks.
@@ -374,27 +382,16 @@ class _Problem:
             H += whole[6:, 6:] - whole[6:, :6] @ back @ whole[:6, 6:]
             backs.append((back @ gradient[:6], back @ whole[:6, 6:]))
         values = errors[self.free]
-        return cost + 0.5 * float(weight @ values**2), g + weight * values, H + np.diag(weight), backs
+        cost += 0.5 * float(weight @ values**2)
+        return _Place(errors, thetas, cost, g + weight * values, H + np.diag(weight), backs)
 
-    def solved(
-        self, errors: FloatArray, thetas: list[FloatArray]
-    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-        """Errors (8,), motions and the Hessian by the free errors at the minimum."""
-        cost, g, H, backs = self.local(errors, thetas)
-        damping = 1e-6
-        for _ in range(_ITERATIONS):
-            step = np.linalg.solve(H + damping * np.diag(np.diagonal(H)), -g)
-            trial = errors.copy()
-            trial[self.free] += step
-            moved = [theta - a - B @ step for theta, (a, B) in zip(thetas, backs, strict=True)]
-            new = self.local(trial, moved)
-            if new[0] <= cost:
-                gain, damping = cost - new[0], damping * 0.1
-                errors, thetas, (cost, g, H, backs) = trial, moved, new
-                if gain < _STILL:
-                    break
-            else:
-                damping = max(damping, 1e-8) * 10.0
-                if damping > 1e6:
-                    break
-        return errors, thetas, H
+    def stepped(self, here: _Place, damping: float) -> _Place | None:
+        step = np.linalg.solve(here.H + damping * np.diag(np.diagonal(here.H)), -here.g)
+        errors = here.errors.copy()
+        errors[self.free] += step
+        moved = [theta - a - B @ step for theta, (a, B) in zip(here.thetas, here.backs, strict=True)]
+        there = self.place(errors, moved)
+        return there if there.cost <= here.cost else None
+
+    def settled(self, before: _Place, after: _Place) -> bool:
+        return before.cost - after.cost < _STILL
