@@ -55,7 +55,7 @@ STEPS = (
     ("match", "rsbench.pipeline.sequence_correction", "match_frames"),
     ("depth", "rsbench.pipeline.sequence_correction", "frame_pair"),
     ("depth of motion", "rsbench.pipeline.sequence_correction", "find_depth"),
-    ("correct", "rsbench.pipeline.sequence_correction", "correct_known"),
+    ("correct", "rsbench.pipeline.sequence_correction", "correct_known_rows"),
     ("look and motion", "rsbench.pipeline.mono_sequence", "_seen"),
     ("motion and depth", "rsbench.pipeline.mono_sequence", "_ready"),
     ("draw", "rsbench.pipeline.mono_sequence", "_moment"),

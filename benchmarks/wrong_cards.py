@@ -19,6 +19,7 @@ from foreign_frames import ROWS, picture, write_case
 from foreign_world import read_photographs
 
 from rsbench.capture.calibration import CardSigma
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.self_calibration import FoundCamera
 from rsbench.core.camera import Lens
 from rsbench.core.rig import SIDES, StereoRig
@@ -40,7 +41,7 @@ def true_and_found(folder: Path) -> tuple[StereoRig, FoundCamera]:
     camera = replace(camera, fx=_LONGER * camera.fx, fy=_LONGER * camera.fy, lens=wrong)
     sigma = CardSigma(focal=_SURE * camera.fx, k1=_SURE_K1)
     given = replace(rig, camera=camera)
-    found = camera_of_frames([images], given, sigma, CorrectionOptions())
+    found = camera_of_frames([images], given, sigma, CorrectionOptions(), KnownInputs())
     return rig, found
 
 

@@ -190,14 +190,14 @@ def score(given: argparse.Namespace) -> list[str]:
         raise RsbenchError(
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
-    ratio, lines = given.ratio, list[str]()
+    ratio, lines, inputs = given.ratio, list[str](), KnownInputs(readout_ratio=given.ratio)
     if sigma := CardSigma(focal=given.focal_sigma, k1=given.k1_sigma):
-        found = camera_of_frames(spread_windows(*sources), rig, sigma, options, ratio)
+        found = camera_of_frames(spread_windows(*sources), rig, sigma, options, inputs)
         lines.append(found.words(rig, sigma))
         rig = found.rig
     capture, calibration = None, NO_ERRORS
     try:
-        capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, ratio)
+        capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, inputs)
         ratio = shutter.readout_ratio
     except RefusedFramesError:
         if ratio is None:

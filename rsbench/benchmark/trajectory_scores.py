@@ -15,7 +15,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS
 from rsbench.capture.model_choice import AUTO
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import estimate_trajectory
@@ -31,6 +30,7 @@ from rsbench.core.se3 import Pose, compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import find_motion
 from rsbench.pipeline.sequence_correction import Window, on_one_trajectory
@@ -113,9 +113,8 @@ def _trajectory(given: Given) -> Estimate:
 
 
 def _correct(given: Given) -> Estimate:
-    options = CorrectionOptions(motion_model=AUTO, seed=given.seed)
     windows = (Window(images={}, pairs=None, found=None, matches=each) for each in given.matches)
-    found = list(on_one_trajectory(windows, given.rig, given.shutter, options, NO_ERRORS))
+    found = list(on_one_trajectory(windows, KnownCapture(rig=given.rig, shutter=given.shutter), given.seed, ""))
     motions = [None if each.found is None else each.found.motion for each in found]
     starts = _stacked([each.pose or _UNKNOWN for each in found])
     return Estimate(windows=motions, starts=starts, failed=sum(motion is None for motion in motions))

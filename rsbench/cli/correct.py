@@ -187,33 +187,21 @@ def _correct_given(given: CorrectInput, target: str, options: CorrectionOptions,
 def _options(
     features: str, solver: str, matcher: str, corrector: str, fill: bool, **others: Any
 ) -> CorrectionOptions:
-    from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.frame_motion import model_to_use
-    from rsbench.solvers.engine.base import load_solver_entry
-    from rsbench.vision.feature_matcher import load_features
-    from rsbench.vision.stereo_matcher import load_matcher
+    from rsbench.pipeline.arrays import options_of
 
-    options = CorrectionOptions(
-        features=load_features(features),
-        solver=load_solver_entry(solver),
-        matcher=load_matcher(matcher),
-        corrector=_corrector(corrector, fill),
-        **others,
-    )
-    return replace(options, motion_model=model_to_use(options.motion_model, options.solver))
+    options = options_of(solver, others.pop("motion_model"), matcher, features, corrector, **others)
+    return options if fill else replace(options, corrector=_without_filling(options.corrector))
 
 
-def _corrector(name: str, fill: bool) -> CorrectorEntry:
-    """The corrector; ``--no-fill`` turns the filling of ours off."""
+def _without_filling(entry: CorrectorEntry) -> CorrectorEntry:
+    """The corrector with the filling of ours turned off."""
     from rsbench.components.imports import component_key
-    from rsbench.vision.corrector import load_corrector
     from rsbench.vision.correctors import FusionCorrector
 
-    entry = load_corrector(name)
-    if fill:
-        return entry
     if not isinstance(entry.component, FusionCorrector):
-        raise RsbenchError(f"--no-fill: corrector {name!r} fills nothing that could be turned off; leave it out")
+        raise RsbenchError(
+            f"--no-fill: corrector {entry.name!r} fills nothing that could be turned off; leave it out"
+        )
     component = replace(entry.component, use_other_views=False)
     return replace(entry, component=component, key=component_key(component, {}))
 
@@ -243,9 +231,7 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
     rig = card.rig_of(images["left", 0], images["right", 0])
     options = replace(options, target_row=target_row(target, images["left", 0].shape[0]))
     with fresh_folder(out) as folder:
-        rig, focal = with_found_camera(
-            rig, card.sigma, [images], options, card.readout_ratio, card.scanning, progress_bar
-        )
+        rig, focal = with_found_camera(rig, card.sigma, [images], options, card.inputs, progress_bar)
         with progress_bar("correcting", 4) as advance:
             result = correct_four(
                 images,
@@ -265,7 +251,7 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
                 write_rectified(folder, f"{side}_{frame}", fused, rig, side)
         if given.rectify:
             write_calibration(folder, rig)
-        calibration = (card.calibration or NO_ERRORS) if result.found is None else result.found.calibration
+        calibration = (card.inputs.calibration or NO_ERRORS) if result.found is None else result.found.calibration
         record = rig_record(rig, result.shutter, result.capture, options, calibration, result.rig_found)
         record["camera_note"] = focal
         record["motion"] = None if result.found is None else motion_record(result.found)

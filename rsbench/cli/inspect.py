@@ -194,15 +194,8 @@ def _with_found_camera(
     from rsbench.vision.feature_matcher import load_features
 
     chain = CorrectionOptions(features=load_features(options.features), seed=options.seed)
-    rig, words = with_found_camera(
-        rig,
-        given.sigma,
-        spread_windows(left, right),
-        chain,
-        given.readout_ratio,
-        given.scanning,
-        progress_bar,
-    )
+    shown = spread_windows(left, right)
+    rig, words = with_found_camera(rig, given.sigma, shown, chain, given.inputs, progress_bar)
     echo(words, err=True)
     return rig
 

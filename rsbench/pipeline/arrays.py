@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.capture.calibration import CardSigma
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.sequence_shutter import shutter_of_sequence
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, Trajectory, estimate_trajectory
@@ -30,7 +31,7 @@ from rsbench.pipeline.frame_motion import model_to_use
 from rsbench.pipeline.isolated_components import Isolation
 from rsbench.pipeline.mono_camera import OneCameraCard
 from rsbench.pipeline.mono_sequence import options_of_camera
-from rsbench.pipeline.sequence_capture import Gyroscope, know_capture, with_found_camera
+from rsbench.pipeline.sequence_capture import FEWEST_FRAMES, Gyroscope, know_capture, with_found_camera
 from rsbench.pipeline.sequence_correction import correct_sequence
 from rsbench.solvers.engine.base import Solver, entry_of
 from rsbench.vision.corrector import demand_corrected, load_corrector
@@ -82,7 +83,8 @@ def of_rig(
     views, known = four_images(images, rig), Given(gyro=gyro_samples(gyro))
     with Isolation() as isolation:
         chain = isolation.chain(options)
-        rig, _ = with_found_camera(rig, sigma, [views], chain, readout_ratio, scanning)
+        inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning)
+        rig, _ = with_found_camera(rig, sigma, [views], chain, inputs)
         found = correct_four(views, rig, readout_ratio, chain, given=known, scanning=scanning)
     demand_corrected(found.frames, options.corrector.name)
     if not close:
@@ -120,10 +122,6 @@ def of_one_camera(
 
 
 # The trajectory of arrays, as ``rsbench.estimate_trajectory`` finds it.
-
-
-FEWEST_FRAMES = 4
-"""Of a sequence that shows its shutter."""
 
 
 def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Correspondences]:

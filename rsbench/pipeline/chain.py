@@ -29,7 +29,6 @@ from rsbench.pipeline.frame_depth import (
     Pairs,
     complete_depth,
     frame_pairs,
-    motion_pairs,
     moving_pairs,
     timed_pairs,
 )
@@ -213,13 +212,11 @@ def find_depth(
     frames: tuple[int, ...] = FRAMES,
 ) -> Pairs:
     """The frames with their depth: by the matcher unless ``pairs`` has it, then from the motion, of ``frames``."""
-    if pairs is None and needs_motion(options.matcher):
+    asks = needs_motion(options.matcher)
+    if pairs is None and (asks or not rig.rows_together(shutter.scanning, shutter.readout_ratio)):
         if motion is None:
-            raise ValueError(f"the motion must be known where matcher {options.matcher.name!r} finds depth")
-        pairs = motion_pairs(images, rig, shutter, motion, options)
-    elif pairs is None and not rig.rows_together(shutter.scanning, shutter.readout_ratio):
-        if motion is None:
-            raise ValueError("the motion must be known where depth is found of cameras that read rows apart")
+            where = f"matcher {options.matcher.name!r} finds depth" if asks else "cameras read rows apart"
+            raise ValueError(f"the motion must be known where {where}")
         pairs = moving_pairs(images, rig, shutter, motion, options)
     elif pairs is None:
         pairs = frame_pairs(images, rig, options, disparity_offset)
@@ -242,30 +239,9 @@ def correct_frames(
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float = 0.0,
 ) -> dict[View, Fused]:
-    """``correct_known`` of correctors that need no more than a motion and a depth."""
+    """``correct_known_rows`` of one row and of correctors that need no more than a motion and a depth."""
     given = Given(motion=motion, pairs=pairs)
-    return correct_known(images, given, rig, shutter, options, views, disparity_offset)
-
-
-def correct_known(
-    images: Images,
-    known: Given,
-    rig: StereoRig,
-    shutter: RollingShutter,
-    options: CorrectionOptions,
-    views: tuple[View, ...] = VIEWS,
-    disparity_offset: float = 0.0,
-) -> dict[View, Fused]:
-    """Corrected frames of the requested views, at the time of ``options.target_row``, through the same lens.
-
-    A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
-
-    Raises:
-        RsbenchError: the corrector needs a gyroscope's samples and there are none, or another package's corrector
-            failed, see ``find_corrected``.
-    """
-    rows = (options.target_row,)
-    return correct_known_rows(images, known, rig, shutter, options, views, disparity_offset, rows)[0]
+    return correct_known_rows(images, given, rig, shutter, options, views, disparity_offset)[0]
 
 
 def correct_known_rows(
@@ -276,9 +252,20 @@ def correct_known_rows(
     options: CorrectionOptions,
     views: tuple[View, ...],
     disparity_offset: float,
-    rows: Sequence[float],
+    rows: Sequence[float] | None = None,
 ) -> list[dict[View, Fused]]:
-    """``correct_known`` at the times of several target rows, in place of that of the options; its errors."""
+    """Corrected frames of the requested views at the times of target rows, through the same lens.
+
+    A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
+
+    Args:
+        rows: by default that of the options.
+
+    Raises:
+        RsbenchError: the corrector needs a gyroscope's samples and there are none, or another package's corrector
+            failed, see ``find_corrected``.
+    """
+    rows = (options.target_row,) if rows is None else rows
     pairs, needs = known.pairs, options.corrector.component.spec.needs
     if shutter.still and not (options.one_time and shutter.right_delay and known.motion is not None):
         return [uncorrected(images, views, pairs) for _ in rows]

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration import CardSigma, of_offset
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml
 from rsbench.components.rig_tables import CameraTable, RightFromLeft, Size, rig_of_tables, tables_of, with_readouts
 from rsbench.core.arguments import LARGEST_M, LARGEST_SIZE, check_number, check_positive
@@ -140,9 +141,10 @@ class RigCard(StatedShutter):
             raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1], or be absent if unknown")
 
     @property
-    def calibration(self) -> tuple[float, ...] | None:
-        """What the calibration is wrong by; None where it is looked for."""
-        return None if self.disparity_offset is None else of_offset(self.disparity_offset)
+    def inputs(self) -> KnownInputs:
+        """What the card gives of a capture."""
+        errors = None if self.disparity_offset is None else of_offset(self.disparity_offset)
+        return KnownInputs(readout_ratio=self.readout_ratio, scanning=self.scanning, calibration=errors)
 
     @property
     def sigma(self) -> CardSigma:

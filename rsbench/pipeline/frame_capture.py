@@ -101,10 +101,8 @@ def know_four(
     forget_matches()
     own, found, doubt = matches is None and rig.rows_together(inputs.reading, inputs.readout_ratio), None, None
     try:
-        if matches is None and inputs.readout_ratio is None and inputs.scanning is None:
-            matches, doubt = match_unknown(images, rig, options)
-        elif matches is None:
-            matches = match_frames(images, rig, options, inputs.scanning)
+        if matches is None:
+            matches, doubt = match_given(images, rig, options, inputs)
         step("matching")
         if own and doubt is None and not rig.aligned and inputs.calibration is None:
             found = rig_of_matches(matches, rig, inputs, options)
@@ -354,6 +352,15 @@ def match_unknown(
         doubt = error
     scanning = Scanning() if options.features.component.apart() is None else Scanning(scan="left")
     return _enough(find_matches_of_rig(images, rig, scanning, options)), doubt
+
+
+def match_given(
+    images: Images, rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs, *, judge_rig: bool = True
+) -> tuple[Correspondences, RefusedFramesError | None]:
+    """``match_frames`` where readout ratio or scanning are given, else ``match_unknown``; their errors."""
+    if inputs.readout_ratio is None and inputs.scanning is None:
+        return match_unknown(images, rig, options, judge_rig=judge_rig)
+    return match_frames(images, rig, options, inputs.scanning, judge_rig=judge_rig), None
 
 
 def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:

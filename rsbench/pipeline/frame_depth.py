@@ -29,6 +29,7 @@ from rsbench.vision.stereo_matcher import (
     body_depth,
     find_depths,
     load_matcher,
+    needs_motion,
     own_depths,
     sensor_disparities,
 )
@@ -182,27 +183,19 @@ def _without_holes(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -
 def moving_pairs(
     images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion, options: CorrectionOptions
 ) -> Pairs:
-    """``frame_pairs`` of cameras that do not read their rows together, by a known motion."""
-
-    def pair(frame: int) -> FramePair:
-        left, right = images["left", frame], images["right", frame]
-        levels = dict(zip(SIDES, eight_bit([left, right]), strict=True))
-        both = moving_disparities(options.matcher, levels, rig, shutter, motion, frame)
-        return replace(depth_of_pair(left, right, both, rig, find_sky=options.find_sky), timed=True)
-
-    first, second = (pair(frame) for frame in FRAMES)
-    return first, second
-
-
-def motion_pairs(
-    images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion, options: CorrectionOptions
-) -> Pairs:
-    """``frame_pairs`` of a matcher that needs the motion, of any cameras that it takes.
+    """``frame_pairs`` by a known motion: of cameras that do not read rows together, or a matcher that needs it.
 
     Raises:
         RsbenchError: see ``find_depths``.
     """
-    both = motion_disparities(options.matcher, images, rig, shutter, motion)
+    if needs_motion(options.matcher):
+        both = motion_disparities(options.matcher, images, rig, shutter, motion)
+    else:
+        both = dict[View, NDArray[np.float32]]()
+        for frame in FRAMES:
+            levels = dict(zip(SIDES, eight_bit([images[side, frame] for side in SIDES]), strict=True))
+            found = moving_disparities(options.matcher, levels, rig, shutter, motion, frame)
+            both |= {(side, frame): each for side, each in zip(SIDES, found, strict=True)}
     first, second = (
         pair_with_motion(images, [both[side, frame] for side in SIDES], frame, rig, find_sky=options.find_sky)
         for frame in FRAMES

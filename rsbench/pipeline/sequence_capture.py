@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -33,7 +34,7 @@ from rsbench.pipeline.frame_capture import (
     KnownCapture,
     find_rig,
     match_frames,
-    match_unknown,
+    match_given,
     models_asked,
     rig_of_matches,
     with_enough,
@@ -105,26 +106,23 @@ def know_capture(
     if isinstance(card, OneCameraCard):
         return _know_camera(sources[0], card, options, gyro, progress)
     left, right = sources
-    rig = card.rig_of(next(iter(left)), next(iter(right)))
-    ratio, scanning, calibration = card.readout_ratio, card.scanning, card.calibration
-    shown = spread_windows(left, right)
-    rig, note = with_found_camera(rig, card.sigma, shown, options, ratio, scanning, progress)
-    turned = with_found_rig(rig, left, right, options, ratio, scanning)
+    rig, inputs, shown = card.rig_of(next(iter(left)), next(iter(right))), card.inputs, spread_windows(left, right)
+    rig, note = with_found_camera(rig, card.sigma, shown, options, inputs, progress)
+    turned = with_found_rig(rig, left, right, options, inputs)
     rig = rig if turned is None else turned.rig
-    calibration = calibration if rig.aligned else calibration or NO_ERRORS  # found as errors of the rig
-    capture, shutter = None, None
-    if ratio is None or calibration is None:
+    if not rig.aligned:  # found as errors of the rig
+        inputs = replace(inputs, calibration=inputs.calibration or NO_ERRORS)
+    capture, shutter, errors = None, None, inputs.calibration
+    if inputs.readout_ratio is None or errors is None:
         with progress("looking at the shutter", min(max(left.count - 1, 1), WINDOWS)) as advance:
-            capture, shutter = estimate_sequence_capture(
-                left, right, rig, options, ratio, scanning, calibration, advance
-            )
+            capture, shutter = estimate_sequence_capture(left, right, rig, options, inputs, advance)
         nothing = capture is None or not rig.rows_together(shutter.scanning)
-        calibration = NO_ERRORS if nothing else capture.calibration
+        errors = NO_ERRORS if nothing else capture.calibration
     return KnownCapture(
         rig=rig,
-        shutter=shutter or rig.shutter_of(scanning or Scanning(), ratio or 0.0),
+        shutter=shutter or inputs.shutter_of(rig),
         capture=capture,
-        calibration=calibration,
+        calibration=errors,
         rig_found=turned,
         camera_note=note,
         gyro=None if gyro is None else gyro.samples,
@@ -238,9 +236,7 @@ def estimate_sequence_capture(
     right: FrameSource,
     rig: StereoRig,
     options: CorrectionOptions,
-    readout_ratio: float | None = None,
-    scanning: Scanning | None = None,
-    calibration: tuple[float, ...] | None = None,
+    inputs: KnownInputs | None = None,
     advance: Callable[[str], None] = lambda word: None,
 ) -> tuple[Capture | None, RollingShutter]:
     """How the cameras of a sequence read, from windows that lie evenly over it: their shutter does not change.
@@ -249,20 +245,22 @@ def estimate_sequence_capture(
     shutter that is found to be global it is found as if that had been known.
 
     Args:
-        readout_ratio, scanning, calibration: see ``know_matches``.
+        inputs: what is given, see ``know_matches``.
         advance: called for each window.
 
     Raises:
         RefusedFramesError: the first windows contradict the given rig.
         NoMotionError: the windows do not determine the shutter.
     """
+    inputs = inputs or KnownInputs()
+    if inputs.readout_ratio is not None:
+        inputs = replace(inputs, scanning=inputs.reading)
 
     def under_global() -> Capture | None:
-        return estimate_sequence_capture(left, right, rig, options, 0.0, Scanning(), calibration, advance)[0]
+        still = replace(inputs, readout_ratio=0.0, scanning=Scanning())
+        return estimate_sequence_capture(left, right, rig, options, still, advance)[0]
 
-    scanning = scanning if readout_ratio is None else scanning or Scanning()
-    inputs = (rig, options, readout_ratio, scanning, calibration)
-    look, refusals = _Look(*inputs, under_global), Refusals(left)
+    look, refusals = _Look(rig, options, inputs, under_global), Refusals(left)
     doubts = list[RefusedFramesError | None]()
     every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(window_images(left, right)):
@@ -272,7 +270,7 @@ def estimate_sequence_capture(
             continue
         matching = with_enough(options, ENOUGH) if look.shaken else options
         try:
-            matches, doubt = _matched(images, rig, matching, scanning, number < JUDGED)
+            matches, doubt = match_given(images, rig, matching, inputs, judge_rig=number < JUDGED)
             doubts.append(doubt)
         except RefusedFramesError as error:
             refusals.add(number, error)
@@ -283,40 +281,27 @@ def estimate_sequence_capture(
         if chosen:
             advance(f"window {number}")
     refusals.end(number + 1)
-    if readout_ratio is not None:
-        shutter = rig.shutter_of(scanning or Scanning(), readout_ratio)
-        return (None if look.is_right else look.concluded()), shutter
-    capture = look.concluded()
+    capture = None if look.is_right else look.concluded()
+    if capture is None or inputs.readout_ratio is not None:
+        return capture, inputs.shutter_of(rig)
     shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
     if doubt is not None and rig.rows_together(shutter.scanning):
         raise doubt
     return capture, shutter
 
 
-def _matched(
-    images: Images, rig: StereoRig, options: CorrectionOptions, scanning: Scanning | None, judge_rig: bool
-) -> tuple[Correspondences, RefusedFramesError | None]:
-    """Of a window; and what speaks against a pair that reads as one, where the scanning is not known."""
-    if scanning is None:
-        return match_unknown(images, rig, options, judge_rig=judge_rig)
-    return match_frames(images, rig, options, scanning, judge_rig=judge_rig), None
-
-
 class _Look:
-    """What windows so far say of a shutter."""
+    """What windows so far show of a shutter."""
 
     def __init__(
         self,
         rig: StereoRig,
         options: CorrectionOptions,
-        readout_ratio: float | None,
-        scanning: Scanning | None,
-        calibration: tuple[float, ...] | None,
+        inputs: KnownInputs,
         under_global: Callable[[], Capture | None],
     ) -> None:
-        self._under_global = under_global
-        self._rig, self._options, self._ratio = rig, options, readout_ratio
-        self._scanning, self._calibration = scanning, calibration
+        self._rig, self._options, self._under_global = rig, options, under_global
+        self._inputs = replace(inputs, models=models_asked(options.motion_model))
         self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
         self._known: Known | None = None
         self._waiting = list[Correspondences]()
@@ -330,11 +315,15 @@ class _Look:
     @property
     def is_right(self) -> bool:
         """Whether there is nothing to look for: the ratio is known, and the calibration shows no errors."""
-        return self._ratio is not None and self._known is not None and not any(self._known.calibration_sigma)
+        return (
+            self._inputs.readout_ratio is not None
+            and self._known is not None
+            and not any(self._known.calibration_sigma)
+        )
 
     def judge(self, number: int) -> None:
         """Whether the rig shakes, once there are enough windows before ``number``: no motion model helps then."""
-        if number + 1 == FEWEST_FRAMES and self._examined and self._ratio is None:
+        if number + 1 == FEWEST_FRAMES and self._examined and self._inputs.readout_ratio is None:
             self.shaken = shakes(conclude(self._examined), self._first, self._rig, self._options.seed)
             if not self.shaken:
                 self._examine_waiting()
@@ -350,12 +339,9 @@ class _Look:
             self._examine_waiting()
 
     def _examine_waiting(self) -> None:
-        options, models = self._options, models_asked(self._options.motion_model)
+        options = self._options
         for matches in self._waiting:
-            given = KnownInputs(
-                readout_ratio=self._ratio, scanning=self._scanning, calibration=self._calibration, models=models
-            )
-            known = self._known = self._known or known_of(matches, self._rig, given)
+            known = self._known = self._known or known_of(matches, self._rig, self._inputs)
             if self.is_right:
                 return
             self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))
@@ -370,12 +356,12 @@ class _Look:
         if self._known is None:
             raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
         capture = conclude(self._examined)
-        if self._ratio is None:
+        if self._inputs.readout_ratio is None:
             capture = as_global(capture, self.used, self._rig, self._known, self._under_global)
-        if self._ratio is not None or len(self._first) + 1 < FEWEST_FRAMES:
+        if self._inputs.readout_ratio is not None or len(self._first) + 1 < FEWEST_FRAMES:
             return capture
         if self.shaken or shakes(capture, self._first, self._rig, self._options.seed):
-            given = None if self._scanning is None else (self._scanning,)
+            given = None if self._inputs.scanning is None else (self._inputs.scanning,)
             return capture_of_sequence(capture, self._first, self._rig, given, self._options.seed)
         return capture
 
@@ -402,37 +388,17 @@ def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
 
 
 def camera_of_frames(
-    windows: Iterable[Images],
-    rig: StereoRig,
-    sigma: CardSigma,
-    options: CorrectionOptions,
-    readout_ratio: float | None = None,
-    scanning: Scanning | None = None,
+    windows: Iterable[Images], rig: StereoRig, sigma: CardSigma, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundCamera:
-    """``find_camera`` from the matches of a few windows; those without matches say nothing.
-
-    Args:
-        readout_ratio, scanning: see ``know_matches``.
-    """
+    """``find_camera`` from the matches of a few windows; those without matches say nothing."""
     matches = list[Correspondences]()
     for images in islice(windows, _WINDOWS):
-        try:
-            if readout_ratio is None and scanning is None:
-                matches.append(match_unknown(images, rig, options, judge_rig=False)[0])
-            else:
-                matches.append(match_frames(images, rig, options, scanning, judge_rig=False))
-        except RefusedFramesError:
-            continue  # the correction says so of each
+        with suppress(RefusedFramesError):  # the correction says so of each
+            matches.append(match_given(images, rig, options, inputs, judge_rig=False)[0])
     if not matches:
         return FoundCamera(rig=rig, sigma=sigma, determined=(False, False))
-    return find_camera(
-        matches,
-        rig,
-        sigma,
-        KnownInputs(readout_ratio=readout_ratio, scanning=scanning),
-        options.robust,
-        options.seed,
-    )
+    shutter = KnownInputs(readout_ratio=inputs.readout_ratio, scanning=inputs.scanning)
+    return find_camera(matches, rig, sigma, shutter, options.robust, options.seed)
 
 
 def with_found_camera(
@@ -440,37 +406,31 @@ def with_found_camera(
     sigma: CardSigma,
     windows: Iterable[Images],
     options: CorrectionOptions,
-    readout_ratio: float | None = None,
-    scanning: Scanning | None = None,
+    inputs: KnownInputs,
     progress: Progress = no_progress,
 ) -> tuple[StereoRig, str]:
     """The rig with the focal length and k1 that are estimated where ``sigma`` is not 0, and words on both."""
     if not sigma:
         return rig, ""
     with progress("looking at the calibration", 1) as advance:
-        found = camera_of_frames(windows, rig, sigma, options, readout_ratio, scanning)
+        found = camera_of_frames(windows, rig, sigma, options, inputs)
         advance("")
     return found.rig, found.words(rig, sigma)
 
 
 def with_found_rig(
-    rig: StereoRig,
-    left: FrameSource,
-    right: FrameSource,
-    options: CorrectionOptions,
-    readout_ratio: float | None = None,
-    scanning: Scanning | None = None,
+    rig: StereoRig, left: FrameSource, right: FrameSource, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundRig | None:
     """The rig as the first frames show it; None where their rows agree with its calibration, or do not tell."""
     images = next(iter(window_images(left, right)), None)
-    if images is None or not rig.rows_together(scanning or Scanning(), readout_ratio):
+    if images is None or not rig.rows_together(inputs.reading, inputs.readout_ratio):
         return None
-    inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning)
+    inputs = replace(inputs, calibration=None)
     try:
         if rig.aligned:
             check_rig(images["left", 0], images["right", 0], rig)
             return None
-        return rig_of_matches(match_frames(images, rig, options, scanning), rig, inputs, options)
+        return rig_of_matches(match_frames(images, rig, options, inputs.scanning), rig, inputs, options)
     except RefusedFramesError as refusal:
         try:
             return find_rig(images, rig, inputs, options, refusal)[0]

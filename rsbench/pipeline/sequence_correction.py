@@ -20,11 +20,10 @@ from rsbench.capture.trajectory_estimate import StreamedWindow, stream_trajector
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.trajectory_tracks import ENOUGH
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.rig import FRAMES, SIDES, StereoRig
+from rsbench.core.rig import FRAMES, SIDES
 from rsbench.core.se3 import Pose, compose
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.chain import Given, check_cameras, correct_known, find_depth
+from rsbench.pipeline.chain import Given, check_cameras, correct_known_rows, find_depth
 from rsbench.pipeline.footage import FrameSource
 from rsbench.pipeline.frame_capture import KnownCapture, match_frames, with_enough
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images, Pairs, frame_pair
@@ -65,32 +64,26 @@ class Window:
     """Body from world at the start of its first frame, where a trajectory was found; the world: the first body."""
 
 
-def on_one_trajectory(
-    windows: Iterable[Window],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    options: CorrectionOptions,
-    calibration: tuple[float, ...],
-    gyro: FloatArray | None = None,
-) -> Iterator[Window]:
+def on_one_trajectory(windows: Iterable[Window], known: KnownCapture, seed: int, solver: str) -> Iterator[Window]:
     """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
 
     Args:
         windows: in order.
-        calibration: what the calibration is wrong by, see ``calibration.TERMS``.
-        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence. It bridges any number of windows:
-            far from those with matches it alone tells how the rig turns, and nobody where it is.
+        known: how they were taken. A gyroscope bridges any number of windows: far from those with matches it alone
+            shows how the rig turns, and nothing shows where it is.
+        seed: of the search for motions of single windows.
+        solver: name for the motions that are found.
     """
-    waiting = deque[Window]()
+    waiting, rig, calibration = deque[Window](), known.rig, known.calibration
 
     def matches() -> Iterator[Correspondences]:
         for window in windows:
             waiting.append(window)
             yield recalibrated(window.matches or Correspondences(), rig, calibration)
 
-    for streamed in stream_trajectory(matches(), rig, shutter, options.seed, gyro=gyro):
+    for streamed in stream_trajectory(matches(), rig, known.shutter, seed, gyro=known.gyro):
         window = waiting.popleft()
-        found = _found(streamed, options, calibration)
+        found = _found(streamed, solver, calibration)
         reason = "" if streamed.supported else window.reason or BRIDGED
         pose = streamed.body_from_world
         if streamed.apart > _LONGEST_BRIDGE:
@@ -100,7 +93,7 @@ def on_one_trajectory(
         yield replace(window, found=found, reason=reason, pose=pose)
 
 
-def _found(streamed: StreamedWindow, options: CorrectionOptions, calibration: tuple[float, ...]) -> FoundMotion:
+def _found(streamed: StreamedWindow, solver: str, calibration: tuple[float, ...]) -> FoundMotion:
     motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
     estimate = MotionEstimate(
         w=motion.w,
@@ -122,7 +115,7 @@ def _found(streamed: StreamedWindow, options: CorrectionOptions, calibration: tu
     return FoundMotion(
         motion=motion,
         robust=robust,
-        solver=options.solver.name,
+        solver=solver,
         reference_point="body",
         calibration=calibration,
         gyro=streamed.gyro,
@@ -163,7 +156,7 @@ def correct_sequence(
         RefusedFramesError: the first three windows, or all, contradict the given rig.
         RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
     """
-    rig, shutter, calibration = known.rig, known.shutter, known.calibration
+    rig, shutter = known.rig, known.shutter
     if not rig.metric:
         frames, starts = frames_with_times(sources[0])
         numbers = sources[0].timeline.originals
@@ -172,16 +165,16 @@ def correct_sequence(
             yield replace(moment, number=int(numbers[moment.number]))
         return
     left, right = sources
-    check_cameras(rig, shutter.scanning, options, calibration[OFFSET])
-    along = _has_trajectory(left, shutter, options)
-    windows = ahead(_windows(left, right, rig, shutter, options, calibration, not along), _AHEAD)
+    check_cameras(rig, shutter.scanning, options, known.calibration[OFFSET])
+    along = takes_gyro(left, options) and not shutter.still
+    windows = ahead(_windows(left, right, known, options, not along), _AHEAD)
     if along:
-        windows = on_one_trajectory(windows, rig, shutter, options, calibration, known.gyro)
-    deep = _with_depth(windows, rig, shutter, options, calibration[OFFSET], first)
+        windows = on_one_trajectory(windows, known, options.seed, options.solver.name)
+    deep = _with_depth(windows, known, options, first)
     places = (each for each in _places(deep) if each[0] >= first)
     # Nothing is known of whether another package's may run twice at a time.
     threads = 2 if options.corrector.built_in and options.matcher.built_in else 1
-    yield from map_ahead(lambda each: _moment(*each, rig, shutter, options), places, _AHEAD, threads)
+    yield from map_ahead(lambda each: _moment(*each, known, options), places, _AHEAD, threads)
 
 
 def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]]:
@@ -194,11 +187,6 @@ def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]
         yield number + 1, 1, [last]
 
 
-def _has_trajectory(left: FrameSource, shutter: RollingShutter, options: CorrectionOptions) -> bool:
-    """Whether one trajectory is fitted to all windows."""
-    return takes_gyro(left, options) and not shutter.still
-
-
 def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
     """Whether a trajectory is fitted if the shutter rolls: of four frames and more whose motion model is open."""
     chosen = options.motion_model == AUTO and "motion" in options.corrector.component.spec.needs
@@ -206,25 +194,18 @@ def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
 
 
 def _windows(
-    left: FrameSource,
-    right: FrameSource,
-    rig: StereoRig,
-    shutter: RollingShutter,
-    options: CorrectionOptions,
-    calibration: tuple[float, ...],
-    with_motion: bool,
+    left: FrameSource, right: FrameSource, known: KnownCapture, options: CorrectionOptions, with_motion: bool
 ) -> Iterator[Window]:
     """The windows of a sequence, each for itself; ``with_motion``: with a motion where the corrector needs one."""
     needs, refusals = options.corrector.component.spec.needs, Refusals(left)
     matching = options if with_motion or "matches" in needs else with_enough(options, ENOUGH)
     number = -1
-    known = KnownCapture(rig=rig, shutter=shutter, calibration=calibration)
     for number, images in enumerate(window_images(left, right)):
         found, reason, matches = None, "", None
         if needs & {"motion", "matches"}:
             try:
                 judged = number < JUDGED
-                matches = match_frames(images, rig, matching, shutter.scanning, judge_rig=judged)
+                matches = match_frames(images, known.rig, matching, known.shutter.scanning, judge_rig=judged)
                 if "motion" in needs and with_motion:
                     found = solve_frames(matches, known, options, in_order=True)
             except NoMotionError as error:
@@ -237,14 +218,10 @@ def _windows(
 
 
 def _with_depth(
-    windows: Iterator[Window],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    options: CorrectionOptions,
-    offset: float,
-    first: int,
+    windows: Iterator[Window], known: KnownCapture, options: CorrectionOptions, first: int
 ) -> Iterator[Window]:
     """The windows with depth from the other camera, that of each frame from ``first`` on found once."""
+    rig, shutter, offset = known.rig, known.shutter, known.calibration[OFFSET]
     apart = not rig.rows_together(shutter.scanning, shutter.readout_ratio) or needs_motion(options.matcher)
     if apart or "depth" not in options.corrector.component.spec.needs:
         yield from windows
@@ -259,15 +236,10 @@ def _with_depth(
 
 
 def _moment(
-    number: int,
-    frame: int,
-    windows: list[Window],
-    rig: StereoRig,
-    shutter: RollingShutter,
-    options: CorrectionOptions,
+    number: int, frame: int, windows: list[Window], known: KnownCapture, options: CorrectionOptions
 ) -> CorrectedMoment:
     """Frame 0 or 1 of the first window; as frame 1 of the second one when only that knows a motion."""
-    here, needs = windows[0], options.corrector.component.spec.needs
+    here, needs, rig, shutter = windows[0], options.corrector.component.spec.needs, known.rig, known.shutter
     images = {side: here.images[side, frame] for side in SIDES}
     places = list(zip(windows, (frame, 1), strict=False))
     if "motion" in needs:
@@ -285,8 +257,8 @@ def _moment(
         pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=frames)
     views = tuple((side, place) for side in SIDES)
     offset = 0.0 if window.found is None else window.found.disparity_offset
-    known = Given(matches=window.matches, motion=motion, pairs=pairs)
-    fused = correct_known(window.images, known, rig, shutter, options, views, offset)
+    given = Given(matches=window.matches, motion=motion, pairs=pairs)
+    (fused,) = correct_known_rows(window.images, given, rig, shutter, options, views, offset)
     for (side, _), each in fused.items():
         if not each.success:
             why = f"{side}: {each.reason}"

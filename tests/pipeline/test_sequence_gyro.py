@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from shaken_rig import RIG, SHAKES, SHUTTER, matches, sines, times
 
-from rsbench.capture.calibration import NO_ERRORS
 from rsbench.core.correspondences import Correspondences
 from rsbench.dataset.corrected_frames import motion_record
-from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.sequence_correction import BRIDGED, TURNED, Window, on_one_trajectory
 
 
@@ -27,7 +26,7 @@ def test_a_gyroscope_turns_frames_far_from_any_that_match() -> None:
 
     def through(gyro: Any) -> list[Window]:
         windows = (Window(images={}, pairs=None, found=None, matches=each) for each in given)
-        return list(on_one_trajectory(windows, RIG, SHUTTER, CorrectionOptions(), NO_ERRORS, gyro))
+        return list(on_one_trajectory(windows, KnownCapture(rig=RIG, shutter=SHUTTER, gyro=gyro), 0, ""))
 
     with_it, alone = through(samples), through(None)
     far = range(6, 9)
