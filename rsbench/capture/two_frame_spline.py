@@ -52,9 +52,8 @@ _DEPTHS = 3.0
 """Deviations of a disparity by which depth is observed: half of the disparities must be larger."""
 _PARTS, _OF_A_PART = 6, 10
 """Parts of the rows, at most, and tracks in one, at least, whose motions are compared."""
-_DISPERSION, _CHANCE, _DOUBTFUL = 1.5, 1e-3, 0.05
-"""Dispersion by common errors of neighbours, and the probability, under a law, to ask for a spline, and to widen
-what is stated of the law's motion."""
+_DISPERSION, _CHANCE = 1.5, 1e-3
+"""Dispersion by common errors of neighbours, and the probability, under a law, to ask for a spline."""
 _APART = 6.0
 """Squared deviations, in sum over the six, within which two splines are one."""
 _MEDIAN = 4.35
@@ -145,24 +144,20 @@ class _Rows(NamedTuple):
 
     square: float
     freedom: int
-    parts: int
     depth: bool
     """Whether depth is observed."""
 
 
 def dispersion_of_rows(matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> float:
-    """Variance of a law's motion over that which noise leaves, at least 1, where its rows ask for several motions.
+    """Variance by which motions that parts of the rows ask for scatter, over that which noise leaves; at least 1.
 
-    These motions scatter about the mean one, and the answer is that of the first rows (random effects; R.
-    DerSimonian, N. Laird, Controlled Clinical Trials 1986).
+    Errors that the rows of a region share, and a law that the rig does not quite follow, both show there.
 
     Args:
         law: as of ``two_frame_spline``.
     """
     rows = None if shutter.still else _by_rows(informative(matches), rig, shutter, law)
-    if rows is None or rows.square <= float(scipy.special.chdtri(rows.freedom, _DOUBTFUL)):
-        return 1.0
-    return 1.0 + rows.parts * (rows.square / rows.freedom - 1.0)
+    return 1.0 if rows is None else max(1.0, rows.square / rows.freedom)
 
 
 def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:
@@ -200,7 +195,7 @@ def _by_rows(window: Correspondences, rig: StereoRig, shutter: RollingShutter, l
         information = np.tensordot(expected[own], each.hessians[own], 1)
         square += float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) / tailed.scale**2
     deep = float(np.median(disparities)) >= _DEPTHS * tailed.scale * np.sqrt(2.0)
-    return _Rows(square=square, freedom=6 * (count - 1), parts=count, depth=deep)
+    return _Rows(square=square, freedom=6 * (count - 1), depth=deep)
 
 
 def _under_law(

@@ -197,6 +197,8 @@ def under_model(
     motion = body_motion(found.estimate, entry.solver.spec, given.rig)
     if splines and requested == AUTO and isinstance(motion, Motion):
         found, choice, motion = or_spline(found, choice, motion, *given, seed)
+    elif isinstance(motion, Motion):
+        found = scaled(found, dispersion_of_rows(*given, motion))
     return UnderModel(found, entry, choice, motion)
 
 
