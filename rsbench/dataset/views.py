@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import IntEnum
+from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -212,6 +213,10 @@ _MOST_STEPS = 12
 _SEEN, _NOT_SEEN, _UNSURE = 0, 1, 2
 
 
+ByBands = Callable[[Callable[[int, int], None], int], object]
+"""Calls a function with the first row, and the last one excluded, of bands that cover so many rows."""
+
+
 class Reprojected(NamedTuple):
     """Where points (...) lie in a picture."""
 
@@ -232,8 +237,25 @@ class _Table(NamedTuple):
     """Entries for each line; 0: one pose for all."""
 
 
-def find(geometry: Geometry, target: ImageView, points: FloatArray, start: FloatArray) -> Reprojected:
+def find(
+    geometry: Geometry,
+    target: ImageView,
+    points: FloatArray,
+    start: FloatArray,
+    *,
+    in_camera: FloatArray | None = None,
+    by_bands: ByBands = lambda work, height: [work(0, height)],
+) -> Reprojected:
     """Search the lines of a picture that see points (rows, n, 3), world frame, from lines (rows, n) near them.
+
+    Args:
+        geometry: rig, shutter and motion.
+        target: the picture.
+        points: see above.
+        start: see above.
+        in_camera: (rows, n, 3), filled with the points in the target's camera at the time it sees them, metres;
+            meaningless where the target does not see the point. Not computed by default.
+        by_bands: runs the search for bands of rows, for example in threads.
 
     Raises:
         RsbenchError: a motion that no table of poses follows.
@@ -243,15 +265,23 @@ def find(geometry: Geometry, target: ImageView, points: FloatArray, start: Float
     pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
     status = np.zeros(start.shape, dtype=np.uint8)
     axis, lines = shutter.axis(target.side), shutter.lines(target.side)
-    reproject_rows(
-        table.entries, table.per_line, _intrinsics(camera), axis, lines, points, start, pixels, eyes, status
-    )
+    optics, seen = _intrinsics(camera), np.zeros((0, 0, 3)) if in_camera is None else in_camera
+
+    def search(first: int, last: int) -> None:
+        rows = slice(first, last)
+        own = pixels[rows], eyes[rows], status[rows], seen[rows]
+        reproject_rows(table.entries, table.per_line, optics, axis, lines, points[rows], start[rows], *own)
+
+    by_bands(search, len(start))
     unsure = status == _UNSURE
     if np.any(unsure):
         found = rs_project(geometry.rig, shutter, geometry.motion, target.side, target.frame, points[unsure])
         pixels[unsure] = found.pixels
         times = np.where(np.isnan(found.tau), target.frame, found.tau)
-        eyes[unsure] = inverse(geometry.rig.cam_from_world(geometry.motion, times, target.side)).t
+        pose = geometry.rig.cam_from_world(geometry.motion, times, target.side)
+        eyes[unsure] = inverse(pose).t
+        if in_camera is not None:
+            in_camera[unsure] = transform(pose, points[unsure])
         unsure[unsure] = found.status == ProjectionStatus.NOT_CONVERGED
     return Reprojected(pixels, eyes, unsure)
 
@@ -311,8 +341,9 @@ def reproject_rows(
     pixels: FloatArray,
     eyes: FloatArray,
     status: NDArray[np.uint8],
+    in_camera: FloatArray,
 ) -> None:
-    """Fill what ``Reprojected`` has; NumPy: ``core.projection.rs_project``.
+    """Fill what ``Reprojected`` has, and ``in_camera`` unless it is empty; NumPy: ``core.projection.rs_project``.
 
     Each point starts where its two neighbours in the row lead, with the slope found there. No other row has an
     effect: the bits of a row are the same whatever rows are requested with it.
@@ -334,6 +365,10 @@ def reproject_rows(
                 offset, change, slope = 0.0, 0.0, -1.0
             for j in range(3):
                 eyes[row, k, j] = -(pose[j] * pose[9] + pose[3 + j] * pose[10] + pose[6 + j] * pose[11])
+            if in_camera.size > 0:
+                for j in range(3):
+                    turned = pose[3 * j] * X[0] + pose[3 * j + 1] * X[1] + pose[3 * j + 2] * X[2]
+                    in_camera[row, k, j] = turned + pose[9 + j]
 
 
 @compiled
@@ -474,14 +509,15 @@ class PairTruth(NamedTuple):
 
 
 class SeenSurfaces:
-    """What the pixels of a rolling-shutter frame see, and from where.
+    """The points that the pixels of a picture see, and the camera's places when it sees them.
 
     Args:
         geometry: of the sequence.
-        source: the frame.
-        depth: (H, W) of the frame, metres, 0 = sky, which is looked for at ``FAR``.
-        rows: these (H,) rows of the frame only, of which ``depth`` is; all by default.
-        numbers: (H, W) of the objects that move and are seen, 0 = none; none by default.
+        source: the picture.
+        depth: (H, W) of the picture, metres, 0 = sky, which is placed at ``FAR``.
+        rows: rows (H,) of the picture to which ``depth`` belongs; all by default.
+        numbers: (H, W) of the moving objects that are seen, 0 = none; none by default.
+        stride: ``depth`` has every ``stride``-th column of the picture.
     """
 
     def __init__(
@@ -491,14 +527,22 @@ class SeenSurfaces:
         depth: NDArray[np.float32],
         rows: Sequence[int] | None = None,
         numbers: NDArray[np.uint8] | None = None,
+        stride: int = 1,
     ) -> None:
         camera, shutter = geometry.rig.sensor(source.side), geometry.shutter
         self.geometry, self.source = geometry, source
-        self.grid = camera.pixel_grid()[slice(None) if rows is None else np.asarray(rows)]
+        chosen = slice(None) if rows is None else np.asarray(rows), slice(None, None, stride)
+        self.grid = camera.pixel_grid()[chosen]
         self.sky = depth == 0
         self.numbers = numbers
-        poses = row_poses(geometry.rig, shutter, geometry.motion, source.side, source.frame)
-        self.points = np.where(self.sky, FAR, depth)[..., None] * camera.unproject(self.grid)
+        if source.shutter == "gs":
+            R, t = _pose(geometry, source)
+            count = shutter.lines(source.side)
+            poses = Pose(np.broadcast_to(R, (count, 3, 3)), np.broadcast_to(t, (count, 3)))
+        else:
+            poses = row_poses(geometry.rig, shutter, geometry.motion, source.side, source.frame)
+        rays = camera.unproject(self.grid) if camera.lens is None else _pixel_rays(camera)[chosen]
+        self.points = np.where(self.sky, FAR, depth)[..., None] * rays
         """(H, W, 3) world frame, metres."""
         eyes = inverse(poses).t
         if shutter.axis(source.side) == 1:
@@ -507,8 +551,10 @@ class SeenSurfaces:
             self.points = self.points @ poses.R[lines]
             eyes = eyes[lines, None]
         else:
-            self.points -= poses.t
-            self.points = np.swapaxes(np.swapaxes(self.points, 0, 1) @ poses.R, 0, 1)
+            lines = self.grid[0, :, 0].astype(np.int64)
+            self.points -= poses.t[lines]
+            self.points = np.swapaxes(np.swapaxes(self.points, 0, 1) @ poses.R[lines], 0, 1)
+            eyes = eyes[lines]
         self.eyes = np.broadcast_to(eyes, self.points.shape)
         """(H, W, 3) the camera's centres, world frame, metres."""
 
@@ -516,6 +562,12 @@ class SeenSurfaces:
     def tau(self) -> FloatArray | None:
         """(H W) times of the pixels; None where nothing moves."""
         return times_at(self.geometry, self.source, self.grid).ravel() if self.geometry.objects else None
+
+
+@lru_cache(maxsize=2)
+def _pixel_rays(camera: PinholeCamera) -> FloatArray:
+    """(H, W, 3) with z = 1: a lens is inverted once for all of its pictures."""
+    return camera.unproject(camera.pixel_grid())
 
 
 class Carried(NamedTuple):
@@ -526,16 +578,21 @@ class Carried(NamedTuple):
     """(H, W, 3) where they are when the target sees them, world frame, metres."""
 
 
-def carry(surfaces: SeenSurfaces, target: ImageView) -> Carried:
-    """Where another picture sees what every pixel of a rolling-shutter frame sees, hidden or not."""
+def carry(
+    surfaces: SeenSurfaces,
+    target: ImageView,
+    in_camera: FloatArray | None = None,
+    by_bands: ByBands = lambda work, height: [work(0, height)],
+) -> Carried:
+    """Where another picture sees what every pixel of a picture sees, hidden or not; the rest as of ``find``."""
     start = _first_lines(surfaces, target)
-    landed = find(surfaces.geometry, target, surfaces.points, start)
+    landed = find(surfaces.geometry, target, surfaces.points, start, in_camera=in_camera, by_bands=by_bands)
     if surfaces.numbers is None or not surfaces.geometry.objects:
         return Carried(landed, surfaces.points)
     points = surfaces.points.copy()
     for number in np.unique(surfaces.numbers[surfaces.numbers > 0]):
         chosen = surfaces.numbers == number
-        points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start)
+        points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start, in_camera)
         for whole, part in zip(landed, own, strict=True):
             whole[chosen] = part
     return Carried(landed, points)
@@ -561,14 +618,22 @@ def pair_truth(surfaces: SeenSurfaces, target: ImageView, carried: Carried, bloc
 
 
 def _landed_with(
-    surfaces: SeenSurfaces, target: ImageView, number: int, chosen: NDArray[np.bool_], start: FloatArray
+    surfaces: SeenSurfaces,
+    target: ImageView,
+    number: int,
+    chosen: NDArray[np.bool_],
+    start: FloatArray,
+    in_camera: FloatArray | None,
 ) -> tuple[FloatArray, Reprojected]:
-    """Where an object has its chosen points (n, 3) when the target sees them, world frame, and where it does."""
+    """The chosen points (n, 3) of an object when the target sees them, world frame, and where it sees them."""
     geometry, thing = surfaces.geometry, surfaces.geometry.objects[number - 1]
     tau = times_at(geometry, surfaces.source, surfaces.grid[chosen])
     X = transform(inverse(thing.world_from_object(tau)), surfaces.points[chosen])
     # Each alone: its neighbours in the row may be other things.
-    found = find(seen_from(geometry, number), target, X[:, None], start[chosen][:, None])
+    seen = None if in_camera is None else np.zeros((len(X), 1, 3))
+    found = find(seen_from(geometry, number), target, X[:, None], start[chosen][:, None], in_camera=seen)
+    if in_camera is not None and seen is not None:
+        in_camera[chosen] = seen[:, 0]
     there = thing.world_from_object(times_at(geometry, target, found.pixels[:, 0]))
     eyes = transform(there, found.eyes[:, 0])
     return transform(there, X), Reprojected(found.pixels[:, 0], eyes, found.unsolved[:, 0])

@@ -374,7 +374,8 @@ def _depth_faults(
     if view not in maps or view.depth in reported:
         return
     sky = part.depth == 0.0
-    relative = relative_depth(maps[view], part.pixels[:, 0], part.depth, sky)
+    ideal = maps[view].camera.ideal_pixels(part.pixels[:, 0])
+    relative = relative_depth(maps[view], part.pixels[:, 0], part.depth, sky, ideal)
     low, high = depths_around(maps[view].depth, part.pixels[:, 0])
     z = np.where(sky, np.inf, part.depth)
     with np.errstate(invalid="ignore"):

@@ -6,22 +6,29 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.compiled import compiled
-from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import Geometry, MovingRig
-from rsbench.core.projection import ROW_TOLERANCE_PX
+from rsbench.core.errors import RsbenchError
+from rsbench.core.geometry import Geometry
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, ImageView, Seen, numbers_of, points_of, seen_by, seen_from
-from rsbench.vision.reprojection import Table, across_lines, line_of, look, optics_of, see
+from rsbench.dataset.views import (
+    FAR,
+    ImageView,
+    Seen,
+    SeenSurfaces,
+    carry,
+    numbers_of,
+    points_of,
+    seen_by,
+    seen_from,
+)
 
 T = TypeVar("T")
 _LEAST_ROWS = 64
@@ -49,310 +56,8 @@ def by_bands(work: Callable[[int, int], T], height: int) -> list[T]:
         return list(pool.map(work, ends[:-1], ends[1:]))
 
 
-_ROTATION, _SHIFT = 1e-10, 1e-10
-"""What entries of a pose between two lines may err by, and metres: 1e-7 px of the longest lenses, and less than a
-thousandth of what float32 says of depths."""
 ROUNDING_PX = 1e-9
 """A place so far before a pixel's centre counts as on it: the two cameras see whole rows in whole rows."""
-_PARTS = (1, 2, 4, 8, 16)
-"""Entries of a table for each line."""
-_MAX_STEPS = 12
-"""Of Newton's method, as ``core.projection`` has it."""
-_TOLERANCE = ROW_TOLERANCE_PX
-
-
-class LinePoses(NamedTuple):
-    """``cam_from_world`` of the lines of a source: (n, 3, 3), (n, 3); of a global shutter one for all."""
-
-    R: FloatArray
-    t: FloatArray
-    columns: bool
-
-
-class PoseTable(NamedTuple):
-    """``cam_from_world`` of a target at lines ``first + k / parts``, and its derivatives by k."""
-
-    R: FloatArray
-    """(n, 3, 3)."""
-    t: FloatArray
-    """(n, 3) metres."""
-    R_rate: FloatArray
-    t_rate: FloatArray
-    first: float
-    parts: float
-    columns: bool
-    """Whether lines are columns."""
-
-
-class Optics(NamedTuple):
-    """The camera of a view."""
-
-    numbers: FloatArray
-    """(6,) fx, fy, cx, cy, width, height."""
-    ideal: Table
-    """As ``reprojection.Optics`` has it, and ``lens``."""
-    lens: Table
-
-
-class Surface(NamedTuple):
-    """The depth map of a target; see ``DepthMap``."""
-
-    inverse: FloatArray
-    flat_blocks: NDArray[np.bool_]
-    empty_blocks: NDArray[np.bool_]
-    slope: Table
-    """(H, W, 2), and ``bent`` (H, W, 2) the ideal pixels; None without a lens."""
-    bent: Table
-
-
-class Carried(NamedTuple):
-    """What is carried, and where to."""
-
-    depth: NDArray[np.float32]
-    """(h, w) of every ``stride``-th pixel of the source, m; 0 = sky."""
-    stride: int
-    far: float
-    """Where the sky is, m."""
-    chosen: NDArray[np.bool_] | None
-    """(h, w) pixels to be carried; None for all."""
-    pixels: NDArray[np.float32]
-    """(h, w, 2) filled in: see ``reprojection.Reprojection``, as the next one."""
-    relative: NDArray[np.float32]
-
-
-def poses_of_source(geometry: MovingRig, view: ImageView) -> LinePoses:
-    """Of the lines of a view."""
-    rig, shutter, side = geometry.rig, geometry.shutter, view.side
-    columns = shutter.axis(side) == 0
-    if view.shutter == "gs":
-        tau = np.atleast_1d(shutter.time_after(view.row, view.frame, side))
-    else:
-        tau = shutter.line_times(view.frame, side)
-    R, t = rig.cam_from_world(geometry.motion, tau, side)
-    return LinePoses(np.ascontiguousarray(R), np.ascontiguousarray(t), columns)
-
-
-def table_of_target(geometry: MovingRig, view: ImageView) -> PoseTable | None:
-    """Of a view; None where no table is exact enough."""
-    shutter, side = geometry.shutter, view.side
-    columns = shutter.axis(side) == 0
-    if view.shutter == "gs":
-        source = poses_of_source(geometry, view)
-        still = np.zeros_like(source.R), np.zeros_like(source.t)
-        return PoseTable(source.R, source.t, *still, 0.0, 1.0, columns)
-    for parts in _PARTS:
-        table = _table(geometry, view, parts)
-        if _errors(geometry, view, table) <= 1.0:
-            return table
-    return None
-
-
-def _table(geometry: MovingRig, view: ImageView, parts: int) -> PoseTable:
-    """With so many entries for each line, from one line before the first to one after the last."""
-    shutter, side = geometry.shutter, view.side
-    count = (shutter.lines(side) + 1) * parts + 1
-    lines = np.arange(count) / parts - 1.0
-    tau = shutter.line_time(lines, view.frame, side)
-    R, t = geometry.rig.cam_from_world(geometry.motion, tau, side)
-    w_rate, speed = geometry.motion.velocity(tau)
-    if not geometry.rig.aligned:
-        turn = geometry.rig.own(side).R.T
-        w_rate, speed = w_rate @ turn, speed @ turn
-    by_entry = shutter.rate(side)[shutter.axis(side)] / parts
-    rates = so3.hat(w_rate) @ R * by_entry, np.asarray(speed) * by_entry
-    R, t, R_rate, t_rate = (np.ascontiguousarray(each) for each in (R, t, *rates))
-    return PoseTable(R, t, R_rate, t_rate, -1.0, float(parts), shutter.axis(side) == 0)
-
-
-def _errors(geometry: MovingRig, view: ImageView, table: PoseTable) -> float:
-    """The largest error midway between two entries, over the allowed one; infinite where one is not finite."""
-    shutter, side = geometry.shutter, view.side
-    lines = table.first + (np.arange(len(table.t) - 1) + 0.5) / table.parts
-    exact = geometry.rig.cam_from_world(geometry.motion, shutter.line_time(lines, view.frame, side), side)
-    pairs = (table.R, table.R_rate, exact.R, _ROTATION), (table.t, table.t_rate, exact.t, _SHIFT)
-    worst = 0.0
-    for value, rate, true, allowed in pairs:
-        middle = 0.5 * (value[:-1] + value[1:]) + 0.125 * (rate[:-1] - rate[1:])
-        worst = max(worst, float(np.max(np.abs(middle - true))) / allowed)
-    return worst if np.isfinite(worst) else np.inf
-
-
-def carry(
-    carried: Carried, source: LinePoses, target: PoseTable, optics: tuple[Optics, Optics], surface: Surface
-) -> None:
-    """Fill in ``carried``; ``optics`` are those of the source and of the target."""
-    by_bands(partial(_carry_rows, carried, source, target, optics, surface), len(carried.depth))
-
-
-def optics_of_camera(camera: PinholeCamera) -> Optics:
-    """Of a camera in its own axes."""
-    ideal, lens, _ = optics_of(camera)
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return Optics(np.array(numbers, dtype=np.float64), ideal, lens)
-
-
-@compiled(error_model="numpy")
-def _carry_rows(
-    carried: Carried,
-    source: LinePoses,
-    target: PoseTable,
-    optics: tuple[Optics, Optics],
-    surface: Surface,
-    first: int,
-    last: int,
-) -> None:
-    """``carry`` for rows ``first`` to ``last`` of those that are carried."""
-    own, there = optics
-    fx, fy, cx, cy = own.numbers[0], own.numbers[1], own.numbers[2], own.numbers[3]
-    for row in range(first, last):
-        for column in range(carried.depth.shape[1]):
-            if not _is_chosen(carried.chosen, row, column):
-                continue
-            x, y = column * carried.stride, row * carried.stride
-            z = carried.depth[row, column]
-            sky = z == 0.0
-            far = carried.far if sky else float(z)
-            u, v = look(own.ideal, x, y)
-            a, b, c = far * ((u - cx) / fx), far * ((v - cy) / fy), far
-            line = min(line_of(source.columns, x, y), len(source.t) - 1)
-            R, t = source.R[line], source.t[line]
-            a, b, c = a - t[0], b - t[1], c - t[2]
-            X = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
-            Y = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
-            Z = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
-            guess = across_lines(target.columns, float(x), float(y))
-            pu, pv, iu, iv, depth = _seen(X, Y, Z, guess, target, there)
-            carried.pixels[row, column, 0] = pu
-            carried.pixels[row, column, 1] = pv
-            carried.relative[row, column] = _relative(pu, pv, iu, iv, depth, sky, surface)
-
-
-@compiled(error_model="numpy")
-def _seen(
-    X: float, Y: float, Z: float, guess: float, target: PoseTable, optics: Optics
-) -> tuple[float, float, float, float, float]:
-    """Pixel, ideal pixel and depth at which the target sees a point of the world; NaN where it does not."""
-    fx, fy, cx, cy = optics.numbers[0], optics.numbers[1], optics.numbers[2], optics.numbers[3]
-    entries, parts, lens = len(target.t), target.parts, optics.lens
-    none = np.nan, np.nan, np.nan, np.nan, np.nan
-    place, at, before, value_before = guess, -1, np.nan, np.nan
-    p0 = p1 = p2 = v0 = v1 = v2 = q0 = q1 = q2 = w0 = w1 = w2 = 0.0
-    for _ in range(_MAX_STEPS):
-        k, s = 0, 0.0
-        if entries > 1:
-            s = (place - target.first) * parts
-            k = min(max(int(np.floor(s)), 0), entries - 2)
-            s -= k
-        if k != at:
-            p0, p1, p2 = _moved(target.R[k], X, Y, Z, target.t[k])
-            if entries > 1:
-                v0, v1, v2 = _moved(target.R_rate[k], X, Y, Z, target.t_rate[k])
-                q0, q1, q2 = _moved(target.R[k + 1], X, Y, Z, target.t[k + 1])
-                w0, w1, w2 = _moved(target.R_rate[k + 1], X, Y, Z, target.t_rate[k + 1])
-            at = k
-        x, dx = _between(p0, v0, q0, w0, s, entries)
-        y, dy = _between(p1, v1, q1, w1, s, entries)
-        z, dz = _between(p2, v2, q2, w2, s, entries)
-        if not z > 0.0:
-            return none
-        iu, iv = fx * x / z + cx, fy * y / z + cy
-        pu, pv = see(lens, iu, iv)
-        if entries == 1:
-            return _inside(pu, pv, iu, iv, z, optics)
-        value = across_lines(target.columns, pu, pv) - place
-        if abs(value) <= _TOLERANCE:
-            return _inside(pu, pv, iu, iv, z, optics)
-        if not np.isfinite(value):
-            return none
-        slope = across_lines(target.columns, fx * (dx - x / z * dz) / z, fy * (dy - y / z * dz) / z) * parts - 1.0
-        if _bends(lens) and place != before and np.isfinite(before):
-            slope = (value - value_before) / (place - before)  # a lens bends the path of the pixel
-        before, value_before = place, value
-        place -= value / slope if slope != 0.0 else np.nan
-        if not np.isfinite(place):
-            return none
-    return none
-
-
-@compiled(error_model="numpy", inline="always")
-def _moved(R: FloatArray, X: float, Y: float, Z: float, t: FloatArray) -> tuple[float, float, float]:
-    return (
-        R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0],
-        R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1],
-        R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2],
-    )
-
-
-@compiled(error_model="numpy", inline="always")
-def _between(p: float, v: float, q: float, w: float, s: float, entries: int) -> tuple[float, float]:
-    """Value and derivative at ``s`` of the cubic with values p, q and slopes v, w at 0 and 1; straight beyond."""
-    if entries == 1:
-        return p, 0.0
-    if s < 0.0:
-        return p + s * v, v
-    if s > 1.0:
-        return q + (s - 1.0) * w, w
-    rise = q - p
-    c, d = 3.0 * rise - 2.0 * v - w, v + w - 2.0 * rise
-    return p + s * (v + s * (c + s * d)), v + s * (2.0 * c + 3.0 * s * d)
-
-
-@compiled(error_model="numpy", inline="always")
-def _inside(
-    pu: float, pv: float, iu: float, iv: float, z: float, optics: Optics
-) -> tuple[float, float, float, float, float]:
-    """What is given, or NaN outside of the image."""
-    width, height = optics.numbers[4], optics.numbers[5]
-    if -0.5 <= pu <= width - 0.5 and -0.5 <= pv <= height - 0.5:
-        return pu, pv, iu, iv, z
-    return np.nan, np.nan, np.nan, np.nan, np.nan
-
-
-@compiled(error_model="numpy")
-def _relative(pu: float, pv: float, iu: float, iv: float, z: float, sky: bool, surface: Surface) -> float:
-    """See ``reprojection.relative_depth``."""
-    height, width = surface.inverse.shape
-    if not np.isfinite(pu):
-        return np.nan
-    x, y = int(np.floor(pu + ROUNDING_PX)), int(np.floor(pv + ROUNDING_PX))
-    if not (1 <= x < width - 2 and 1 <= y < height - 2):
-        return np.nan
-    if surface.empty_blocks[y - 1, x - 1]:
-        return 0.0 if sky else -np.inf
-    if sky or not surface.flat_blocks[y - 1, x - 1]:
-        return np.nan
-    right, down = pu - x, pv - y
-    inverse = surface.inverse
-    top = (1 - right) * inverse[y, x] + right * inverse[y, x + 1]
-    bottom = (1 - right) * inverse[y + 1, x] + right * inverse[y + 1, x + 1]
-    found = (1 - down) * top + down * bottom
-    for axis, ideal in ((0, iu), (1, iv)):
-        found += _by_lens(surface.slope, surface.bent, x, y, right, down, axis, ideal)
-    return z * found - 1.0
-
-
-# Not inlined by Numba, which would then not leave out the branch of what is None.
-@compiled(error_model="numpy")
-def _is_chosen(chosen: NDArray[np.bool_] | None, row: int, column: int) -> bool:
-    return True if chosen is None else chosen[row, column]
-
-
-@compiled(error_model="numpy")
-def _bends(lens: Table) -> bool:
-    return lens is not None
-
-
-@compiled(error_model="numpy")
-def _by_lens(
-    slope: Table, bent: Table, x: int, y: int, right: float, down: float, axis: int, ideal: float
-) -> float:
-    """What a lens adds to inverse depth between four pixels, by one axis of the ideal pixel."""
-    if slope is None or bent is None:
-        return 0.0
-    top = (1 - right) * bent[y, x, axis] + right * bent[y, x + 1, axis]
-    bottom = (1 - right) * bent[y + 1, x, axis] + right * bent[y + 1, x + 1, axis]
-    return slope[y, x, axis] * (ideal - ((1 - down) * top + down * bottom))
-
 
 DEPTH_TOLERANCE = 1e-4
 """Relative difference of two depths of one surface point that still agree."""
@@ -360,7 +65,8 @@ FLATNESS = 2e-5
 """Largest relative second difference of inverse depth (linear on planes by ideal pixels) of a locally flat
 surface: bilinear interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends
 far more."""
-_CHUNK_PIXELS = 1 << 17
+_CHUNK_PIXELS = 1 << 20
+"""Pixels that are carried at once."""
 
 BoolArray = NDArray[np.bool_]
 
@@ -432,13 +138,6 @@ class DepthMap:
         """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] are one flat surface."""
         return self._evenness[1]
 
-    @property
-    def surface(self) -> Surface:
-        """What ``carry`` looks at."""
-        bending = None if self.camera.lens is None else _bending(self.camera)
-        lens = (None, None) if bending is None else (self.slope, bending.ideal)
-        return Surface(self.inverse, self.flat_blocks, self.empty_blocks, *lens)
-
     @cached_property
     def empty_blocks(self) -> BoolArray:
         """(H-3, W-3) whether pixels [y, x] to [y + 3, x + 3] see no surface at all."""
@@ -486,37 +185,52 @@ class Reprojection(NamedTuple):
     is not one flat surface, -inf where it sees none; sky is at 0 in sky, NaN elsewhere."""
 
 
-def reproject(sequence: Sequence, source: DepthMap, target: DepthMap, stride: int = 1) -> Reprojection:
+def reproject(geometry: Geometry, source: DepthMap, target: DepthMap, stride: int = 1) -> Reprojection:
     """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
-    depth = np.ascontiguousarray(source.depth[::stride, ::stride])
+    depth = source.depth[::stride, ::stride]
+    labels = None if source.labels is None else numbers_of(source.labels[::stride, ::stride])
     found = Reprojection(np.full((*depth.shape, 2), np.nan, np.float32), np.full(depth.shape, np.nan, np.float32))
-    labels = np.zeros(0) if source.labels is None else numbers_of(source.labels[::stride, ::stride])
-    for number in sorted({0, *np.unique(labels).tolist()}):
-        own, chosen = seen_from(sequence, int(number)), labels == number if labels.size else None
-        table = table_of_target(own, target.view)
-        if table is None:
-            _reproject_exactly(sequence, source, target, found, stride)
-            break
-        carried = Carried(depth, stride, FAR, chosen, *found)
-        optics = optics_of_camera(source.camera), optics_of_camera(target.camera)
-        carry(carried, poses_of_source(own, source.view), table, optics, target.surface)
+    step = max(1, _CHUNK_PIXELS // depth.shape[1])
+    for first in range(0, len(depth), step):
+        rows = slice(first, first + step)
+        numbers = None if labels is None else labels[rows]
+        in_image = range(len(source.depth))[::stride][rows]
+        seen = _carried(geometry, source.view, target, depth[rows], in_image, numbers, stride)
+        found.pixels[rows] = seen.pixels
+        found.relative[rows] = relative_depth(target, seen.pixels, seen.depth, depth[rows] == 0, seen.ideal)
     return found
 
 
-def _reproject_exactly(
-    sequence: Sequence, source: DepthMap, target: DepthMap, found: Reprojection, stride: int
-) -> None:
-    """The same with the pose at each pixel's own time."""
-    grid = source.camera.pixel_grid()[::stride, ::stride]
-    depth = source.depth[::stride, ::stride].astype(np.float64)
-    step = max(1, _CHUNK_PIXELS // grid.shape[1])
-    for first in range(0, len(grid), step):
-        rows = slice(first, first + step)
-        sky = depth[rows] == 0
-        numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][rows])
-        seen = seen_with(sequence, source.view, target.view, grid[rows], np.where(sky, FAR, depth[rows]), numbers)
-        found.pixels[rows] = seen.pixels
-        found.relative[rows] = relative_depth(target, seen.pixels, seen.depth, sky)
+class _Landed(NamedTuple):
+    """Where the target sees pixels of the source."""
+
+    pixels: FloatArray
+    """(h, w, 2) px in the target, NaN outside of it."""
+    depth: FloatArray
+    """(h, w) z in the target's camera, m."""
+    ideal: FloatArray
+    """(h, w, 2) px that the target without its lens would see."""
+
+
+def _carried(
+    geometry: Geometry,
+    source: ImageView,
+    target: DepthMap,
+    depth: NDArray[np.float32],
+    rows: range,
+    numbers: NDArray[np.uint8] | None,
+    stride: int,
+) -> _Landed:
+    """Where the target sees rows (h,) of every ``stride``-th column of the source, of this depth (h, w)."""
+    surfaces = SeenSurfaces(geometry, source, depth, rows, numbers, stride)
+    in_camera = np.full((*depth.shape, 3), np.nan)
+    try:
+        pixels = carry(surfaces, target.view, in_camera, by_bands).landed.pixels
+    except RsbenchError:  # no table of poses follows the motion: the pose at each pixel's own time
+        z = np.where(surfaces.sky, FAR, depth)
+        seen = seen_with(geometry, source, target.view, surfaces.grid, z, numbers)
+        return _Landed(seen.pixels, seen.depth, target.camera.ideal_pixels(seen.pixels))
+    return _Landed(pixels, in_camera[..., 2], target.camera.ideal.project(in_camera))
 
 
 def seen_with(
@@ -572,8 +286,13 @@ def _changing(each: DepthMap, one_time: bool) -> NDArray[np.uint8]:
     return found
 
 
-def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray) -> FloatArray:
-    """See ``Reprojection.relative``; of points (...) with depth ``z`` at ``pixels`` (..., 2) of the target."""
+def relative_depth(
+    target: DepthMap, pixels: FloatArray, z: FloatArray, sky: BoolArray, ideal: FloatArray
+) -> FloatArray:
+    """See ``Reprojection.relative``; of points (...) with depth ``z`` at ``pixels`` (..., 2) of the target.
+
+    ``ideal`` (..., 2) are the pixels that it would see without its lens.
+    """
     height, width = target.depth.shape
     relative = np.full(z.shape, np.nan)
     corner = np.floor(np.where(np.isfinite(pixels), pixels + ROUNDING_PX, -1.0)).astype(np.int64)
@@ -584,12 +303,12 @@ def relative_depth(target: DepthMap, pixels: FloatArray, z: FloatArray, sky: Boo
     flat[inner], empty[inner] = target.flat_blocks[block], target.empty_blocks[block]
     relative[empty] = np.where(sky[empty], 0.0, -np.inf)
     flat &= ~sky
-    relative[flat] = z[flat] * _interpolated(target, pixels[flat], y0[flat], x0[flat]) - 1.0
+    relative[flat] = z[flat] * _interpolated(target, pixels[flat], ideal[flat], y0[flat], x0[flat]) - 1.0
     return relative
 
 
 def _interpolated(
-    target: DepthMap, pixels: FloatArray, y0: NDArray[np.int64], x0: NDArray[np.int64]
+    target: DepthMap, pixels: FloatArray, ideal: FloatArray, y0: NDArray[np.int64], x0: NDArray[np.int64]
 ) -> FloatArray:
     """Inverse depth (n,) at pixels (n, 2) between four that see one flat surface, the first of them y0, x0."""
     share = pixels - np.stack([x0, y0], axis=-1)
@@ -604,5 +323,5 @@ def _interpolated(
     found = between(target.inverse)
     if target.camera.lens is None:
         return found
-    beside = target.camera.ideal_pixels(pixels) - between(_bending(target.camera).ideal)
+    beside = ideal - between(_bending(target.camera).ideal)
     return np.asarray(found + np.sum(target.slope[y0, x0] * beside, axis=-1))

@@ -11,15 +11,15 @@ import pytest
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
+from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry, MovingObject
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.views import VIEW_PAIRS, ImageView
-from rsbench.verification import reprojection
-from rsbench.verification.reprojection import DepthMap, Reprojection, reproject, table_of_target
+from rsbench.dataset.views import FAR, VIEW_PAIRS, ImageView, SeenSurfaces, carry
+from rsbench.verification.reprojection import DepthMap, Reprojection, relative_depth, reproject, seen_with
 
 W, D = [0.03, -0.05, 0.04], [0.2, -0.1, 0.25]
 CAMERA = PinholeCamera.centred(64, 48, 60.0)
@@ -66,9 +66,13 @@ def room(view: ImageView, camera: PinholeCamera) -> DepthMap:
 def both_ways(
     geometry: Any, source: DepthMap, target: DepthMap, stride: int = 1
 ) -> tuple[Reprojection, Reprojection]:
-    shape = source.depth[::stride, ::stride].shape
-    exact = Reprojection(np.full((*shape, 2), np.nan, np.float32), np.full(shape, np.nan, np.float32))
-    reprojection._reproject_exactly(geometry, source, target, exact, stride)
+    depth = source.depth[::stride, ::stride].astype(np.float64)
+    grid, sky = source.camera.pixel_grid()[::stride, ::stride], depth == 0
+    numbers = None if source.labels is None else source.labels[::stride, ::stride]
+    seen = seen_with(geometry, source.view, target.view, grid, np.where(sky, FAR, depth), numbers)
+    ideal = target.camera.ideal_pixels(seen.pixels)
+    relative = relative_depth(target, seen.pixels, seen.depth, sky, ideal)
+    exact = Reprojection(seen.pixels.astype(np.float32), relative.astype(np.float32))
     return reproject(geometry, source, target, stride), exact
 
 
@@ -115,8 +119,11 @@ def test_every_pixel_lands_where_the_row_equation_says(geometry: FixedGeometry) 
         check_alike(*both_ways(geometry, here, there, 2))
 
 
-def test_a_motion_that_no_table_follows_has_none() -> None:
-    assert table_of_target(geometry_of(Kinked(W, D)), ImageView("rs", "left", 0)) is None
+def test_a_motion_that_no_table_follows_is_refused() -> None:
+    depth = np.ones((48, 64), np.float32)
+    surfaces = SeenSurfaces(geometry_of(Kinked(W, D)), ImageView("rs", "right", 0), depth)
+    with pytest.raises(RsbenchError, match="Kinked: jumps"):
+        carry(surfaces, ImageView("rs", "left", 0))
 
 
 def test_what_moves_is_carried_along() -> None:

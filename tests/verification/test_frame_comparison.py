@@ -60,7 +60,8 @@ def test_depth_between_pixels_is_that_of_the_plane(lens: Lens | None) -> None:
     x0, y0 = np.floor(pixels).astype(int).T
     exact = seen.camera.unproject(pixels) @ PLANE
     # Float32, and the slope at a corner of the square instead of in it: 1e-3 of a correction of 1e-4.
-    np.testing.assert_allclose(reprojection._interpolated(seen, pixels, y0, x0), exact, rtol=3e-7)
+    ideal = seen.camera.ideal_pixels(pixels)
+    np.testing.assert_allclose(reprojection._interpolated(seen, pixels, ideal, y0, x0), exact, rtol=3e-7)
 
 
 @pytest.fixture
