@@ -140,7 +140,7 @@ def _sequence(scene: str) -> tuple[float, float]:
 def _command_alone() -> tuple[float, float]:
     """Seconds, for each of many made-up sequences of as many files: when it is finished, and in the manifest."""
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.destinations import folder_destination
+    from rsbench.dataset.destinations import open_destination
     from rsbench.dataset.sequence import files_of
     from rsbench.storage.files import sha256, write_json
 
@@ -154,7 +154,7 @@ def _command_alone() -> tuple[float, float]:
                 (out / sequence.name / name).write_text(name)
             listed = {name: sha256(out / sequence.name / name) for name in files}
             write_json(out / sequence.name / "sequence.json", {"files": listed})
-        with folder_destination(out, rehash=False) as destination:
+        with open_destination(out, 1, rehash=False) as destination:
             begun = time.perf_counter()
             for sequence in card.sequence:
                 made[sequence.name] = destination.learned(sequence.name)

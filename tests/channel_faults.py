@@ -12,7 +12,7 @@ from attack.planting import drop, manifest_of, put
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.dataset.channels import AFFINE, COMPONENTS, MATCHER, TRACKS, matches_file
+from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
 from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled, save_matches
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.tracks import AffineFrames, jacobians_of, save_affine
@@ -33,7 +33,7 @@ from rsbench.storage.untrusted_files import load_arrays
 
 def values_of(file: str, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Callable[[Path], None]:
     def plant(folder: Path) -> None:
-        names = COMPONENTS["disparity" if file.startswith("disparity") else "flow"]
+        names = ("d",) if file.startswith("disparity") else ("x", "y")
         changed = change(read_exr(folder / file, names))
         write_exr(folder / file, {name: changed[..., k] for k, name in enumerate(names)})
 

@@ -26,7 +26,7 @@ from rsbench.core.so3 import FloatArray
 
 ROW_TOLERANCE_PX = 1e-9
 """Accepted residual of the row equation."""
-_COARSE_ROWS, _FINE_ROWS, _MAX_ITERATIONS, _MAX_NEWTON_STEPS = 17, 513, 60, 12
+_COARSE_ROWS, _MAX_ITERATIONS, _MAX_NEWTON_STEPS = 17, 60, 12
 
 
 class ProjectionStatus(IntEnum):

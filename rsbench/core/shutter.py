@@ -118,7 +118,7 @@ class RollingShutter:
     width: int | None = None
     """Number of columns; needed where columns are read."""
     right_readout_ratio: float | None = None
-    """That of the right camera; None: as the left camera's."""
+    """Readout ratio of the right camera; None: that of the left camera."""
     right_size: tuple[int, int] | None = None
     """Columns and rows of the right camera; None: as the left camera's."""
 
@@ -207,6 +207,10 @@ class RollingShutter:
     def first_line(self, side: str) -> int:
         """Number of the line that is read first."""
         return 0 if self.scan_of(side) in ("top", "left") else self.lines(side) - 1
+
+    def line_after(self, count: int, side: str) -> int:
+        """Number of the line that is read when ``count`` lines have been read."""
+        return abs(self.first_line(side) - count)
 
     def start(self, frame: ArrayLike, side: str) -> FloatArray:
         """Time (...) at which a camera reads the first line of frame ``frame`` (...)."""

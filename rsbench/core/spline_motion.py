@@ -418,7 +418,7 @@ def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:
 
 
 LARGEST_TURN_DEG = 90.0
-"""Between two poses: beyond, nobody can tell how the rig got there."""
+"""Largest rotation between two poses: beyond it the path between them is ambiguous."""
 _SAME = 1e-9
 """Largest difference of w and d that are still those of given poses."""
 _UNIT = 1e-6

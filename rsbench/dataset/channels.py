@@ -89,10 +89,6 @@ global-shutter twin (gs_flow)."""
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 INSTANCE_TABLE, TRACKS, AFFINE = "instances.json", "tracks.npz", "affine.npz"
 MATCHER = "matches/matcher.json"
-COMPONENTS: dict[PairChannel, tuple[str, ...]] = {"disparity": ("d",), "flow": ("x", "y"), "gs_flow": ("x", "y")}
-"""Names of the float32 channels of the EXR files."""
-NORMAL_COMPONENTS = ("x", "y", "z")
-RADIANCE_COMPONENTS = ("R", "G", "B")
 STEP_PX = 2.0**-10
 """Values are rounded to multiples of it, which makes the files four times smaller."""
 _BRIGHTEST = float(np.finfo(np.float16).max)
@@ -103,9 +99,9 @@ class Layer(NamedTuple):
 
     channel: PairChannel
     row: int = 0
-    """Of the global-shutter twin to which it leads."""
+    """Row of the global-shutter twin to which it leads."""
     back: bool = False
-    """Of ``flow``: from the frames between the first and the last to the one before."""
+    """Whether a ``flow`` leads back: from the frames between the first and the last to the frame before."""
 
     def values(self, side: str, frame: int) -> str:
         """File below the folder of a sequence, as ``mask`` is."""
@@ -204,7 +200,7 @@ class SequenceTruth:
     folder: Path
     geometry: FixedGeometry
     seed: str
-    """Of the random draws of its channels."""
+    """Seed of the random draws of its channels."""
     frame_period_s: float
     sensor: Sensor | None
     imu: Imu
@@ -256,6 +252,7 @@ class TruthChannel:
             write_exr(path, {name: values[..., k] for k, name in enumerate(self.components)})
 
     components: ClassVar[tuple[str, ...]] = ()
+    """Names of the float32 channels of the EXR files."""
 
     def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
         """What ``write_values`` wrote, of a camera of this size (width, height); RsbenchError for another file."""
@@ -290,7 +287,7 @@ class _Pairs(TruthChannel):
 
 
 class _Disparity(_Pairs):
-    name, components = "disparity", COMPONENTS["disparity"]
+    name, components = "disparity", ("d",)
 
     def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
         if not plain:
@@ -299,11 +296,11 @@ class _Disparity(_Pairs):
 
 
 class _Flow(_Pairs):
-    name, components = "flow", COMPONENTS["flow"]
+    name, components = "flow", ("x", "y")
 
 
 class _CorrectionFlow(_Pairs):
-    name, components = "gs_flow", COMPONENTS["gs_flow"]
+    name, components = "gs_flow", ("x", "y")
 
 
 class _Timing(TruthChannel):
@@ -317,24 +314,39 @@ class _Timing(TruthChannel):
         write_timing(whole.folder, shutter, whole.frame_period_s, whole.sensor, frames)
 
 
-class _Normals(TruthChannel):
-    name, components, rounding = "normals", NORMAL_COMPONENTS, 1e-5
+class _Pictures(TruthChannel):
+    """One file for each rolling-shutter frame, ``FOLDER/SIDE_FRAME.END``, and perhaps one for all."""
+
+    end: ClassVar[str] = "exr"
+    table: ClassVar[tuple[str, ...]] = ()
 
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
-        return (surface_file("normals", *view) for view in views_of(frames))
+        return (*self.table, *(self.file(*view) for view in views_of(frames)))
+
+    def file(self, side: str, frame: int) -> str:
+        """Path below the folder of a sequence."""
+        return f"{self.name}/{side}_{frame}.{self.end}"
+
+    def values(self, frame: FrameTruth) -> NDArray[Any]:
+        """(H, W, ...) of one frame."""
+        raise NotImplementedError
 
     def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
-        yield surface_file("normals", *frame.view[1:3]), frame.surfaces.normals
+        yield self.file(*frame.view[1:3]), self.values(frame)
 
 
-class _Instances(TruthChannel):
-    name, of_pairs, rounding = "instances", True, 0.0
+class _Normals(_Pictures):
+    name, components, rounding = "normals", ("x", "y", "z"), 1e-5
 
-    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
-        return (INSTANCE_TABLE, *(surface_file("instances", *view) for view in views_of(frames)))
+    def values(self, frame: FrameTruth) -> NDArray[Any]:
+        return frame.surfaces.normals
 
-    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
-        yield surface_file("instances", *frame.view[1:3]), frame.surfaces.instances
+
+class _Instances(_Pictures):
+    name, of_pairs, rounding, end, table = "instances", True, 0.0, "png", (INSTANCE_TABLE,)
+
+    def values(self, frame: FrameTruth) -> NDArray[Any]:
+        return frame.surfaces.instances
 
     def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
         return read_grey_png(path, size, 16)
@@ -380,14 +392,11 @@ class _Affine(TruthChannel):
         save_affine(whole.folder / AFFINE, make_affine(whole.geometry, whole.tracks, whole.rays))
 
 
-class _Radiance(TruthChannel):
-    name, of_pairs, components = "hdr", True, RADIANCE_COMPONENTS
+class _Radiance(_Pictures):
+    name, of_pairs, components = "hdr", True, ("R", "G", "B")
 
-    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
-        return (radiance_file(*view) for view in views_of(frames))
-
-    def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
-        yield radiance_file(*frame.view[1:3]), frame.rendered.image
+    def values(self, frame: FrameTruth) -> NDArray[Any]:
+        return frame.rendered.image
 
     def write_values(self, path: Path, values: NDArray[Any]) -> None:
         light = {name: values[..., k] for k, name in enumerate(self.components)}
@@ -504,7 +513,7 @@ def surface_file(channel: Literal["normals", "instances"], side: str, frame: int
 
 
 def matches_file(first: int) -> str:
-    """Of frame ``first`` and the next."""
+    """File of the matches of frame ``first`` and the next, below the folder of a sequence."""
     return f"matches/{first}.npz"
 
 
@@ -660,5 +669,5 @@ class ChannelReader:
 
 
 def _side_of(file: str) -> Side:
-    """Of a file that belongs to one frame: FOLDER/SIDE_FRAME.END."""
+    """The camera of a file of one frame, FOLDER/SIDE_FRAME.END."""
     return "left" if PurePosixPath(file).name.startswith("left") else "right"

@@ -376,7 +376,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> None:
 
 
 DEFAULT_FPS = 30.0
-"""Of frames that do not say it."""
+"""Frame rate, frames/s, of inputs that state none."""
 
 
 def is_video(out: Path) -> bool:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, SequenceCard
@@ -34,54 +34,18 @@ from rsbench.storage.work_folder import (
 )
 
 
-class Target(Protocol):
-    """Where sequences go; picklable, for processes that make them."""
-
-    def work_folder(self) -> Path:
-        """A folder of this machine in which sequences come into being."""
-        ...
-
-    def place(self, partial: Path, name: str) -> None:
-        """Put a complete sequence, a folder in the workplace, under its name; the folder is gone then."""
-        ...
-
-
-class Destination(Protocol):
-    """A place of a dataset in which this command alone works."""
-
-    @property
-    def hidden(self) -> Path:
-        """A folder of this machine for what a later run can use."""
-        ...
-
-    @property
-    def target(self) -> Target: ...
-
-    def complete(
-        self, sequences: Sequence[SequenceCard], plans: Mapping[str, Plan], scene_hashes: SceneHashes
-    ) -> Iterator[tuple[str, Files]]:
-        """Names and files of the sequences that were made from the same plans and are as they were then."""
-        ...
-
-    def learned(self, name: str) -> Files:
-        """The files of a sequence that was just placed."""
-        ...
-
-    def finish(self, card: DatasetCard, made: Mapping[str, Files]) -> None:
-        """Write dataset.json, unless it says this already."""
-        ...
-
-
 @dataclass(frozen=True)
 class FolderTarget:
-    """A ``Target``."""
+    """Where the sequences of a folder go; picklable, for processes that render them."""
 
     out: Path
 
     def work_folder(self) -> Path:
+        """A folder of this machine in which sequences are rendered."""
         return self.out / HIDDEN / WORK
 
     def place(self, partial: Path, name: str) -> None:
+        """Move a complete sequence, a folder in the work folder, to its name."""
         place = self.out / name
         if os.path.lexists(place):
             _refuse_unknown_files(place, "it is to be replaced")
@@ -90,7 +54,10 @@ class FolderTarget:
 
 
 class FolderDestination:
-    """A ``Destination``."""
+    """The folder of a dataset in which this command alone works.
+
+    ``hidden`` is a folder of this machine for what a later run can use.
+    """
 
     def __init__(self, out: Path, hidden: Path, rehash: bool) -> None:
         self.hidden, self.target = hidden, FolderTarget(out)
@@ -100,6 +67,7 @@ class FolderDestination:
     def complete(
         self, sequences: Sequence[SequenceCard], plans: Mapping[str, Plan], scene_hashes: SceneHashes
     ) -> Iterator[tuple[str, Files]]:
+        """Names and files of the sequences that were rendered from the same plans and have not changed since."""
         for sequence in sequences:
             files = self._complete(sequence, plans[sequence.name], scene_hashes)
             if files is not None:
@@ -107,6 +75,7 @@ class FolderDestination:
         self._hashes.flush()
 
     def learned(self, name: str) -> Files:
+        """The files of a sequence that was just placed."""
         listed = read_json(self._out / name / "sequence.json")["files"]
         listed = {"sequence.json": sha256(self._out / name / "sequence.json"), **listed}
         files = {file: self._hashes.learn(f"{name}/{file}", digest) for file, digest in listed.items()}
@@ -114,6 +83,7 @@ class FolderDestination:
         return files
 
     def finish(self, card: DatasetCard, made: Mapping[str, Files]) -> None:
+        """Write dataset.json, unless it has this content."""
         write_manifest(card, self._out, made)
 
     def _complete(self, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes) -> Files | None:
@@ -152,39 +122,17 @@ def _refuse_unknown_files(folder: Path, why: str) -> None:
         )
 
 
-@contextmanager
-def folder_destination(out: Path, rehash: bool) -> Iterator[FolderDestination]:
-    """A folder, made if missing, in which this command alone works; ``rehash`` forgets the hashes that it keeps.
-
-    Raises:
-        RsbenchError: see ``work_folder``.
-    """
-    with work_folder(out) as hidden:
-        yield FolderDestination(out, hidden, rehash)
-
-
-@contextmanager
-def open_destination(out: Path | str, workers: Workers, rehash: bool) -> Iterator[Destination]:
-    """A folder, or the store of a URL, for a run of so many processes."""
-    if isinstance(out, Path):
-        with folder_destination(out, rehash) as folder:
-            yield folder
-    else:
-        with store_destination(out, workers, rehash) as store:
-            yield store
-
-
 _OBJECTS = "objects.jsonl"
 _MANIFEST = "sequence.json"
 _REHASHED = 8
 """Files in memory at once."""
 _MOST_CHILDREN = 1024
-"""Of all commands at work on one machine of a cluster for one store."""
+"""Largest number of processes on one machine of a cluster that write to one store."""
 
 
 @dataclass(frozen=True)
 class StoreTarget:
-    """A ``Target``."""
+    """Where the sequences of a store go, as ``FolderTarget``."""
 
     url: str
     work: Path | None
@@ -206,7 +154,7 @@ class _Known(NamedTuple):
     """A sequence as it was sent or first seen."""
 
     token: str
-    """Of its sequence.json: size and token, as of ``Listed``."""
+    """Size and token of its sequence.json, as in ``Listed``."""
     sha256: str
     sizes: dict[str, int]
     manifest: Plan
@@ -218,7 +166,7 @@ class _Known(NamedTuple):
 
 
 class StoreDestination:
-    """A ``Home``."""
+    """The dataset of an object store, as ``FolderDestination``."""
 
     def __init__(self, store: Store, hidden: Path, target: StoreTarget, rehash: bool) -> None:
         self.hidden, self.target = hidden, target
@@ -373,15 +321,23 @@ def store_for(url: str, workers: Workers) -> Store:
 
 
 @contextmanager
-def store_destination(url: str, workers: Workers, rehash: bool) -> Iterator[StoreDestination]:
-    """A store, to which no other command of this user on this machine sends a dataset; ``rehash`` reads all of it.
+def open_destination(
+    out: Path | str, workers: Workers, rehash: bool
+) -> Iterator[FolderDestination | StoreDestination]:
+    """A folder, made if missing, or the store of a URL, in which no other command of this machine works.
+
+    ``rehash`` reads every file again, whatever hashes are known.
 
     Raises:
         RsbenchError: see ``store_for`` and ``work_folder``.
     """
-    store, hidden = store_for(url, workers), cache_of(url)
+    if isinstance(out, Path):
+        with work_folder(out) as hidden:
+            yield FolderDestination(out, hidden, rehash)
+        return
+    store, hidden = store_for(out, workers), cache_of(out)
     with work_folder(hidden, hidden):
-        target = StoreTarget(url, None if isinstance(workers, Cluster) else hidden / WORK)
+        target = StoreTarget(out, None if isinstance(workers, Cluster) else hidden / WORK)
         yield StoreDestination(store, hidden, target, rehash)
 
 

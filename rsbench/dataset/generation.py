@@ -28,7 +28,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channels import SequenceTruth, write_channels, write_sequence_channels
-from rsbench.dataset.destinations import Target, open_destination
+from rsbench.dataset.destinations import FolderTarget, StoreTarget, open_destination
 from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import clean_file
 from rsbench.dataset.manifest import Files
@@ -107,7 +107,8 @@ Progress = Callable[[str], None]
 
 
 def steps_of(card: DatasetCard) -> int:
-    """Of each sequence: a rolling-shutter and a global-shutter render of each camera and time, and placing it."""
+    """Steps of each sequence: two renderings of each camera and time, by both shutters, and placing the
+    sequence."""
     return 1 + 2 * len(SIDES) * card.frames
 
 
@@ -147,6 +148,11 @@ def generate_dataset(
     if "matches" in card.channels:
         load_features((card.matches or Matching()).features)  # before hours of rendering
     plans = plans_of(card, options)
+
+    def step(name: str, times: int) -> None:
+        for _ in range(times if progress else 0):
+            progress(name)  # pyrefly: ignore[not-callable]
+
     with open_destination(out, workers, rehash) as destination:
         # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
         build = lru_cache(maxsize=1)(build_scene)
@@ -154,7 +160,7 @@ def generate_dataset(
         made: dict[str, Files] = {}
         for name, files in destination.complete(card.sequence, plans, scene_hashes):
             made[name] = files
-            _repeat(progress, name, steps_of(card))
+            step(name, steps_of(card))
         todo = [sequence for sequence in card.sequence if sequence.name not in made]
         done: Counter[str] = Counter()
         ordered = sorted(todo, key=scene_name)
@@ -162,14 +168,9 @@ def generate_dataset(
             done[name] += steps
             if done[name] == steps_of(card):
                 made[name] = destination.learned(name)
-            _repeat(progress, name, steps)
+            step(name, steps)
         destination.finish(card, made)
     return [sequence.name for sequence in todo]
-
-
-def _repeat(progress: Progress | None, name: str, times: int) -> None:
-    for _ in range(times if progress else 0):
-        progress(name)  # pyrefly: ignore[not-callable]
 
 
 def scene_name(sequence: SequenceCard) -> str:
@@ -187,7 +188,7 @@ def _render_all(
     options: RendererOptions,
     plans: dict[str, Plan],
     build: Build,
-    target: Target,
+    target: FolderTarget | StoreTarget,
     workers: Workers,
 ) -> Iterator[tuple[str, int]]:
     """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
@@ -207,7 +208,7 @@ def _render_all(
 
 
 def _serve_renders(
-    card: DatasetCard, options: RendererOptions, target: Target, threads: int
+    card: DatasetCard, options: RendererOptions, target: FolderTarget | StoreTarget, threads: int
 ) -> Callable[[tuple[SequenceCard, Plan]], None]:
     """What renders sequences, in a child."""
     from rsbench.renderers.backend import set_threads, start_backend
@@ -233,7 +234,7 @@ def _render_sequence(
     options: RendererOptions,
     plan: Plan,
     stage: PosedScenes,
-    target: Target,
+    target: FolderTarget | StoreTarget,
 ) -> Iterator[None]:
     """Render into a folder of the workplace and place it when complete; yields after each step."""
     from rsbench.renderers.backend import start_backend
@@ -360,7 +361,7 @@ def render_view(
     shutter = geometry.shutter
     tau, columns = shutter.line_times(view.frame, view.side), shutter.axis(view.side) == 0
     if view.shutter == "gs":
-        line = abs(shutter.first_line(view.side) - view.row)
+        line = shutter.line_after(view.row, view.side)
         poses = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
         # No stitching: all rows have one pose, and one time.
         tau, options = np.full(tau.shape, tau[line]), replace(options, method="single-pass")
@@ -376,12 +377,12 @@ def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDAr
 
 
 _LISTED_BYTES = 200
-"""Of a file in sequence.json and dataset.json."""
+"""Bytes that a file takes in sequence.json and dataset.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Of a whole dataset; bytes and seconds are those of the left frames times the number of all, by pixels."""
+    """Estimated cost of a dataset: that of left frames, times the number of pixels of all frames over theirs."""
 
     sequences: int
     files: int
@@ -418,7 +419,7 @@ def _sum(parts: list[Estimate]) -> Estimate:
 def _of_scene(
     card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, warm: set[str]
 ) -> Estimate:
-    """Of the sequences of one scene: a trial with each sensor. ``warm``: those whose kernels are compiled."""
+    """Estimate for the sequences of one scene: a trial with each sensor; kernels of ``warm`` ones are compiled."""
     from rsbench.renderers.scene import MitsubaScene
 
     start = time.monotonic()
@@ -443,7 +444,7 @@ def _of_scene(
 def _of_kind(
     card: DatasetCard, sequences: list[SequenceCard], options: RendererOptions, scene: MitsubaScene, warm: bool
 ) -> Estimate:
-    """Of sequences of one sensor; its first image compiles, which is counted once."""
+    """Estimate for sequences of one sensor; the first image compiles, which is counted once."""
     glossy: dict[str, bool] = {"glossy": True} if scene.glossy else {}
     own = files_of(card.manifest_of(sequences[0]) | glossy)
     with tempfile.TemporaryDirectory(prefix="rsbench-") as temporary:

@@ -13,17 +13,13 @@ MOST_TWINS = 64
 MOST_FRAMES = 1000
 """A number in a manifest must not ask for a list of millions, nor does the next."""
 _MOST_WHOLE_FRAMES = 1 << 14
-"""Of one camera and time."""
+"""Largest number of whole frames of one camera at one time."""
 _KINDS = (("rs", "png"), ("rs_depth", "exr"), ("gs", "png"), ("gs_depth", "exr"), ("poses", "csv"))
 
 
 def relative_files(frames: int) -> tuple[str, ...]:
     """What every sequence of so many frames has."""
     return tuple(f"{folder}/{side}_{frame}.{end}" for folder, end in _KINDS for side, frame in views_of(frames))
-
-
-RELATIVE_FILES = relative_files(len(FRAMES))
-"""Of a sequence of two frames."""
 
 
 def clean_file(side: str, frame: int) -> str:

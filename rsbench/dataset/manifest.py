@@ -31,7 +31,7 @@ _KINDS = {
 _WHERE = "https://github.com/rsbench/rsbench"
 _SEQUENCE = r"(?:.*[/\\])?([^/\\]+)[/\\]%s[/\\][^/\\]+$"
 _SIDE, _FRAME = r".*[/\\](left|right)_[0-9]+\.[a-z]+$", r".*_([0-9]+)\.[a-z]+$"
-"""Of whole paths, from their beginning."""
+"""Pattern of whole paths, from their beginning."""
 _POSE = {name: "sc:Float" for name in ("tau", "qw", "qx", "qy", "qz", "tx", "ty", "tz")}
 
 

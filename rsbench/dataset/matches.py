@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from rsbench.core.rig import VIEWS, View
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
-from rsbench.dataset.views import FAR
+from rsbench.dataset.views import FAR, Rays
 from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays
 
@@ -154,13 +154,6 @@ def at(view: View, first: int) -> View:
     return view[0], first + view[1]
 
 
-class MatchRays(Protocol):
-    """Rays through a scene, as ``renderers.segments.SceneRays``."""
-
-    def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]: ...
-    def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray: ...
-
-
 def matcher_record(matching: Matching) -> dict[str, Any]:
     """Content of matcher.json: who matches, and the versions with which the same pictures match alike.
 
@@ -197,7 +190,7 @@ def matched_frames(geometry: Geometry, first: int, images: Images, entry: Featur
 
 
 def make_matches(
-    geometry: Geometry, first: int, images: Images, matching: Matching, rays: MatchRays
+    geometry: Geometry, first: int, images: Images, matching: Matching, rays: Rays
 ) -> LabelledMatches:
     """The labelled matches of frame ``first`` and the next, by their images (H, W, 3).
 
@@ -229,9 +222,7 @@ def arranged(found: Correspondences) -> Arranged:
     return Arranged(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def labelled(
-    geometry: Geometry, first: int, matches: Arranged, bound_px: float, rays: MatchRays
-) -> LabelledMatches:
+def labelled(geometry: Geometry, first: int, matches: Arranged, bound_px: float, rays: Rays) -> LabelledMatches:
     """Label matches by the truth."""
     parts = []
     for number, views in enumerate(MATCHED.values()):
@@ -244,7 +235,7 @@ def labelled(
 
 
 def _truth_of(
-    geometry: Geometry, source: View, target: View, pixels: FloatArray, bound_px: float, rays: MatchRays
+    geometry: Geometry, source: View, target: View, pixels: FloatArray, bound_px: float, rays: Rays
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
     """Depth (n,), true places (n, 2) and classes (n,) of matches (n, 2, 2)."""
     if len(pixels) == 0:

@@ -29,7 +29,7 @@ class Recording:
     cameras: Mapping[Side, PinholeCamera]
     images: Mapping[View, Path]
     shutters: Mapping[Side, RollingShutter] = field(default_factory=dict)
-    """Of the cameras whose readout is known; a global one has the ratio 0."""
+    """Shutters of the cameras whose readout is known; a global one has the ratio 0."""
     frame_period_s: float | None = None
     right_from_left: Pose | None = None
     """``X_right = R X_left + t`` between the cameras as they are, each in its own axes."""
@@ -64,7 +64,8 @@ class Recording:
 
     @property
     def shutter(self) -> RollingShutter | None:
-        """Of both cameras of the rig, each with its own ratio; None where a camera's readout is not known."""
+        """The shutter of both cameras of the rig, each with its own ratio; None where a camera's readout is not
+        known."""
         if self.rig is None or set(self.shutters) != set(SIDES):
             return None
         left, right = (self.shutters[side].readout_ratio for side in SIDES)

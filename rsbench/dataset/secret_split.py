@@ -1,6 +1,6 @@
 """Secret datasets: of a card, with scenes, motions, noise, order and names from a secret text.
 
-Whoever has the text draws the same card again. What is drawn for one purpose tells nothing of what is drawn for
+Whoever has the text draws the same card again. What is drawn for one purpose reveals nothing of what is drawn for
 another, nor of the text: all are hashes of it, each with a word of its own before it. A text is announced by such
 a hash too, which is not the seed of anything.
 """
@@ -23,9 +23,9 @@ from rsbench.storage.untrusted_files import read_text
 SHORTEST = 16
 """Characters of a secret: shorter ones could be tried."""
 _LEAST = 0.7
-"""Of the card's rotation, translation and readout ratio a secret share is taken: what a card says, all know."""
+"""Smallest secret share of the card's rotation, translation and readout ratio: the card itself is public."""
 _BITS = 62
-"""Of seeds, which TOML and others hold as 64 bits with a sign."""
+"""Bits of a seed, which TOML and others store in 64 bits with a sign."""
 _SEED = re.compile(r"^seed *=.*\n", re.MULTILINE)
 
 
@@ -144,7 +144,7 @@ def _rounds(card: DatasetCard, count: int | None) -> int:
 
 
 def _again(number: int) -> tuple[int, ...]:
-    """What tells the draws of a card apart; the first is as if there were no others."""
+    """The key of a repeated draw of a card; the first draw has none, as if there were no others."""
     return (number,) if number else ()
 
 
@@ -182,7 +182,8 @@ def _drawn(single: DatasetCard, secret: Secret, again: tuple[int, ...]) -> Seque
     if stated is None or (stated.rotation_axis, stated.translation_axis) != ("random", "random"):
         raise ValueError(f'{single.sequence[0].name}: motion: a secret split needs both axes to be "random"')
     if sequence.moving:
-        raise ValueError(f"{single.sequence[0].name}: moving: the card tells where its objects are; take others")
+        name = single.sequence[0].name
+        raise ValueError(f"{name}: moving: the card states where its objects are; use sequences without `moving`")
     motion = sequence.motion or stated
     assert motion.rotation_deg is not None and motion.translation is not None
     ratio = single.readout_ratio if sequence.readout_ratio is None else sequence.readout_ratio

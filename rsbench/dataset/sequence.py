@@ -52,13 +52,13 @@ from rsbench.storage.untrusted_files import check_name, check_size, inside
 
 FORMAT, OF_RIG = 1, 2
 FORMATS = (FORMAT, OF_RIG)
-"""Of files: that of the ideal rig, and that of cameras which differ or do not look the same way."""
+"""Formats of files: 1 for the ideal rig, 2 for cameras that differ or look in different directions."""
 CONVENTIONS, WITH_LENS, OF_FRAMES, WITH_MOVING = 1, 2, 3, 4
-"""Of pixels and times. Those of a lens, another scan or a late right camera are others, and so are those of more
-than two frames, and of objects that move, whatever the cameras: earlier versions of rsbench, that would take them
-for ideal, for two or for still, refuse to read them."""
+"""Conventions of pixels and times. A lens, another scan or a late right camera has its own number, and so have
+more than two frames, and of objects that move, whatever the cameras: earlier versions of rsbench, that would take
+them for ideal, for two or for still, refuse to read them."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
-"""What dataset.json tells people who find the folder."""
+"""Units in dataset.json, for people who find the folder."""
 
 M = TypeVar("M")
 
@@ -145,9 +145,9 @@ class SequenceManifest(Scanning):
     conventions: int
     name: str
     camera: PinholeCamera | None = None
-    """Of format 1: both cameras."""
+    """Both cameras, in format 1."""
     cameras: CamerasManifest | None = None
-    """Of format 2, with ``right_from_left``."""
+    """The cameras in format 2, with ``right_from_left``."""
     right_from_left: RightFromLeft | None = None
     baseline: float
     readout_ratio: float
@@ -227,7 +227,7 @@ class DatasetManifest:
     format: int
     sequences: tuple[str, ...]
     files: dict[str, FileManifest]
-    """By the path below the dataset's folder."""
+    """Files by their paths below the dataset's folder."""
     name: str = ""
     license: str = "CC-BY-4.0"
     """SPDX name; data of rsbench 0.1 do not say it, and are under this one."""
@@ -253,11 +253,11 @@ class Sequence(ChannelReader):
     motion: Motion
     frame_period_s: float
     sensor: Sensor | None = None
-    """Of the rolling-shutter frames; None: an ideal one's."""
+    """Sensor of the rolling-shutter frames; None: an ideal one."""
     imu: Imu | None = None
-    """Of the channel ``imu``."""
+    """Sensor of the channel ``imu``."""
     matching: Matching | None = None
-    """Of the channel ``matches``."""
+    """Matcher of the channel ``matches``."""
     twins: tuple[int, ...] = ()
     """Rows, counted as they are read, from whose poses there are global-shutter twins beside those of row 0."""
     exposed_twins: bool = False
@@ -267,7 +267,7 @@ class Sequence(ChannelReader):
     frames: int = len(FRAMES)
     """How many each camera has."""
     first: int = 0
-    """Of a pair: frame 0 of it is this one of the folder."""
+    """Number, in the folder, of the frame that is frame 0 here; above 0 only for a pair."""
     moving: tuple[MovingManifest, ...] = ()
     """Objects that move by themselves, numbered from 1."""
     objects: tuple[MovingObject, ...] = ()
@@ -281,7 +281,7 @@ class Sequence(ChannelReader):
         """Each two successive frames as a sequence of their own, such as ``castle.3`` of frames 3 and 4.
 
         Its world is the body at its own time 0, and its motion is the rest of it, seen from there. Of the
-        channels it has those that tell of one frame or lead to another. Of two frames there is one: the sequence.
+        channels it has those of one frame or between two. A sequence of two frames is its only pair.
         """
         if self.frames == len(FRAMES):
             return [self]

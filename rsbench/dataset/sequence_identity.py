@@ -72,7 +72,7 @@ class SceneHashes:
             self._known = {}
 
     def of(self, name: str) -> str:
-        """By the name or path of a scene card; each is looked at once."""
+        """The hash of a scene by the name or path of its card; each card is read once."""
         if name not in self._by_name:
             self._by_name[name] = self._find(name)
         return self._by_name[name]

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,12 @@ from rsbench.core.projection import ProjectionStatus, back_project, pixel_moves,
 from rsbench.core.rig import SIDES, View
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.views import PixelClass
+from rsbench.dataset.views import PixelClass, Rays
 from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:
     from rsbench.core.geometry import Geometry
-    from rsbench.renderers.visibility import Surfaces
 
 IN_ALL = 2048
 """Points drawn from the pixels of all frames, of each as many."""
@@ -35,7 +34,7 @@ def track_views(frames: int) -> tuple[View, ...]:
 
 
 def _source_type(views: int) -> np.dtype[Any]:
-    """Of the numbers of frames."""
+    """Type of the numbers of frames."""
     return np.min_scalar_type(views - 1)
 
 
@@ -144,7 +143,11 @@ def write_tracks(path: Path, tracks: Tracks) -> None:
 
 
 def read_tracks(path: Path, frames: int) -> Tracks:
-    """Of so many frames; RsbenchError as ``reading.load_arrays``, and for arrays that are no such tracks."""
+    """Read the tracks of ``frames`` frames.
+
+    Raises:
+        RsbenchError: see ``load_arrays``; or the arrays are no such tracks.
+    """
     try:
         tracks = Tracks(**load_arrays(path))
     except (TypeError, ValueError) as error:
@@ -156,15 +159,9 @@ def read_tracks(path: Path, frames: int) -> Tracks:
     return tracks
 
 
-class SurfaceRays(Protocol):
-    """Rays through a scene, as ``renderers.segments.SceneRays``."""
-
-    def surfaces(self, eyes: FloatArray, points: FloatArray) -> Surfaces: ...
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AffineFrames:
-    """Of the points (n) of ``tracks``.
+    """Affine frames of the points (n) of ``tracks``.
 
     Raises:
         ValueError: arrays of other shapes or types.
@@ -190,7 +187,7 @@ class AffineFrames:
         return self.jacobians[:, other] @ inverse_2x2(self.jacobians[:, one])
 
 
-def make_affine(geometry: Geometry, tracks: Tracks, rays: SurfaceRays) -> AffineFrames:
+def make_affine(geometry: Geometry, tracks: Tracks, rays: Rays) -> AffineFrames:
     """The affine frames of tracks, on the surfaces that rays through their pixels meet."""
     normals = np.zeros_like(tracks.points)
     for k, (side, _) in enumerate(track_views(geometry.frames)):

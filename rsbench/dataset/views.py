@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import IntEnum
 from functools import lru_cache
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry, Geometry, RelativeMotion
-from rsbench.core.projection import ProjectionStatus, back_project, row_poses, rs_project, rs_project_near
+from rsbench.core.projection import ProjectionStatus, row_poses, rs_project
 from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray, hat
@@ -32,7 +32,7 @@ FAR = 1e7
 
 
 NUMBER, SHADED = 127, 128
-"""Of a label: the bits of the number, and the one that says that a moving object hides the sun."""
+"""Bits of a label: those of the object's number, and the one that a moving object hides the sun."""
 
 
 class PixelClass(IntEnum):
@@ -52,7 +52,7 @@ class PixelClass(IntEnum):
 
 
 def numbers_of(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Of the objects at labels (...); 0 = none."""
+    """Numbers (...) of the objects at labels (...); 0 = none."""
     return np.asarray(labels & NUMBER, dtype=np.uint8)
 
 
@@ -69,7 +69,7 @@ class ImageView(NamedTuple):
     side: Side
     frame: int
     row: int = 0
-    """Of a global shutter: the row whose pose it has, counted as they are read."""
+    """The row whose pose a global shutter has, counted in the order of the readout."""
 
     @property
     def image(self) -> str:
@@ -82,17 +82,17 @@ class ImageView(NamedTuple):
 
     @property
     def labels(self) -> str:
-        """Of what moves by itself, where anything does."""
+        """File of the labels of moving objects, where there are any."""
         return moving_file(*self)
 
     @property
     def gloss(self) -> str:
-        """Of glossy surfaces, where any is."""
+        """File of the mask of glossy surfaces, where there are any."""
         return gloss_file(*self)
 
     @property
     def exposed(self) -> str:
-        """Of a global shutter as the sensor exposes it, where the dataset has that."""
+        """File of the global-shutter image as the sensor exposes it, where the dataset has it."""
         return exposed_file(*self[1:])
 
     @property
@@ -112,7 +112,7 @@ class ImageView(NamedTuple):
         return self._replace(frame=self.frame - 1)
 
     def partners(self) -> Iterator[ImageView]:
-        """Those that see most of the same: of the other shutter, the other camera, the time after and before.
+        """Views that see most of the same surfaces: other shutter, other camera, next frame, previous frame.
 
         The last two need not be there.
         """
@@ -142,42 +142,7 @@ def nearby_views(view: ImageView, frames: int) -> list[ImageView]:
 
 
 IMAGE_VIEWS, VIEW_PAIRS = image_views(FRAMES), view_pairs(FRAMES)
-"""Of a sequence of two frames."""
-
-
-class Seen(NamedTuple):
-    """Where and when a view sees points (...); NaN where it does not."""
-
-    pixels: FloatArray
-    """(..., 2) px."""
-    depth: FloatArray
-    """(...) z in the camera of that time, metres."""
-    tau: FloatArray
-    """(...) frame periods."""
-
-
-def points_of(geometry: Geometry, view: ImageView, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-    """World points (..., 3) that a view sees at pixels (..., 2) with depth (...)."""
-    rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
-    if view.shutter == "gs":
-        x_in_cam = depth[..., None] * rig.sensor(view.side).unproject(pixels)
-        return transform(inverse(_pose(geometry, view)), x_in_cam)
-    return back_project(rig, shutter, motion, view.side, view.frame, pixels, depth)
-
-
-def seen_by(geometry: Geometry, view: ImageView, X: FloatArray, rows: ArrayLike) -> Seen:
-    """Where a view sees world points (..., 3); ``rows`` (...) are guesses, of columns where it reads those."""
-    rig, shutter, motion = geometry.rig, geometry.shutter, geometry.motion
-    if view.shutter == "rs":
-        found = rs_project_near(rig, shutter, motion, view.side, view.frame, X, rows)
-        return Seen(found.pixels, found.depth, found.tau)
-    x_in_cam = transform(_pose(geometry, view), X)
-    camera = rig.sensor(view.side)
-    pixels = camera.project(x_in_cam)
-    outside = ~camera.contains(pixels)
-    pixels[outside] = np.nan
-    tau = np.broadcast_to(_time(geometry, view), outside.shape)
-    return Seen(pixels, np.where(outside, np.nan, x_in_cam[..., 2]), np.where(outside, np.nan, tau))
+"""All pictures, and all pairs of them, of a sequence of two frames."""
 
 
 def times_at(geometry: Geometry, view: ImageView, pixels: FloatArray) -> FloatArray:
@@ -244,6 +209,7 @@ def find(
     start: FloatArray,
     *,
     in_camera: FloatArray | None = None,
+    any_motion: bool = False,
     by_bands: ByBands = lambda work, height: [work(0, height)],
 ) -> Reprojected:
     """Search the lines of a picture that see points (rows, n, 3), world frame, from lines (rows, n) near them.
@@ -255,15 +221,15 @@ def find(
         start: see above.
         in_camera: (rows, n, 3), filled with the points in the target's camera at the time it sees them, metres;
             meaningless where the target does not see the point. Not computed by default.
+        any_motion: search every crossing of every point, slowly, if no table of poses follows the motion.
         by_bands: runs the search for bands of rows, for example in threads.
 
     Raises:
-        RsbenchError: a motion that no table of poses follows.
+        RsbenchError: a motion that no table of poses follows, unless ``any_motion``.
     """
     camera, shutter = geometry.rig.sensor(target.side), geometry.shutter
-    table = _pose_table(geometry, target)
     pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
-    status = np.zeros(start.shape, dtype=np.uint8)
+    status = np.full(start.shape, _UNSURE, dtype=np.uint8)
     axis, lines = shutter.axis(target.side), shutter.lines(target.side)
     optics, seen = _intrinsics(camera), np.zeros((0, 0, 3)) if in_camera is None else in_camera
 
@@ -272,7 +238,12 @@ def find(
         own = pixels[rows], eyes[rows], status[rows], seen[rows]
         reproject_rows(table.entries, table.per_line, optics, axis, lines, points[rows], start[rows], *own)
 
-    by_bands(search, len(start))
+    try:
+        table = _pose_table(geometry, target)
+        by_bands(search, len(start))
+    except RsbenchError:
+        if not any_motion:
+            raise
     unsure = status == _UNSURE
     if np.any(unsure):
         found = rs_project(geometry.rig, shutter, geometry.motion, target.side, target.frame, points[unsure])
@@ -497,10 +468,11 @@ class Rays(Protocol):
         self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None
     ) -> NDArray[np.bool_]: ...
     def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces: ...
+    def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray: ...
 
 
 class PairTruth(NamedTuple):
-    """Of the pixels of a source."""
+    """Where the pixels of a source lie in another picture, and what became of them."""
 
     offset: FloatArray
     """(H, W, 2) x_target - x_source, px; NaN where the class is UNSOLVED or OUT_OF_VIEW."""
@@ -582,17 +554,17 @@ def carry(
     surfaces: SeenSurfaces,
     target: ImageView,
     in_camera: FloatArray | None = None,
-    by_bands: ByBands = lambda work, height: [work(0, height)],
+    **options: Any,
 ) -> Carried:
-    """Where another picture sees what every pixel of a picture sees, hidden or not; the rest as of ``find``."""
+    """Where another picture sees what every pixel of a picture sees, hidden or not; ``options`` as of ``find``."""
     start = _first_lines(surfaces, target)
-    landed = find(surfaces.geometry, target, surfaces.points, start, in_camera=in_camera, by_bands=by_bands)
+    landed = find(surfaces.geometry, target, surfaces.points, start, in_camera=in_camera, **options)
     if surfaces.numbers is None or not surfaces.geometry.objects:
         return Carried(landed, surfaces.points)
     points = surfaces.points.copy()
     for number in np.unique(surfaces.numbers[surfaces.numbers > 0]):
         chosen = surfaces.numbers == number
-        points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start, in_camera)
+        points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start, in_camera, **options)
         for whole, part in zip(landed, own, strict=True):
             whole[chosen] = part
     return Carried(landed, points)
@@ -624,6 +596,7 @@ def _landed_with(
     chosen: NDArray[np.bool_],
     start: FloatArray,
     in_camera: FloatArray | None,
+    **options: Any,
 ) -> tuple[FloatArray, Reprojected]:
     """The chosen points (n, 3) of an object when the target sees them, world frame, and where it sees them."""
     geometry, thing = surfaces.geometry, surfaces.geometry.objects[number - 1]
@@ -631,7 +604,9 @@ def _landed_with(
     X = transform(inverse(thing.world_from_object(tau)), surfaces.points[chosen])
     # Each alone: its neighbours in the row may be other things.
     seen = None if in_camera is None else np.zeros((len(X), 1, 3))
-    found = find(seen_from(geometry, number), target, X[:, None], start[chosen][:, None], in_camera=seen)
+    found = find(
+        seen_from(geometry, number), target, X[:, None], start[chosen][:, None], in_camera=seen, **options
+    )
     if in_camera is not None and seen is not None:
         in_camera[chosen] = seen[:, 0]
     there = thing.world_from_object(times_at(geometry, target, found.pixels[:, 0]))

@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 MOST_FAULTS = 1000
-"""Of one sequence that are reported one by one: its manifests may list any number of files."""
+"""Faults of one sequence that are reported one by one: its manifests may list any number of files."""
 
 
 def verify_dataset(
@@ -110,7 +110,7 @@ def verification_steps(manifest: Mapping[str, Any]) -> int:
 
 
 def _steps(listing: manifest_checks.Listing) -> int:
-    """Of each sequence."""
+    """Progress reports of each sequence."""
     frames = len(FRAMES) if isinstance(listing.card, Finding) else listing.card.frames
     return 1 + STEPS * (frames - 1)
 

@@ -6,14 +6,14 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, SIDES
-from rsbench.core.se3 import inverse
+from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import (
     INSTANCE_TABLE,
@@ -28,10 +28,10 @@ from rsbench.dataset.channels import (
     surface_file,
 )
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, numbers_of, points_of, seen_from, times_at
+from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, SeenSurfaces, numbers_of, times_at
 from rsbench.renderers.image import linear_of_codes, to_srgb8
 from rsbench.verification.content import clean_picture
-from rsbench.verification.findings import Finding, cheapest_cause, rows_of
+from rsbench.verification.findings import Again, Finding, cheapest_cause, rows_of, rows_with_most
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.reprojection import BoolArray, DepthMap, reproject
 
@@ -46,15 +46,16 @@ _FEW, _OF_A_ROW = 1e-3, 0.25
 _SURFACE, _BEHIND = 5e-5, 3e-4
 """Relative distance below which a pixel sees the target's surface, and beyond which it is behind it."""
 _FEW_THIN, _FEW_GAPS, _FEW_SHOWN = 0.01, 0.3, 3e-3
-"""Of the pixels on flat surfaces of the target, of those behind them, and of all in view: what is thinner than a
+"""Shares of the pixels on flat surfaces of the target, behind them, and in view: what is thinner than a
 pixel hides points between the target's pixels, or shows them. Where little is hidden, such as joints between tiles
 may be most of it."""
 _OF_A_THIN_ROW, _OF_ITS_WIDTH = 0.5, 0.125
 """Such things may lie along a row: shares of its pixels that are reported, and of all its pixels."""
 _FEW_AGAIN = 5e-3
-"""Of rows made again: on another processor, rounding of depth moves points across edges now and then."""
+"""Share of the pixels of rows made again that may differ: on another processor, rounding of depth moves points
+across edges now and then."""
 _LEAST = 8
-"""So many pixels may always differ."""
+"""Number of pixels that may always differ."""
 _EXPLAINS = 0.8
 _NO_VALUE = (PixelClass.UNSOLVED, PixelClass.OUT_OF_VIEW)
 _OF_SKY = (PixelClass.SKY, PixelClass.SKY_OCCLUDED)
@@ -115,7 +116,7 @@ def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
 
 def channels_again(
     sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
-) -> Iterator[tuple[str, Finding | None, bool]]:
+) -> Iterator[Again]:
     """Make rows of the channels of a frame again: each file, its fault or None, and whether its bits are equal.
 
     Args:
@@ -171,7 +172,7 @@ def _pair_faults(
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
         cause = _pair_cause(layer, view, stored, derived, stride)
-        yield Finding(file, what, _rows(wrong & both, stride, len(stored[view].classes)), cause)
+        yield Finding(file, what, rows_with_most(wrong & both, stride, len(stored[view].classes)), cause)
     empty = np.isnan(values).any(axis=-1)
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
@@ -203,7 +204,7 @@ def _mask_faults(
         (f"visible, but hidden by {there.depth}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
     ):
         if many(wrong & among, among):
-            rows = _rows(wrong & among, stride, height)
+            rows = rows_with_most(wrong & among, stride, height)
             yield Finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
 
@@ -253,12 +254,6 @@ def _percent(wrong: BoolArray, among: BoolArray) -> str:
     return f"{share:.0f} % of {count} pixels" if share >= 10 else f"{share:.2g} % of {count} pixels"
 
 
-def _rows(wrong: BoolArray, stride: int, height: int) -> str:
-    """Words for the rows in which many of the wrong pixels lie."""
-    share = np.mean(wrong, axis=1)
-    return rows_of(np.repeat(share > 0.5 * np.max(share), stride)[:height])
-
-
 def _pair_cause(
     layer: Layer, view: ImageView, stored: Mapping[ImageView, _Stored], derived: _Derived, stride: int
 ) -> str:
@@ -292,12 +287,13 @@ def _explains(candidate: Float32Array, derived: _Derived) -> bool:
 
 
 _UNIT = 1e-5
-"""Of a length: the rounding of float32."""
+"""Tolerance of a length: the rounding of float32."""
 LEVEL, FEW_BENT = 0.05, 0.02
 """Cosine between a normal and its surface, which bends by less where it counts as flat; and the share of flat
 pixels that may be beyond, at creases of less than that."""
-_SAME_SURFACE, _FEW_OTHERS = 5e-5, 0.02
-"""As in ``channel_checks``; what is thinner than a pixel may lie between four that see something else."""
+_FEW_OTHERS = 0.02
+"""Share of the pixels of one surface that may show another instance: what is thinner than a pixel may lie between
+four that see something else."""
 
 
 def surface_faults(
@@ -341,14 +337,13 @@ def _normal_faults(
     wrong = ~(np.abs(length - solid) <= _UNIT)
     if np.sum(wrong) > _LEAST:
         yield Finding(
-            file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", _worst_rows(wrong)
+            file, f"{np.sum(wrong)} normals are not of length 1, or 0 without a surface", rows_with_most(wrong)
         )
         return
-    z = np.where(solid, depth_map.depth, 1.0).astype(np.float64)
-    X, rays, normals = _resting(sequence, depth_map, z, normals)
+    X, rays, normals = _resting(sequence, depth_map, normals)
     away = solid & (np.sum(rays * normals, axis=-1) > 0)
     if np.sum(away) > _LEAST:
-        yield Finding(file, f"{np.sum(away)} normals point away from the camera", _worst_rows(away))
+        yield Finding(file, f"{np.sum(away)} normals point away from the camera", rows_with_most(away))
     bent = np.zeros(solid.shape, dtype=np.bool_)
     for step in (X[1:-1, 2:] - X[1:-1, :-2], X[2:, 1:-1] - X[:-2, 1:-1]):
         cosine = np.sum(step * normals[1:-1, 1:-1], axis=-1) / np.linalg.norm(step, axis=-1)
@@ -357,29 +352,23 @@ def _normal_faults(
     if np.sum(bent & flat) > max(FEW_BENT * np.sum(flat), _LEAST):
         share = f"{100 * np.sum(bent & flat) / np.sum(flat):.2g} % of the flat pixels"
         what = f"{share} have a normal that is not upright on the surface of {depth_map.view.depth}"
-        yield Finding(file, what, _worst_rows(bent & flat))
+        yield Finding(file, what, rows_with_most(bent & flat))
 
 
 def _resting(
-    sequence: Sequence, depth_map: DepthMap, z: FloatArray, normals: NDArray[np.float32]
+    sequence: Sequence, depth_map: DepthMap, normals: NDArray[np.float32]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
-    """Points, rays to them and normals, (H, W, 3) each, in the world; of what moves, in its own frame, where it
-    rests: the normals of a frame are those of the times of its rows."""
-    view, grid, labels = depth_map.view, depth_map.camera.pixel_grid(), depth_map.labels
-
-    def of(number: int, chosen: Any) -> tuple[FloatArray, FloatArray]:
-        pixels, depth = grid[chosen], z[chosen]
-        own = seen_from(sequence, number)
-        points = points_of(own, view, pixels, depth)
-        return points, points - points_of(own, view, pixels, depth * 0)
-
-    X, rays = of(0, ...)
-    for number, thing in enumerate(sequence.objects, start=1):
-        chosen = np.zeros(z.shape, np.bool_) if labels is None else numbers_of(labels) == number
-        X[chosen], rays[chosen] = of(number, chosen)
-        turned = inverse(thing.world_from_object(times_at(sequence, view, grid[chosen]))).R
-        normals = normals.copy()
-        normals[chosen] = (turned @ normals[chosen][..., None])[..., 0]
+    """Points, rays to them and normals, (H, W, 3) each, in the world; of a moving object in the frame in which it
+    rests: the normals of a picture belong to the times of its rows."""
+    surfaces = SeenSurfaces(sequence, depth_map.view, depth_map.depth)
+    X, rays, labels = surfaces.points, surfaces.points - surfaces.eyes, depth_map.labels
+    for number, thing in enumerate(sequence.objects if labels is not None else (), start=1):
+        chosen = numbers_of(labels) == number
+        pose = inverse(thing.world_from_object(times_at(sequence, depth_map.view, surfaces.grid[chosen])))
+        X, normals = X.copy(), normals.copy()
+        X[chosen] = transform(pose, X[chosen])
+        for vectors in (rays, normals):
+            vectors[chosen] = (pose.R @ vectors[chosen][..., None])[..., 0]
     return X, rays, normals
 
 
@@ -387,11 +376,13 @@ def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], 
     wrong = (numbers > 0) != (depth_map.depth > 0)
     if np.sum(wrong) > _LEAST:
         yield Finding(
-            file, f"{np.sum(wrong)} pixels have an instance and no depth, or depth and none", _worst_rows(wrong)
+            file, f"{np.sum(wrong)} pixels have an instance and no depth, or depth and none", rows_with_most(wrong)
         )
     if np.any(numbers > count):
         yield Finding(
-            file, f"holds instance {np.max(numbers)}, {INSTANCE_TABLE} has {count}", _worst_rows(numbers > count)
+            file,
+            f"holds instance {np.max(numbers)}, {INSTANCE_TABLE} has {count}",
+            rows_with_most(numbers > count),
         )
 
 
@@ -404,7 +395,7 @@ def _agreement_faults(
 ) -> Iterator[Finding]:
     reprojection = reproject(sequence, maps[view], maps[partner])
     with np.errstate(invalid="ignore"):
-        same = np.abs(reprojection.relative) < _SAME_SURFACE
+        same = np.abs(reprojection.relative) < _SURFACE
     # One of the four pixels around must see the same: between them, things that touch change.
     height, width = same.shape
     x, y = np.floor(reprojection.pixels[same]).astype(int).T
@@ -418,13 +409,7 @@ def _agreement_faults(
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
         file, there = (surface_file("instances", each.side, each.frame) for each in (view, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
-        yield Finding(file, f"{share} see another instance than {there}", _worst_rows(other))
-
-
-def _worst_rows(wrong: BoolArray) -> str:
-    """Words for the rows in which many of the wrong pixels lie."""
-    share = np.mean(wrong, axis=1)
-    return rows_of(share > 0.5 * np.max(share))
+        yield Finding(file, f"{share} see another instance than {there}", rows_with_most(other))
 
 
 _CODE = 0.54
@@ -454,9 +439,8 @@ def hdr_faults(
         if np.sum(wrong) > max(_FEW * wrong.size, _LEAST):
             off = np.max(np.abs(to_srgb8(radiance, exposure) - codes))
             what = f"{100 * np.mean(wrong):.3g} % of {wrong.size} pixels are not {image} before its rounding"
-            rows = np.mean(wrong, axis=1)
-            in_rows = rows_of(rows > 0.5 * np.max(rows))
-            yield Finding(file, f"{what}, by up to {off:g} codes", in_rows, _radiance_cause(light, picture))
+            cause = _radiance_cause(light, picture)
+            yield Finding(file, f"{what}, by up to {off:g} codes", rows_with_most(wrong), cause)
 
 
 def _radiance_cause(light: NDArray[np.float32], picture: Picture) -> str:

@@ -455,7 +455,7 @@ def with_table(text: str) -> str:
 
 
 STEPS = len(VIEW_PAIRS)
-"""Of progress, for two successive frames."""
+"""Progress reports for two successive frames."""
 
 
 def run_stage(state: State, stage: Stage) -> None:

@@ -18,7 +18,7 @@ F32 = NDArray[np.float32]
 
 
 class Evidence(NamedTuple):
-    """Of a source, as ``depth_checks.DepthEvidence`` has it, all (h, w); filled in."""
+    """Fields of ``depth_checks.DepthEvidence`` of a source, (h, w) each, which the loops fill in."""
 
     confirmed: Bits
     contradicted: Bits
@@ -141,7 +141,7 @@ def vote_rows(
     first: int,
     last: int,
 ) -> NDArray[np.int64]:
-    """Of rows of a source: count the pixels that see one surface in both pictures, and those of another colour.
+    """Count the pixels in rows of a source that see one surface in both pictures, and those of another colour.
 
     Args:
         shown: see there.

@@ -134,8 +134,7 @@ def twin_faults(content: Content) -> Iterator[Finding]:
     """
     for view in image_views(content.times):
         twin, maps, pictures = view._replace(shutter="gs"), content.maps, content.pictures
-        axis, number = _first_line(content, view)
-        line = f"{'row' if axis == 0 else 'column'} {number}"
+        axis, number, line = shared_line(content.sequence, twin)
         if view.shutter != "rs":
             continue
         if {view, twin} <= pictures.keys():
@@ -159,17 +158,17 @@ def _rounding(axis: int, most: float) -> float:
 
 
 def spare_pixels(axis: int, size: int) -> int:
-    """So many of the pixels of a line that two images share may differ: of a row none.
+    """How many pixels may differ in a line that two images share: none in a row.
 
-    Of a column some: rays are traced in packets along rows, and beside others a ray is rounded otherwise.
+    Some in a column: rays are traced in packets along rows, and beside others a ray is rounded otherwise.
     """
     return 0 if axis == 0 else max(2, size // 20)
 
 
-def _first_line(content: Content, view: ImageView) -> tuple[int, int]:
-    """Axis and number of the line of an image that is read first."""
-    shutter = content.sequence.shutter
-    return 1 - shutter.axis(view.side), shutter.first_line(view.side)
+def shared_line(sequence: Sequence, twin: ImageView) -> tuple[int, int, str]:
+    """Axis, number and name ("row 3") of the line that a global-shutter picture shares with its frame."""
+    axis, line = 1 - sequence.shutter.axis(twin.side), sequence.shutter.line_after(twin.row, twin.side)
+    return axis, line, f"{'row' if axis == 0 else 'column'} {line}"
 
 
 def _first_of_twin(depth: NDArray[np.float32], twin: NDArray[np.float32]) -> str:
@@ -320,7 +319,7 @@ def images_of_others(sequence: Sequence, others: Callable[[], Iterable[Sequence]
 
 _SAME_SURFACE, _LEAST_SHARED = 0.05, 100
 """Relative distance within which surfaces are one and the same, badly placed; beyond, one hides the other. And the
-pixels that tell."""
+smallest number of shared pixels that is judged."""
 _MOST_WRONG = 0.1
 """Share of them: what is thinner than a pixel, and edges that are nearly flat."""
 
@@ -346,9 +345,8 @@ def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iter
 
 
 def _shared_line_faults(content: Content, twins: Content, source: ImageView, twin: ImageView) -> Iterator[Finding]:
-    shutter = content.sequence.shutter
-    axis, line = 1 - shutter.axis(twin.side), abs(shutter.first_line(twin.side) - twin.row)
-    words = f"{'row' if axis == 0 else 'column'} {line} differs from"
+    axis, line, name = shared_line(content.sequence, twin)
+    words = f"{name} differs from"
     if source in content.pictures and twin in twins.pictures:
         own, other = (
             np.take(each.colours, line, axis) for each in (twins.pictures[twin], content.pictures[source])

@@ -17,7 +17,7 @@ from rsbench.core.geometry import Geometry
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import ImageView, Times, nearby_views, numbers_of
+from rsbench.dataset.views import ImageView, Times, nearby_views
 from rsbench.verification.compiled_comparison import Evidence, Limits, weigh_rows
 from rsbench.verification.findings import DepthAgreement, Finding
 from rsbench.verification.reprojection import (
@@ -27,7 +27,7 @@ from rsbench.verification.reprojection import (
     Reprojection,
     by_bands,
     reproject,
-    seen_with,
+    seen_in,
 )
 
 Bits = NDArray[np.uint8]
@@ -91,7 +91,7 @@ class DepthEvidence:
         return self.map.depth[:: self.stride, :: self.stride] > 0
 
     def bit(self, partner: ImageView) -> np.uint8:
-        """That of a partner."""
+        """The bit of a partner."""
         return np.uint8(1 << list(self.map.view.partners()).index(partner))
 
 
@@ -103,7 +103,7 @@ class MapFault:
     rows: BoolArray
     """(H,) where."""
     share: float
-    """Of what could be compared: the map with the largest is wrong first."""
+    """Share of the compared pixels that is wrong: the map with the largest share is reported first."""
     uncompared: bool = False
     """Whether it has a surface, and nothing of it could be compared."""
 
@@ -243,7 +243,7 @@ class GeometryFault(NamedTuple):
     what: str
     cause: str
     share: float
-    """Of the pixels of the worst pair that agree."""
+    """Share of the pixels of the worst pair that agree."""
     over_time: bool
     """Whether it is only the two times that disagree."""
 
@@ -434,21 +434,15 @@ def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: 
 
 def _roughly_alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
     stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
-    grid, depth = source.camera.pixel_grid()[::stride, ::stride], source.depth[::stride, ::stride]
-    numbers = None if source.labels is None else numbers_of(source.labels[::stride, ::stride][depth > 0])
-    pixels, z = grid[depth > 0], depth[depth > 0].astype(np.float64)
-    seen = seen_with(geometry, source.view, target.view, pixels, z, numbers)
-    inside = np.isfinite(seen.depth)
-    middle = np.rint(seen.pixels[inside]).astype(np.int64)
-    shares = [
-        _share_of_depth(target, middle + np.array(by) * _AWAY, seen.depth[inside])
-        for by in product((0, 1, -1), repeat=2)
-    ]
+    pixels, x_in_cam = seen_in(geometry, source, target, range(0, len(source.depth), stride), stride)
+    inside = np.isfinite(pixels[..., 0]) & (source.depth[::stride, ::stride] > 0)
+    middle, z = np.rint(pixels[inside]).astype(np.int64), x_in_cam[inside][:, 2]
+    shares = [_share_of_depth(target, middle + np.array(by) * _AWAY, z) for by in product((0, 1, -1), repeat=2)]
     return shares[0] > _LIKER * max(shares[1:])
 
 
 def _share_of_depth(target: DepthMap, middle: NDArray[np.int64], depth: FloatArray) -> float:
-    """Of points (n,) those that are as deep as one of the 3 x 3 pixels (n, 2) around, in the picture."""
+    """Share of the points (n,) that are as deep as one of the 3 x 3 pixels around ``middle`` (n, 2)."""
     height, width = target.depth.shape
     inside = np.all((middle >= 1) & (middle < np.array([width - 1, height - 1])), axis=1)
     x, y = middle[inside].T

@@ -1,9 +1,12 @@
-"""What verification says: findings as values, the line that is printed of each, and reports."""
+"""Findings of verification as values, the line that is printed for each, and reports."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +42,7 @@ class Finding:
 
     @classmethod
     def of(cls, error: RsbenchError) -> Finding:
-        """That a file cannot be read; the error names it by its whole path."""
+        """The finding that a file cannot be read; the error names its whole path."""
         return cls("", str(error))
 
     def __str__(self) -> str:
@@ -58,7 +61,7 @@ class DepthAgreement:
     compared: int
     """Pixels on a locally flat surface that lie on one in the target and are not plainly hidden there."""
     agreeing: int
-    """Of these, within ``reprojection.DEPTH_TOLERANCE``."""
+    """The number of these that agree within ``reprojection.DEPTH_TOLERANCE``."""
     typical: float
     """Median of the relative difference of the agreeing and near pixels."""
     p99: float
@@ -85,8 +88,38 @@ class SequenceReport:
         return tuple(map(str, self.findings))
 
 
+Again = tuple[str, Finding | None, bool]
+"""A file that is made again: its name, its fault or None, and whether all of its bits are equal."""
+_Args = ParamSpec("_Args")
+_Found = TypeVar("_Found")
+
+
+def reports_unreadable(check: Callable[_Args, Iterator[Finding]]) -> Callable[_Args, Iterator[Finding]]:
+    """A check that ends with a finding at the first file that it cannot read."""
+
+    @wraps(check)
+    def run(*args: _Args.args, **options: _Args.kwargs) -> Iterator[Finding]:
+        try:
+            yield from check(*args, **options)
+        except RsbenchError as error:
+            yield Finding.of(error)
+
+    return run
+
+
+def skips_unreadable(check: Callable[_Args, Iterator[_Found]]) -> Callable[_Args, Iterator[_Found]]:
+    """A check that ends at the first file that it cannot read, which another check has reported."""
+
+    @wraps(check)
+    def run(*args: _Args.args, **options: _Args.kwargs) -> Iterator[_Found]:
+        with suppress(RsbenchError):
+            yield from check(*args, **options)
+
+    return run
+
+
 def files_of(findings: Iterable[Finding]) -> set[str]:
-    """Files that findings tell of."""
+    """The files that findings name."""
     return {each.file for each in findings}
 
 
@@ -97,6 +130,15 @@ def cheapest_cause(costs: Mapping[str, float], as_is: float, share: float = 0.2)
     """
     best = min(costs, key=costs.__getitem__)
     return f"looks {best}" if best and costs[best] < share * as_is else ""
+
+
+def rows_with_most(wrong: NDArray[np.bool_], stride: int = 1, height: int | None = None) -> str:
+    """The rows with more than half as many wrong pixels (h, w) as the worst row, in words.
+
+    ``wrong`` has every ``stride``-th row of an image of this ``height``.
+    """
+    share = np.mean(wrong, axis=1)
+    return rows_of(np.repeat(share > 0.5 * np.max(share), stride)[:height])
 
 
 def rows_of(flags: NDArray[np.bool_]) -> str:

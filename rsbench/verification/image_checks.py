@@ -90,8 +90,8 @@ CHANGES = (
 )
 _TABLE = np.array([[c.down, c.right, c.flip_x, c.flip_y, *c.order] for c in CHANGES], dtype=np.int64)
 _SHIFTS = slice(1, 5)
-"""A path tracer's frame and its global-shutter twin, whose pixels have the same noise, cannot tell these: where
-the surface moves by about a pixel, the noise looks shifted."""
+"""A path tracer's frame and its global-shutter twin, whose pixels have the same noise, cannot show these changes:
+where the surface moves by about a pixel, the noise looks shifted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class ColourAgreement:
     plain: NDArray[np.float64]
     """(B,) what the best single colour would cost."""
     refuted: BoolArray
-    """(C, B) changes of the source that this pair cannot tell, or that another partner clearly speaks against, see
+    """(C, B) changes of the source that this pair cannot show, or that another partner clearly contradicts, see
     ``without_refuted``."""
 
     @property

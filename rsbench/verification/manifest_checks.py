@@ -36,14 +36,14 @@ _SAME = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """A dataset as its dataset.json tells it, sorted once for all of its sequences."""
+    """The content of a dataset.json, sorted once for all of its sequences."""
 
     folder: Path
     manifest: Mapping[str, Any]
     card: DatasetCard | Finding
     """The card, or the fault that it is none."""
     names: tuple[str, ...]
-    """Of sequences that may be opened: folders in it, each once."""
+    """Names of sequences that may be opened: folders in the dataset, each once."""
     files: Mapping[str, Mapping[str, object]]
     """What ``files`` says of each sequence, by its name and the path below its folder."""
     planned: Mapping[str, SequenceCard]
@@ -158,7 +158,7 @@ def _croissant_faults(listing: Listing) -> Iterator[Finding]:
         if not says(read_bytes(path), wanted):
             yield Finding(CROISSANT, f"does not describe {DATASET}: run rsbench generate again, which writes it")
     except (RsbenchError, KeyError, TypeError, ValueError):
-        yield Finding(CROISSANT, f"cannot be compared with {DATASET}, which lacks what it tells")
+        yield Finding(CROISSANT, f"cannot be compared with {DATASET}, which lacks what it describes")
 
 
 def _stays_inside(path: str) -> bool:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.views import ImageView, numbers_of, view_pairs
-from rsbench.verification.content import Content, spare_pixels
+from rsbench.verification.content import Content, shared_line, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
 from rsbench.verification.rerender import Rerenderer
@@ -76,7 +78,8 @@ def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
     for each in (*fresh.maps.values(), *twins.maps.values()):
         yield from _gloss_by_itself(each)
     for part in (content, twins):
-        yield from _dropped(part, {view: _gloss_unlike_twin(content, each) for view, each in part.maps.items()})
+        what = "pixels at the same pose"
+        yield from _dropped(part, {v: _unlike_twin(content, each, "gloss", what) for v, each in part.maps.items()})
     yield from _dropped(content, dict(_contradicted(content)))
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
@@ -90,7 +93,7 @@ def _dropped(content: Content, faults: dict[ImageView, Finding | None]) -> Itera
 
 
 def _gloss_by_itself(each: DepthMap) -> Iterator[Finding]:
-    gloss, solid = _gloss_of(each), each.depth > 0
+    gloss, solid = _mask_of(each, "gloss") > 0, each.depth > 0
     empty = gloss & ~solid
     if np.any(empty):
         what = f"{np.sum(empty)} pixels of the mask show no surface"
@@ -102,18 +105,24 @@ def _gloss_by_itself(each: DepthMap) -> Iterator[Finding]:
         yield Finding(each.view.gloss, what)
 
 
-def _gloss_unlike_twin(content: Content, own: DepthMap) -> Finding | None:
-    """The line of a global shutter that its rolling-shutter frame shares."""
+def _unlike_twin(content: Content, own: DepthMap, kind: Literal["gloss", "labels"], what: str) -> Finding | None:
+    """The line that a global-shutter picture shares with its rolling-shutter frame, if its masks differ."""
     source, view = own.view._replace(shutter="rs", row=0), own.view
     if view == source or source not in content.maps:
         return None
-    shutter = content.sequence.shutter
-    axis, line = 1 - shutter.axis(view.side), abs(shutter.first_line(view.side) - view.row)
-    unlike = np.take(_gloss_of(own), line, axis) != np.take(_gloss_of(content.maps[source]), line, axis)
-    if np.sum(unlike) <= spare_pixels(axis, unlike.size):
+    axis, line, name = shared_line(content.sequence, view)
+    one, other = (np.take(_mask_of(each, kind), line, axis) for each in (own, content.maps[source]))
+    if np.sum(one != other) <= spare_pixels(axis, one.size):
         return None
-    words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.gloss}"
-    return Finding(view.gloss, f"{words}: {np.sum(unlike)} pixels at the same pose")
+    return Finding(
+        getattr(view, kind), f"{name} differs from {getattr(source, kind)}: {np.sum(one != other)} {what}"
+    )
+
+
+def _mask_of(each: DepthMap, kind: Literal["gloss", "labels"]) -> NDArray[Any]:
+    """(H, W); 0 where there is no mask."""
+    mask = getattr(each, kind)
+    return np.zeros(each.depth.shape, dtype=np.uint8) if mask is None else mask
 
 
 def _contradicted(content: Content) -> Iterator[tuple[ImageView, Finding]]:
@@ -155,16 +164,12 @@ def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolAr
 
 def _span(each: DepthMap) -> tuple[BoolArray, BoolArray]:
     """(H, W) whether all of the 3 x 3 pixels around are glossy, and whether any is."""
-    gloss, around = _gloss_of(each).astype(np.uint8), np.ones((3, 3), np.uint8)
+    gloss, around = _mask_of(each, "gloss").astype(np.uint8), np.ones((3, 3), np.uint8)
     return cv2.erode(gloss, around) > 0, cv2.dilate(gloss, around) > 0
 
 
-def _gloss_of(each: DepthMap) -> BoolArray:
-    return np.zeros(each.depth.shape, dtype=np.bool_) if each.gloss is None else each.gloss
-
-
 _FEW_LABELS = 8
-"""So many labels may be wrong anywhere: at edges thinner than a pixel."""
+"""Number of labels that may be wrong in a picture, at edges thinner than a pixel."""
 
 
 def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
@@ -181,41 +186,30 @@ def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
         faults = {view: _on_nothing(each) or _misplaced(content, each) for view, each in part.maps.items()}
         yield from _dropped(part, faults)
     for part in (content, twins):
-        yield from _dropped(part, {view: _labels_unlike_twin(content, twins, view) for view in part.maps})
+        what = "labels at the same time"
+        yield from _dropped(
+            part, {v: _unlike_twin(content, each, "labels", what) for v, each in part.maps.items()}
+        )
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
 
 
 def _on_nothing(each: DepthMap) -> Finding | None:
-    labels = np.zeros(each.depth.shape, dtype=np.uint8) if each.labels is None else each.labels
-    empty = (labels > 0) & (each.depth == 0)
+    empty = (_mask_of(each, "labels") > 0) & (each.depth == 0)
     if not np.any(empty):
         return None
-    return Finding(each.view.labels, f"{np.sum(empty)} labels where there is no surface", _rows(empty))
-
-
-def _labels_unlike_twin(content: Content, twins: Content, view: ImageView) -> Finding | None:
-    """The line of a global shutter that its rolling-shutter frame shares."""
-    source = view._replace(shutter="rs", row=0)
-    own, other = (twins.maps if view.row else content.maps).get(view), content.maps.get(source)
-    if view == source or own is None or other is None or own.labels is None or other.labels is None:
-        return None
-    shutter = content.sequence.shutter
-    axis, line = 1 - shutter.axis(view.side), abs(shutter.first_line(view.side) - view.row)
-    unlike = np.take(own.labels, line, axis) != np.take(other.labels, line, axis)
-    if np.sum(unlike) <= spare_pixels(axis, unlike.size):
-        return None
-    words = f"{'row' if axis == 0 else 'column'} {line} differs from {source.labels}"
-    return Finding(view.labels, f"{words}: {np.sum(unlike)} labels at the same time")
+    return Finding(
+        each.view.labels, f"{np.sum(empty)} labels where there is no surface", rows_of(np.any(empty, axis=1))
+    )
 
 
 def _misplaced(content: Content, own: DepthMap) -> Finding | None:
     """Surfaces through which partners see where their labels take them, and which they see where another would."""
     sequence, view = content.sequence, own.view
     stride = max(1, int(np.sqrt(own.depth.size / _TRIED_PIXELS)))
-    numbers = np.zeros(own.depth.shape, np.uint8) if own.labels is None else numbers_of(own.labels)
+    numbers = numbers_of(_mask_of(own, "labels"))
     elsewhere = np.zeros(own.depth[::stride, ::stride].shape, dtype=np.bool_)
-    # The other camera sees all of them at about the same time, which tells nothing.
+    # The other camera sees all of them at about the same time, which shows no movement.
     over_time = view._replace(frame=view.frame + 1, row=0), view.frame_before._replace(row=0)
     for partner in (view.other_shutter._replace(row=0), *over_time):
         if partner not in content.maps:
@@ -234,7 +228,3 @@ def _misplaced(content: Content, own: DepthMap) -> Finding | None:
         return None
     what = f"{np.sum(elsewhere)} pixels are not where their labels take them, but where another would"
     return Finding(view.labels, what, rows_of(np.repeat(np.any(elsewhere, axis=1), stride)[: len(own.depth)]))
-
-
-def _rows(wrong: BoolArray) -> str:
-    return rows_of(np.any(wrong, axis=1))

@@ -26,7 +26,6 @@ from rsbench.dataset.matches import (
     LabelledMatches,
     MatchClass,
     Matching,
-    MatchRays,
     PairLabels,
     arranged,
     at,
@@ -40,7 +39,6 @@ from rsbench.dataset.matches import (
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import (
     AffineFrames,
-    SurfaceRays,
     Tracks,
     jacobians_of,
     look_for,
@@ -50,7 +48,7 @@ from rsbench.dataset.tracks import (
 )
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays
 from rsbench.verification.channel_checks import FEW_BENT, LEVEL
-from rsbench.verification.findings import Finding
+from rsbench.verification.findings import Again, Finding, reports_unreadable, skips_unreadable
 from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, relative_depth
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher
@@ -61,10 +59,11 @@ _BEFORE, _BEHIND, _FEW = 1e-2, 1e-2, 0.15
 """Relative distance beyond which a point is before or behind all that the pixels around it see; the share that may
 be, by what is thinner than a pixel: leaves far away, and gaps between them."""
 _NEARLY_ALL = 0.8
-"""Of the points that lie so, the share whose class cannot be such leaves' and gaps' doing."""
+"""Share of the points that lie so above which thin leaves and gaps cannot explain their class."""
 _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
+@reports_unreadable
 def track_faults(
     sequence: Sequence,
     maps: Mapping[ImageView, DepthMap],
@@ -77,11 +76,7 @@ def track_faults(
     """
     if "tracks" not in sequence.channels or TRACKS in reported:
         return
-    try:
-        tracks = sequence.tracks()
-    except RsbenchError as error:
-        yield Finding.of(error)
-        return
+    tracks = sequence.tracks()
     if len(tracks.points) == 0 and any(np.any(each.depth) for each in maps.values()):
         yield Finding(TRACKS, "has no points")
     for k, view in enumerate(track_views(sequence.frames)):
@@ -164,16 +159,12 @@ def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[Float
     return np.min(around, axis=0, initial=np.inf), np.max(around, axis=0, initial=0.0)
 
 
-def tracks_again(
-    sequence: Sequence, rays: Rays, reported: Collection[str]
-) -> Iterator[tuple[str, Finding | None, bool]]:
+@skips_unreadable
+def tracks_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
     """As ``channel_checks.channels_again``, of tracks: what rays say of each frame."""
     if "tracks" not in sequence.channels or TRACKS in reported:
         return
-    try:
-        tracks = sequence.tracks()
-    except RsbenchError:  # reported already
-        return
+    tracks = sequence.tracks()
     views = enumerate(track_views(sequence.frames))
     wrong: list[BoolArray] = [_classes_unlike(sequence, tracks, k, view, rays) for k, view in views]
     share = float(np.mean(wrong)) if len(tracks.points) else 0.0
@@ -188,12 +179,14 @@ def _classes_unlike(sequence: Sequence, tracks: Tracks, k: int, view: View, rays
 
 
 _UNIT = 1e-6
-"""Of a length: normals are rounded to float32."""
+"""Tolerance of a length: normals are rounded to float32."""
 _SAME_DERIVATIVE = 1e-6
-"""Of a derivative, relative to its largest entry: what rounding of normals and rows leaves at a grazing view."""
+"""Tolerance of a derivative, relative to its largest entry: what rounding of normals and rows leaves at a grazing
+view."""
 _FEW_WITHOUT_NORMAL = 0.02
 
 
+@reports_unreadable
 def affine_faults(
     sequence: Sequence,
     maps: Mapping[ImageView, DepthMap],
@@ -206,11 +199,7 @@ def affine_faults(
     """
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
-    try:
-        affine, tracks = sequence.affine(), sequence.tracks()
-    except RsbenchError as error:
-        yield Finding.of(error)
-        return
+    affine, tracks = sequence.affine(), sequence.tracks()
     if affine.jacobians.shape[:2] != tracks.tau.shape:
         yield Finding(AFFINE, f"is of {affine.jacobians.shape[:2]} points and views, tracks of {tracks.tau.shape}")
         return
@@ -277,16 +266,12 @@ def _normal_faults(
         yield Finding(AFFINE, what, part=f"{depth.view.side}_{depth.view.frame}")
 
 
-def affine_again(
-    sequence: Sequence, rays: SurfaceRays, reported: Collection[str]
-) -> Iterator[tuple[str, Finding | None, bool]]:
+@skips_unreadable
+def affine_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
     """As ``channel_checks.channels_again``, of affine frames: what rays meet at the points of the tracks."""
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
-    try:
-        stored, tracks = sequence.affine(), sequence.tracks()
-    except RsbenchError:  # reported already
-        return
+    stored, tracks = sequence.affine(), sequence.tracks()
     made = make_affine(sequence, tracks, rays)
     wrong = np.any(np.abs(made.normals - stored.normals) > 10 * _UNIT, axis=1)
     bad = np.sum(wrong) > max(_FEW_AGAIN * len(wrong), _LEAST)
@@ -296,19 +281,20 @@ def affine_again(
     yield AFFINE, Finding(AFFINE, what) if bad else None, same
 
 
-"""Of distances, and px: roundings, and the 1e-9 px to which rows are solved over a small slope."""
 _BESIDE_ALL, _FEW_BESIDE = 1e-2, 0.15
 """Relative distance from all that the pixels around see, and the share of what may lie beyond, by things thinner
 than a pixel: keypoints sit at edges."""
 _FEW_OTHERS = 0.02
-"""Of what is compared on flat surfaces, with what is matched again on another processor, and with other rays."""
+"""Share of matches that may differ on flat surfaces, when matched again on another processor, and by other
+rays."""
 _AGREES_PX = 1e-3
-"""Of places made again by rays: depth is rounded to float32."""
+"""Tolerance of places computed again by rays, px: depth is rounded to float32."""
 Report = Callable[..., Finding]
 """Makes findings of one pair of views, from their words."""
 _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 
 
+@reports_unreadable
 def match_faults(
     sequence: Sequence, maps: Mapping[ImageView, DepthMap], reported: Collection[str], first: int = 0
 ) -> Iterator[Finding]:
@@ -322,11 +308,7 @@ def match_faults(
     yield from _record_faults(sequence, matching, reported)
     if (stored := matches_file(first)) in reported:
         return
-    try:
-        matches = sequence.matches(first)
-    except RsbenchError as error:
-        yield Finding.of(error)
-        return
+    matches = sequence.matches(first)
     for k, (name, views) in enumerate(MATCHED.items()):
         source, target = (at(view, first) for view in views)
         part, found = matches.of_pair(k), partial(Finding, stored, part=name)
@@ -340,15 +322,12 @@ def match_faults(
         yield from _class_faults(sequence, part, source, target, maps, reported, matching.bound_px, found)
 
 
+@reports_unreadable
 def _record_faults(sequence: Sequence, matching: Matching, reported: Collection[str]) -> Iterator[Finding]:
     """matcher.json against sequence.json, and against the card of the same name where this version wrote it."""
     if MATCHER in reported:
         return
-    try:
-        record = sequence.matcher()
-    except RsbenchError as error:
-        yield Finding.of(error)
-        return
+    record = sequence.matcher()
     own = record.get("versions") == _versions() and matching.features in list_cards("features")
     made = matcher_record(matching) if own else asdict(matching)
     for key, value in made.items():
@@ -488,16 +467,12 @@ def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Itera
             yield Finding(file, what, part=name)
 
 
-def matches_again(
-    sequence: Sequence, first: int, rays: MatchRays, reported: Collection[str]
-) -> Iterator[tuple[str, Finding | None, bool]]:
+@skips_unreadable
+def matches_again(sequence: Sequence, first: int, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
     """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
     if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
         return
-    try:
-        stored = sequence.matches(first)
-    except RsbenchError:  # reported already
-        return
+    stored = sequence.matches(first)
     as_given = Arranged(stored.sets, stored.tracks, stored.pixels)
     made = labelled(sequence, first, as_given, (sequence.matching or Matching()).bound_px, rays)
     with np.errstate(invalid="ignore"):

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core import so3
-from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import Side, views_of
 from rsbench.core.se3 import inverse
@@ -29,30 +28,26 @@ from rsbench.dataset.imu import (
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.timing import TIMING_COLUMNS, TIMING_MANIFEST, table_file, timing_manifest, timing_table
 from rsbench.storage.files import read_pose_table
-from rsbench.verification.findings import Finding, cheapest_cause, rows_of
+from rsbench.verification.findings import Finding, cheapest_cause, reports_unreadable, rows_of
 
 _ROUNDING = 1e-12
-"""Of row times (frame periods), quaternions and places (metres): a thousand roundings of numbers near 1."""
+"""Tolerance of row times (frame periods), quaternions and places (metres): a thousand roundings of numbers near
+1."""
 
 
 def pose_faults(sequence: Sequence) -> Iterator[Finding]:
     """Stored row poses that are not the motion at the row times."""
     for side, frame in views_of(sequence.frames):
-        file = f"poses/{side}_{frame}.csv"
-        try:
-            table = read_pose_table(sequence.folder / file)
-        except RsbenchError as error:
-            yield Finding.of(error)
-            continue
-        if len(table) != (lines := sequence.shutter.lines(side)):
-            yield Finding(file, f"has {len(table)} rows, the camera has {lines}")
-        else:
-            yield from _pose_table_faults(sequence, file, side, frame, table)
+        yield from _pose_table_faults(sequence, side, frame)
 
 
-def _pose_table_faults(
-    sequence: Sequence, file: str, side: Side, frame: int, table: FloatArray
-) -> Iterator[Finding]:
+@reports_unreadable
+def _pose_table_faults(sequence: Sequence, side: Side, frame: int) -> Iterator[Finding]:
+    file = f"poses/{side}_{frame}.csv"
+    table = read_pose_table(sequence.folder / file)
+    if len(table) != (lines := sequence.shutter.lines(side)):
+        yield Finding(file, f"has {len(table)} rows, the camera has {lines}")
+        return
     norm = np.linalg.norm(table[:, 2:6], axis=1)
     zero = norm == 0
     if np.any(zero):
@@ -87,7 +82,7 @@ def _pose_table(sequence: Sequence, side: Side, frame: int) -> FloatArray:
 
 
 def _differences(table: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of each row: time (frame periods), angle (rad) and place (m)."""
+    """Differences of each row: time (frame periods), angle (rad) and place (m)."""
     R = so3.from_quaternion(table[:, 2:6])
     angle = so3.angle(R @ np.swapaxes(expected[:, 1:10].reshape(-1, 3, 3), -1, -2))
     place = np.max(np.abs(table[:, 6:9] - expected[:, 10:]), axis=1)
@@ -123,19 +118,14 @@ def timing_faults(sequence: Sequence, reported: Collection[str]) -> Iterator[Fin
     """Where timing.json and its tables differ from sequence.json and the poses, but for files ``reported``."""
     if "timing" not in sequence.channels:
         return
-    try:
-        if TIMING_MANIFEST not in reported:
-            yield from _timing_manifest_faults(sequence)
-    except RsbenchError as error:
-        yield Finding.of(error)
+    if TIMING_MANIFEST not in reported:
+        yield from _timing_manifest_faults(sequence)
     for side, frame in views_of(sequence.frames):
-        try:
-            if table_file(side, frame) not in reported:
-                yield from _timing_table_faults(sequence, side, frame, reported)
-        except RsbenchError as error:
-            yield Finding.of(error)
+        if table_file(side, frame) not in reported:
+            yield from _timing_table_faults(sequence, side, frame, reported)
 
 
+@reports_unreadable
 def _timing_manifest_faults(sequence: Sequence) -> Iterator[Finding]:
     stored = sequence.timing()
     expected = timing_manifest(sequence.shutter, sequence.frame_period_s, sequence.sensor, sequence.frames)
@@ -150,6 +140,7 @@ def _timing_manifest_faults(sequence: Sequence) -> Iterator[Finding]:
                 yield Finding(TIMING_MANIFEST, f"{key}.{name} = {own.get(name)!r}, sequence.json makes {part!r}")
 
 
+@reports_unreadable
 def _timing_table_faults(
     sequence: Sequence, side: Side, frame: int, reported: Collection[str]
 ) -> Iterator[Finding]:
@@ -185,23 +176,21 @@ _SIGMAS = 6.0
 _KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
 
 
+@reports_unreadable
 def imu_faults(sequence: Sequence, reported: Collection[str]) -> Iterator[Finding]:
     """What the inertial sensor shows that the motion cannot have made, but for files ``reported``."""
     if "imu" not in sequence.channels:
         return
-    try:
-        scene = sequence.manifest.get("scene")
-        gravity = gravity_of(scene if isinstance(scene, dict) else {})
-        imu = sequence.imu
-        if imu is None:
-            yield Finding("sequence.json", "lacks 'imu', the sensor of the channel of this name")
-            return
-        if IMU_MANIFEST not in reported:
-            yield from _imu_manifest_faults(sequence, imu, gravity)
-        if not {MEASURED, TRUE} & set(reported):
-            yield from _sample_faults(sequence, imu, gravity, sequence.inertial())
-    except RsbenchError as error:
-        yield Finding.of(error)
+    scene = sequence.manifest.get("scene")
+    gravity = gravity_of(scene if isinstance(scene, dict) else {})
+    imu = sequence.imu
+    if imu is None:
+        yield Finding("sequence.json", "lacks 'imu', the sensor of the channel of this name")
+        return
+    if IMU_MANIFEST not in reported:
+        yield from _imu_manifest_faults(sequence, imu, gravity)
+    if not {MEASURED, TRUE} & set(reported):
+        yield from _sample_faults(sequence, imu, gravity, sequence.inertial())
 
 
 def _imu_manifest_faults(sequence: Sequence, imu: Imu, gravity: FloatArray) -> Iterator[Finding]:

@@ -7,32 +7,21 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import Geometry
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.views import (
-    FAR,
-    ImageView,
-    Seen,
-    SeenSurfaces,
-    carry,
-    numbers_of,
-    points_of,
-    seen_by,
-    seen_from,
-)
+from rsbench.dataset.views import ImageView, SeenSurfaces, carry, numbers_of
 
 T = TypeVar("T")
 _LEAST_ROWS = 64
-"""Of a band: starting a thread costs what some rows do."""
+"""Fewest rows of a band: starting a thread costs as much as some rows."""
 _threads = os.cpu_count() or 1
 
 
@@ -164,7 +153,7 @@ def _bending(camera: PinholeCamera) -> _Bending:
 
 
 def _second_differences(values: FloatArray) -> tuple[FloatArray, ...]:
-    """Of (H, W, ...) across, down and twist, as ``DepthMap._bends``."""
+    """Second differences of values (H, W, ...): across, down and twist, as in ``DepthMap._bends``."""
     return np.diff(values, 2, axis=1), np.diff(values, 2, axis=0), np.diff(np.diff(values, axis=0), axis=1)
 
 
@@ -188,82 +177,38 @@ class Reprojection(NamedTuple):
 def reproject(geometry: Geometry, source: DepthMap, target: DepthMap, stride: int = 1) -> Reprojection:
     """Carry every ``stride``-th pixel of the source, in both directions, into the target."""
     depth = source.depth[::stride, ::stride]
-    labels = None if source.labels is None else numbers_of(source.labels[::stride, ::stride])
     found = Reprojection(np.full((*depth.shape, 2), np.nan, np.float32), np.full(depth.shape, np.nan, np.float32))
     step = max(1, _CHUNK_PIXELS // depth.shape[1])
     for first in range(0, len(depth), step):
         rows = slice(first, first + step)
-        numbers = None if labels is None else labels[rows]
-        in_image = range(len(source.depth))[::stride][rows]
-        seen = _carried(geometry, source.view, target, depth[rows], in_image, numbers, stride)
-        found.pixels[rows] = seen.pixels
-        found.relative[rows] = relative_depth(target, seen.pixels, seen.depth, depth[rows] == 0, seen.ideal)
+        pixels, x_in_cam = seen_in(geometry, source, target, range(len(source.depth))[::stride][rows], stride)
+        ideal = target.camera.ideal.project(x_in_cam)
+        found.pixels[rows] = pixels
+        found.relative[rows] = relative_depth(target, pixels, x_in_cam[..., 2], depth[rows] == 0, ideal)
     return found
 
 
-class _Landed(NamedTuple):
-    """Where the target sees pixels of the source."""
+def seen_in(
+    geometry: Geometry, source: DepthMap, target: DepthMap, rows: range, stride: int
+) -> tuple[FloatArray, FloatArray]:
+    """Where the target sees what the source shows in some rows (h,) of every ``stride``-th column.
 
-    pixels: FloatArray
-    """(h, w, 2) px in the target, NaN outside of it."""
-    depth: FloatArray
-    """(h, w) z in the target's camera, m."""
-    ideal: FloatArray
-    """(h, w, 2) px that the target without its lens would see."""
-
-
-def _carried(
-    geometry: Geometry,
-    source: ImageView,
-    target: DepthMap,
-    depth: NDArray[np.float32],
-    rows: range,
-    numbers: NDArray[np.uint8] | None,
-    stride: int,
-) -> _Landed:
-    """Where the target sees rows (h,) of every ``stride``-th column of the source, of this depth (h, w)."""
-    surfaces = SeenSurfaces(geometry, source, depth, rows, numbers, stride)
-    in_camera = np.full((*depth.shape, 3), np.nan)
-    try:
-        pixels = carry(surfaces, target.view, in_camera, by_bands).landed.pixels
-    except RsbenchError:  # no table of poses follows the motion: the pose at each pixel's own time
-        z = np.where(surfaces.sky, FAR, depth)
-        seen = seen_with(geometry, source, target.view, surfaces.grid, z, numbers)
-        return _Landed(seen.pixels, seen.depth, target.camera.ideal_pixels(seen.pixels))
-    return _Landed(pixels, in_camera[..., 2], target.camera.ideal.project(in_camera))
-
-
-def seen_with(
-    geometry: Geometry,
-    source: ImageView,
-    target: ImageView,
-    pixels: FloatArray,
-    depth: FloatArray,
-    numbers: NDArray[np.uint8] | None,
-) -> Seen:
-    """Where a target sees what a source sees at pixels (..., 2) with depth (...).
-
-    ``numbers`` (...) of the objects that are seen, and move in between; 0 and None of what stands still.
+    Returns:
+        Pixels (h, w, 2), NaN outside of the target; the points (h, w, 3) in its camera then, metres.
     """
-
-    def of(number: int, chosen: Any) -> Seen:
-        own = seen_from(geometry, number)
-        X = points_of(own, source, pixels[chosen], depth[chosen])
-        return seen_by(own, target, X, pixels[chosen][..., own.shutter.axis(target.side)])
-
-    seen = of(0, ...)
-    for number in () if numbers is None else np.unique(numbers[numbers > 0]):
-        chosen = numbers == number
-        for whole, part in zip(seen[:2], of(int(number), chosen)[:2], strict=True):
-            whole[chosen] = part
-    return seen
+    depth = source.depth[rows, ::stride]
+    numbers = None if source.labels is None else numbers_of(source.labels[rows, ::stride])
+    surfaces = SeenSurfaces(geometry, source.view, depth, rows, numbers, stride)
+    x_in_cam = np.full((*depth.shape, 3), np.nan)
+    found = carry(surfaces, target.view, x_in_cam, any_motion=True, by_bands=by_bands)
+    return found.landed.pixels, x_in_cam
 
 
 def without_changing_light(
     sequence: Sequence, source: DepthMap, target: DepthMap, reprojection: Reprojection, stride: int
 ) -> Reprojection:
-    """The same without what colours do not tell: gloss, and what turns, or is shaded by what moves, at another
-    time."""
+    """The same without pixels whose colours may change: gloss, and what moves, or is shaded by what moves, at
+    another time."""
     one_time = source.view.side != target.view.side and sequence.shutter.plain and sequence.rig.rectified
     changing = [_changing(each, one_time) for each in (source, target)]
     if not any(map(np.any, changing)):

@@ -154,11 +154,11 @@ Rerender = Literal["no", "auto", "all"]
 _ALIKE = (": the same bits", ": the same but for rounding")
 """Ends of the note where nothing differs."""
 _ROWS = 16
-"""Of an image, with ``auto``."""
+"""Rows of each image that ``auto`` renders again."""
 _COMPRESSED = 4
-"""Of the rows of a compressed frame one in so many: each takes 48 rows of the sensor."""
+"""One in so many of these rows is made of a compressed frame: each takes 48 rows of the sensor."""
 _MOST_RAYS = 2e8
-"""Of a sequence, with ``auto``: fewer rows where the samples are many."""
+"""Rays of a sequence with ``auto``: the more samples, the fewer rows."""
 
 
 @dataclass(eq=False)
@@ -167,9 +167,9 @@ class Rerenderer:
 
     mode: Rerender
     scene_cards: Many[Path] = ()
-    """Of scenes that are not rsbench's own. What a dataset says of its scene is a name, and never opened."""
+    """Cards of scenes that are not rsbench's own. The scene that a dataset names is never opened as a file."""
     mesh_files: Many[Path] = ()
-    """Of objects that move, likewise."""
+    """Mesh files of moving objects, likewise."""
     _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
 
     def depth_is_rendered(self, content: Content, view: ImageView) -> bool:
@@ -181,9 +181,9 @@ class Rerenderer:
 
     def image_is_rendered(self, content: Content, view: ImageView) -> bool:
         """Whether a picture, without its sensor, is what its scene looks like: all of it, with all samples."""
-        manifest, camera = content.sequence.manifest, content.sequence.rig.sensor(view.side)
+        camera = content.sequence.rig.sensor(view.side)
         with contextlib.suppress(RsbenchError):  # reported by ``check``
-            options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+            options = _options_of(content.sequence)
             rows = list(range(camera.height))
             if _rays_of(camera.width, options) * camera.height > _MOST_RAYS:
                 return False
@@ -193,7 +193,7 @@ class Rerenderer:
         return False
 
     def cleared(self, content: Content, accused: Collection[str]) -> set[str]:
-        """Of files of channels those that are the same, bit for bit, when all of them is made again by rays."""
+        """The accused files of channels whose bits are the same when they are made again by rays."""
         from rsbench.renderers.visibility import SceneRays
 
         sequence, same = content.sequence, set[str]()
@@ -216,8 +216,7 @@ class Rerenderer:
 
     def whole(self, content: Content, view: ImageView) -> tuple[MitsubaScene, Frame]:
         """The scene of a sequence, and a whole frame of it, of one sample."""
-        manifest = content.sequence.manifest
-        options = parse_card(RendererOptions, _table(manifest, "renderer"), "sequence.json: renderer")
+        options = _options_of(content.sequence)
         scene, _ = self.scene(content.sequence)
         quick = replace(options, samples=1, integrator="sunsky")
         rows = list(range(content.sequence.rig.sensor(view.side).height))
@@ -260,9 +259,7 @@ class RerenderedRows:
         self._sequence, self._checks = sequence, list[RowCheck]()
         self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
         try:
-            self._options = parse_card(
-                RendererOptions, _table(sequence.manifest, "renderer"), "sequence.json: renderer"
-            )
+            self._options = _options_of(sequence)
             self._scene, self._digest = again.scene(sequence)
         except RsbenchError as error:
             self._refusal = f"no row rendered again: {error}"
@@ -341,6 +338,10 @@ def _rays_of(pixels: int, options: RendererOptions) -> int:
     return pixels * options.samples * (options.max_depth if options.integrator == "path" else 1)
 
 
+def _options_of(sequence: Sequence) -> RendererOptions:
+    return parse_card(RendererOptions, _table(sequence.manifest, "renderer"), "sequence.json: renderer")
+
+
 def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
     table = manifest.get(key)
     if not isinstance(table, dict):
@@ -372,10 +373,10 @@ def _row_checks(
         rays = SceneRays(scene, content.sequence.objects)
         again = channels_again(content.sequence, view, rows, frame, rays, reported)
         yield from (RowCheck(*check) for check in again)
-        if view.shutter == "rs":
-            yield from _frame_checks(content, scene, options, view, rows, reported)
-        elif content.sequence.exposed_twins:
-            yield from _exposed_check(content, scene, options, view, rows, reported)
+        yield from _sensed_check(content, scene, options, view, rows, reported)
+        if view.shutter == "rs" and whole_frames(content.sequence.manifest):
+            with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+                yield _stack_check(content, scene, _of_image(content, options, view), view, rows)
 
 
 def _picture_check(
@@ -389,7 +390,7 @@ def _picture_check(
     return image_check(file, stored, rendered, rows, noisy, _by_gpu(content))
 
 
-def _frame_checks(
+def _sensed_check(
     content: Content,
     scene: MitsubaScene,
     options: RendererOptions,
@@ -397,52 +398,32 @@ def _frame_checks(
     rows: list[int],
     reported: set[str],
 ) -> Iterator[RowCheck]:
-    """What lies beside a clean rolling-shutter frame: what its sensor makes of it, and the stack of whole frames.
+    """What the sensor makes of a rolling-shutter frame, or shows of a global-shutter picture without noise.
 
-    Each row of a sensor has random numbers of its own, and so its bits without the others; of an image that was
-    interpolated or compressed, with those around.
+    Each row of a sensor has random numbers of its own, so it can be made alone with the same bits; a row of an
+    image that was interpolated or compressed is made with the rows around it.
     """
     from rsbench.renderers.render import sensed_rows
 
-    sequence, chosen, elsewhere = content.sequence, _of_image(content, options, view), not _made_here(content)
-    with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
-        if sequence.sensor is not None and view.image not in reported:
-            seen = Picture.of(view, sequence.image(*view[:3]), noisy=False)
-            sensor = sequence.sensor.of(view.side, view.frame)
-            some = rows[::_COMPRESSED] if sensor.jpeg_quality and len(rows) < len(seen.colours) else rows
-            period = sequence.frame_period_s
-            sensed = sensed_rows(scene, sequence, (view.side, view.frame), sensor, period, chosen, some)
-            yield image_check(view.image, seen, sensed, some, elsewhere, _by_gpu(content))
-    with contextlib.suppress(RsbenchError):
-        if whole_frames(sequence.manifest):
-            yield _stack_check(content, scene, chosen, view, rows)
-
-
-def _exposed_check(
-    content: Content,
-    scene: MitsubaScene,
-    options: RendererOptions,
-    view: ImageView,
-    rows: list[int],
-    reported: set[str],
-) -> Iterator[RowCheck]:
-    """The global-shutter image as the sensor exposes it."""
-    from rsbench.renderers.render import sensed_rows
-
-    sequence, chosen = content.sequence, _of_image(content, options, view)
-    if sequence.sensor is None or view.exposed in reported:
+    sequence, rolling = content.sequence, view.shutter == "rs"
+    file = view.image if rolling else view.exposed
+    if sequence.sensor is None or file in reported or not (rolling or sequence.exposed_twins):
         return
     with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
-        seen = Picture.of(view, sequence.exposed_image(*view[1:]), noisy=False)
-        sensor, place = sequence.sensor.of(view.side, view.frame).noiseless, (view.side, view.frame)
-        made = sensed_rows(scene, sequence, place, sensor, sequence.frame_period_s, chosen, rows, view.row)
-        yield image_check(view.exposed, seen, made, rows, not _made_here(content), _by_gpu(content))
+        image = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
+        seen, sensor = Picture.of(view, image, noisy=False), sequence.sensor.of(view.side, view.frame)
+        sensor, twin = (sensor, None) if rolling else (sensor.noiseless, view.row)
+        few = rolling and sensor.jpeg_quality and len(rows) < len(seen.colours)
+        some, chosen = rows[::_COMPRESSED] if few else rows, _of_image(content, options, view)
+        place, period = (view.side, view.frame), sequence.frame_period_s
+        made = sensed_rows(scene, sequence, place, sensor, period, chosen, some, twin)
+        yield image_check(file, seen, made, some, not _made_here(content), _by_gpu(content))
 
 
 def _stack_check(
     content: Content, scene: MitsubaScene, chosen: RendererOptions, view: ImageView, rows: list[int]
 ) -> RowCheck:
-    """Of whole frames at the poses of some rows, other rows: each of these rows at the pose of another."""
+    """Rows of the stack at other rows' poses: row i of the image that is rendered at the pose of row j."""
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import LinePoses, render
 

@@ -45,15 +45,15 @@ _MOST, _MOST_OF_ROWS = 0.02, 0.1
 """Share of the values of an image, or of a row of pixels or blocks, that may be otherwise. Sound: none of a
 mosaic; of JPEG up to 1.2e-2 at quality 20, 1e-3 at 90."""
 _LEAST, _LEAST_OF_ROWS = 200, 20
-"""Values that must tell."""
+"""Smallest numbers of values from which an image, or a row, is judged."""
 _NEAR = 1.5
 """Codes by which a value may differ from the mean of its neighbours. All are rounded by half a code; in the mean
 that of a bright neighbour counts up to twice."""
 _COARSE, _OFF = 4, 1.25
-"""Steps from which on a coefficient tells, and how far it may be from whole steps: six standard deviations of what
-rounding to codes leaves where it differs from pixel to pixel. Of those that were not rounded to a step of 4, a
-third are farther off. Where values of a block repeat, as in equal rows, so do their rounding errors, which add up:
-more is allowed, by the root of how often each value is there."""
+"""The smallest step at which a coefficient is judged, and how far it may be from whole steps: six standard
+deviations of what rounding to codes leaves where it differs from pixel to pixel. Of those that were not rounded to
+a step of 4, a third are farther off. Where values of a block repeat, as in equal rows, so do their rounding
+errors, which add up: more is allowed, by the root of how often each value is there."""
 _OPEN = 125.0
 """Luminance about grey beyond which it may have been cut off."""
 _FIRST = 1.0 / np.sqrt(2.0)
@@ -62,13 +62,13 @@ _DCT = 0.5 * np.cos(np.pi / 16 * np.outer(np.arange(8), 2 * np.arange(8) + 1)) *
 
 
 class _Counts(NamedTuple):
-    """Of each row of pixels (H,) how many values are not what they should be, and how many tell."""
+    """For each row of pixels (H,): how many values are wrong, and how many can be judged."""
 
     wrong: FloatArray
     judged: FloatArray
 
     def rows(self) -> NDArray[np.bool_]:
-        """(H,) those in which too many are wrong; none where the values do not tell."""
+        """(H,) those in which too many are wrong; none where too few values can be judged."""
         bad = (self.wrong > _MOST_OF_ROWS * self.judged) & (self.judged >= _LEAST_OF_ROWS)
         if np.sum(self.judged) >= _LEAST and np.sum(self.wrong) > _MOST * np.sum(self.judged):
             bad |= self.wrong > _MOST * self.judged
@@ -76,7 +76,7 @@ class _Counts(NamedTuple):
 
 
 def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> Finding | None:
-    """An image (H, W, 3) that is not compressed or interpolated as its sensor's are; None where nothing tells.
+    """An image (H, W, 3) that is not compressed or interpolated as its sensor's are; None where nothing shows it.
 
     Compressed images do not show a mosaic any more.
     """
@@ -148,7 +148,7 @@ class _Blocks(NamedTuple):
     distinct: NDArray[np.int64]
     """(...) how many values of luminance they have."""
     rows: int
-    """Of pixels in the image."""
+    """Rows of pixels in the image."""
 
     @classmethod
     def of(cls, image: NDArray[np.uint8]) -> _Blocks:
@@ -181,18 +181,19 @@ def quality_steps(quality: int) -> FloatArray:
 
 
 _BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
-"""Of Gaussian noise 6e-7 are beyond, of Poisson numbers in the dark more; and a blur sees what lies between the
-samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show. This share
-is for four samples, and grows with the distance between them."""
+"""A share of 6e-7 of Gaussian noise lies beyond, and more of Poisson noise in the dark; a blur sees what lies
+between the samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show. This
+share is for four samples, and grows with the distance between them."""
 _LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
 """The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
 _COMPRESSED_RANGE, _BLOCKS_ALIKE = (0.5, 2.0), 10
-"""Of a compressed image over that of the clean twin after the same; its noise is that of blocks, not of values:
-both numbers are chosen, not measured."""
+"""Variance of a compressed image over that of the clean twin after the same compression; its noise is that of
+blocks, not of values: both numbers are chosen, not measured."""
 _JPEG_REACH = 17
 """Pixels over which JPEG spreads what it leaves out: a block of colours of half the resolution, and one more."""
 _MOST_BIAS = 0.75
-"""Of the mean, in sigma: where the twin is uneven by less than one sigma, its middle is off by half at most."""
+"""Largest difference of the means, in sigma: where the twin is uneven by less than one sigma, its middle is off by
+half at most."""
 _FARTHER = 3
 _UNCLIPPED = (0.03, 0.75)
 _WHITE = 255.0
@@ -275,7 +276,7 @@ def _window(
     rig, shutter, motion = seen_from(sequence, number)[:3]
     tau = shutter.pixel_time(grid, view.frame, view.side)
     if view.shutter == "gs":
-        line = shutter.line_times(view.frame, view.side)[abs(shutter.first_line(view.side) - view.row)]
+        line = shutter.line_times(view.frame, view.side)[shutter.line_after(view.row, view.side)]
         tau = np.full(tau.shape, line)
     rays = depth_map.camera.unproject(grid) * np.where(depth > 0, depth, FAR)[:, None]
     X = transform(inverse(rig.cam_from_world(motion, tau, view.side)), rays)

@@ -19,7 +19,7 @@ from commands import assert_refused, bytes_below, run_here
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard
-from rsbench.dataset.destinations import store_destination
+from rsbench.dataset.destinations import open_destination
 from rsbench.dataset.generation import Built, generate_dataset
 from rsbench.renderers import scene, visibility
 from rsbench.storage.object_store import Store, path_or_url
@@ -161,7 +161,7 @@ def test_stopped_before_any_operation_it_goes_on_to_the_same_bytes(
 @pytest.mark.usefixtures("quick")
 def test_two_commands_do_not_send_to_one_store(boxes: DatasetCard, memory: Any) -> None:
     with (
-        store_destination(URL, 1, False),
+        open_destination(URL, 1, False),
         pytest.raises(RsbenchError, match=f"process {os.getpid()} on .* is at work"),
     ):
         generate_dataset(boxes, URL)

@@ -14,12 +14,14 @@ from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry, MovingObject
 from rsbench.core.motion import Motion
+from rsbench.core.projection import back_project, project_at, rs_project, rs_project_near
 from rsbench.core.rig import StereoRig
-from rsbench.core.se3 import Pose
+from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.views import FAR, VIEW_PAIRS, ImageView, SeenSurfaces, carry
-from rsbench.verification.reprojection import DepthMap, Reprojection, relative_depth, reproject, seen_with
+from rsbench.dataset.views import FAR, VIEW_PAIRS, ImageView, SeenSurfaces, carry, seen_from
+from rsbench.verification.reprojection import DepthMap, Reprojection, relative_depth, reproject
 
 W, D = [0.03, -0.05, 0.04], [0.2, -0.1, 0.25]
 CAMERA = PinholeCamera.centred(64, 48, 60.0)
@@ -68,12 +70,39 @@ def both_ways(
 ) -> tuple[Reprojection, Reprojection]:
     depth = source.depth[::stride, ::stride].astype(np.float64)
     grid, sky = source.camera.pixel_grid()[::stride, ::stride], depth == 0
-    numbers = None if source.labels is None else source.labels[::stride, ::stride]
-    seen = seen_with(geometry, source.view, target.view, grid, np.where(sky, FAR, depth), numbers)
-    ideal = target.camera.ideal_pixels(seen.pixels)
-    relative = relative_depth(target, seen.pixels, seen.depth, sky, ideal)
-    exact = Reprojection(seen.pixels.astype(np.float32), relative.astype(np.float32))
+    numbers = np.zeros(depth.shape) if source.labels is None else source.labels[::stride, ::stride]
+    pixels, z = np.full(grid.shape, np.nan), np.full(depth.shape, np.nan)
+    for number in np.unique(numbers).astype(int):
+        chosen = numbers == number
+        own = seen_from(geometry, number)
+        X = world_points(own, source.view, grid[chosen], np.where(sky, FAR, depth)[chosen])
+        pixels[chosen], z[chosen] = where_seen(own, target.view, X, grid[chosen])
+    relative = relative_depth(target, pixels, z, sky, target.camera.ideal_pixels(pixels))
+    exact = Reprojection(pixels.astype(np.float32), relative.astype(np.float32))
     return reproject(geometry, source, target, stride), exact
+
+
+def world_points(geometry: FixedGeometry, view: ImageView, pixels: FloatArray, z: FloatArray) -> FloatArray:
+    rig, shutter, motion = geometry[:3]
+    if view.shutter == "rs":
+        return back_project(rig, shutter, motion, view.side, view.frame, pixels, z)
+    pose = rig.cam_from_world(motion, shutter.time_after(view.row, view.frame, view.side), view.side)
+    return transform(inverse(pose), z[..., None] * rig.sensor(view.side).unproject(pixels))
+
+
+def where_seen(
+    geometry: FixedGeometry, view: ImageView, X: FloatArray, near: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    rig, shutter, motion = geometry[:3]
+    if view.shutter == "rs":
+        lines = near[..., shutter.axis(view.side)]
+        found = rs_project_near(rig, shutter, motion, view.side, view.frame, X, lines)
+        if motion.name == "kinked":  # some points are seen twice: the first row counts
+            found = rs_project(rig, shutter, motion, view.side, view.frame, X)
+        return found.pixels, found.depth
+    seen = project_at(rig, motion, view.side, shutter.time_after(view.row, view.frame, view.side), X)
+    seen[~rig.sensor(view.side).contains(seen[..., :2])] = np.nan
+    return seen[..., :2], seen[..., 2]
 
 
 def check_alike(found: Reprojection, exact: Reprojection) -> None:
