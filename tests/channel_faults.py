@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from rsbench.core import so3
 from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
-from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled, save_matches
+from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.tracks import AffineFrames, jacobians_of, save_affine
+from rsbench.dataset.tracks import AffineFrames, jacobians_of
 from rsbench.dataset.views import PixelClass
 from rsbench.renderers.image import to_srgb8
 from rsbench.storage.files import (
@@ -249,7 +249,7 @@ def farther(folder: Path) -> None:
     """Keypoints that see what is a tenth farther away, with all that follows from it."""
     arrays = load_arrays(folder / _MATCHES)
     found, rays = Arranged(*(arrays[name] for name in Arranged._fields)), Depths(1.1 * arrays["depth"])
-    save_matches(folder / _MATCHES, labelled(read_sequence(folder), 0, found, Matching().bound_px, rays))
+    labelled(read_sequence(folder), 0, found, Matching().bound_px, rays).save(folder / _MATCHES)
 
 
 def one_view(k: int, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Callable[[NDArray[Any]], NDArray[Any]]:
@@ -279,9 +279,8 @@ def on_another_plane(folder: Path) -> None:
     """All normals turned by 20 degrees, and derivatives of these planes."""
     sequence, normals = read_sequence(folder), load_arrays(folder / AFFINE)["normals"]
     turned = normals @ so3.exp(np.array([0.35, 0.0, 0.0]))
-    save_affine(
-        folder / AFFINE, AffineFrames(jacobians=jacobians_of(sequence, sequence.tracks(), turned), normals=turned)
-    )
+    made = AffineFrames(jacobians=jacobians_of(sequence, sequence.tracks(), turned), normals=turned)
+    made.save(folder / AFFINE)
 
 
 FAULTS |= {

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry, Geometry
-from rsbench.core.rig import FRAMES, VIEWS, Side, StereoRig, View, views_of
+from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.imu import (
@@ -37,8 +37,6 @@ from rsbench.dataset.matches import (
     Matching,
     make_matches,
     matcher_record,
-    read_matches,
-    save_matches,
 )
 from rsbench.dataset.timing import TIMING_MANIFEST, read_timing_table, table_file, timing_files, write_timing
 from rsbench.dataset.tracks import (
@@ -46,10 +44,6 @@ from rsbench.dataset.tracks import (
     Tracks,
     make_affine,
     make_tracks,
-    read_affine,
-    read_tracks,
-    save_affine,
-    write_tracks,
 )
 from rsbench.dataset.views import (
     ImageView,
@@ -376,7 +370,7 @@ class _Tracks(TruthChannel):
         return (TRACKS,)
 
     def write_whole(self, whole: SequenceTruth) -> None:
-        write_tracks(whole.folder / TRACKS, whole.tracks)
+        whole.tracks.save(whole.folder / TRACKS)
 
 
 class _Affine(TruthChannel):
@@ -389,7 +383,7 @@ class _Affine(TruthChannel):
         return (AFFINE,)
 
     def write_whole(self, whole: SequenceTruth) -> None:
-        save_affine(whole.folder / AFFINE, make_affine(whole.geometry, whole.tracks, whole.rays))
+        make_affine(whole.geometry, whole.tracks, whole.rays).save(whole.folder / AFFINE)
 
 
 class _Radiance(_Pictures):
@@ -421,8 +415,7 @@ class _Matches(TruthChannel):
         for first in range(whole.geometry.frames - 1):
             views = [(side, first + frame) for side, frame in VIEWS]
             images = {view: read_png(folder / ImageView("rs", *view).image) for view in views}
-            made = make_matches(whole.geometry, first, images, matching, whole.rays)
-            save_matches(folder / matches_file(first), made)
+            make_matches(whole.geometry, first, images, matching, whole.rays).save(folder / matches_file(first))
 
 
 OBJECTS: dict[str, TruthChannel] = {
@@ -629,18 +622,21 @@ class ChannelReader:
 
     def tracks(self) -> Tracks:
         """Surface points and where the frames see them; RsbenchError as of ``channel_values``."""
-        return read_tracks(self._path("tracks", TRACKS), self.frames)
+        found, views = Tracks.read(path := self._path("tracks", TRACKS)), len(SIDES) * self.frames
+        if found.tau.shape[1] != views:
+            raise RsbenchError(f"{path}: is of {found.tau.shape[1]} views, the sequence has {views}")
+        return found
 
     def affine(self) -> AffineFrames:
         """How the surroundings of the tracks' points lie in the frames; RsbenchError as of ``channel_values``."""
-        return read_affine(self._path("affine", AFFINE))
+        return AffineFrames.read(self._path("affine", AFFINE))
 
     def matches(self, first: int = 0) -> LabelledMatches:
         """What a feature matcher found in frame ``first`` and the next, and what is true.
 
         RsbenchError as of ``channel_values``.
         """
-        return read_matches(self._path("matches", matches_file(first + self.first)))
+        return LabelledMatches.read(self._path("matches", matches_file(first + self.first)))
 
     def matcher(self) -> dict[str, Any]:
         """Content of matches/matcher.json: the matcher; RsbenchError as of ``channel_values``."""

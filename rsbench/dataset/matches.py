@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from enum import IntEnum
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
@@ -12,16 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.correspondences import Correspondences, repeated
-from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import Geometry
 from rsbench.core.projection import ProjectionStatus, rs_project, rs_project_near
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
+from rsbench.dataset.tracks import ArrayFile
 from rsbench.dataset.views import FAR, Rays
-from rsbench.storage.files import save_arrays
-from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:
     from rsbench.pipeline.frame_depth import Images
@@ -79,7 +76,7 @@ class PairLabels(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LabelledMatches:
+class LabelledMatches(ArrayFile):
     """Matches (n), those of each pair of frames together, in the order of ``MATCHED``; tracks come first.
 
     Raises:
@@ -102,13 +99,10 @@ class LabelledMatches:
     """(n,) of ``MatchClass``."""
 
     def __post_init__(self) -> None:
-        n, f8, u1 = len(self.sets), np.dtype(np.float64), np.dtype(np.uint8)
-        wanted = {"sets": ((n,), u1), "tracks": ((n,), np.dtype(np.int32)), "pixels": ((n, 2, 2), f8)}
-        wanted |= {"depth": ((n,), f8), "truth": ((n, 2), f8), "error": ((n,), f8), "classes": ((n,), u1)}
-        for name, (shape, kind) in wanted.items():
-            value = getattr(self, name)
-            if value.shape != shape or value.dtype != kind:
-                raise ValueError(f"{name} is {value.dtype} of shape {value.shape}: {kind} of {shape} is needed")
+        n, f8 = len(self.sets), np.float64
+        found = {"sets": ((n,), np.uint8), "tracks": ((n,), np.int32), "pixels": ((n, 2, 2), f8)}
+        truth = {"depth": ((n,), f8), "truth": ((n, 2), f8), "error": ((n,), f8), "classes": ((n,), np.uint8)}
+        self.check_arrays(found | truth)
         if np.any(np.diff(self.sets.astype(int)) < 0) or np.any(self.sets >= len(MATCHED)):
             raise ValueError(f"sets must grow from 0 to {len(MATCHED) - 1} at most")
         if not np.all(np.isfinite(self.pixels)) or not np.all(np.isfinite(self.depth) & (self.depth >= 0.0)):
@@ -131,19 +125,6 @@ class LabelledMatches:
         whole = (np.bincount(self.tracks[kept & (self.tracks >= 0)]) == len(MATCHED)).nonzero()[0]
         at = [self.pixels[(self.sets == k) & (self.tracks >= 0)][whole] for k in (2, 3)]
         return Correspondences(**rows, tracks=np.concatenate(at, axis=1).reshape(-1, 8))
-
-
-def save_matches(path: Path, matches: LabelledMatches) -> None:
-    """The arrays by their names."""
-    save_arrays(path, {field.name: getattr(matches, field.name) for field in fields(matches)})
-
-
-def read_matches(path: Path) -> LabelledMatches:
-    """Raises RsbenchError as ``reading.load_arrays``, and for arrays that are no matches."""
-    try:
-        return LabelledMatches(**load_arrays(path))
-    except (TypeError, ValueError) as error:
-        raise RsbenchError(f"{path}: {error}") from error
 
 
 _TRACK_HALF = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7], "stereo_0": [0, 1, 2, 3], "stereo_1": [4, 5, 6, 7]}

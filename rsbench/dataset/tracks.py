@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from rsbench.core.camera import inverse_2x2
 from rsbench.core.errors import RsbenchError
@@ -39,7 +39,33 @@ def _source_type(views: int) -> np.dtype[Any]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tracks:
+class ArrayFile:
+    """Arrays that are stored as an npz file under the names of their fields."""
+
+    def check_arrays(self, wanted: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> None:
+        """Raises ValueError for an array of another shape or type than is wanted by its name."""
+        for name, (shape, kind) in wanted.items():
+            value = getattr(self, name)
+            if value.shape != shape or value.dtype != kind:
+                raise ValueError(
+                    f"{name} is {value.dtype} of shape {value.shape}: {np.dtype(kind)} of {shape} is needed"
+                )
+
+    def save(self, path: Path) -> None:
+        """Write the file."""
+        save_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read the file; RsbenchError as of ``load_arrays``, and for arrays that are not possible."""
+        try:
+            return cls(**load_arrays(path))
+        except (TypeError, ValueError) as error:
+            raise RsbenchError(f"{path}: {error}") from error
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tracks(ArrayFile):
     """Points (n) and what became of them in all frames (v), in the order of ``track_views``.
 
     Raises:
@@ -58,14 +84,10 @@ class Tracks:
     """(n, v) of ``PixelClass``: VISIBLE, OCCLUDED (the pixel is known), OUT_OF_VIEW or UNSOLVED."""
 
     def __post_init__(self) -> None:
-        n, f8, u1 = len(self.points), np.dtype(np.float64), np.dtype(np.uint8)
+        n, f8 = len(self.points), np.float64
         v = self.tau.shape[1] if self.tau.ndim == 2 and self.tau.shape[1] else 4
-        wanted = {"points": ((n, 3), f8), "sources": ((n,), _source_type(v)), "pixels": ((n, v, 2), f8)}
-        wanted |= {"tau": ((n, v), f8), "classes": ((n, v), u1)}
-        for name, (shape, kind) in wanted.items():
-            value = getattr(self, name)
-            if value.shape != shape or value.dtype != kind:
-                raise ValueError(f"{name} is {value.dtype} of shape {value.shape}: {kind} of {shape} is needed")
+        seen = {"pixels": ((n, v, 2), f8), "tau": ((n, v), f8), "classes": ((n, v), np.uint8)}
+        self.check_arrays({"points": ((n, 3), f8), "sources": ((n,), _source_type(v)), **seen})
         if not np.all(np.isfinite(self.points)) or np.any(self.sources >= v):
             raise ValueError(f"points must be finite, and sources 0 to {v - 1}")
         if np.any(self.classes > PixelClass.OUT_OF_VIEW):
@@ -137,30 +159,8 @@ def look_for(
     return found.pixels, found.tau, classes
 
 
-def write_tracks(path: Path, tracks: Tracks) -> None:
-    """The arrays by their names."""
-    save_arrays(path, {field.name: getattr(tracks, field.name) for field in fields(tracks)})
-
-
-def read_tracks(path: Path, frames: int) -> Tracks:
-    """Read the tracks of ``frames`` frames.
-
-    Raises:
-        RsbenchError: see ``load_arrays``; or the arrays are no such tracks.
-    """
-    try:
-        tracks = Tracks(**load_arrays(path))
-    except (TypeError, ValueError) as error:
-        raise RsbenchError(f"{path}: {error}") from error
-    if tracks.tau.shape[1] != len(track_views(frames)):
-        raise RsbenchError(
-            f"{path}: is of {tracks.tau.shape[1]} views, the sequence has {len(track_views(frames))}"
-        )
-    return tracks
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class AffineFrames:
+class AffineFrames(ArrayFile):
     """Affine frames of the points (n) of ``tracks``.
 
     Raises:
@@ -175,10 +175,7 @@ class AffineFrames:
 
     def __post_init__(self) -> None:
         n, views = len(self.normals), self.jacobians.shape[1:2]
-        for name, shape in (("jacobians", (n, *views, 2, 2)), ("normals", (n, 3))):
-            value = getattr(self, name)
-            if value.shape != shape or value.dtype != np.float64:
-                raise ValueError(f"{name} is {value.dtype} of shape {value.shape}: float64 of {shape} is needed")
+        self.check_arrays({"jacobians": ((n, *views, 2, 2), np.float64), "normals": ((n, 3), np.float64)})
         if not np.all(np.isfinite(self.normals)):
             raise ValueError("normals must be finite")
 
@@ -216,16 +213,3 @@ def _moves(geometry: Geometry, view: View, tracks: Tracks, k: int, along: FloatA
     tau = np.where(np.isnan(tracks.tau[:, k]), 0.0, tracks.tau[:, k])
     moves = pixel_moves(geometry.rig, geometry.shutter, geometry.motion, view[0], tau, tracks.points, along)
     return np.where(np.isnan(tracks.tau[:, k])[:, None, None], np.nan, moves)
-
-
-def save_affine(path: Path, affine: AffineFrames) -> None:
-    """The arrays by their names."""
-    save_arrays(path, {field.name: getattr(affine, field.name) for field in fields(affine)})
-
-
-def read_affine(path: Path) -> AffineFrames:
-    """Raises RsbenchError as ``reading.load_arrays``, and for arrays that are no affine frames."""
-    try:
-        return AffineFrames(**load_arrays(path))
-    except (TypeError, ValueError) as error:
-        raise RsbenchError(f"{path}: {error}") from error
