@@ -89,7 +89,7 @@ _BRIGHTEST = float(np.finfo(np.float16).max)
 
 
 class Layer(NamedTuple):
-    """A channel that leads from frames to one picture each."""
+    """A channel between two pictures: from each frame to one other picture."""
 
     channel: PairChannel
     row: int = 0
@@ -98,7 +98,7 @@ class Layer(NamedTuple):
     """Whether a ``flow`` leads back: from the frames between the first and the last to the frame before."""
 
     def values(self, side: str, frame: int) -> str:
-        """File below the folder of a sequence, as ``mask`` is."""
+        """Path of the offsets below the folder of a sequence, like ``mask``, that of their classes."""
         return f"{self._folder}{self._row}/{side}_{frame}.exr"
 
     def mask(self, side: str, frame: int) -> str:
@@ -113,18 +113,18 @@ class Layer(NamedTuple):
         return f"/{self.row:04d}" if self.row else ""
 
     def views(self, frames: int) -> tuple[View, ...]:
-        """The views from which it leads, in a sequence of so many frames."""
+        """The source views, in a sequence of ``frames`` frames."""
         return tuple(view for view in views_of(frames) if not self.back or 0 < view[1] < frames - 1)
 
     def target(self, source: ImageView, frames: int) -> ImageView:
-        """The picture in which it looks for the pixels of a frame, in a sequence of so many frames."""
+        """The target picture of a source view, in a sequence of ``frames`` frames."""
         twin = source.other_shutter._replace(row=self.row)
         over_time = source.frame_before if self.back else source.next_frame(frames)
         return {"disparity": source.other_side, "flow": over_time, "gs_flow": twin}[self.channel]
 
 
 def pair_layers(names: Collection[str], twins: Iterable[int], frames: int = len(FRAMES)) -> list[Layer]:
-    """The layers of the channels of these names in a sequence of so many frames, channel by channel."""
+    """The layers of the named channels in a sequence of ``frames`` frames, channel by channel."""
     layers: list[Layer] = []
     for channel in PAIR_CHANNELS:
         if channel in names:
@@ -135,7 +135,7 @@ def pair_layers(names: Collection[str], twins: Iterable[int], frames: int = len(
 
 
 class FrameTruth:
-    """What the channels of one rolling-shutter frame are made of.
+    """The data from which the channels of one rolling-shutter frame are computed.
 
     Args:
         geometry: of the sequence.
@@ -189,7 +189,7 @@ class FrameTruth:
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceTruth:
-    """What the channels of a whole sequence are made of, when its frames are there."""
+    """The data from which the channels of a whole sequence are computed, after its frames were written."""
 
     folder: Path
     geometry: FixedGeometry
@@ -201,7 +201,7 @@ class SequenceTruth:
     matching: Matching
     scene: MitsubaScene
     record: Mapping[str, Any]
-    """What sequence.json says of the scene."""
+    """The table ``scene`` of sequence.json."""
     rays: Any
     """``SceneRays`` through the scene."""
 
@@ -217,9 +217,9 @@ class TruthChannel:
 
     name: ClassVar[str] = ""
     knows_movement: ClassVar[bool] = True
-    """Whether it is right where objects move."""
+    """Whether it is correct where objects move."""
     of_pairs: ClassVar[bool] = False
-    """Whether a pair of successive frames (``Sequence.pairs``) has it too."""
+    """Whether a pair of successive frames (``Sequence.pairs``) keeps it."""
     rounding: ClassVar[float | None] = None
     """Largest difference between a stored value of a frame and one that rays make again; None: not compared."""
 
@@ -239,7 +239,7 @@ class TruthChannel:
         return ()
 
     def write_values(self, path: Path, values: NDArray[Any]) -> None:
-        """Write what ``made`` gives: float32 as EXR with these components, whole numbers as PNG."""
+        """Write values of ``made``: float32 as EXR with ``components``, whole numbers as PNG."""
         if path.suffix == ".png":
             (write_png16 if values.dtype == np.uint16 else write_png)(path, values)
         else:
@@ -249,11 +249,12 @@ class TruthChannel:
     """Names of the float32 channels of the EXR files."""
 
     def read_values(self, path: Path, size: tuple[int, int]) -> NDArray[Any]:
-        """What ``write_values`` wrote, of a camera of this size (width, height); RsbenchError for another file."""
+        """Read a file of ``write_values``; ``size`` (width, height) of the camera; RsbenchError for another
+        file."""
         return read_exr(path, self.components, size)
 
     def write_whole(self, whole: SequenceTruth) -> None:
-        """Write the files that belong to no one frame."""
+        """Write the files of the whole sequence."""
 
 
 class _Pairs(TruthChannel):
@@ -444,7 +445,7 @@ CHANNELS: tuple[Channel, ...] = tuple(OBJECTS)
 
 
 def known(names: Iterable[str]) -> list[TruthChannel]:
-    """The channels of these names, in the order of ``OBJECTS``; those of later versions are left out."""
+    """The channels of these names, in the order of ``OBJECTS``, without those of later versions."""
     return [OBJECTS[name] for name in OBJECTS if name in {*names}]
 
 
@@ -486,7 +487,7 @@ def write_channels(
 
 
 def write_sequence_channels(names: Sequence[Channel], whole: SequenceTruth) -> None:
-    """Write the files of named channels that belong to no one frame."""
+    """Write the files of the named channels that belong to the whole sequence."""
     for channel in known(names):
         channel.write_whole(whole)
 
@@ -534,7 +535,7 @@ def named_channels(text: str) -> tuple[Channel, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelReader:
-    """What a ``Sequence`` reads of its channels; each raises RsbenchError where it does not have them."""
+    """Readers of a sequence's channels; each raises RsbenchError if the sequence does not have the channel."""
 
     folder: Path
     rig: StereoRig
@@ -567,7 +568,7 @@ class ChannelReader:
     def classes(
         self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
     ) -> NDArray[np.uint8]:
-        """(H, W) of ``PixelClass``: what became of each pixel in the picture that the channel looks at.
+        """(H, W) of ``PixelClass``: whether the target picture sees the surface of each pixel.
 
         Arguments and RsbenchError as of ``offsets``.
         """
@@ -604,7 +605,7 @@ class ChannelReader:
         return read_timing_table(self._path("timing", table_file(side, frame)), self.shutter.lines(side))
 
     def inertial(self) -> ImuSamples:
-        """What the inertial sensor measured, and the truth; RsbenchError as of ``channel_values``."""
+        """Measured and true inertial samples; RsbenchError as of ``channel_values``."""
         self._path("imu", IMU_MANIFEST)
         return read_imu(self.folder)
 
@@ -628,11 +629,11 @@ class ChannelReader:
         return found
 
     def affine(self) -> AffineFrames:
-        """How the surroundings of the tracks' points lie in the frames; RsbenchError as of ``channel_values``."""
+        """Affine frames of the tracks' points; RsbenchError as of ``channel_values``."""
         return AffineFrames.read(self._path("affine", AFFINE))
 
     def matches(self, first: int = 0) -> LabelledMatches:
-        """What a feature matcher found in frame ``first`` and the next, and what is true.
+        """Matches of a feature matcher between frame ``first`` and the next, with true places and classes.
 
         RsbenchError as of ``channel_values``.
         """

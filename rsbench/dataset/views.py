@@ -36,15 +36,15 @@ NUMBER, SHADED = 127, 128
 
 
 class PixelClass(IntEnum):
-    """What became of a pixel's surface in the other picture: the values of a mask."""
+    """Whether another picture sees the surface of a pixel: the values of a mask."""
 
     UNSOLVED = 0
-    """The row that sees it could not be found; no value."""
+    """No row that sees it was found; there is no value."""
     VISIBLE = 1
     OCCLUDED = 2
     """In view, but something nearer hides it."""
     OUT_OF_VIEW = 3
-    """Beside the picture or behind the camera, sky too."""
+    """Outside of the picture or behind the camera; of sky too."""
     SKY = 4
     """No surface here, and none there: the value is that of the direction."""
     SKY_OCCLUDED = 5
@@ -57,13 +57,14 @@ def numbers_of(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def seen_from(geometry: Geometry, number: int) -> FixedGeometry:
-    """How the rig moves seen from an object, in whose frame the object's points stand still; 0: from the world."""
+    """The rig's motion in the frame of a moving object, in which the object's points are at rest; 0: in the
+    world."""
     motion = RelativeMotion(geometry.motion, geometry.objects[number - 1]) if number else geometry.motion
     return FixedGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
 
 
 class ImageView(NamedTuple):
-    """One camera at one time, through a rolling shutter or a global one."""
+    """A picture: one camera at one time, with a rolling or a global shutter."""
 
     shutter: Shutter
     side: Side
@@ -73,7 +74,7 @@ class ImageView(NamedTuple):
 
     @property
     def image(self) -> str:
-        """File below the folder of the sequence, as ``depth`` is."""
+        """Path of the image below the folder of the sequence, like ``depth``, that of the depth map."""
         return picture_file(*self)
 
     @property
@@ -104,7 +105,7 @@ class ImageView(NamedTuple):
         return self._replace(side="right" if self.side == "left" else "left")
 
     def next_frame(self, frames: int) -> ImageView:
-        """At the next time, of so many; of the last one, at the time before."""
+        """The picture of the next of ``frames`` frames; of the previous one for the last frame."""
         return self._replace(frame=self.frame + (1 if self.frame < frames - 1 else -1))
 
     @property
@@ -121,11 +122,11 @@ class ImageView(NamedTuple):
 
 
 Times = tuple[int, int]
-"""Numbers of two successive frames."""
+"""Two successive frame numbers."""
 
 
 def image_views(times: Iterable[int]) -> tuple[ImageView, ...]:
-    """All pictures of these frames, but for twins of later rows."""
+    """All pictures of these frames, without twins at other rows than the first."""
     return tuple(ImageView(*each) for each in product(SHUTTERS, SIDES, times))
 
 
@@ -183,23 +184,23 @@ ByBands = Callable[[Callable[[int, int], None], int], object]
 
 
 class Reprojected(NamedTuple):
-    """Where points (...) lie in a picture."""
+    """Pixels at which a picture sees points (...)."""
 
     pixels: FloatArray
     """(..., 2) px; NaN where it does not see them."""
     eyes: FloatArray
-    """(..., 3) the camera's centre at that time, world frame; at any time where it does not see them."""
+    """(..., 3) the camera's centre at that time, world frame; arbitrary where it does not see them."""
     unsolved: NDArray[np.bool_]
-    """(...) whether it is not known if it sees them."""
+    """(...) whether the search failed, so that it is unknown whether the picture sees them."""
 
 
 class _Table(NamedTuple):
-    """Poses of a picture over its lines, from line -1 on."""
+    """Poses of a picture as a function of the line, from line -1."""
 
     entries: FloatArray
     """(n, 24): rotation and translation of ``cam_from_world``, and their changes by an entry."""
     per_line: float
-    """Entries for each line; 0: one pose for all."""
+    """Number of entries per line; 0: one pose for all lines."""
 
 
 def find(
@@ -395,7 +396,7 @@ def _off(
     line: float,
     pose: FloatArray,
 ) -> float:
-    """How far beyond a line its camera sees a point, px; NaN behind it."""
+    """Residual of the row equation at a line, px; NaN behind the camera."""
     _pose_between(table, (line + 1.0) * per_line, pose)
     x, y = _pixel(pose, camera, X)
     return (x if axis == 0 else y) - line

@@ -39,7 +39,7 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGB
 
 
 def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
-    """What keeps a file from being an 8-bit RGB image of ``size`` (width, height); only its header is read."""
+    """The reason why a file is no 8-bit RGB image of ``size`` (width, height); only its header is read."""
     try:
         with open_regular(path) as stream:
             head = stream.read(26)
@@ -57,7 +57,7 @@ def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
 
 
 Judge = Callable[[ImageView], bool]
-"""Says of a file of a view, from what nobody who made the dataset could change, that it is right."""
+"""Whether a file of a view is correct, by evidence that the dataset's author cannot change."""
 
 
 @dataclass(eq=False)
@@ -190,7 +190,7 @@ class Comparison:
     colour_agreements: list[image_checks.ColourAgreement] = field(default_factory=list)
     votes: dict[ImageView, image_checks.ImageVotes] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    """What could not be compared well, and is no fault."""
+    """What could not be compared well; these are no faults."""
 
     def __post_init__(self) -> None:
         self.evidence = {

@@ -30,11 +30,11 @@ class Finding:
     file: str
     """Below the folder of the sequence; "" where ``words`` name it, being those of an error."""
     words: str
-    """What is wrong, and by how much."""
+    """The fault and its size."""
     rows: str = ""
-    """Where in the file, as ``rows_of`` says it."""
+    """Rows of the file, from ``rows_of``."""
     cause: str = ""
-    """What the file looks like instead."""
+    """The likely cause."""
     part: str = ""
     """View, or pair of views, in a file that holds many."""
     check: str = field(default="", compare=False)
@@ -74,13 +74,13 @@ class DepthAgreement:
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceReport:
-    """What verification found in one sequence, or in dataset.json where ``name`` is that."""
+    """The findings in one sequence, or in dataset.json if that is the ``name``."""
 
     name: str
     findings: tuple[Finding, ...]
     agreements: tuple[DepthAgreement, ...] = ()
     notes: tuple[str, ...] = ()
-    """What could not be checked, and what was: no faults."""
+    """What was checked in addition, or could not be checked; these are no faults."""
 
     @property
     def faults(self) -> tuple[str, ...]:

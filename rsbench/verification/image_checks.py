@@ -60,7 +60,7 @@ _PERMUTATIONS = [order for order in permutations(range(3)) if order != (0, 1, 2)
 
 @dataclass(frozen=True)
 class Change:
-    """Something that may have been done to an image: where a pixel's true colour stands in it."""
+    """A change that an image may have undergone: where it shows the true colour of a pixel."""
 
     words: str
     down: int = 0
@@ -287,7 +287,7 @@ def without_refuted(agreements: list[ColourAgreement]) -> list[ColourAgreement]:
 
 
 def wrong_images(agreements: list[ColourAgreement]) -> Iterator[tuple[ImageView, list[ColourAgreement]]]:
-    """Images in the order of how many disagreeing pairs each alone explains, with these pairs."""
+    """Images, with the disagreeing pairs that each explains; the image that explains most pairs comes first."""
     left = [each for each in agreements if np.any(each.unlike)]
     while left:
         counts = Counter(view for each in left for view in (each.source, each.target))

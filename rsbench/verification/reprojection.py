@@ -1,4 +1,4 @@
-"""Where the surface that one picture of a sequence sees lies in another, and how well both agree."""
+"""Surfaces of one picture reprojected into another, and how well the depth maps agree."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _threads = os.cpu_count() or 1
 
 
 def set_threads(count: int) -> None:
-    """Let this process use so many (one of several that share the cores)."""
+    """Set the number of threads of this process, one of several that share the cores."""
     global _threads
     _threads = count
 
 
 def by_bands(work: Callable[[int, int], T], height: int) -> list[T]:
-    """What ``work`` makes of bands of rows, first to last without the last, in their order.
+    """Call ``work(first, last)`` for bands of rows, ``last`` excluded; returns the results in their order.
 
-    It runs in threads, so it must let go of the interpreter, and write to no place that another band writes to.
+    It runs in threads: it should release the interpreter, and must not write where another band writes.
     """
     threads = min(_threads, max(1, height // _LEAST_ROWS))
     bands = 1 if threads == 1 else min(4 * threads, height // _LEAST_ROWS)
@@ -62,14 +62,14 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """A depth map, and where it is one flat surface."""
+    """A depth map, and the pixels at which its surface is locally flat."""
 
     view: ImageView
     depth: NDArray[np.float32]
     """(H, W) metres, 0 = no surface."""
     camera: PinholeCamera
     labels: NDArray[np.uint8] | None = None
-    """(H, W) what moves there, see ``Sequence.labels``; None where nothing does."""
+    """(H, W) labels of moving objects, see ``Sequence.labels``; None where nothing moves."""
     gloss: BoolArray | None = None
     """(H, W) whether the surface is glossy; None where none is."""
 
@@ -134,7 +134,7 @@ class DepthMap:
 
 
 class _Bending(NamedTuple):
-    """What a lens does to straight lines of pixels."""
+    """How a lens bends straight lines of pixels."""
 
     ideal: FloatArray
     """(H, W, 2) ideal pixels."""
