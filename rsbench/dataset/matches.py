@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.tracks import ArrayFile
-from rsbench.dataset.views import FAR, Rays
+from rsbench.dataset.views import FAR
 
 if TYPE_CHECKING:
     from rsbench.pipeline.frame_depth import Images
@@ -135,6 +135,13 @@ def at(view: View, first: int) -> View:
     return view[0], first + view[1]
 
 
+class MatchRays(Protocol):
+    """Rays through a scene that does not move: ``renderers.segments.SceneRays`` is one."""
+
+    def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]: ...
+    def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray: ...
+
+
 def matcher_record(matching: Matching) -> dict[str, Any]:
     """Content of matcher.json: who matches, and the versions with which the same pictures match alike.
 
@@ -171,7 +178,7 @@ def matched_frames(geometry: Geometry, first: int, images: Images, entry: Featur
 
 
 def make_matches(
-    geometry: Geometry, first: int, images: Images, matching: Matching, rays: Rays
+    geometry: Geometry, first: int, images: Images, matching: Matching, rays: MatchRays
 ) -> LabelledMatches:
     """The labelled matches of frame ``first`` and the next, by their images (H, W, 3).
 
@@ -203,7 +210,9 @@ def arranged(found: Correspondences) -> Arranged:
     return Arranged(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def labelled(geometry: Geometry, first: int, matches: Arranged, bound_px: float, rays: Rays) -> LabelledMatches:
+def labelled(
+    geometry: Geometry, first: int, matches: Arranged, bound_px: float, rays: MatchRays
+) -> LabelledMatches:
     """Label matches by the truth."""
     parts = []
     for number, views in enumerate(MATCHED.values()):
@@ -216,7 +225,7 @@ def labelled(geometry: Geometry, first: int, matches: Arranged, bound_px: float,
 
 
 def _truth_of(
-    geometry: Geometry, source: View, target: View, pixels: FloatArray, bound_px: float, rays: Rays
+    geometry: Geometry, source: View, target: View, pixels: FloatArray, bound_px: float, rays: MatchRays
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
     """Depth (n,), true places (n, 2) and classes (n,) of matches (n, 2, 2)."""
     if len(pixels) == 0:

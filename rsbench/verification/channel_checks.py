@@ -362,8 +362,8 @@ def _resting(
     rests: the normals of a picture belong to the times of its rows."""
     surfaces = SeenSurfaces(sequence, depth_map.view, depth_map.depth)
     X, rays, labels = surfaces.points, surfaces.points - surfaces.eyes, depth_map.labels
-    for number, thing in enumerate(sequence.objects if labels is not None else (), start=1):
-        chosen = numbers_of(labels) == number
+    for number, thing in enumerate(sequence.objects, start=1):
+        chosen = np.zeros(X.shape[:2], np.bool_) if labels is None else numbers_of(labels) == number
         pose = inverse(thing.world_from_object(times_at(sequence, depth_map.view, surfaces.grid[chosen])))
         X, normals = X.copy(), normals.copy()
         X[chosen] = transform(pose, X[chosen])

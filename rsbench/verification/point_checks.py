@@ -26,6 +26,7 @@ from rsbench.dataset.matches import (
     LabelledMatches,
     MatchClass,
     Matching,
+    MatchRays,
     PairLabels,
     arranged,
     at,
@@ -468,7 +469,7 @@ def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Itera
 
 
 @skips_unreadable
-def matches_again(sequence: Sequence, first: int, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
+def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Collection[str]) -> Iterator[Again]:
     """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
     if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
         return
