@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from rsbench.core.errors import RsbenchError
+
 if TYPE_CHECKING:
     from rsbench.jobs.process_jobs import Workers
 
@@ -31,7 +33,6 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
     """
     if scheduler is None:
         return workers or default
-    from rsbench.core.errors import RsbenchError
     from rsbench.jobs.process_jobs import Cluster
 
     if workers is not None:
@@ -69,7 +70,6 @@ def results_at(out: str, scheduler: str | None) -> Iterator[Path]:
     Raises:
         RsbenchError: a URL that is not supported, or a URL with a cluster; see ``mirrored``.
     """
-    from rsbench.core.errors import RsbenchError
     from rsbench.storage.object_store import path_or_url, shown
 
     place = path_or_url(out)

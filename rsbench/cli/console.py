@@ -6,6 +6,7 @@ Texts are printed literally: brackets such as ``[view]`` are not taken for rich'
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -79,8 +80,6 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
 @contextmanager
 def late_progress(label: str) -> Iterator[Callable[[str], None]]:
     """A counter of steps on stderr of a terminal, for work of more than two seconds; stdout is not used."""
-    import time
-
     # Without redirection, since a command's output would go to stderr with the bar.
     progress = _progress(transient=True, redirect_stdout=False, redirect_stderr=False)
     task = progress.add_task(label, total=None, word="")

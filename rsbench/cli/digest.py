@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, late_progress
+from rsbench.core.errors import RsbenchError
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -32,8 +33,6 @@ def digest(
     ] = None,
 ) -> None:
     """Write a SHA-256 for each sequence of a dataset, or check those of an earlier copy."""
-    from rsbench.cli.console import late_progress
-    from rsbench.core.errors import RsbenchError
     from rsbench.storage.files import write_bytes
     from rsbench.verification.digests import differences, digests, read_digests, text_of
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at, shared_path
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_table, progress_bar, say
 from rsbench.cli.names import complete
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -129,8 +130,6 @@ def evaluate(
 def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, corrector: str, seed: int) -> None:
     """Depth of pairs with disparities, motion of one camera with poses, its frames with their truth: tables."""
     from rsbench.benchmark.recordings import depth_scores, pose_scores
-    from rsbench.cli.console import print_table, say
-    from rsbench.core.errors import RsbenchError
     from rsbench.interop.readers.layouts import read_others
     from rsbench.storage.files import check_out, write_table
     from rsbench.storage.mirror import name_of
@@ -161,7 +160,6 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
 def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.DataFrame:
     """Of one camera's correctors: scaled flow and ``corrector``, or ours where that is the default of a rig."""
     from rsbench.benchmark.recordings import check_sees_one_camera, correction_scores, pairs_with_truth
-    from rsbench.cli.console import progress_bar
     from rsbench.vision.corrector import load_corrector
 
     names = dict.fromkeys(("flow-scaled", "mono-fusion" if corrector == _OF_A_RIG else corrector))
@@ -209,7 +207,6 @@ def evaluate_dataset(
     from rsbench.benchmark.images.evaluation import open_evaluation
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.compile_ahead import compiling_ahead
-    from rsbench.cli.console import print_table, progress_bar
     from rsbench.report.evaluation_page import summary_tables, write_report
     from rsbench.storage.mirror import name_of
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, late_progress, say
 from rsbench.cli.names import complete
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.dataset.sequence import Sequence
@@ -75,7 +76,6 @@ def export(
 
     A note names what a format cannot represent; some sequences are refused.
     """
-    from rsbench.cli.console import late_progress, say
     from rsbench.interop.writers.exporter import export_dataset
 
     with late_progress(f"exporting to {to}") as advance:
@@ -120,8 +120,6 @@ def view(
 
     Needs the extra of the viewer: pip install 'rsbench\[view]'
     """
-    from rsbench.cli.console import late_progress
-    from rsbench.core.errors import RsbenchError
     from rsbench.interop.writers.exporter import chosen_sequences
     from rsbench.storage.files import check_out
 

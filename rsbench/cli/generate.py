@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, shared_path
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.names import complete
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.dataset.card import DatasetCard
@@ -134,7 +135,6 @@ def generate(
     backend: _Backend = None,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
-    from rsbench.cli.console import progress_bar
     from rsbench.dataset.destinations import store_for
     from rsbench.dataset.generation import generate_dataset, steps_of
     from rsbench.renderers.backend import start_backend
@@ -163,7 +163,6 @@ def generate(
 
 def _ask_for(backend: str | None, scheduler: str | None) -> None:
     """The backend of this process and of those that it starts, which the workers of a cluster are not."""
-    from rsbench.core.errors import RsbenchError
     from rsbench.renderers.backend import ask_for
 
     if backend is not None and scheduler is not None:
@@ -180,7 +179,6 @@ def _whole(
     sequences: int | None,
 ) -> DatasetCard:
     """A card, or a split of it, with all of its sequences."""
-    from rsbench.core.errors import RsbenchError
     from rsbench.dataset.card import load_dataset_card
 
     own = load_dataset_card(card, trajectory, seeds)
@@ -193,7 +191,6 @@ def _whole(
 
 def _split(card: str, name: str, place: Path | str, changed: bool, count: int | None) -> DatasetCard:
     """A split of a card, with the cards of its scenes beside the dataset."""
-    from rsbench.core.errors import RsbenchError
     from rsbench.dataset.secret_split import open_split, secret_card, write_scenes
     from rsbench.storage.untrusted_files import NAME
 
@@ -224,8 +221,6 @@ def _chosen(
 
 def _part(word: str) -> tuple[int, int]:
     """Of ``2/5``: 2 and 5."""
-    from rsbench.core.errors import RsbenchError
-
     part, slash, parts = word.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal()):
         raise RsbenchError(f"--shard {word}: must be I/N, such as 1/4")
@@ -234,8 +229,6 @@ def _part(word: str) -> tuple[int, int]:
 
 def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
     """What it will take, in one line."""
-    from rsbench.cli.console import progress_bar
-    from rsbench.core.errors import RsbenchError
     from rsbench.dataset.generation import estimate_dataset
 
     if full_frames:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_rows, progress_bar
 from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
@@ -101,7 +104,6 @@ def export(
 ) -> None:
     """Write the inputs of a track for any language; of a public split the truth too."""
     from rsbench.benchmark.leaderboard.inputs import check_place, write_frames, write_inputs
-    from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 
     split = split_of(track, data, seed_file, secret)
@@ -122,8 +124,6 @@ def template(
     out: Annotated[Path | None, typer.Option(help="New folder for it; needed on tracks of pictures.")] = None,
 ) -> None:
     """Print a file of predictions that is in order: fill in your own."""
-    import tempfile
-
     from rsbench.benchmark.leaderboard.submissions import write_template
 
     split = split_of(track, data, seed_file)
@@ -216,14 +216,11 @@ def run(
     ] = None,
 ) -> None:
     """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
-    import os
-
     from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
     from rsbench.benchmark.leaderboard.inputs import prepare_inputs
     from rsbench.benchmark.leaderboard.running import count_steps, load_cards, run_cards
     from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.benchmark.provenance import provenance
-    from rsbench.cli.console import progress_bar
     from rsbench.storage.work_folder import work_folder
 
     processes = chosen_workers(workers, scheduler, os.cpu_count() or 1)
@@ -265,8 +262,6 @@ def _first(split: Split, problems: int | None) -> Split:
 
 def _stored(split: Split, folder: Path | None) -> list[Scored]:
     """Entries of stored predictions of a split: of a folder, or else of the working folder's results."""
-    import tempfile
-
     from rsbench.benchmark.leaderboard.board import restore
 
     folders = [folder] if folder is not None else sorted(Path("results").glob(f"*/predictions/{split.track.id}"))
@@ -314,8 +309,6 @@ def show(
 @board_app.command()
 def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = None) -> None:
     """Add the truth and others that know it, as rows without a rank; to correction, frames as they are too."""
-    import tempfile
-
     from rsbench.benchmark.leaderboard.board import add_all
     from rsbench.benchmark.leaderboard.submissions import write_oracles
     from rsbench.benchmark.provenance import provenance
@@ -411,10 +404,7 @@ def smoke(
 
     Exit code 1: there is one.
     """
-    import os
-
     from rsbench.benchmark.leaderboard import smoke as smoke_run
-    from rsbench.cli.console import progress_bar
     from rsbench.storage.files import check_out
 
     jobs = smoke_run.chosen_jobs(track, entry)
@@ -463,7 +453,6 @@ def publish(
     """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
     from rsbench.benchmark.leaderboard import publishing
     from rsbench.benchmark.leaderboard.tracks import track_of_name
-    from rsbench.cli.console import progress_bar
     from rsbench.dataset.generation import steps_of
     from rsbench.dataset.secret_split import read_secret, secret_card
 
@@ -541,10 +530,6 @@ def split_of(track: str, data: Path | None, seed_file: Path | None, secret: bool
 
 def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
     """A bar of the problems whose pictures are scored."""
-    from contextlib import nullcontext
-
-    from rsbench.cli.console import progress_bar
-
     if not split.track.pictures:  # the rest takes no time
         return nullcontext(lambda word: None)
     return progress_bar(f"scoring {split.name}", len(split.truths))
@@ -580,7 +565,6 @@ def _show(
     """Print a table; of one method, its line alone. Of ``beside`` those are in it whose name the board has not."""
     from rsbench.benchmark.leaderboard.board import entries_of
     from rsbench.benchmark.leaderboard.standings import standings, table
-    from rsbench.cli.console import print_rows
 
     wanted = None if at_most is None else [name.strip() for name in at_most.split(",")]
     entries = entries_of(board, protocol, split)

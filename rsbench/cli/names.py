@@ -9,12 +9,14 @@ import inspect
 import itertools
 import textwrap
 from collections.abc import Callable
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_rows, say
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     from rsbench.components.plugins import Kind, Offer
@@ -46,7 +48,6 @@ def component_kind(kind: str) -> Any:
     """The ``plugins.Kind`` of a kind; None for kinds whose cards name no class."""
     if kind not in COMPONENTS:
         return None
-    from importlib import import_module
 
     module, _, name = COMPONENTS[kind].partition(":")
     return getattr(import_module(module), name)
@@ -88,8 +89,6 @@ def complete_any(incomplete: str) -> list[str]:
 
 def _quick_names(kind: str) -> list[str]:
     """Names of one kind without imports; classes of rsbench without a card are left out."""
-    from importlib import metadata
-
     from rsbench.components.cards import CardKind, list_cards
 
     names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # pyrefly: ignore[bad-argument-type]
@@ -120,9 +119,7 @@ def list_(
     """List scenes, solvers, datasets and so on, with the cards to copy and edit, and who they come from."""
     import json as json_module
 
-    from rsbench.cli.console import print_rows, say
     from rsbench.components.cards import choices
-    from rsbench.core.errors import RsbenchError
 
     kinds = kind_names()
     if kind is not None and kind not in kinds:
@@ -162,7 +159,6 @@ def entries(kind: str) -> list[dict[str, Any]]:
 def _row(kind: Kind[Any, Any] | None, offer: Offer) -> dict[str, Any]:
     from rsbench.components import plugins
     from rsbench.components.cards import read_toml
-    from rsbench.core.errors import RsbenchError
 
     description, broken = "", ""
     if offer.path is not None:
@@ -215,8 +211,6 @@ def show(
 
 
 def _print(about: dict[str, Any]) -> None:
-    from rsbench.cli.console import print_rows, say
-
     title = f"{about['kind']}: {about['name']}"
     if "content" in about:
         say(f"{title}\n\n{Path(about['card']).read_text('utf-8')}\ncard: {about['card']}\n")
@@ -245,7 +239,6 @@ def _text(value: object) -> str:
 def _kinds_of(name: str, kind: str | None) -> list[str]:
     """The kinds that have this name."""
     from rsbench.components.cards import choices, current_name
-    from rsbench.core.errors import RsbenchError
 
     kinds = kind_names()
     if kind is not None:

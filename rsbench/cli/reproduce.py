@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -203,8 +204,6 @@ def _first(target: Target, data: Path) -> str:
 
 
 def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:
-    from contextlib import ExitStack
-
     from rsbench.storage.work_folder import work_folder
 
     with ExitStack() as stack:

@@ -3,10 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsbench.cli.console import echo
+import pandas as pd
+
+from rsbench.benchmark.provenance import dataset_record, provenance
+from rsbench.benchmark.studies import real_cameras
+from rsbench.benchmark.studies.correction_study import (
+    by_law,
+    by_scene,
+    by_sequence,
+    study_dataset,
+    summarise,
+    summarise_bands,
+)
+from rsbench.benchmark.studies.fig4_panels import Panels, correct_literally, load_panels, make_panels, save_panels
+from rsbench.benchmark.studies.sgm_timing import TIMINGS, compare, right_row_poses
+from rsbench.cli.console import echo, progress_bar
+from rsbench.cli.generate import generate
+from rsbench.components.cards import load_card
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import VIEWS
+from rsbench.dataset.card import load_dataset_card
+from rsbench.dataset.generation import generate_dataset, steps_of
+from rsbench.dataset.sequence import read_dataset, read_sequence
+from rsbench.pipeline.chain import correct_four
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.renderers.backend import start_backend
+from rsbench.renderers.image import to_srgb8
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import LinePoses, render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.report.correction_page import draw_frames, write_laws, write_real_page, write_sgm_page, write_study
+from rsbench.report.paper_figures import draw_fig4
+from rsbench.scenes.load import load_scene
+from rsbench.storage.files import read_png, write_json, write_png, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,15 +64,6 @@ def fig4(out: Path, data: Path) -> None:
 
     That by the paper's own components comes first, see ``fig4_literal``.
     """
-    import pandas as pd
-
-    from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.fig4_panels import load_panels, make_panels, save_panels
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.paper_figures import draw_fig4
-    from rsbench.storage.files import write_json, write_table
-
     folder = out / "fig4"
     folder.mkdir(parents=True, exist_ok=True)
     fig4_literal(out, data)
@@ -62,15 +86,6 @@ def fig4(out: Path, data: Path) -> None:
 
 def fig4_literal(out: Path, data: Path) -> None:
     """The paper's Figure 4 in its scene, by the paper's own solver, matches and correction of a single view."""
-    import pandas as pd
-
-    from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.fig4_panels import Panels, correct_literally
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.paper_figures import draw_fig4
-    from rsbench.storage.files import write_json, write_table
-
     folder = out / "fig4"
     folder.mkdir(parents=True, exist_ok=True)
     _generate("paper", data)
@@ -93,13 +108,6 @@ def fig4_literal(out: Path, data: Path) -> None:
 
 def correction(out: Path, data: Path, workers: int | None = None) -> None:
     """Baselines, ours and oracles on the strata; ``workers`` processes, one per core for None."""
-    import pandas as pd
-
-    from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_study import by_scene, summarise, summarise_bands
-    from rsbench.report.correction_page import write_study
-    from rsbench.storage.files import write_json, write_table
-
     folder = out / "correction"
     folder.mkdir(parents=True, exist_ok=True)
     studies = [_studied(card, card, data, workers) for card in STRATA]
@@ -119,13 +127,6 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
 
 def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
     """The same methods where motions follow five laws, on the sequences of ``laws`` without a sensor's noise."""
-    import pandas as pd
-
-    from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.correction_study import by_law, by_sequence
-    from rsbench.report.correction_page import write_laws
-    from rsbench.storage.files import write_json, write_table
-
     folder = out / "laws-correction"
     folder.mkdir(parents=True, exist_ok=True)
     images, _, motions = _studied("laws", LAWS_FRAMES, data, workers, lambda name: "-ideal-" in name)
@@ -141,12 +142,6 @@ def _studied(
     card: str, name: str, data: Path, workers: int | None, among: Callable[[str], bool] = bool
 ) -> list[pd.DataFrame]:
     """Views, bands of rows and motions, of sequences ``among`` those of a card whose folder is ``name``."""
-    import pandas as pd
-
-    from rsbench.benchmark.studies.correction_study import study_dataset
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.sequence import read_dataset
-
     _generate(card, data, name)
     folder, kept = data / name, data / "correction" / name
     count = sum(among(sequence.name) for sequence in read_dataset(folder))
@@ -160,15 +155,6 @@ def _studied(
 
 def sgm(out: Path, data: Path) -> None:
     """Semi-global matching when the right camera reads its rows at other times."""
-    import pandas as pd
-
-    from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies.sgm_timing import TIMINGS, compare
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.sequence import read_sequence
-    from rsbench.report.correction_page import write_sgm_page
-    from rsbench.storage.files import read_png, write_json, write_table
-
     folder = out / "sgm"
     folder.mkdir(parents=True, exist_ok=True)
     for card in dict.fromkeys(card for card, _ in _SGM):
@@ -195,20 +181,6 @@ def sgm(out: Path, data: Path) -> None:
 
 def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     """The default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's."""
-    from dataclasses import asdict
-
-    import pandas as pd
-
-    from rsbench.benchmark.provenance import dataset_record, provenance
-    from rsbench.benchmark.studies import real_cameras
-    from rsbench.cli.console import progress_bar
-    from rsbench.core.errors import RsbenchError
-    from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.renderers.backend import start_backend
-    from rsbench.report.correction_page import write_real_page
-    from rsbench.storage.files import write_json, write_table
-
     if seeds < real_cameras.FEWEST_SEEDS:
         raise RsbenchError(f"--seeds {seeds}: must be at least {real_cameras.FEWEST_SEEDS}")
     folder, card = out / "real", load_dataset_card("real")
@@ -238,12 +210,6 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
 
 
 def _draw_real(places: dict[str, Path], folder: Path) -> Path:
-    from rsbench.core.rig import VIEWS
-    from rsbench.dataset.sequence import read_sequence
-    from rsbench.pipeline.chain import correct_four
-    from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.report.correction_page import draw_frames
-
     ideal, real = (read_sequence(places[camera] / _SHOWN) for camera in ("ideal", "real"))
     images = {view: real.image("rs", *view) for view in VIEWS}
     ratio, scanning = real.shutter.readout_ratio, real.shutter.scanning
@@ -260,23 +226,10 @@ def _draw_real(places: dict[str, Path], folder: Path) -> Path:
 
 def _generate(card: str, data: Path, name: str = "") -> None:
     """Render what is missing of a card: all its sequences, so that every target finds the same dataset."""
-    from rsbench.cli.generate import generate
-
     generate(card, str(data / (name or card)), None, workers=1)
 
 
 def _render_right(card: str, name: str, timing: Timing, path: Path) -> None:
-    from rsbench.benchmark.studies.sgm_timing import right_row_poses
-    from rsbench.components.cards import load_card
-    from rsbench.dataset.card import load_dataset_card
-    from rsbench.renderers.backend import start_backend
-    from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.options import RendererOptions
-    from rsbench.renderers.render import LinePoses, render
-    from rsbench.renderers.scene import MitsubaScene
-    from rsbench.scenes.load import load_scene
-    from rsbench.storage.files import write_png
-
     dataset = load_dataset_card(card)
     sequence = next(one for one in dataset.sequence if one.name == name)
     options = load_card(RendererOptions, "renderers", dataset.renderer)

@@ -8,8 +8,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rsbench.benchmark.leaderboard.board import entries_of, splits_of, store
+from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES
+from rsbench.benchmark.leaderboard.smoke import own_solvers
+from rsbench.benchmark.leaderboard.tracks import track_of_id, track_of_name
+from rsbench.benchmark.provenance import provenance
+from rsbench.benchmark.trajectory_scores import METHODS
 from rsbench.cli.console import echo
+from rsbench.cli.generate import generate
+from rsbench.cli.leaderboard import oracles, run, smoke
 from rsbench.cli.reproduce_correction import LAWS_FRAMES
+from rsbench.components.plugins import Kind, offers
+from rsbench.report.board_page import build_site
+from rsbench.storage.files import write_json
+from rsbench.storage.untrusted_files import read_json
+from rsbench.vision.corrector import CORRECTORS, load_corrector
+from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
 BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
 """Folders of the boards below ``--data``."""
@@ -27,9 +41,6 @@ _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
     """The board of simulated points, which may have other entries too, and the scores of the smoke run."""
-    from rsbench.benchmark.leaderboard.smoke import own_solvers
-    from rsbench.cli.leaderboard import smoke
-
     _fill(data / BOARD, {"points": own_solvers()}, workers)
     smoke(out / "leaderboard" / "smoke", write=True)
     publish(data / BOARD, out / "leaderboard")
@@ -40,9 +51,6 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
 
     Of pictures the site alone is published: the answers are gigabytes.
     """
-    from rsbench.benchmark.leaderboard.board import splits_of, store
-    from rsbench.benchmark.leaderboard.tracks import track_of_id
-
     board, folder = data / LAWS, out / LAWS
     _fill(board, entries_of_laws(), workers, "laws", data / LAWS_FRAMES)
     publish(board, folder, "rsbench reproduce laws")
@@ -59,8 +67,6 @@ def boards(out: Path, data: Path, workers: int | None) -> None:
 
 def handheld(out: Path, data: Path, workers: int | None) -> None:
     """The track of trajectories on footage from hands."""
-    from rsbench.benchmark.trajectory_scores import METHODS
-
     board = data / f"{HANDHELD}-board"
     _fill(board, {"trajectory": list(METHODS)}, workers, "handheld", data / HANDHELD, oracles_too=False)
     publish(board, out / HANDHELD, "rsbench reproduce handheld")
@@ -87,10 +93,6 @@ def _fill(
 
     ``frames`` is the dataset of ``card``, rendered where it is missing, for the tracks of frames.
     """
-    from rsbench.benchmark.leaderboard.tracks import track_of_name
-    from rsbench.cli.generate import generate
-    from rsbench.cli.leaderboard import oracles, run
-
     count = workers or os.cpu_count() or 1
     if frames is not None:
         generate(card, str(frames), None, workers=count)
@@ -103,8 +105,6 @@ def _fill(
 
 def entries_of_laws() -> dict[str, list[str]]:
     """By protocol, what comes with rsbench: one entry a method, and of solvers the one that chooses its law."""
-    from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES
-
     first = entries_of_frames()
     solvers, readers = (
         [name for name in first[track] if name not in SAME_METHOD] + [CHOOSES] for track in ("pose", "readout")
@@ -117,10 +117,6 @@ def entries_of_frames() -> dict[str, list[str]]:
 
     ``readout`` has those that look for a ratio: the maximum-likelihood ones of both cameras, which it takes alone.
     """
-    from rsbench.benchmark.leaderboard.smoke import own_solvers
-    from rsbench.components.plugins import Kind, offers
-    from rsbench.vision.corrector import CORRECTORS, load_corrector
-    from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
     def own(kind: Kind[Any, Any]) -> list[str]:
         return [offer.name for offer in offers(kind) if offer.origin == "rsbench"]
@@ -139,12 +135,6 @@ def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboar
 
     What is there of protocols that the board does not have stays: their tables do too.
     """
-    from rsbench.benchmark.leaderboard.board import entries_of, splits_of
-    from rsbench.benchmark.provenance import provenance
-    from rsbench.report.board_page import build_site
-    from rsbench.storage.files import write_json
-    from rsbench.storage.untrusted_files import read_json
-
     page, path, splits = (
         build_site(board, out / "site", problem_pages=False),
         out / "provenance.json",

@@ -6,7 +6,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
+from rsbench.benchmark.provenance import provenance
+from rsbench.benchmark.simulated.run_sweep import errors_of_rows
+from rsbench.benchmark.simulated.sweep_card import load_sweep
+from rsbench.benchmark.studies.claims import (
+    APART,
+    GLOBAL,
+    LITERAL,
+    OURS,
+    best_readings,
+    holding_settings,
+    judge_claims,
+    judge_settings,
+    readings_of,
+    settings_card,
+    write_cards,
+)
+from rsbench.benchmark.studies.image_claims import judge_image_claims
 from rsbench.cli.console import echo
+from rsbench.cli.simulate import run_and_summarise
+from rsbench.report.claim_pages import claims_page, image_claims_page, readings_page, sweeps_page
+from rsbench.report.paper_figures import SWEEPS, draw_fig3, fig3_page, read_summaries, setting_table
+from rsbench.storage.files import save_arrays, write_bytes, write_json, write_table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,12 +42,6 @@ _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-
 
 
 def fig3(out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.simulated.run_sweep import errors_of_rows
-    from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.report.paper_figures import SWEEPS, draw_fig3, fig3_page, setting_table
-    from rsbench.storage.files import save_arrays, write_bytes, write_json, write_table
-
     folder = out / "fig3"
     folder.mkdir(parents=True, exist_ok=True)
     command = "rsbench reproduce fig3"
@@ -47,11 +64,6 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
 
 
 def sweeps(out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.report.claim_pages import sweeps_page
-    from rsbench.storage.files import write_bytes, write_json, write_table
-
     folder = out / "sweeps"
     folder.mkdir(parents=True, exist_ok=True)
     command = "rsbench reproduce sweeps"
@@ -67,13 +79,6 @@ def sweeps(out: Path, data: Path, workers: int | None) -> None:
 
 def claims(out: Path, data: Path, workers: int | None) -> None:
     """Every claim, in every reading of the paper's solver."""
-    from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.claims import LITERAL, best_readings, judge_claims, readings_of, write_cards
-    from rsbench.report.claim_pages import claims_page
-    from rsbench.report.paper_figures import SWEEPS
-    from rsbench.storage.files import write_bytes, write_json, write_table
-
     fig3(out, data, workers)
     folder, home, command = out / "claims", data / "simulated", "rsbench reproduce claims"
     folder.mkdir(parents=True, exist_ok=True)
@@ -96,10 +101,6 @@ def _claim_tables(
     fig3_folder: Path, folder: Path, home: Path, workers: int | None, command: str
 ) -> dict[str, dict[str, pd.DataFrame]]:
     """Summaries of the sweeps of Figure 3 by the matches per camera, with the readings of the paper's solver."""
-    from rsbench.benchmark.studies.claims import APART
-    from rsbench.report.paper_figures import SWEEPS, read_summaries
-    from rsbench.storage.files import write_table
-
     hundred = read_summaries(fig3_folder, SWEEPS)
     tables: dict[str, dict[str, pd.DataFrame]] = {"100 + 100": {}, "9 + 9": {}}
     for name in SWEEPS:
@@ -118,9 +119,6 @@ def _claim_tables(
 def _with_readings(name: str, points: int | None, home: Path, workers: int | None, command: str) -> pd.DataFrame:
     """Summary of a sweep of the paper run with the readings of its solver; where Figure 3 has none, also with what
     they are compared with."""
-    from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.claims import GLOBAL, OURS, readings_of, write_cards
-
     others = () if points == 100 else (OURS, GLOBAL)
     card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
     folder = home / (f"{name}-readings" if points is None else f"{name}-{points}-readings")
@@ -129,20 +127,6 @@ def _with_readings(name: str, points: int | None, home: Path, workers: int | Non
 
 def readings(out: Path, data: Path, workers: int | None) -> None:
     """The claims in settings that the paper does not state."""
-    from rsbench.benchmark.provenance import provenance
-    from rsbench.benchmark.simulated.sweep_card import load_sweep
-    from rsbench.benchmark.studies.claims import (
-        GLOBAL,
-        LITERAL,
-        holding_settings,
-        judge_settings,
-        settings_card,
-        write_cards,
-    )
-    from rsbench.report.claim_pages import readings_page
-    from rsbench.report.paper_figures import SWEEPS
-    from rsbench.storage.files import write_bytes, write_json, write_table
-
     folder, home, command = out / "readings", data / "simulated", "rsbench reproduce readings"
     folder.mkdir(parents=True, exist_ok=True)
     chosen = (LITERAL, replace(LITERAL, extraction="symmetric"))
@@ -161,10 +145,6 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
 
 def image_claims(out: Path) -> None:
     """The claims about images, from the results that ``out`` holds."""
-    from rsbench.benchmark.studies.image_claims import judge_image_claims
-    from rsbench.report.claim_pages import image_claims_page
-    from rsbench.storage.files import write_bytes
-
     text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"
     page.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(page, text.encode())
@@ -173,12 +153,8 @@ def image_claims(out: Path) -> None:
 
 def _summary(card: SweepCard, folder: Path, workers: int | None, command: str) -> pd.DataFrame:
     """Summary of a sweep whose trials stay in ``folder``; one draw of all its rows, whatever comes out."""
-    from rsbench.cli.simulate import run_and_summarise
-
     return run_and_summarise(card, folder, workers, command)
 
 
 def _joined(*tables: pd.DataFrame) -> pd.DataFrame:
-    import pandas as pd
-
     return pd.concat(tables, ignore_index=True)

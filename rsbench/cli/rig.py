@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -68,8 +69,6 @@ def rig(
     json: Annotated[bool, typer.Option("--json", help="Print what was understood as one JSON object.")] = False,
 ) -> None:
     """Show what is understood of a calibration, and convert it between the formats of tools."""
-    import dataclasses
-
     from rsbench.interop.readers.calibration_parts import cropped, refuse_unseen, resized, with_size
     from rsbench.interop.readers.rig_files import calibration_of
 

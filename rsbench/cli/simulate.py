@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_table, progress_bar, say
 from rsbench.cli.names import complete
+from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,7 +94,6 @@ def run_and_summarise(
     """Run a sweep with a progress bar and write its summary and provenance; returns the summary."""
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.run_sweep import run_sweep, summarise_sweep, sweep_steps
-    from rsbench.cli.console import progress_bar
     from rsbench.storage.files import write_json
 
     with progress_bar(f"simulating {card.name}", sweep_steps(card)) as advance:
@@ -112,8 +112,6 @@ def run_and_summarise(
 
 def show(card: SweepCard, table: pd.DataFrame) -> None:
     """The medians of each variant as a terminal table."""
-    from rsbench.cli.console import print_table, say
-
     given = {"left pairs": "L", "left and right pairs": "L+R", "linked pairs": "L+R linked", "tracks": "tracks"}
     columns = {
         "value": card.axis,
@@ -142,8 +140,6 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
 def _changes(assignments: list[str]) -> dict[str, object]:
     """FIELD=VALUE pairs; values as in a card, plain words may lack their quotes."""
     import tomllib
-
-    from rsbench.core.errors import RsbenchError
 
     changes: dict[str, object] = {}
     for text in assignments:

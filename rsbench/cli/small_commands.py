@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_table, progress_bar, say
 from rsbench.cli.names import complete
+from rsbench.core.errors import RsbenchError
 
 
 def demo(
@@ -44,7 +46,6 @@ def compile_(
 ) -> None:
     """Compile now what the first commands would compile, into a cache on disk: a minute."""
     from rsbench.cli.compile_ahead import PARTS, compile_now, compile_portable
-    from rsbench.cli.console import progress_bar
 
     if portable:
         compile_portable()
@@ -58,7 +59,6 @@ def doctor() -> None:
     """Try every rendering backend in a child process, list the versions that matter, and say what to do."""
     import pandas as pd
 
-    from rsbench.cli.console import print_table
     from rsbench.renderers.diagnosis import advice, doctor_report
 
     report = doctor_report()
@@ -84,7 +84,6 @@ def docs(
 ) -> None:
     """List the documents and examples that come with rsbench, or print where one of them is."""
     from rsbench.components.cards import choices
-    from rsbench.core.errors import RsbenchError
 
     documents = list_documents()
     if name is not None:
@@ -93,8 +92,6 @@ def docs(
         echo(str(documents[name]))
         return
     import pandas as pd
-
-    from rsbench.cli.console import print_table
 
     rows = [{"name": known, "about": _title(path)} for known, path in documents.items()]
     print_table("documents and examples", pd.DataFrame(rows))
@@ -143,12 +140,10 @@ def check_solver(
 ) -> None:
     """Check the contract of a solver: exact data solved, equal results of equal runs, failures as values."""
     import json as json_module
-    from dataclasses import asdict
 
     import pandas as pd
 
     from rsbench.benchmark.simulated.contract import check_solver as find
-    from rsbench.cli.console import print_table, say
     from rsbench.solvers.engine.base import load_solver_entry
 
     entry = load_solver_entry(solver)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, is_quiet, late_progress, print_rows
 from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
@@ -121,9 +122,6 @@ def _answers(
     motion_model: str,
 ) -> Iterator[dict[str, Any] | RsbenchError]:
     """One answer per problem and solver, or the error that a problem is."""
-    import sys
-
-    from rsbench.cli.console import late_progress
     from rsbench.pipeline.answer import solve_problem
     from rsbench.pipeline.isolated_components import SolverRunner
     from rsbench.pipeline.problem import read_problems
@@ -140,8 +138,6 @@ def _answers(
 
 
 def _show(answers: list[dict[str, Any]]) -> None:
-    from rsbench.cli.console import is_quiet, print_rows
-
     rows = [_row(answer) for answer in answers]
     if len(answers) == 1:
         _show_one(answers[0])

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, late_progress, print_rows, print_table, progress_bar, say
 from rsbench.cli.names import complete
 
 EPILOG = """[bold]Examples[/bold]
@@ -110,7 +110,6 @@ def _verify_ours(
     """Each channel against all others, and rows rendered again; ``more``: faults that were found before."""
     import pandas as pd
 
-    from rsbench.cli.console import print_table, progress_bar, say
     from rsbench.dataset.manifest import DATASET
     from rsbench.storage.files import read_json
     from rsbench.verification import verification_steps, verify_dataset
@@ -145,7 +144,6 @@ def _verify_ours(
 
 def _verify_others(folder: Path, layout: str) -> None:
     """Files, sizes, depth and matches under poses and row times, and disparities, as far as a layout has them."""
-    from rsbench.cli.console import late_progress, print_rows, say
     from rsbench.interop.readers.check import NEAR_PX, agreements, disparity_faults, file_faults, sights
     from rsbench.interop.readers.layouts import read_others
 
