@@ -48,6 +48,17 @@ def say(note: str) -> None:
         echo(note)
 
 
+def report_faults(faults: Sequence[str], summary: str) -> None:
+    """Print each fault on stderr and the summary on stdout; exit code 1 if there is a fault."""
+    import typer
+
+    for fault in faults:
+        echo(f"fault: {fault}", err=True)
+    echo(summary)
+    if faults:
+        raise typer.Exit(1)
+
+
 def _progress(
     before: tuple[ProgressColumn, ...] = (), after: tuple[ProgressColumn, ...] = (), **options: Any
 ) -> Progress:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import echo, late_progress
+from rsbench.cli.console import echo, late_progress, report_faults
 from rsbench.core.errors import RsbenchError
 
 EPILOG = """[bold]Examples[/bold]
@@ -50,11 +50,7 @@ def digest(
         echo(f"{out}: digests of {len(found)} sequences" if out else text_of(found), nl=out is not None)
         return
     faults = differences(found, known)
-    for fault in faults:
-        echo(f"fault: {fault}", err=True)
-    echo(f"{folder}: {len(found)} sequences, {len(faults)} faults")
-    if faults:
-        raise typer.Exit(1)
+    report_faults(faults, f"{folder}: {len(found)} sequences, {len(faults)} faults")
 
 
 def register(app: typer.Typer) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at, shared_path
 from rsbench.cli.console import echo, print_table, progress_bar, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -43,30 +43,16 @@ _Out = Annotated[
 ]
 _Solvers = Annotated[
     list[str] | None,
-    typer.Option(
-        help="Solver to score, a name or a card; repeatable. Default: all that come with rsbench.",
-        autocompletion=complete("solvers"),
-    ),
+    named("solvers", "Solver to score, a name or a card; repeatable. Default: all that come with rsbench."),
 ]
-_CorrectWith = Annotated[
-    str,
-    typer.Option(help="Solver whose motion the correction uses; scored too.", autocompletion=complete("solvers")),
-]
-_Matcher = Annotated[
-    str, typer.Option(help="Stereo matcher, a name or a card.", autocompletion=complete("matchers"))
-]
-_Features = Annotated[
-    str, typer.Option(help="Feature matcher, a name or a card.", autocompletion=complete("features"))
-]
-_Corrector = Annotated[
-    str, typer.Option(help="Corrector, a name or a card.", autocompletion=complete("correctors"))
-]
+_CorrectWith = Annotated[str, named("solvers", "Solver whose motion the correction uses; it is scored too.")]
+_Matcher = Annotated[str, named("matchers", "Stereo matcher, a name or a card.")]
+_Features = Annotated[str, named("features", "Feature matcher, a name or a card.")]
+_Corrector = Annotated[str, named("correctors", "Corrector, a name or a card.")]
 _OF_A_RIG = "fusion"
 _Metrics = Annotated[
     list[str] | None,
-    typer.Option(
-        help="Metric that adds columns, a name or a card; repeatable.", autocompletion=complete("metrics")
-    ),
+    named("metrics", "Metric that adds columns, a name or a card; repeatable."),
 ]
 _Only = Annotated[
     list[str] | None,

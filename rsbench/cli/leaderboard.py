@@ -167,17 +167,10 @@ def submit(
     workers: Workers = 1,
 ) -> None:
     """Score a file of predictions and add it to a board."""
-    from rsbench.benchmark.leaderboard.board import add
-    from rsbench.benchmark.leaderboard.submissions import check_submission
-    from rsbench.benchmark.provenance import provenance
-
     split = split_of(_track_of(file), data, seed_file, secret)
-    for note in check_submission(file, split).notes:
-        echo(f"note: {note}", err=True)
-    scored = add(board, file, split, provenance("rsbench leaderboard submit"), replace=replace, workers=workers)
+    scored = _added(board, file, split, "rsbench leaderboard submit", replace, workers)
     _show(board, split.track.id, split.name, None, scored.header.method)
-    if scored.doubt:
-        echo(f"in doubt, and not ranked: {scored.doubt}")
+    _echo_doubt(scored)
 
 
 @board_app.command()
@@ -484,23 +477,16 @@ def score(
     workers: Workers = 1,
 ) -> None:
     """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
-    from rsbench.benchmark.leaderboard.board import add
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
-    from rsbench.benchmark.leaderboard.submissions import check_submission
     from rsbench.benchmark.leaderboard.tracks import track_of_id
-    from rsbench.benchmark.provenance import provenance
     from rsbench.dataset.secret_split import read_secret
 
     announced = read_announcement(published)
     track, text = track_of_id(announced.protocol), read_secret(seed_file)
     split = announced_split(announced, track, card or announced.card, text, keep)
-    for note in check_submission(file, split).notes:
-        echo(f"note: {note}", err=True)
-    made = provenance("rsbench leaderboard score")
-    scored = add(board, file, split, made, replace=replace, workers=workers)
+    scored = _added(board, file, split, "rsbench leaderboard score", replace, workers)
     echo(f"entry: {scored.folder}")
-    if scored.doubt:
-        echo(f"in doubt, and not ranked: {scored.doubt}")
+    _echo_doubt(scored)
 
 
 @board_app.command()
@@ -526,6 +512,22 @@ def split_of(track: str, data: Path | None, seed_file: Path | None, secret: bool
     from rsbench.benchmark.leaderboard.tracks import track_of_name
 
     return track_of_name(track).split(data, seed_file, secret)
+
+
+def _added(board: Path, file: Path, split: Split, command: str, replace: bool, workers: int) -> Scored:
+    """Print the notes on a file of predictions, score it and add it to a board."""
+    from rsbench.benchmark.leaderboard.board import add
+    from rsbench.benchmark.leaderboard.submissions import check_submission
+    from rsbench.benchmark.provenance import provenance
+
+    for note in check_submission(file, split).notes:
+        echo(f"note: {note}", err=True)
+    return add(board, file, split, provenance(command), replace=replace, workers=workers)
+
+
+def _echo_doubt(scored: Scored) -> None:
+    if scored.doubt:
+        echo(f"in doubt, and not ranked: {scored.doubt}")
 
 
 def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:

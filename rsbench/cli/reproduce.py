@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import statistics
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
 from rsbench.cli.console import echo, say
+from rsbench.storage.work_folder import work_folder
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -66,57 +69,48 @@ class Target(StrEnum):
     everything = "everything"
 
 
+class _Recipe(NamedTuple):
+    """How a target is made."""
+
+    maker: str
+    """``module:function`` below ``rsbench.cli``; takes those of ``out``, ``data``, ``workers``, ``seeds`` and
+    ``width`` that it names."""
+    minutes: int
+    """On two cores, as measured in November 2026: for estimates of the remaining time."""
+    rendered: tuple[str, ...] = ()
+    """Folders of datasets below ``--data`` that it reads, and renders first where they are missing."""
+    folders: tuple[str, ...] = ()
+    """Where it writes below ``--out``, if not in the folder of its name."""
+    seeds: int = 1
+    """Runs of each solver in the committed results."""
+
+
+_RECIPES = {
+    Target.images: _Recipe("reproduce:images", 3, ("paper",), seeds=20),
+    Target.fig3: _Recipe("reproduce_simulated:fig3", 4),
+    Target.claims: _Recipe("reproduce_simulated:claims", 15, folders=("fig3", "claims")),
+    Target.image_claims: _Recipe("reproduce_simulated:image_claims", 1, folders=("claims",)),
+    Target.readings: _Recipe("reproduce_simulated:readings", 8),
+    Target.sweeps: _Recipe("reproduce_simulated:sweeps", 9),
+    Target.fig4: _Recipe("reproduce_correction:fig4", 9, ("paper", "moderate", "aggressive")),
+    Target.fig4_literal: _Recipe("reproduce_correction:fig4_literal", 1, ("paper",), ("fig4",)),
+    Target.correction: _Recipe("reproduce_correction:correction", 67, ("mild", "moderate", "aggressive", "poles")),
+    Target.laws_correction: _Recipe("reproduce_correction:laws_correction", 30, ("laws-frames",)),
+    Target.sgm: _Recipe("reproduce_correction:sgm", 1, ("mild", "moderate")),
+    Target.real: _Recipe("reproduce_correction:real", 19, ("real-ideal", "real"), seeds=10),
+    Target.leaderboard: _Recipe("reproduce_leaderboard:leaderboard", 20),
+    Target.laws: _Recipe("reproduce_leaderboard:laws", 240, ("laws-frames",)),
+    Target.boards: _Recipe("reproduce_leaderboard:boards", 180, ("standard",), ("leaderboard",)),
+    Target.handheld: _Recipe("reproduce_leaderboard:handheld", 45, ("handheld",)),
+    Target.footage: _Recipe("reproduce_leaderboard:footage", 110, ("footage", "standard")),
+}
 _ORDER = (
     *(each for each in Target if each not in ("fig3", "fig4-literal", "image-claims", "everything")),
     Target.image_claims,
 )
-"""Claims make Figure 3 in passing, and fig4 its literal part; those about images judge what is stored."""
-_SEEDS = {Target.images: 20, Target.real: 10}
-"""Runs of each solver in what is committed."""
-_MINUTES = {
-    Target.images: 3,
-    Target.fig3: 4,
-    Target.claims: 15,
-    Target.readings: 8,
-    Target.sweeps: 9,
-    Target.fig4: 9,
-    Target.fig4_literal: 1,
-    Target.correction: 67,
-    Target.laws_correction: 30,
-    Target.sgm: 1,
-    Target.real: 19,
-    Target.leaderboard: 20,
-    Target.laws: 240,
-    Target.boards: 180,
-    Target.handheld: 45,
-    Target.footage: 110,
-    Target.image_claims: 1,
-}
-"""Of two cores, as measured in November 2026: for the time that is left of everything, not as a promise."""
-_RENDERED: dict[Target, tuple[str, ...]] = {
-    Target.images: ("paper",),
-    Target.fig4: ("paper", "moderate", "aggressive"),
-    Target.fig4_literal: ("paper",),
-    Target.correction: ("mild", "moderate", "aggressive", "poles"),
-    Target.laws_correction: ("laws-frames",),
-    Target.sgm: ("mild", "moderate"),
-    Target.real: ("real-ideal", "real"),
-    Target.laws: ("laws-frames",),
-    Target.boards: ("standard",),
-    Target.handheld: ("handheld",),
-    Target.footage: ("footage", "standard"),
-}
-"""Folders of datasets below ``--data`` that a target reads, and renders first where they are missing."""
+"""Targets of ``everything``: ``claims`` makes Figure 3, ``fig4`` its literal part; image claims need the rest."""
 _KEPT = 0.1
-"""Share of its minutes below which a target had been made before."""
-_TRACKS = (Target.leaderboard, Target.laws, Target.boards, Target.handheld, Target.footage)
-_FOLDERS = {
-    Target.fig4_literal: ("fig4",),
-    Target.claims: ("fig3", "claims"),
-    Target.image_claims: ("claims",),
-    Target.boards: ("leaderboard",),
-}
-"""Where a target writes below ``--out``, if not in the folder of its name."""
+"""Fraction of its minutes below which a target must have been made before."""
 
 
 def reproduce(
@@ -164,7 +158,7 @@ def reproduce(
         for each in Target:
             of = _ORDER if each is Target.everything else (each,)
             needs = [_first(each, data)] if each is not Target.everything else []
-            echo(f"{each}: about {sum(_MINUTES[one] for one in of)} minutes on two cores{''.join(needs)}")
+            echo(f"{each}: about {sum(_RECIPES[one].minutes for one in of)} minutes on two cores{''.join(needs)}")
         return
     check_out(out)
     _make(_ORDER if target is Target.everything else (target,), out, data, workers, seeds, width)
@@ -179,9 +173,9 @@ def _make(
         start = time.monotonic()
         whole = f"[{number + 1} of {len(targets)}] " if len(targets) > 1 else ""
         say(f"{whole}{each}: {_left(targets[number:], paces)}{_first(each, data)}")
-        _reproduce(each, out, data, workers, seeds or _SEEDS.get(each, 1), width)
-        paces.append((time.monotonic() - start) / 60.0 / _MINUTES[each])
-        echo(f"{each}: {paces[-1] * _MINUTES[each]:.1f} minutes")
+        _reproduce(each, out, data, workers, seeds or _RECIPES[each].seeds, width)
+        paces.append((time.monotonic() - start) / 60.0 / _RECIPES[each].minutes)
+        echo(f"{each}: {paces[-1] * _RECIPES[each].minutes:.1f} minutes")
     if len(targets) > 1:
         echo(f"{Target.everything}: {(time.monotonic() - begin) / 60.0:.1f} minutes")
 
@@ -189,7 +183,7 @@ def _make(
 def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
     """About how long the next target, and all of them, take by the pace of those that were made so far."""
     made = [pace for pace in paces if pace > _KEPT]
-    minutes = [_MINUTES[each] * (statistics.median(made) if made else 1.0) for each in targets]
+    minutes = [_RECIPES[each].minutes * (statistics.median(made) if made else 1.0) for each in targets]
     begin = f"about {minutes[0]:.0f} minutes on two cores"
     return begin if len(targets) == 1 else f"{begin}; with what follows {sum(minutes) / 60.0:.1f} hours"
 
@@ -198,65 +192,24 @@ def _first(target: Target, data: Path) -> str:
     """What is rendered or needed before a target is made."""
     if target is Target.image_claims:
         return "; judges what the other targets have written: make them first"
-    places = [data / name for name in _RENDERED.get(target, ())]
+    places = [data / name for name in _RECIPES[target].rendered]
     missing = [str(place) for place in places if not (place / "dataset.json").is_file()]
     return f"; renders first what is missing: {', '.join(missing)}" if missing else ""
 
 
 def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:
-    from rsbench.storage.work_folder import work_folder
-
+    recipe = _RECIPES[target]
+    module, _, name = recipe.maker.partition(":")
+    maker = getattr(import_module(f"rsbench.cli.{module}"), name)
+    given = {"out": out, "data": data, "workers": workers, "seeds": seeds, "width": width}
     with ExitStack() as stack:
-        for name in _FOLDERS.get(target, (target.value,)):
-            stack.enter_context(work_folder(out / name))
-        if target is Target.images:
-            _images(out, data, seeds)
-        elif target in (Target.correction, Target.laws_correction):
-            _correction(target, out, data, workers)
-        elif target is Target.real:
-            _real(out, data, seeds, width)
-        elif target in _TRACKS:
-            _leaderboard(target, out, data, workers)
-        elif target in (Target.fig4, Target.fig4_literal, Target.sgm):
-            _depth(target, out, data)
-        else:
-            _simulated(target, out, data, workers)
+        for folder in recipe.folders or (target.value,):
+            stack.enter_context(work_folder(out / folder))
+        maker(**{name: given[name] for name in inspect.signature(maker).parameters})
 
 
-def _correction(target: Target, out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.cli.reproduce_correction import correction, laws_correction
-
-    (correction if target is Target.correction else laws_correction)(out, data, workers)
-
-
-def _leaderboard(target: Target, out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.cli import reproduce_leaderboard
-
-    getattr(reproduce_leaderboard, target.value)(out, data, workers)
-
-
-def _real(out: Path, data: Path, seeds: int, width: int | None) -> None:
-    from rsbench.cli.reproduce_correction import real
-
-    real(out, data, seeds, width)
-
-
-def _depth(target: Target, out: Path, data: Path) -> None:
-    from rsbench.cli import reproduce_correction
-
-    getattr(reproduce_correction, target.name)(out, data)
-
-
-def _simulated(target: Target, out: Path, data: Path, workers: int | None) -> None:
-    from rsbench.cli import reproduce_simulated
-
-    if target is Target.image_claims:
-        reproduce_simulated.image_claims(out)
-    else:
-        getattr(reproduce_simulated, target.value)(out, data, workers)
-
-
-def _images(out: Path, data: Path, seeds: int) -> None:
+def images(out: Path, data: Path, seeds: int) -> None:
+    """The paper's image experiment, by every solver."""
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.evaluate import evaluate_dataset, every_solver
     from rsbench.cli.generate import generate

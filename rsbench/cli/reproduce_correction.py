@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
@@ -20,7 +20,7 @@ from rsbench.benchmark.studies.correction_study import (
     summarise_bands,
 )
 from rsbench.benchmark.studies.fig4_panels import Panels, correct_literally, load_panels, make_panels, save_panels
-from rsbench.benchmark.studies.sgm_timing import TIMINGS, compare, right_row_poses
+from rsbench.benchmark.studies.sgm_timing import TIMINGS, Timing, compare, right_row_poses
 from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.generate import generate
 from rsbench.components.cards import load_card
@@ -40,11 +40,6 @@ from rsbench.report.correction_page import draw_frames, write_laws, write_real_p
 from rsbench.report.paper_figures import draw_fig4
 from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_png, write_json, write_png, write_table
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from rsbench.benchmark.studies.sgm_timing import Timing
 
 LAWS_FRAMES = "laws-frames"
 """Folder of the card ``laws``."""
@@ -80,8 +75,7 @@ def fig4(out: Path, data: Path) -> None:
         for path in draw_fig4(rows, folder / f"fig4-{card}"):
             echo(f"figure: {path}")
     write_table(folder / "numbers.csv", pd.DataFrame(numbers))
-    records = [dataset_record(data / card) for card, _ in _FIG4]
-    write_json(folder / "provenance.json", provenance("rsbench reproduce fig4", datasets=records))
+    _write_provenance(folder, "fig4", [data / card for card, _ in _FIG4])
 
 
 def fig4_literal(out: Path, data: Path) -> None:
@@ -102,8 +96,7 @@ def fig4_literal(out: Path, data: Path) -> None:
     write_table(folder / "literal.csv", pd.DataFrame(views))
     for path in draw_fig4([(sequence.name, panels[0])], folder / "fig4-literal", quality=60):
         echo(f"figure: {path}")
-    made = provenance("rsbench reproduce fig4-literal", datasets=[dataset_record(data / "paper")])
-    write_json(folder / "literal-provenance.json", made)
+    _write_provenance(folder, "fig4-literal", [data / "paper"], "literal-provenance.json")
 
 
 def correction(out: Path, data: Path, workers: int | None = None) -> None:
@@ -119,8 +112,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     write_table(folder / "summary.csv", summarise(stored))
     write_table(folder / "scenes.csv", by_scene(stored))
     write_table(folder / "rows.csv", summarise_bands(bands))
-    records = [dataset_record(data / card) for card in STRATA]
-    write_json(folder / "provenance.json", provenance("rsbench reproduce correction", datasets=records))
+    _write_provenance(folder, "correction", [data / card for card in STRATA])
     for path in write_study(folder):
         echo(f"written: {path}")
 
@@ -133,8 +125,7 @@ def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
     write_table(folder / "sequences.csv", by_sequence(images))
     write_table(folder / "motions.csv", motions)
     write_table(folder / "summary.csv", by_law(pd.read_csv(folder / "sequences.csv")))
-    records = [dataset_record(data / LAWS_FRAMES)]
-    write_json(folder / "provenance.json", provenance("rsbench reproduce laws-correction", datasets=records))
+    _write_provenance(folder, "laws-correction", [data / LAWS_FRAMES])
     echo(f"written: {write_laws(folder)}")
 
 
@@ -157,7 +148,8 @@ def sgm(out: Path, data: Path) -> None:
     """Semi-global matching when the right camera reads its rows at other times."""
     folder = out / "sgm"
     folder.mkdir(parents=True, exist_ok=True)
-    for card in dict.fromkeys(card for card, _ in _SGM):
+    cards = list(dict.fromkeys(card for card, _ in _SGM))
+    for card in cards:
         _generate(card, data)
     rows = []
     with progress_bar("matching", len(_SGM) * len(TIMINGS)) as advance:
@@ -173,8 +165,7 @@ def sgm(out: Path, data: Path) -> None:
                 rows.append({"stratum": card, "sequence": name, **scores})
                 advance(f"{name}, {timing.name}")
     write_table(folder / "sgm.csv", pd.DataFrame(rows))
-    records = [dataset_record(data / card) for card in dict.fromkeys(card for card, _ in _SGM)]
-    write_json(folder / "provenance.json", provenance("rsbench reproduce sgm", datasets=records))
+    _write_provenance(folder, "sgm", [data / card for card in cards])
     for path in write_sgm_page(folder):
         echo(f"written: {path}")
 
@@ -203,8 +194,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
         pd.read_csv(folder / f"{name}.csv", keep_default_na=False, na_values=[""]) for name in ("motions", "views")
     )
     write_table(folder / "summary.csv", real_cameras.summarise(*stored))
-    records = [dataset_record(place) for place in places.values()]
-    write_json(folder / "provenance.json", provenance("rsbench reproduce real", datasets=records))
+    _write_provenance(folder, "real", places.values())
     for path in (_draw_real(places, folder), write_real_page(folder, asdict(card))):
         echo(f"written: {path}")
 
@@ -222,6 +212,12 @@ def _draw_real(places: dict[str, Path], folder: Path) -> Path:
         "its global-shutter twin": real.image("gs", "left", 1),
     }
     return draw_frames(frames, folder / "frames.jpg")
+
+
+def _write_provenance(folder: Path, target: str, datasets: Iterable[Path], name: str = "provenance.json") -> None:
+    """Record the command, the code and the datasets from which a target was made."""
+    records = [dataset_record(dataset) for dataset in datasets]
+    write_json(folder / name, provenance(f"rsbench reproduce {target}", datasets=records))
 
 
 def _generate(card: str, data: Path, name: str = "") -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import echo, late_progress, print_rows, print_table, progress_bar, say
+from rsbench.cli.console import echo, late_progress, print_rows, print_table, progress_bar, report_faults, say
 from rsbench.cli.names import complete
 
 EPILOG = """[bold]Examples[/bold]
@@ -135,11 +135,8 @@ def _verify_ours(
     ):
         say(note)
     faults = more + [f"{report.name}: {fault}" for report in reports for fault in report.faults]
-    for fault in faults:
-        echo(f"fault: {fault}", err=True)
-    echo(f"{folder}: {sum(report.name != DATASET for report in reports)} sequences, {len(faults)} faults")
-    if faults:
-        raise typer.Exit(1)
+    count = sum(report.name != DATASET for report in reports)
+    report_faults(faults, f"{folder}: {count} sequences, {len(faults)} faults")
 
 
 def _verify_others(folder: Path, layout: str) -> None:
@@ -173,11 +170,7 @@ def _verify_others(folder: Path, layout: str) -> None:
     if seen:
         columns = ["recording", "seen", "count", f"within {NEAR_PX:g} px (%)", "typical (px)"]
         print_rows("Features where cameras and poses say", columns, seen, right=columns[2:])
-    for fault in faults:
-        echo(f"fault: {fault}", err=True)
-    echo(f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
-    if faults:
-        raise typer.Exit(1)
+    report_faults(faults, f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
 
 
 def register(app: typer.Typer) -> None:

@@ -26,19 +26,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsbench.components.imports import lifeline
-from rsbench.storage.work_folder import cpu_key
+from rsbench.storage.work_folder import cpu_key, user_cache
 
 _MAXIMUM_ENTRIES = 64
 
 
 def cache_file() -> Path | None:
-    """Where verdicts are kept; None when the user has no home folder."""
-    chosen = os.environ.get("XDG_CACHE_HOME", "")
-    try:
-        base = Path(chosen) if chosen else Path.home() / ".cache"
-    except RuntimeError:
-        return None
-    return base / "rsbench" / "probes.json" if base.is_absolute() else None
+    """File with the results of earlier probes; None when the user has no home folder."""
+    base = user_cache()
+    return base / "probes.json" if base is not None and base.is_absolute() else None
 
 
 def recall(key: str) -> str | None:

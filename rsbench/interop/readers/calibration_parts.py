@@ -176,10 +176,11 @@ def rotation_of(values: FloatArray, where: str) -> FloatArray:
     return u @ vt
 
 
-def quaternion_of(wxyz: Sequence[float], where: str) -> FloatArray:
+def quaternion_of(wxyz: Sequence[float] | FloatArray, where: str) -> FloatArray:
+    """Rotation matrix (3, 3) of a quaternion (w, x, y, z); RsbenchError where its length is not 1 within 1 %."""
     length = float(np.linalg.norm(wxyz))
     if not abs(length - 1.0) < 1e-2:
-        raise RsbenchError(f"{where}: quaternion of length {length:g}, not 1")
+        raise RsbenchError(f"{where}: the quaternion has length {length:g}, not 1")
     return so3.from_quaternion(wxyz)
 
 

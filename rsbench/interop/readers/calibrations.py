@@ -460,35 +460,25 @@ def _depthai_camera(camera: Fields) -> Table:
 # RealSense.
 
 
-def _realsense_cameras(tree: Any, name: str = "") -> dict[str, Mapping[str, Any]]:
-    """Tables of intrinsics by the names on the way to them."""
+def _tables_with(keys: Sequence[str], tree: Any, name: str = "") -> dict[str, Mapping[str, Any]]:
+    """Inner tables that have all keys, each by the keys that lead to it, in lower case and joined by blanks."""
     if not isinstance(tree, Mapping):
         return {}
-    if keyed(tree, "fx", "fy", "ppx", "ppy"):
+    if keyed(tree, *keys):
         return {name: tree}
     found = dict[str, Mapping[str, Any]]()
     for key, value in tree.items():
-        found |= _realsense_cameras(value, f"{name} {key}".strip().lower())
+        found |= _tables_with(keys, value, f"{name} {key}".strip().lower())
     return found
 
 
-def _realsense_extrinsics(tree: Any, name: str = "") -> dict[str, Mapping[str, Any]]:
-    if not isinstance(tree, Mapping):
-        return {}
-    if keyed(tree, "rotation", "translation"):
-        return {name: tree}
-    found = dict[str, Mapping[str, Any]]()
-    for key, value in tree.items():
-        found |= _realsense_extrinsics(value, f"{name} {key}".strip().lower())
-    return found
-
-
+_RS2_INTRINSICS, _RS2_EXTRINSICS = ("fx", "fy", "ppx", "ppy"), ("rotation", "translation")
 _IR = (r"left|infra(red)?[ _]?1|ir[ _]?1|fisheye[ _]?1", r"right|infra(red)?[ _]?2|ir[ _]?2|fisheye[ _]?2")
 
 
 def _read_realsense(files: Files) -> Calibration:
     top = files.only()
-    cameras = _realsense_cameras(top.tree)
+    cameras = _tables_with(_RS2_INTRINSICS, top.tree)
     if len(cameras) == 1:
         ((name, own),) = cameras.items()
         return Calibration(format="RealSense", left=_realsense_camera(Fields(own, f"{top.where}: {name}")))
@@ -497,7 +487,7 @@ def _read_realsense(files: Files) -> Calibration:
         raise RsbenchError(f"{top.where}: {', '.join(cameras)}: name the cameras left and right")
     (left,), (right,) = sides
     apart = None
-    for name, own in _realsense_extrinsics(top.tree).items():
+    for name, own in _tables_with(_RS2_EXTRINSICS, top.tree).items():
         words = re.search(rf"({_IR[0]}|{_IR[1]})\w*[ _]+to[ _]+({_IR[0]}|{_IR[1]})", name)
         at = Fields(own, f"{top.where}: {name or 'extrinsics'}")
         pose = Pose(
@@ -709,7 +699,7 @@ FORMATS: tuple[Format, ...] = (
     Format("DepthAI", lambda tree: keyed(tree, "cameraData"), _read_depthai),
     Format(_RIG_CONFIG, _is_rig_config, _read_rig_config),
     Format("COLMAP", lambda tree: keyed(tree, "colmap"), _read_colmap, _colmap_files),
-    Format("RealSense", lambda tree: bool(_realsense_cameras(tree)), _read_realsense),
+    Format("RealSense", lambda tree: bool(_tables_with(_RS2_INTRINSICS, tree)), _read_realsense),
     Format("EuRoC", lambda tree: keyed(tree, "T_BS", "intrinsics", "resolution"), _read_asl, _asl_files),
     Format("ROS camera_info", is_ros, read_ros, ros_files),
     Format("OpenCV", is_opencv, read_opencv, opencv_files),

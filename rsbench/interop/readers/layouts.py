@@ -65,9 +65,9 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, View
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.so3 import FloatArray, from_quaternion
+from rsbench.core.so3 import FloatArray
 from rsbench.dataset.recording import PoseAt, Recording
-from rsbench.interop.readers.calibration_parts import Table, brown, camera_of, rotation_of, table_of
+from rsbench.interop.readers.calibration_parts import Table, brown, camera_of, quaternion_of, rotation_of, table_of
 from rsbench.interop.readers.calibration_trees import Fields, read_tree
 from rsbench.interop.readers.calibrations import (
     asl_camera,
@@ -108,14 +108,6 @@ def only_file(folder: Path, *names: str) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise RsbenchError(f"{folder}: holds no {' or '.join(names)}")
-
-
-def rotation(q: FloatArray, where: object) -> FloatArray:
-    """(3, 3) of a quaternion (w, x, y, z), normalised; RsbenchError where its length is far from one."""
-    length = float(np.linalg.norm(q))
-    if not abs(length - 1.0) < 1e-2:
-        raise RsbenchError(f"{where}: quaternion {q.tolist()} has length {length:g}, not 1")
-    return from_quaternion(q)
 
 
 def _pinhole(size: Sequence[float], K: FloatArray, where: object, lens: Lens | None = None) -> PinholeCamera:
@@ -258,7 +250,7 @@ def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
     if len(words) != 10:
         raise RsbenchError(f"{where}: must be a number, a quaternion, a translation, a camera and a name")
     values = numbers(" ".join(words[1:8]), where, 7)
-    return words[0], words[9].strip(), words[8], Pose(rotation(values[:4], where), values[4:])
+    return words[0], words[9].strip(), words[8], Pose(quaternion_of(values[:4], where), values[4:])
 
 
 def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
@@ -423,7 +415,7 @@ def _trajectory(root: Path, start_ns: int, period_s: float) -> PoseAt | None:
         if len(values) < 7:
             raise RsbenchError(f"{where}: must be a time, a position and a quaternion")
         stamps.append((ns - start_ns) * 1e-9 / period_s)
-        rows.append((rotation(values[3:7], where), values[:3]))
+        rows.append((quaternion_of(values[3:7], where), values[:3]))
     tau = np.array(stamps)
     if len(tau) < 2 or not np.all(np.diff(tau) > 0.0):
         raise RsbenchError(f"{path}: must hold at least two times, increasing")

@@ -19,6 +19,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_parts import Calibration, Table, camera_of
 from rsbench.interop.writers.colmap_and_tum import camera_line
 from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, yaml_transform
+from rsbench.interop.writers.sequence_views import number
 from rsbench.storage.files import write_bytes
 
 
@@ -205,7 +206,7 @@ def _write_ros(found: Calibration, out: Path) -> list[Path]:
         text += f"distortion_model: {model}\n"
         for name, block in blocks.items():
             rows, cols = block.shape
-            data = ", ".join(_decimal(value) for value in block.ravel().tolist())
+            data = ", ".join(number(value) for value in block.ravel().tolist())
             text += f"{name}:\n  rows: {rows}\n  cols: {cols}\n  data: [{data}]\n"
         files.append(out / f"{side}.yaml")
         write_bytes(files[-1], text.encode())
@@ -213,12 +214,6 @@ def _write_ros(found: Calibration, out: Path) -> list[Path]:
 
 
 _ROS_MODELS = {"brown-conrady": "plumb_bob", "rational": "rational_polynomial", "kannala-brandt": "equidistant"}
-
-
-def _decimal(value: float) -> str:
-    """With a point: YAML 1.1 reads 1e-05 as text."""
-    text = repr(value)
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
 # COLMAP

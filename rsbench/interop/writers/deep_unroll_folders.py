@@ -97,17 +97,23 @@ def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArr
 
 
 def _write_carla_frame(sequence: Sequence, view: View, place: Path) -> None:
-    middle, camera = sequence.shutter.lines(view.side) // 2, sequence.rig.sensor(view.side)
-    names = {"rs": picture_file("rs", view.side, view.frame), "gs_f": picture_file("gs", view.side, view.frame)}
-    if middle in sequence.twins:
-        names["gs_m"] = picture_file("gs", view.side, view.frame, middle)
-    for name, file in names.items():
-        write_bytes(place / f"{view.frame:04d}_{name}.png", read_bytes(inside(sequence.folder, file)))
+    camera = sequence.rig.sensor(view.side)
+    _copy_pictures(sequence, view, f"{place}/{view.frame:04d}", ("rs", "gs_f", "gs_m"))
     for name, depth in (
         ("rs", sequence.depth("rs", view.side, view.frame)),
         ("gs_f", sequence.depth("gs", view.side, view.frame)),
     ):
         write_bytes(place / f"{view.frame:04d}_{name}.depth", _depth_text(radial(camera, depth)))
+
+
+def _copy_pictures(sequence: Sequence, view: View, stem: str, names: tuple[str, str, str]) -> None:
+    """Copy a frame and its twins of the first and, if the dataset has it, the middle row to STEM_NAME.png."""
+    side, frame, middle = view.side, view.frame, sequence.shutter.lines(view.side) // 2
+    files = [picture_file("rs", side, frame), picture_file("gs", side, frame)]
+    if middle in sequence.twins:
+        files.append(picture_file("gs", side, frame, middle))
+    for name, file in zip(names, files, strict=False):
+        write_bytes(Path(f"{stem}_{name}.png"), read_bytes(inside(sequence.folder, file)))
 
 
 def radial(camera: PinholeCamera, depth: NDArray[np.float32]) -> FloatArray:
@@ -175,12 +181,8 @@ def _write_fastec(sequence: Sequence, root: Path, images: Images) -> Note:
         place.mkdir(parents=True)
         write_lines(place / _META, [f"# {sequence.name}, {side} camera: readout ratio {ratio:g}"])
         for frame in range(sequence.frames):
-            names = {"rolling": picture_file("rs", side, frame), "global_first": picture_file("gs", side, frame)}
-            if middle in sequence.twins:
-                names["global_middle"] = picture_file("gs", side, frame, middle)
-            for name, file in names.items():
-                path = place / f"{frame:03d}_{name}.png"
-                write_bytes(path, read_bytes(inside(sequence.folder, file)))
+            names = ("rolling", "global_first", "global_middle")
+            _copy_pictures(sequence, View(side, frame), f"{place}/{frame:03d}", names)
         if middle not in sequence.twins:
             sentences.append(
                 f"there is no twin of row {middle}, so no NNN_global_middle.png, which training reads"
