@@ -107,7 +107,7 @@ def compile_portable() -> None:
 
 
 PARTS = ("spline", "depth", "correction", "motion", "matching")
-"""Of the chain, in the order of ``parts``."""
+"""Names of the parts of the correction, in the order of ``parts``."""
 
 
 def parts() -> list[Callable[[], object]]:

@@ -144,7 +144,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
 
 
 def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.DataFrame:
-    """Of one camera's correctors: scaled flow and ``corrector``, or ours where that is the default of a rig."""
+    """Scores of two correctors of one camera: scaled flow, and ``corrector`` or, if that is the default, ours."""
     from rsbench.benchmark.recordings import check_sees_one_camera, correction_scores, pairs_with_truth
     from rsbench.vision.corrector import load_corrector
 
@@ -159,7 +159,7 @@ def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.Da
 
 
 def _means(table: pd.DataFrame) -> pd.DataFrame:
-    """Of the pairs, by target and method."""
+    """Mean scores of the pairs, by target row and method."""
     groups = table.groupby(["row", "method"], sort=False)
     means = groups[["psnr", "ssim", "psnr_mask", "ssim_deepunroll"]].mean().dropna(axis="columns")
     means.insert(0, "frames", groups.size())

@@ -1,4 +1,4 @@
-"""How a command ends otherwise than it should: by Ctrl-C or SIGTERM, or by an unexpected error.
+"""Early ends of a command: by Ctrl-C or SIGTERM, or by an unexpected error.
 
 A signal ends every command within two seconds, with a line that says how to go on and exit code 130 or 143. It
 raises ``Stopped`` in the main thread, so that everything is closed in order. The main thread may be deep in a
@@ -42,7 +42,7 @@ _ADVICE = {
     "export": "--out is as it was before",
     "solve": "nothing is kept; what was answered stays answered",
 }
-"""How to go on, by command."""
+"""What the user can do after an interruption, by command."""
 _SHOW_CURSOR = "\x1b[?25h"
 
 

@@ -220,7 +220,7 @@ def _chosen(
 
 
 def _part(word: str) -> tuple[int, int]:
-    """Of ``2/5``: 2 and 5."""
+    """The two numbers of a shard I/N: 2 and 5 for ``2/5``."""
     part, slash, parts = word.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal()):
         raise RsbenchError(f"--shard {word}: must be I/N, such as 1/4")

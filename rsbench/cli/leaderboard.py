@@ -301,7 +301,7 @@ def show(
 
 @board_app.command()
 def oracles(track: Track, board: _Board, data: Data = None, seed_file: Secret = None) -> None:
-    """Add the truth and others that know it, as rows without a rank; to correction, frames as they are too."""
+    """Add the ground truth and methods that use it, without a rank; for correction, the uncorrected frames too."""
     from rsbench.benchmark.leaderboard.board import add_all
     from rsbench.benchmark.leaderboard.submissions import write_oracles
     from rsbench.benchmark.provenance import provenance

@@ -104,7 +104,7 @@ def _fill(
 
 
 def entries_of_laws() -> dict[str, list[str]]:
-    """By protocol, what comes with rsbench: one entry a method, and of solvers the one that chooses its law."""
+    """Entries that come with rsbench, by protocol: one for each method, and the solver that selects a model."""
     first = entries_of_frames()
     solvers, readers = (
         [name for name in first[track] if name not in SAME_METHOD] + [CHOOSES] for track in ("pose", "readout")
@@ -113,7 +113,7 @@ def entries_of_laws() -> dict[str, list[str]]:
 
 
 def entries_of_frames() -> dict[str, list[str]]:
-    """By track, what comes with rsbench and needs no more than the track gives.
+    """Entries that come with rsbench and need no more than the inputs of the track, by track.
 
     ``readout`` has those that look for a ratio: the maximum-likelihood ones of both cameras, which it takes alone.
     """

@@ -165,7 +165,7 @@ def _lines(found: Calibration) -> list[str]:
     for side in ("left", "right"):
         if (own := record.get(side)) is None:
             continue
-        size = f"{own['width']} x {own['height']} px" if "width" in own else "size not said"
+        size = f"{own['width']} x {own['height']} px" if "width" in own else "size not given"
         name = side if "right" in record else "camera"
         lines.append(
             f"{name}: {size}, focal length {own['fx']:.2f}, {own['fy']:.2f} px, "

@@ -129,7 +129,7 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
         print_table(title, rows[list(columns)].rename(columns=columns), digits)
         for row in rows[rows.failures > 0].to_dict("records"):
             say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
-    rolling = table[table.shutter == "rolling"]  # the others know no time between the rows
+    rolling = table[table.shutter == "rolling"]  # other shutters have no time between rows
     for (solver, assumed), rows in rolling.groupby(["solver", "assumed_motion"], sort=False):
         others = sorted(set(rows.motion_model) - {assumed})
         if others:

@@ -58,7 +58,7 @@ def _anything_goes(component: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """How a component is run, as its card sets it."""
+    """Options of running a component, set by its card."""
 
     time_limit_s: float = 300.0
     """Wall-clock time for one problem, after which a component of another package has failed."""
@@ -102,7 +102,7 @@ class Entry(Generic[Component, Options]):
     component: Component
     options: Options
     parameters: dict[str, Any] = field(default_factory=dict)
-    """As the card gives them."""
+    """Parameters that the card sets."""
     key: str
     """Hash of class, source, parameters and the components inside: equal keys give equal answers."""
 

@@ -23,7 +23,7 @@ from rsbench.core.so3 import FloatArray
 Size = tuple[int, int]
 _OF_IMAGE = ("width", "height", "fx", "fy", "cx", "cy")
 _MOST = 4.0
-"""Of ``rig_scale``."""
+"""Largest ``rig_scale``."""
 Vector = tuple[float, float, float]
 _DIGITS = 1e-2
 """Share by which printed line delays may exceed a frame period."""

@@ -246,7 +246,7 @@ class _Child:
         return None, f"took longer than {limit_s:g} s"
 
     def _used_mb(self) -> float:
-        """Memory of the process; 0 where the system does not tell."""
+        """Memory of the process, MB; 0 where the system does not report it."""
         try:
             with open(f"/proc/{self._process.pid}/statm", "rb") as file:
                 pages = int(file.read().split()[1])

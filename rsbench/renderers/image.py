@@ -54,7 +54,7 @@ class Sensor:
     """
 
     exposure_s: float = 0.0
-    """For how long a row collects light, seconds; the middle of it is the row's time. 0: an instant."""
+    """Exposure time of a row, seconds, centred on the row's time; 0 is instantaneous."""
     full_well: float = 6000.0
     """Electrons of a pixel that saturates at gain 1."""
     gain: float = 1.0
@@ -129,7 +129,7 @@ class Sensor:
 
     @property
     def record(self) -> dict[str, Any]:
-        """For JSON: what cameras and frames share is stored once, newer keys only if not at their default."""
+        """Values for JSON; keys that were added later are left out at their defaults."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         own = {name: value for name, value in values.items() if name not in _DEFAULTS or value != _DEFAULTS[name]}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
@@ -141,7 +141,7 @@ class Sensor:
 
     @property
     def bits(self) -> int:
-        """Of the digital numbers; 0: there are none."""
+        """Bits of the digital numbers; 0 if values are not quantised."""
         return self.bit_depth or (0 if self.mosaic == "none" else _MOSAIC_BITS)
 
     @property
@@ -151,9 +151,9 @@ class Sensor:
         return round(_BLACK_SHARE * top), top
 
     def variance(self, light: ArrayLike) -> NDArray[np.float64]:
-        """Of linear values (...), white = 1, where ``light`` falls on the sensor; away from black and white.
+        """Noise variance of linear values (...), white = 1, under light ``light``, away from black and white.
 
-        Of a pixel as it is read: neither interpolated from a mosaic nor compressed.
+        It applies to raw pixels, before demosaicing and compression.
         """
         black, top = self.levels
         dark = self.dark_current * self.exposure_s
@@ -320,7 +320,7 @@ def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
 def shares_of_noise(mosaic: Mosaic, width: int, height: int) -> NDArray[np.float64]:
     """Variance (H, W, 3) of the image's linear values over that of the pixels read, inside the image.
 
-    Which two neighbours are nearer to each other does not tell their mean, so choosing them changes nothing.
+    Which pair of neighbours is chosen does not depend on its mean, so the choice does not change the variance.
     """
     if mosaic == "none":
         return np.ones((height, width, 3))

@@ -15,7 +15,7 @@ _MOST_SAMPLES, _LONGEST_PATH, _MOST_SKY_RAYS = 1 << 16, 1 << 10, 64
 
 @dataclass(frozen=True, kw_only=True)
 class RendererOptions:
-    """How images are made; depth does not depend on any of it.
+    """Options of rendering images; depth does not depend on them.
 
     Raises:
         RsbenchError: a value is out of its range.
@@ -59,7 +59,7 @@ class RendererOptions:
 
     @property
     def record(self) -> dict[str, Any]:
-        """As JSON holds it; what came later only where there is any."""
+        """Values for JSON; keys that were added later are left out at their defaults."""
         return {name: value for name, value in asdict(self).items() if name != "sky_rays" or value}
 
 

@@ -87,7 +87,7 @@ class Reflectances:
 
 
 def _number(shape: Any) -> int:
-    """By which a kernel knows it."""
+    """Identifier of a shape inside a kernel."""
     import drjit as dr
     import mitsuba as mi
 
@@ -112,7 +112,7 @@ def _between(coordinate: Any, size: Any) -> list[tuple[Any, Any]]:
 
 
 def checked_texture(material: Material) -> NDArray[np.uint8]:
-    """Of a material that has one."""
+    """The texture of a textured material; RsbenchError if it is not (h, w, 3) uint8."""
     texture = np.asarray(material.texture)
     if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
         raise RsbenchError(
@@ -362,7 +362,7 @@ def _mapped(radiance: NDArray[np.float32], environment: Environment) -> dict[str
 
 
 def _without_texture(material: Material) -> Material:
-    """Unless it is glossy: Mitsuba itself evaluates a coat and what is below."""
+    """The material without its texture, unless it is glossy, since Mitsuba itself evaluates glossy materials."""
     return replace(material, texture=None) if material.roughness is None else material
 
 

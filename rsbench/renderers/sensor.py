@@ -25,7 +25,8 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose, inverse
 
 _EXACT_PX = 1e-8
-"""How near to its sample a ray is, in double precision; rounding it to single errs a thousand times more."""
+"""Largest error of an undistorted ray, px, in double precision; rounding to single precision errs a thousand
+times more."""
 _MOST_STEPS = 12
 _TRIED = 65
 """Pixels along each side of the image that the host tries, the outermost among them."""

@@ -40,9 +40,9 @@ class CorridorBuilder(PartsBuilder):
     RANGES = (("doors", 0, 6), ("lights", 1, 8))
 
     doors: int = 5
-    """On each side."""
+    """Number of doors on each side."""
     lights: int = 5
-    """Openings in the ceiling; the sun enters through nothing else."""
+    """Number of openings in the ceiling, the only ones through which the sun enters."""
 
     def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_floor(), *_ceiling(self.lights), *_end_walls(), *_niche()]
@@ -173,7 +173,7 @@ def _niche() -> list[Piece]:
 
 
 def _radiator() -> list[Piece]:
-    """On the wall y = 0, as the two below."""
+    """Standing on the floor in front of the wall y = 0, like the next two."""
     return [block("enamel", (0.055, 0.06, 0.6), (0.07 * (k - 6.5), -0.09, 0.12)) for k in range(14)]
 
 

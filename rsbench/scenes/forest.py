@@ -26,9 +26,9 @@ class ForestBuilder(PartsBuilder):
     RANGES = (("trees", 10, 150), ("ferns", 0, 200))
 
     trees: int = 75
-    """Beside those in the foreground."""
+    """Number of trees, besides those in the foreground."""
     ferns: int = 60
-    """On the ground between them."""
+    """Number of ferns on the ground between the trees."""
 
     def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_ground(rng), *_backdrop(rng), *_foreground(rng)]

@@ -42,9 +42,9 @@ class StreetBuilder(PartsBuilder):
     RANGES = (("storeys", 2, 8), ("cars", 0, 16))
 
     storeys: tuple[int, int] = (4, 6)
-    """Least and greatest."""
+    """Least and greatest number of storeys of the houses."""
     cars: int = 12
-    """At the kerbs."""
+    """Number of cars parked at the kerbs."""
 
     def pieces(self, rng: np.random.Generator) -> list[Piece]:
         pieces = [*_roadway(), *_closing(rng, self.storeys), *_furniture(rng, self.cars)]

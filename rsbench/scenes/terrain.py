@@ -68,7 +68,7 @@ class TerrainBuilder(PartsBuilder):
     relief: float = 2.5
     """Height of the swells of the land, metres."""
     houses: int = 2
-    """On each of the four plots at the crossing."""
+    """Number of houses on each of the four plots at the crossing."""
 
     def pieces(self, rng: np.random.Generator) -> list[Piece]:
 

@@ -223,7 +223,7 @@ def read_exr(
 def _check_exr_header(
     headers: list[dict[str, Any]], path: Path, names: tuple[str, ...], size: tuple[int, int] | None
 ) -> None:
-    """Before pixels are decoded: refuse other parts, channels or sizes."""
+    """Refuse unexpected parts, channels or sizes before pixels are decoded."""
     import OpenEXR
 
     found = sorted(channel.name for header in headers for channel in header["channels"])

@@ -1,11 +1,11 @@
-"""Results on a store: a command works in a folder of this machine, and its files go there as they come to be.
+"""Results in an object store: a command works in a local folder, whose files are uploaded.
 
-The folder lies in the user's cache. ``sent.json`` beside it says what was sent or brought, and what is about to
-be: so a later command knows whether the folder is ahead of the store, or others have changed the store since.
+The folder lies in the user's cache. ``sent.json`` beside it records the completed and the pending transfers, so
+that a later command can detect whether the folder is newer than the store or others changed the store.
 
-Files are sent in the order in which they were written, so that the store is as the folder was a moment ago: what
-says of others that they are complete comes after them. Of the hidden folder of a command, what a later run can use
-goes there too: another machine goes on from it.
+Files are uploaded in the order in which they were written, so that a file that marks others as complete comes
+after them. Files of the hidden folder that a later run can use are uploaded too, so that another machine can
+resume.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from rsbench.storage.work_folder import HIDDEN, LOCK, WORK, files_below, remove,
 
 _BEAT_S = 30.0
 _BROUGHT = 64
-"""Files that are asked for together."""
+"""Files of one download request."""
 _MARK = f"{HIDDEN}/{LOCK}"
 """Makes the hidden folder one of rsbench's: empty at the store, where nothing can be locked."""
 _OF_THIS_MACHINE = (_MARK, HASHES)
 _urls: dict[Path, str] = {}
-"""Of the folders that are open in this process."""
+"""URLs of the folders that are open in this process."""
 
 
 class _Known(NamedTuple):
@@ -51,11 +51,11 @@ class _Mirror:
         self._known: dict[str, _Known] = {}
         try:
             self._known = {path: _Known(*known) for path, known in read_json(self._record).items()}
-        except (RsbenchError, TypeError):  # none yet, or damaged: nobody knows what the folder holds
+        except (RsbenchError, TypeError):  # none yet, or damaged: the state of the folder is unknown
             remove(self.folder)
 
     def bring(self) -> None:
-        """Make the folder what the store is; or, where it has gone on from there, add what it lacks."""
+        """Make the folder equal to the store, or only add missing files if the folder is newer than the store."""
         self.folder.mkdir(parents=True, exist_ok=True)
         here, there = self._here(), self._there()
         if self._is_ahead(here, there):
@@ -76,7 +76,7 @@ class _Mirror:
         self._store.upload({_MARK: self._work / LOCK})  # before minutes of work: whether it can be written
 
     def send(self) -> None:
-        """Make the store what the folder is. What is about to be done is written down first."""
+        """Make the store equal to the folder; the pending changes are recorded first."""
         here = self._here()
         due = [path for path, now in here.items() if not self._is_sent(path, now)]
         gone = sorted(self._known.keys() - here.keys())
@@ -96,7 +96,7 @@ class _Mirror:
         self._save()
 
     def keep_sending(self, done: threading.Event) -> None:
-        """What fails is tried again; the last time, it is told."""
+        """Upload until ``done``; after an error it is tried again, and ``finish`` raises the last one."""
         while not done.wait(_BEAT_S):
             with contextlib.suppress(RsbenchError, OSError):
                 self.send()
@@ -112,7 +112,7 @@ class _Mirror:
             ) from error
 
     def _is_ahead(self, here: dict[str, str], there: dict[str, str]) -> bool:
-        """Whether nobody else changed the store, or removed files here, since it was last as the folder was."""
+        """Whether neither others changed the store nor files here were removed since both were last equal."""
         return all(
             (known.there in ("", there.get(path)) or (not known.here and path not in there))
             and (not known.here or path in here)
@@ -124,7 +124,7 @@ class _Mirror:
         return known is not None and known.here == now and known.there != ""
 
     def _here(self) -> dict[str, str]:
-        """Time and size of each file of the folder, from the first to the last that was written."""
+        """Time and size of each file of the folder, in the order of writing."""
         found: list[tuple[int, bool, str, int]] = []
         for path in filter(_travels, files_below(self.folder)):
             state = (self.folder / path).lstat()
@@ -139,7 +139,7 @@ class _Mirror:
         write_json(self._record, dict(self._known))
 
     def _download(self, paths: list[str], there: dict[str, str]) -> None:
-        """Each is there whole, or not at all."""
+        """Download files; each appears complete or not at all."""
         partial = {path: self._work / str(number) for number, path in enumerate(paths)}
         self._store.download(partial)
         for path, file in partial.items():
@@ -173,7 +173,7 @@ def _is_hidden(path: str) -> bool:
 
 
 def _travels(path: str) -> bool:
-    """Whether a file is for others too: complete, no lock or the like, and of a name that is a path anywhere."""
+    """Whether a file is uploaded: complete, not a lock, and with a name that is valid on every system."""
     *_, name = parts = path.split("/")
     own = path in _OF_THIS_MACHINE or path.startswith(f"{HIDDEN}/{WORK}/")
     plain = not {"", ".", ".."}.intersection(parts) and not re.search(r"[\\:]", path)
@@ -184,11 +184,12 @@ def _travels(path: str) -> bool:
 def mirrored(url: str) -> Iterator[Path]:
     """A folder of this machine in which a command works as in any, with the results that the store has.
 
-    Its files are sent while the command works, and when it ends, however it ends. The store is changed in nothing
-    else: what others have there stays.
+    Its files are uploaded while the command works and when it ends, also by an error. Other files in the store
+    stay as they are.
 
     Raises:
-        RsbenchError: see ``Store`` and ``work_folder``; or the store refused results, which are kept here then.
+        RsbenchError: see ``Store`` and ``work_folder``; or the store refused results, which then stay in the
+            local folder.
     """
     store, hidden = open_store(url), cache_of(url)
     with contextlib.ExitStack() as stack:
@@ -205,7 +206,7 @@ def mirrored(url: str) -> Iterator[Path]:
         except BaseException:
             done.set()
             thread.join()
-            with contextlib.suppress(RsbenchError, OSError):  # why the command ended is what must be told
+            with contextlib.suppress(RsbenchError, OSError):  # the command's own error is the one to report
                 mirror.finish()
             raise
         finally:

@@ -46,9 +46,9 @@ ORIENTATIONS = {
     7: "mirrored and turned by 270 degrees",
     8: "turned by 270 degrees",
 }
-"""How frames are shown, clockwise."""
+"""Descriptions of the orientations; rotations are clockwise."""
 _CODECS = {".mp4": "libx264", ".m4v": "libx264", ".mov": "libx264", ".avi": "mjpeg", ".mkv": "ffv1"}
-"""By the file's ending; FFV1 loses nothing."""
+"""Codec by the file's suffix; FFV1 is lossless."""
 _OTHERS = {".webm", ".wmv", ".mpg", ".mpeg", ".flv", ".ogv", ".3gp", ".ts", ".mts", ".gif", ".hevc", ".h264"}
 """Endings of videos that are not written."""
 SUFFIXES = frozenset(_CODECS)
@@ -107,7 +107,7 @@ class VideoFile:
     path: Path
     width: int
     height: int
-    """Of frames as they are stored."""
+    """Height of frames as they are stored, before rotation for display."""
     count: int
     """Frames, as the file says; 0 where it does not."""
     rate: float | None

@@ -346,7 +346,7 @@ def test_camera_info_of_single_cameras_has_no_extrinsics(tmp_path: Path) -> None
     with pytest.raises(RsbenchError, match=r"P\[0, 3\] = 0.*calibrate them as a pair"):
         rsbench.read_rig(tmp_path / "left.yaml")
     (tmp_path / "right.yaml").unlink()
-    with pytest.raises(RsbenchError, match="is of one camera alone: give the folder"):
+    with pytest.raises(RsbenchError, match="describes only one camera: give the folder"):
         rsbench.read_rig(tmp_path / "left.yaml")
 
 
@@ -472,7 +472,7 @@ def test_pixels_of_colmap_begin_at_the_corner(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "is no calibration that is read here"),
+        ("", "is not a calibration of a supported format"),
         ("a: [1, 2", "neither YAML, JSON, XML nor an INI file"),
         ("{", "not valid JSON"),
         ("<a>", "not valid XML"),
@@ -481,7 +481,7 @@ def test_pixels_of_colmap_begin_at_the_corner(tmp_path: Path) -> None:
         ("[LEFT_CAM_HD]\nfx=1\n", "RIGHT_CAM_HD|STEREO|is missing"),
         ("M1: {rows: 3, cols: 3, data: [1, 2]}\n", "matrix of 3 x 3"),
         ("[" * 2000, "nested too deeply"),
-        ("cam0: 3\n", "is no calibration"),
+        ("cam0: 3\n", "is not a calibration"),
         ('{"cameraData": 3}', "DepthAI"),
         ('{"value0": {"intrinsics": [3]}}', "intrinsics"),
         ('[{"cameras": [3, 4]}]', "must be a table"),

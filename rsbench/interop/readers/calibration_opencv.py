@@ -43,13 +43,13 @@ _ROLES = (
     ("distortion", r"(d|k?d)(_?[lr012])?|d_\w+|\w*dist\w*", (4, 5, 8, 12, 14)),
     ("size", r"size|(image|img)_?size|resolution", (2,)),
 )
-"""What a key of any name holds, by its name in lower case and the count of its numbers; camera matrices show."""
+"""Role, pattern of the key in lower case, and counts of numbers; camera matrices are recognised by their zeros."""
 _ARRAYS = (np.ndarray, list)
 _FISHEYE = ("fisheye", "kannala_brandt", "equidistant")
 
 
 class Parts:
-    """What the keys of files hold, whatever their names are."""
+    """Matrices and vectors of OpenCV files, recognised by the names of their keys and their sizes."""
 
     def __init__(self, *trees: Any) -> None:
         self.matrices: dict[str, FloatArray] = {}
@@ -92,7 +92,7 @@ class Parts:
 
     @property
     def apart(self) -> bool:
-        """Whether they say how the cameras stand."""
+        """Whether the files contain the relative pose of the cameras."""
         return (
             bool(self.values["rotation"] and self.values["translation"])
             or {"r1", "r2", "p2"} <= self.values["rectified"].keys()
@@ -110,7 +110,7 @@ def is_opencv(tree: Any) -> bool:
 
 
 def opencv_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
-    """The file, with the one beside it that has what it lacks: intrinsics.yml and extrinsics.yml of the sample."""
+    """The file, and the one beside it with the missing part, as intrinsics.yml and extrinsics.yml of OpenCV."""
     own, others = Parts(near[path]), {each: tree for each, tree in near.items() if each != path}
     if (own.matrices and own.apart) or len(own.matrices) == 1:
         return {path: near[path]}
@@ -120,7 +120,7 @@ def opencv_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
 
 
 def read_opencv(files: Files) -> Calibration:
-    """One camera, or two with R and T, or with what rectifies them."""
+    """One camera, or two with R and T or with their rectification."""
     if len(files.trees) > 2:
         files.only()
     found, where = Parts(*files.trees.values()), files.where
@@ -139,7 +139,7 @@ def read_opencv(files: Files) -> Calibration:
 
 
 def _by_side(values: Mapping[str, FloatArray], where: str) -> dict[str, FloatArray]:
-    """Of two keys that differ in l and r, left and right, 1 and 2, or 0 and 1."""
+    """Values by side, from two keys that differ only in l and r, left and right, 1 and 2, or 0 and 1."""
 
     def differ(one: str, two: str) -> bool:
         a, b = (key.lower().replace("left", "l").replace("right", "r") for key in (one, two))
@@ -149,7 +149,7 @@ def _by_side(values: Mapping[str, FloatArray], where: str) -> dict[str, FloatArr
     pairs = [pair for pair in permutations(values, 2) if differ(*pair)]
     if len(pairs) != 1:
         raise RsbenchError(
-            f"{where}: {', '.join(values)}: names do not say which is the left camera; name them M1, D1, M2, D2"
+            f"{where}: {', '.join(values)}: which is the left camera is not clear; name them M1, D1, M2, D2"
         )
     return {side: values[key] for side, key in zip(SIDES, pairs[0], strict=True)}
 
@@ -176,14 +176,14 @@ def _apart(found: Parts, where: str) -> Pose:
         return Pose(rotation_of(R, f"{where}: R"), t)
     if not found.apart:
         raise RsbenchError(
-            f"{where}: R and T are missing: nothing says how the cameras stand; give the folder that also holds "
+            f"{where}: R and T, the relative pose of the cameras, are missing; give the folder that also holds "
             "extrinsics.yml, or calibrate them together (stereoCalibrate)"
         )
     return _apart_of_rectified(rectified["r1"], rectified["r2"], rectified["p2"].reshape(3, 4), where)
 
 
 def _apart_of_rectified(R1: FloatArray, R2: FloatArray, P2: FloatArray, where: str) -> Pose:
-    """From what rectifies both cameras."""
+    """``right_from_left`` from the rectifying rotations of both cameras and the second projection matrix."""
     if not (P2[0, 0] > 0.0 and P2[1, 1] > 0.0):
         raise RsbenchError(f"{where}: projection: focal lengths {P2[0, 0]:g}, {P2[1, 1]:g}: must be positive")
     first, second = (rotation_of(R.ravel(), f"{where}: rectification") for R in (R1, R2))
@@ -203,7 +203,7 @@ _OTHER_SIDE += (("infra1", "infra2"), ("_0", "_1"), ("_1", "_2"), ("_l.", "_r.")
 
 
 def ros_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
-    """The file, and that of the other camera: of the other name in this folder or in the one beside it."""
+    """The file and that of the other camera, found by its name in this folder or in the folder beside it."""
     others = [each for each in near if each != path]
     for pair in _OTHER_SIDE:
         for one, other in (pair, pair[::-1]):
@@ -227,8 +227,8 @@ def read_ros(files: Files) -> Calibration:
     shift = [p[0, 3] if abs(p[0, 3]) >= abs(p[1, 3]) else p[1, 3] for p in P]
     if not any(shift):
         raise RsbenchError(
-            f"{files.where}: projection_matrix: both cameras stand at one place (P[0, 3] = 0), as in files of "
-            "single cameras: nothing says how they stand; calibrate them as a pair (cameracalibrator)"
+            f"{files.where}: projection_matrix: the cameras have no baseline (P[0, 3] = 0), as in files of "
+            "single cameras; calibrate them as a pair (cameracalibrator)"
         )
     left, right = (0, 1) if abs(shift[0]) <= abs(shift[1]) else (1, 0)
     R = [_numbers_of(camera, 9, "rectification_matrix", "r", "R") for camera in cameras]

@@ -1,4 +1,4 @@
-"""What readers of calibrations have in common: their result, and lenses, rotations and units of other tools."""
+"""Shared parts of the calibration readers: their result, and lenses, rotations and units of other tools."""
 
 from __future__ import annotations
 
@@ -22,50 +22,50 @@ from rsbench.interop.readers.calibration_trees import Fields
 
 Table = dict[str, Any]
 _LONGEST_M = 2.0
-"""A baseline beyond it is one in another unit than metres, unless a unit is given."""
+"""Longest baseline, metres, without a given unit; a longer one is taken for another unit than metres."""
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 _PROPORTION = 0.005
-"""By which the proportions of scaled images may differ: whole pixels."""
+"""Largest relative difference of the aspect ratios of scaled images, whose sizes are whole pixels."""
 _NEAR = 1e-3
-"""By which printed rotations may miss being rotations."""
+"""Largest error of R R^T - I of a rotation matrix that was printed with few digits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assumptions:
-    """What a user adds to a file that leaves something open."""
+    """What the user states about a calibration that its file leaves open."""
 
     unit: float | None = None
-    """Metres to the unit of its lengths."""
+    """Metres per unit of the file's lengths."""
     fisheye: bool | None = None
     """Whether four coefficients are those of a fisheye lens, where the file does not say."""
     invert: bool = False
-    """Its transform takes the right camera's coordinates to the left one's."""
+    """Whether the file's transform maps right-camera to left-camera coordinates."""
     exchange: bool = False
-    """Its second camera is the left one."""
+    """Whether the file's second camera is the left one."""
     frame_size: Callable[[], Size] | None = None
     """(width, height) of the frames, by which some formats choose a section."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What files say of one camera or of two."""
+    """Calibration of one camera or of two."""
 
     format: str
     left: Table
-    """Of rig.toml: width, height, fx, fy, cx, cy, lens, line_delay_s; what is not known is absent."""
+    """Keys as in rig.toml: width, height, fx, fy, cx, cy, lens, line_delay_s; unknown ones are absent."""
     right: Table | None = None
     right_from_left: Pose | None = None
-    """In metres."""
+    """``X_right = R X_left + t``, metres."""
     right_delay_s: float = 0.0
     """Seconds by which the right camera reads later than the left one."""
     readout: Table = field(default_factory=dict)
-    """Of rig.toml alone: readout_ratio, scan, right_delay and so on, above its tables."""
+    """Keys of rig.toml above its tables: readout_ratio, scan, right_delay and so on; empty for other formats."""
     notes: tuple[str, ...] = ()
-    """What was assumed or is approximate, a sentence each."""
+    """Assumptions and approximations, one sentence each."""
     files: tuple[Path, ...] = field(default=())
 
     def tables(self) -> Table:
-        """Tables of rig.toml without anything about the readout."""
+        """Tables of rig.toml without the readout."""
         found = {"left": _still(self.left)}
         if self.right is not None and self.right_from_left is not None:
             R, t = self.right_from_left
@@ -79,7 +79,7 @@ def _still(table: Table) -> Table:
 
 
 class Files(NamedTuple):
-    """Files of one format that belong together, with what they hold."""
+    """Files of one format that belong together, with their parsed contents."""
 
     trees: Mapping[Path, Any]
     given: Assumptions
@@ -103,18 +103,18 @@ class Format(NamedTuple):
     """Whether the content of a file is of this format."""
     read: Callable[[Files], Calibration]
     parts: Callable[[Path, Mapping[Path, Any]], Mapping[Path, Any]] | None = None
-    """Of a file and all files of the format beside it, those that belong to it; None where a file has all."""
+    """Selects the files that belong to a file among all of its format beside it; None if one file is enough."""
 
 
 def table_of(size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], lens: Lens | None) -> Table:
-    """Of rig.toml, from (width, height), (fx, fy, cx, cy) and a lens."""
+    """Camera table of rig.toml from (width, height), (fx, fy, cx, cy) and a lens."""
     sizes = {} if size is None else dict(zip(("width", "height"), map(round, size), strict=True))
     numbers = dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True))
     return {**sizes, **numbers, **({} if lens is None else {"lens": lens.record()})}
 
 
 def camera_of(table: Table, where: str) -> PinholeCamera:
-    """The camera of such a table; RsbenchError for one that cannot be."""
+    """The camera of a table; RsbenchError if its values are impossible."""
     try:
         return parse_card(CameraTable, _still(table), where).camera()
     except ValueError as error:
@@ -128,7 +128,7 @@ def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | Non
     if any(values[len(names) :]):
         raise RsbenchError(
             f"{where}: distortion coefficients {values[len(names) :]} after the first {len(names)}: thin prisms "
-            "and tilted sensors (s1 to s4, tauX, tauY) are not known here; calibrate without them"
+            "and tilted sensors (s1 to s4, tauX, tauY) are not supported; calibrate without them"
         )
     try:
         return Lens(model=model, **dict(zip(names, values, strict=False)))  # pyrefly: ignore[bad-argument-type]
@@ -149,9 +149,9 @@ def brown(coefficients: Iterable[float], where: str) -> Lens | None:
 def fitted(
     size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], profile: Profile, name: str, where: str
 ) -> tuple[Table, str]:
-    """A camera of a symmetric fisheye model, as the nearest Kannala-Brandt one, and a sentence about that."""
+    """The Kannala-Brandt camera nearest to one of another radial model, and a note on the error of the fit."""
     if size is None:
-        raise RsbenchError(f"{where}: {name}: needs the size of the images, for which it is fitted")
+        raise RsbenchError(f"{where}: {name}: fitting a Kannala-Brandt lens needs the size of the images; add it")
     fx, fy, cx, cy = intrinsics
     try:
         camera = PinholeCamera(width=round(size[0]), height=round(size[1]), fx=fx, fy=fy, cx=cx, cy=cy)
@@ -166,7 +166,7 @@ def fitted(
 
 
 def rotation_of(values: FloatArray, where: str) -> FloatArray:
-    """(3, 3) of nine numbers, or of a rotation vector."""
+    """Rotation matrix (3, 3) from nine numbers, row by row, or from a rotation vector (3,)."""
     if len(values) == 3:
         return so3.exp(values)
     R = values.reshape(3, 3)
@@ -185,13 +185,13 @@ def quaternion_of(wxyz: Sequence[float] | FloatArray, where: str) -> FloatArray:
 
 
 def pose_of(fields: Fields, key: str) -> Pose:
-    """A transform of twelve or sixteen numbers, row by row."""
+    """Transform from the 12 or 16 numbers of a 3 x 4 or 4 x 4 matrix, row by row."""
     T = fields.numbers(key, 12, 16).reshape(-1, 4)
     return Pose(rotation_of(T[:3, :3].ravel(), f"{fields.where}: {key}"), T[:3, 3])
 
 
 def in_metres(t: FloatArray, given: Assumptions, where: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """A translation whose unit the file does not say, and a sentence about it."""
+    """Translation in metres of a file without a unit, and a note on the assumption."""
     length = float(np.linalg.norm(t))
     if given.unit is not None:
         return t * given.unit, ()
@@ -226,7 +226,7 @@ _NAMES = {
 
 
 def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None:
-    """A lens by the name that tools give its model."""
+    """Lens from the name of its model in other tools."""
     kind = _NAMES.get(name)
     if kind is None:
         raise RsbenchError(f"{where}: lens model {name!r}: must be one of {', '.join(_NAMES)}")
@@ -236,7 +236,7 @@ def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None
 
 
 def unfolded(found: Calibration, given: Assumptions) -> Calibration:
-    """The calibration with lenses that do not fold at the corners of the image, and a sentence about each such."""
+    """The calibration with monotonic continuations of lens polynomials that fold inside the image."""
     tables, notes = list[Table | None](), list(found.notes)
     for side, table in (("left", found.left), ("right", found.right)):
         size = None if table is None else _size_of(table)
@@ -262,7 +262,7 @@ def _camera(table: Table, size: Size) -> PinholeCamera:
 
 
 def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
-    """A camera whose lens folds before the corners of the image, with one that does not; None for any other."""
+    """The camera with a continued lens, and a note, if its polynomial folds inside the image; otherwise None."""
     if table.get("lens", {}).get("model") not in ("brown-conrady", "rational"):
         return None
     fx, fy, cx, cy = (table[key] for key in ("fx", "fy", "cx", "cy"))
@@ -319,7 +319,7 @@ def cropped(found: Calibration, crop: str) -> Calibration:
     def cut(table: Table) -> Table:
         whole = _size_of(table)
         if whole is None or not (0 < width <= whole[0] - x and 0 < height <= whole[1] - y):
-            shown = "of unknown size: give --size" if whole is None else f"of {whole[0]} x {whole[1]} px"
+            shown = "whose size is unknown: give --size" if whole is None else f"of {whole[0]} x {whole[1]} px"
             raise RsbenchError(f"--crop {crop}: must lie inside the images, {shown}")
         return table | {"width": width, "height": height, "cx": table["cx"] - x, "cy": table["cy"] - y}
 
@@ -327,10 +327,10 @@ def cropped(found: Calibration, crop: str) -> Calibration:
 
 
 def with_size(found: Calibration, size: Size) -> Calibration:
-    """The calibration with images of this size where it does not say one.
+    """The calibration with this image size where it has none.
 
     Raises:
-        RsbenchError: it says another one.
+        RsbenchError: it has another size.
     """
 
     def sized(table: Table) -> Table:
@@ -350,7 +350,7 @@ def resized(found: Calibration, size: Size) -> Calibration:
 
     def scaled(table: Table) -> Table:
         if "width" not in table:
-            raise RsbenchError("--resize: the calibration does not say the size of its images: give --size too")
+            raise RsbenchError("--resize: the calibration has no image size: give --size too")
         across, down = (new / table[name] for new, name in zip(size, ("width", "height"), strict=True))
         if abs(across / down - 1.0) > _PROPORTION:
             raise RsbenchError(

@@ -1,7 +1,7 @@
-"""What calibration files hold, as nested dicts, lists, text and numbers, whatever their syntax is.
+"""Contents of calibration files of any syntax as nested dicts, lists, texts and numbers.
 
 YAML (OpenCV's with its ``%YAML:1.0`` and tags too), JSON, OpenCV's XML, the sections of an INI file, and the lines
-of COLMAP's cameras.txt and rigs.txt. The syntax is told by the content, for names of such files say little. A
+of COLMAP's cameras.txt and rigs.txt. The syntax is recognised by the content, not by the file's name. A
 matrix, with ``rows`` and ``cols`` or ``sizes``, and ``data``, becomes an array.
 """
 
@@ -23,17 +23,17 @@ from rsbench.core.so3 import FloatArray
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 _LONGEST = 8 * MB
-"""Bytes of a file; COLMAP lists a camera for each image of a collection."""
+"""Largest file, bytes; COLMAP lists a camera for each image of a collection."""
 _DEEPEST = 16
-"""Levels of tables and lists."""
+"""Deepest nesting of tables and lists."""
 _LISTS = (list, tuple, np.ndarray)
 _MOST_FILES = 200
-"""Files of a folder that are looked at."""
+"""Largest number of files of a folder that are examined."""
 _SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".conf", ".txt", ".calib")
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases, by which a small file could stand for a large one."""
+    """PyYAML's safe loader, without aliases, since nested aliases let a small file expand to gigabytes."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):
@@ -50,7 +50,7 @@ def read_tree(path: Path) -> Any:
     """The content of a file.
 
     Raises:
-        RsbenchError: it cannot be read, or is in none of the syntaxes.
+        RsbenchError: it cannot be read, or has none of the supported syntaxes.
     """
     text = read_text(path, _LONGEST)
     try:
@@ -87,7 +87,7 @@ def _of_yaml(text: str) -> Any:
 
 def _of_xml(text: str) -> Any:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError("XML with definitions of its own (DOCTYPE) is not read")
+        raise ValueError("XML with a DOCTYPE or ENTITY definition is not supported")
     try:
         return _of_element(ElementTree.fromstring(text))
     except ElementTree.ParseError as error:
@@ -145,7 +145,7 @@ def files_in(folder: Path) -> Iterator[Path]:
 
 
 class Fields:
-    """A table of a file whose values are asked for by key; errors name the file and the key."""
+    """Typed access to the keys of a table of a file; errors name the file and the key."""
 
     def __init__(self, tree: Any, where: str) -> None:
         self.where = where
@@ -157,11 +157,11 @@ class Fields:
         return self.tree.get(key) is not None
 
     def get(self, *keys: str) -> Any:
-        """The value of the first of some keys that is there; None where none is."""
+        """Value of the first key that exists; None if none does."""
         return next((self.tree[key] for key in keys if key in self), None)
 
     def inner(self, key: str) -> Fields:
-        """A table in it."""
+        """The table under a key."""
         return Fields(self.tree.get(key), f"{self.where}: {key}")
 
     def text(self, *keys: str, default: str = "") -> str:
@@ -174,7 +174,7 @@ class Fields:
         return default if default is not None and key not in self else float(self.numbers(key, 1)[0])
 
     def numbers(self, key: str, *counts: int) -> FloatArray:
-        """Finite numbers (n,), of nested lists too; of one of some counts, if any are given."""
+        """Finite numbers (n,), flattened from nested lists; n must be one of ``counts``, if any are given."""
         value = self.get(key)
         if value is None:
             raise RsbenchError(f"{self.where}: {key}: is missing")

@@ -1,12 +1,12 @@
-"""Calibrations of other tools, read as they are: one reader for each format, one result.
+"""Readers of the calibration files of other tools, with one common result.
 
-A reader gives the tables of rig.toml: ``left``, ``right`` and ``X_right = R X_left + t`` in metres. What differs
-between the tools, from their documents and sources:
+A reader returns the tables of rig.toml: ``left``, ``right`` and ``X_right = R X_left + t`` in metres. Conventions
+of the tools, from their documentation and sources:
 
 **Kalibr** (camchain.yaml, camchain-imucam.yaml; OpenVINS has the same keys): ``T_cn_cnm1`` takes the previous
 camera's coordinates to this one's; ``T_cam_imu`` those of the IMU to the camera's, OpenVINS's ``T_imu_cam`` the
-reverse. ``timeshift_cam_imu`` is what is added to a camera's clock to have the IMU's; ``line_delay`` is the only
-readout that any format here has.
+reverse. A camera's time plus ``timeshift_cam_imu`` is the IMU's time; no other format here has a ``line_delay``,
+which is the readout.
 
 **Basalt**: ``T_imu_cam`` takes a camera's coordinates to the IMU's. **ZED** (SN*.conf): millimetres, a rotation
 vector (RX, CV, RZ), T = (-Baseline, TY, TZ), sections by the size of the images. **DepthAI**: centimetres, x_to =
@@ -72,7 +72,7 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
 
     Args:
         path: a file of one of the formats, or a folder with one or with the files that belong together.
-        given: what is known beside it.
+        given: what the user states in addition to the file.
 
     Raises:
         RsbenchError: one line with the file, the field, what is wrong and the remedy.
@@ -91,7 +91,7 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, OverflowError) as error:
         words = " ".join(str(error).split())
         raise RsbenchError(
-            f"{path}: is not as {kind.name} has it: {type(error).__name__}: {words[:100]}"
+            f"{path}: is not a valid {kind.name} calibration: {type(error).__name__}: {words[:100]}"
         ) from error
     return unfolded(replace(_left_first(found, given, str(path)), files=tuple(trees)), given)
 
@@ -101,12 +101,12 @@ def _format_of(tree: Any, path: Path) -> Format:
         if kind.holds(tree):
             return kind
     raise RsbenchError(
-        f"{path}: is no calibration that is read here; there are: rig.toml, {', '.join(k.name for k in FORMATS)}"
+        f"{path}: is not a calibration of a supported format: rig.toml, {', '.join(k.name for k in FORMATS)}"
     )
 
 
 def _all_of(kind: Format, paths: Iterable[Path]) -> dict[Path, Any]:
-    """The files of a format among some, with their trees; others are passed over."""
+    """Contents of the files that have this format; other files are skipped."""
     found = dict[Path, Any]()
     for path in paths:
         try:
@@ -119,7 +119,7 @@ def _all_of(kind: Format, paths: Iterable[Path]) -> dict[Path, Any]:
 
 
 def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
-    """The files of the one format that a folder has."""
+    """The only format in a folder, and its files; RsbenchError if there is none or more than one."""
     paths = list(files_in(folder))
     of_kind = {kind.name: (kind, trees) for kind in FORMATS if (trees := _all_of(kind, paths))}
     if _RIG_CONFIG in of_kind:  # cameras.txt beside it is a part
@@ -131,7 +131,7 @@ def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
 
 
 def _left_first(found: Calibration, given: Assumptions, where: str) -> Calibration:
-    """The calibration with its unit, direction and order settled."""
+    """The calibration with the left camera first and the transform from left to right."""
     if found.right_from_left is None:
         return found
     R, t = found.right_from_left
@@ -141,7 +141,7 @@ def _left_first(found: Calibration, given: Assumptions, where: str) -> Calibrati
         found = _exchanged(found)
     R, t = found.right_from_left or apart
     if not np.linalg.norm(t) > 0.0:
-        raise RsbenchError(f"{where}: both cameras are at one place: the translation between them is 0")
+        raise RsbenchError(f"{where}: the translation between the cameras is 0; give one with a baseline")
     if -(R.T @ t)[0] - t[0] < -np.linalg.norm(t):
         if found.format not in _NUMBERED:
             raise RsbenchError(
@@ -208,8 +208,8 @@ def _kalibr_from_imu(camera: Fields) -> Pose:
     if "T_imu_cam" in camera:
         return inverse(pose_of(camera, "T_imu_cam"))
     raise RsbenchError(
-        f"{camera.where}: T_cn_cnm1: is missing, as are T_cam_imu and T_imu_cam: nothing says how the cameras "
-        "stand; calibrate them together"
+        f"{camera.where}: T_cn_cnm1, T_cam_imu and T_imu_cam are missing, so the relative pose of the cameras "
+        "is unknown; calibrate them together"
     )
 
 
@@ -217,11 +217,11 @@ def kalibr_in_body(path: Path) -> list[tuple[Table, Pose]]:
     """Table and ``body_from_camera`` of each camera of a camchain that has the IMU, whose axes are the body's.
 
     Raises:
-        RsbenchError: the file is none, or does not say how a camera stands.
+        RsbenchError: it is not a camchain, or a camera has no pose.
     """
     top, found = Fields(read_tree(path), str(path)), list[tuple[Table, Pose]]()
     if not _is_kalibr(top.tree):
-        raise RsbenchError(f"{path}: is no camchain of Kalibr")
+        raise RsbenchError(f"{path}: is not a camchain of Kalibr; give camchain-imucam.yaml")
     for camera in map(top.inner, sorted(key for key in top.tree if re.fullmatch(r"cam\d", key))):
         if found and not {"T_cam_imu", "T_imu_cam"} & camera.tree.keys():
             in_body = compose(found[-1][1], inverse(pose_of(camera, "T_cn_cnm1")))
@@ -253,7 +253,7 @@ def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:
     else:
         if model == "omni" and (distortion not in ("radtan", "none") or any(d[2:])):
             raise RsbenchError(
-                f"{where}: omni with {distortion} {d}: tangential and other distortion of omni is not known here; "
+                f"{where}: omni with {distortion} {d}: only radial distortion of omni is supported; "
                 "calibrate as pinhole-equi, ds-none or eucm-none"
             )
         profile = mirror_profile(own[0], *d[:2]) if model == "omni" else unified_profile(*own)
@@ -335,7 +335,7 @@ _ZED_SIZES = {
     "4K": (3840, 2160),
     "QHDPLUS": (3200, 1800),
 }
-"""Sizes of one camera's images by the ending of the names of sections."""
+"""Image size (width, height) of one camera by the suffix of the section's name."""
 
 
 def _is_zed(tree: Any) -> bool:
@@ -349,8 +349,8 @@ def _read_zed(files: Files) -> Calibration:
     wanted = files.given.frame_size() if files.given.frame_size is not None else None
     if wanted is None and len(sizes) > 1:
         raise RsbenchError(
-            f"{top.where}: has calibrations of {', '.join(f'{w} x {h}' for w, h in sizes.values())}: say of which "
-            "size the frames of one camera are: rsbench rig FILE --size 1280x720"
+            f"{top.where}: has calibrations of {', '.join(f'{w} x {h}' for w, h in sizes.values())}: give the "
+            "size of one camera's frames: rsbench rig FILE --size 1280x720"
         )
     name = next((name for name, size in sizes.items() if wanted is None or size == tuple(wanted)), None)
     if name is None:
@@ -444,7 +444,7 @@ def _chained(links: Mapping[tuple[int, int], Pose], start: int, end: int, where:
                 known[b] = compose(step, known[a])
                 todo.append(b)
     if end not in known:
-        raise RsbenchError(f"{where}: extrinsics: nothing links the camera {start} with {end}")
+        raise RsbenchError(f"{where}: extrinsics: no chain of extrinsics links camera {start} with camera {end}")
     return known[end]
 
 
@@ -505,7 +505,7 @@ def _read_realsense(files: Files) -> Calibration:
 
 
 _RS2 = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta", "brown_conrady", "kannala_brandt4")
-"""Models by the number that rs2_distortion gives them."""
+"""Model names in the order of the enumeration rs2_distortion."""
 
 
 def _realsense_camera(camera: Fields) -> Table:
@@ -514,7 +514,7 @@ def _realsense_camera(camera: Fields) -> Table:
     d = camera.numbers("coeffs").tolist() if "coeffs" in camera else []
     if model in ("inverse_brown_conrady", "modified_brown_conrady", "ftheta") and any(d):
         raise RsbenchError(
-            f"{camera.where}: model = {model}: with coefficients that are not 0 it is not known here; take the "
+            f"{camera.where}: model = {model}: this model is supported only if its coefficients are 0; use the "
             "infrared or another stream whose coefficients are 0, or calibrate with OpenCV"
         )
     lens = by_name(model, d, camera.where) if any(d) or model == "kannala_brandt4" else None
@@ -538,13 +538,13 @@ _COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
     "FOV": ("fx fy cx cy omega", "fov"),
     "EUCM": ("fx fy cx cy alpha beta", "eucm"),
 }
-"""Parameters in their order, and the lens model."""
+"""Names of the parameters in their order, and the lens model."""
 
 
 def colmap_camera(
     name: str, params: Sequence[Any], size: Sequence[float] | FloatArray | None, where: str
 ) -> tuple[Table, str]:
-    """Table of a camera from the model's name and parameters, and a sentence where it was fitted."""
+    """Camera table from the model's name and parameters, and a note if the lens was fitted, otherwise \"\"."""
     if name not in _COLMAP_MODELS:
         raise RsbenchError(f"{where}: camera model {name!r}: must be one of {', '.join(_COLMAP_MODELS)}")
     keys, model = _COLMAP_MODELS[name]
@@ -627,7 +627,7 @@ def _colmap_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
 
 
 def _colmap_cameras(lines: Iterable[list[str]], where: str) -> dict[str, tuple[Table, str]]:
-    """Cameras of cameras.txt by their numbers, each with a sentence where it is approximate."""
+    """Cameras of cameras.txt by their numbers, each with a note if it is approximate."""
     made = dict[str, tuple[Table, str]]()
     for words in lines:
         if len(words) > 4 and words[1].isupper() and words[2] not in ("CAMERA", "IMU"):
@@ -704,6 +704,6 @@ FORMATS: tuple[Format, ...] = (
     Format("ROS camera_info", is_ros, read_ros, ros_files),
     Format("OpenCV", is_opencv, read_opencv, opencv_files),
 )
-"""In the order in which a file is tried."""
+"""Supported formats, in the order in which a file is tested."""
 _NUMBERED = ("Kalibr", "Basalt", "COLMAP", "EuRoC")
-"""Formats whose first camera need not be the left one."""
+"""Formats that number their cameras, so that the first need not be the left one."""

@@ -1,8 +1,8 @@
-"""Whether a recording agrees with itself: files, sizes, depth and poses, disparities, and what images show.
+"""Consistency checks of a recording: files, sizes, depth against poses, disparities, and matches in the images.
 
 For the images, a few pairs are matched, of the two cameras at one time and of one camera at successive times:
-matches must lie on epipolar lines, and points at their pixels. A lens, an extrinsic or a pose that is read the
-wrong direction moves the lines by far more than the error of features.
+matches must lie on epipolar lines, and points at their pixels. A lens, extrinsic or pose with the wrong
+convention moves the lines by far more than the error of features.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ _LEAST_DISPARITY_SHARE = 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """How the depth of one frame agrees with that of the next one."""
+    """Agreement of the depth maps of two successive frames."""
 
     side: Side
     frames: tuple[int, int]
     pixels: int
-    """Compared pixels: the other frame sees them, and nothing hides them."""
+    """Compared pixels: those visible in both frames."""
     share: float
     """Share of these that agree within a hundredth."""
     typical: float

@@ -1,4 +1,4 @@
-"""Whatever file a user has of cameras: rig.toml, camera.toml, or a calibration of another tool."""
+"""Readers of a user's camera files: rig.toml, camera.toml, or a calibration of another tool."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _READOUTS = ("readout_ratio", "shutter", "line_delay_s")
 
 @dataclass(frozen=True, kw_only=True)
 class Readout:
-    """What a user says of the readout beside a file, in place of what the file says."""
+    """Readout options of the user, which replace the values in the file."""
 
     readout_ratio: float | None = None
     shutter: str | None = None
     """Name or path of a shutter card."""
     fps: float | None = None
-    """Frames per second: what is given in seconds needs it."""
+    """Frames per second, required for values in seconds."""
 
     def __post_init__(self) -> None:
         if self.readout_ratio is not None and self.shutter is not None:
@@ -40,7 +40,7 @@ class Readout:
             raise RsbenchError(f"--fps {self.fps:g}: must be a positive number of frames per second")
 
     def into(self, table: Mapping[str, Any]) -> Table:
-        """The tables of a rig or a camera with it."""
+        """The tables of a rig or camera with these values in place of theirs."""
         made = dict(table)
         if self.readout_ratio is not None or self.shutter is not None:
             made = _without(made, _READOUTS)
@@ -57,11 +57,11 @@ def _without(table: Mapping[str, Any], keys: tuple[str, ...]) -> Table:
 def read_rig_file(
     path: Path, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
 ) -> tuple[RigCard, tuple[str, ...]]:
-    """The card of a rig from rig.toml or a calibration of another tool, and what was assumed, a sentence each.
+    """The card of a rig from rig.toml or a calibration of another tool, and the assumptions, one sentence each.
 
     Args:
         path: the file, or a folder with files that belong together.
-        readout: in place of what the file says of it.
+        readout: replaces the values in the file.
         frame_size: gives the (width, height) of the frames, by which some formats choose a section.
 
     Raises:
@@ -73,8 +73,8 @@ def read_rig_file(
     found = read_calibration(path, Assumptions(frame_size=frame_size))
     if found.right is None:
         raise RsbenchError(
-            f"{path}: {found.format}: is of one camera alone: give the folder that holds both, or --camera for "
-            "frames of one"
+            f"{path}: {found.format}: describes only one camera: give the folder with both, or use --camera for "
+            "frames of one camera"
         )
     refuse_unseen(found, path)
     table, missing = tables_of_calibration(found, readout)
@@ -83,7 +83,7 @@ def read_rig_file(
 
 
 def tables_of_calibration(found: Calibration, readout: Readout) -> tuple[Table, tuple[str, ...]]:
-    """Tables of rig.toml, and sentences about what is in seconds where nobody gave the frames' rate."""
+    """Tables of rig.toml, and a note on each value in seconds that needs the missing frame rate."""
     table, notes = found.tables(), list[str]()
     given = readout.readout_ratio is not None or readout.shutter is not None
     for side, own in (("left", found.left), ("right", found.right)):
@@ -113,7 +113,7 @@ def read_camera_file(
     found = read_calibration(path, Assumptions(frame_size=frame_size))
     notes = list(found.notes)
     if found.right is not None:
-        notes.append("holds two cameras; the left one is taken")
+        notes.append("describes two cameras; the left one is used")
     own = dict(found.left)
     size, delay = (own.pop("width", None), own.pop("height", None)), own.pop("line_delay_s", None)
     if frame_size is not None and None not in size and size != (wanted := frame_size()):
@@ -133,15 +133,15 @@ def read_camera_file(
 
 
 class KnownRig(NamedTuple):
-    """What a file says of a rig."""
+    """A rig as described by a file."""
 
     rig: StereoRig
     readout_ratio: float | None
-    """Readout time over frame period; None where the frames have to tell."""
+    """Readout time over frame period; None if it has to be estimated from the frames."""
     scanning: Scanning | None
-    """From which side lines are read, and how the right camera differs; None where the frames have to tell."""
+    """Scan direction, and differences of the right camera; None if they have to be estimated from the frames."""
     notes: tuple[str, ...]
-    """What was assumed of the file, or needs the frames' rate."""
+    """Assumptions, and values that need the frame rate."""
 
 
 def known_rig(path: Path, sizes: tuple[Size, Size] | None = None, fps: float | None = None) -> KnownRig:
@@ -149,7 +149,7 @@ def known_rig(path: Path, sizes: tuple[Size, Size] | None = None, fps: float | N
     card, notes = read_rig_file(path, Readout(fps=fps), None if sizes is None else lambda: sizes[0])
     left, right = (None if side is None else side.size for side in (card.left, card.right))
     if sizes is None and (left is None or right is None):
-        raise RsbenchError(f"{path}: does not say the size of the images: give size = (width, height)")
+        raise RsbenchError(f"{path}: has no image size: give size = (width, height)")
     left, right = sizes or (left, right)
     assert left is not None and right is not None
     try:

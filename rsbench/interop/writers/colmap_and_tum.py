@@ -211,7 +211,7 @@ CORRECTED_ABOUT = {
     "tum": (
         "NAME/body.txt has the pose of the middle of the rig at the start of each frame that was corrected, "
         "NAME/left.txt and right.txt those of the cameras, NAME/left_rows.txt that of the left camera at each of "
-        "its rows, where they were asked for. Times are frame periods; the world is the body at the start of the "
+        "its rows, if --row-poses was given. Times are frame periods; the world is the body at the start of the "
         "first frame, camera axes are x right, y down, z forward."
     ),
     "colmap": (
@@ -335,7 +335,7 @@ def _write_corrected_tum(corrected: Corrected, folder: Path) -> Note:
     write_poses(folder / "body.txt", corrected.times, corrected.poses)
     for side in SIDES:
         write_poses(folder / f"{side}.txt", corrected.times, _camera_pose(corrected, side, corrected.poses))
-    sentences = ["times are frame periods: rsbench correct does not know the frame rate"]
+    sentences = ["times are frame periods: the corrected folder has no frame rate"]
     rows = corrected.folder / "row_poses.csv"
     if rows.is_file():
         times, poses = read_poses(rows)

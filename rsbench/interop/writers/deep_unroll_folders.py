@@ -122,7 +122,7 @@ def radial(camera: PinholeCamera, depth: NDArray[np.float32]) -> FloatArray:
 
 
 def _depth_text(values: FloatArray) -> bytes:
-    """As ``np.savetxt``, with the nine digits of a float32."""
+    """Text of ``np.savetxt`` with nine digits, which a float32 needs."""
     stream = io.StringIO()
     np.savetxt(stream, values, fmt="%.9g")
     return stream.getvalue().encode()

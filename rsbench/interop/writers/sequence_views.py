@@ -1,4 +1,4 @@
-"""What exports share: poses of images, others' pixel conventions, surface points, and the row-motion error.
+"""Shared parts of the exports: poses of images, pixel conventions, surface points, and the row-motion error.
 
 Surface points are world points of depth maps and where the images of a sequence see them, exactly: what a
 reconstruction holds. The row-motion error is the distance, px, of a format's model of how a camera moves during
@@ -151,11 +151,11 @@ def reads_from_top(sequence: Sequence) -> bool:
 
 
 def lens_fault(rig: StereoRig, *known: LensModel) -> str:
-    """Why a format that knows these lenses alone cannot hold a rig; empty where it can."""
+    """Why a format that supports only these lenses cannot represent a rig; empty if it can."""
     for side in SIDES:
         lens = rig.sensor(side).lens
         if lens is not None and lens.model not in known:
-            lenses = f"knows {' and '.join(known)} lenses alone" if known else "has no lenses"
+            lenses = f"supports only {' and '.join(known)} lenses" if known else "has no lenses"
             return f"it {lenses}, and the {side} camera's is {lens.model}; choose other sequences"
     return ""
 
@@ -165,7 +165,7 @@ def about_moving_objects(sequence: Sequence) -> list[str]:
     if not sequence.moving:
         return []
     count = len(sequence.moving)
-    return [f"{count} object{'s' if count > 1 else ''} move in the images; the format knows a still world alone"]
+    return [f"{count} object{'s' if count > 1 else ''} move in the images; the format supports only static scenes"]
 
 
 _POINTS = 50_000

@@ -66,7 +66,7 @@ _NERFSTUDIO_ABOUT = (
 )
 _DEBLUR_LAW = "first order in pixels, from the middle of the readout"
 AXES = np.array([1.0, -1.0, -1.0])
-"""From our camera axes to OpenGL's."""
+"""Signs that convert our camera axes to OpenGL's."""
 
 
 def _nerfstudio_fault(sequence: Sequence, images: Images) -> str:
@@ -78,7 +78,7 @@ def _nerfstudio_fault(sequence: Sequence, images: Images) -> str:
     if (fault := lens_fault(sequence.rig, "brown-conrady", "kannala-brandt")) or images == "gs":
         return fault
     if not reads_from_top(sequence):
-        return "3dgs-deblur knows rows that are read from the top alone; take --images gs"
+        return "3dgs-deblur supports only rows that are read from the top; use --images gs"
     if any(camera.lens is not None for camera in cameras):
         what = "nerfstudio undistorts images before it trains, and a row of time is one of the distorted image"
         return f"{what}; take --images gs"
@@ -106,7 +106,7 @@ def _write_nerfstudio(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def camera_fields(sequence: Sequence) -> dict[str, Any]:
-    """The fields of transforms.json above its frames: those of equal cameras; each frame has those of others."""
+    """Top-level fields of transforms.json; intrinsics of cameras that differ are in each frame instead."""
     model = {"camera_model": _camera_model(sequence.rig.sensor("left"))}
     return model | (_intrinsics(sequence.rig.camera) if sequence.rig.aligned else {})
 
