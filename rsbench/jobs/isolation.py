@@ -1,14 +1,14 @@
-"""Other people's code in a child process: it may raise, exit, crash, hang or print, and fails alone.
+"""Other people's code in a child process, which may raise, exit, crash, hang or print without harm to the parent.
 
 A worker starts its child with the first call and keeps it for the next ones. A call that takes longer than its
 limit, or whose child ends, is a failed ``Outcome`` with the reason; the child is killed with all processes of its
 group, and a fresh one serves the next call. What the child prints is captured. The child ends with its parent,
-even if the parent is killed. This is protection against mistakes, not against malice: the code runs as the user,
-and a process that leaves the group survives. Where memory is limited, the child's use is read ten times a second
-(the address space, which a system can limit, is reserved by compilers and BLAS far beyond what they use).
+even if the parent is killed. This protects against mistakes, not against malice: the code runs with the user's
+rights, and a process that leaves the group survives. Where memory is limited, the child's use is read ten times a
+second (a limit of the address space would not do: compilers and BLAS reserve far more of it than they use).
 
-What a child sends is plain data, so that the parent runs nothing that comes from there: None, a truth value, a
-number, a text, an array, or a tuple, list, dict or dataclass of such. A message is its length and an npz file:
+A child sends only plain data, so that the parent executes nothing of it: None, a truth value, a
+number, a text, an array, or a tuple, list, dict or dataclass of these. A message is its length and an npz file:
 arrays, and the rest as JSON that refers to them.
 """
 
@@ -44,7 +44,7 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 ONE_THREAD = dict.fromkeys(THREAD_VARIABLES, "1")
 """Environment of a child process whose numerical libraries use one thread."""
 START_LIMIT_S = 300.0
-"""Time to load a module and to compile what it needs."""
+"""Default time limit for loading a module and compiling its functions, seconds."""
 NO_ANSWER = "gave no valid answer"
 _POLL_S = 0.1
 _LAST_ANSWER_S = 10.0
@@ -79,7 +79,7 @@ class Outcome:
     output: str
     """The last part of what the child has printed so far."""
     ended: bool = False
-    """Whether the process ended by itself or was killed by others, perhaps for another reason than this call."""
+    """Whether the process ended by itself or was killed from outside, perhaps not because of this call."""
 
     @property
     def success(self) -> bool:

@@ -1,7 +1,7 @@
-"""Stores of objects by URL, through fsspec (the extra ``rsbench[cloud]``); nothing else imports it.
+"""Object stores by URL, through fsspec (the extra ``rsbench[cloud]``); no other module imports it.
 
-A store has whole objects with names: no locks, links or renaming. An object that is being written becomes visible
-when it is complete, as on S3 and similar stores.
+A store holds complete objects by name and has no locks, links or renaming. An object that is being
+written becomes visible when it is complete, as on S3 and similar stores.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Listed(NamedTuple):
 
     size: int
     token: str
-    """Changes with the content; empty where the store has none."""
+    """A text that changes with the content; empty if the store has none."""
 
     @property
     def state(self) -> str:

@@ -1,6 +1,6 @@
-"""Reading files of other origin: sizes are checked before decoding, and names cannot lead out of a folder.
+"""Reading untrusted files: sizes are checked before decoding, and paths cannot lead out of a folder.
 
-A small file can decode to more than a machine's memory. Sizes that no dataset states are limited here; the
+A small file can decode to more than a machine's memory. The sizes of such files are limited here; the
 environment variable ``RSBENCH_LIMITS`` is a factor for all limits. Errors are one line.
 """
 
@@ -36,7 +36,7 @@ FILE_BYTES = 256 * MB
 PIXELS = 1 << 23
 """Limit for one frame, slightly more than 3840 x 2160: correcting four takes 0.5 to 0.7 kB for each pixel."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
-"""Names of sequences, which become folders."""
+"""Valid names of sequences, which become names of folders."""
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)
 """Names that are devices on Windows, with any suffix, and names whose last dot it drops."""
 _OPEN = re.compile(r"/dev/[^/]+|/dev/fd/\d+|/proc/[^/]+(/task/\d+)?/fd/\d+")

@@ -1,9 +1,9 @@
-"""Folders of rsbench's own: in the user's cache, for temporary files, and hidden in a folder of results.
+"""Private folders of rsbench: in the user's cache, for temporary files, and hidden in a folder of results.
 
-``.rsbench/lock`` is locked for as long as a command works in a folder of results, and says whose command it is.
-Results are written to ``.rsbench/work`` and renamed when complete. What lies in the hidden folder is rsbench's
-own. It is the only place where rsbench removes whole folders: what it finds elsewhere is moved there first, once
-every file of it is known to be rsbench's.
+``.rsbench/lock`` is locked while a command works in a folder of results, and records its process and host.
+Results are written to ``.rsbench/work`` and renamed when complete. Everything in the hidden folder belongs to
+rsbench, and only there does rsbench remove whole folders: folders elsewhere are moved there first, after a check
+that rsbench wrote every file in them.
 
 The system frees the lock when its process ends, however it ends. Where the file system has no locks, or does not
 pass them on to other hosts, the owner's record counts for ``_DEAD_S`` after it was last renewed.

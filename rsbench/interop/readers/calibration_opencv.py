@@ -176,7 +176,7 @@ def _apart(found: Parts, where: str) -> Pose:
         return Pose(rotation_of(R, f"{where}: R"), t)
     if not found.apart:
         raise RsbenchError(
-            f"{where}: R and T, the relative pose of the cameras, are missing; give the folder that also holds "
+            f"{where}: R and T are missing, so the relative pose is unknown; give the folder that also holds "
             "extrinsics.yml, or calibrate them together (stereoCalibrate)"
         )
     return _apart_of_rectified(rectified["r1"], rectified["r2"], rectified["p2"].reshape(3, 4), where)

@@ -208,8 +208,8 @@ def _kalibr_from_imu(camera: Fields) -> Pose:
     if "T_imu_cam" in camera:
         return inverse(pose_of(camera, "T_imu_cam"))
     raise RsbenchError(
-        f"{camera.where}: T_cn_cnm1, T_cam_imu and T_imu_cam are missing, so the relative pose of the cameras "
-        "is unknown; calibrate them together"
+        f"{camera.where}: T_cn_cnm1: is missing, as are T_cam_imu and T_imu_cam, so the relative pose of the "
+        "cameras is unknown; calibrate them together"
     )
 
 
@@ -253,7 +253,7 @@ def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:
     else:
         if model == "omni" and (distortion not in ("radtan", "none") or any(d[2:])):
             raise RsbenchError(
-                f"{where}: omni with {distortion} {d}: only radial distortion of omni is supported; "
+                f"{where}: omni with {distortion} {d}: tangential and other distortion of omni is not supported; "
                 "calibrate as pinhole-equi, ds-none or eucm-none"
             )
         profile = mirror_profile(own[0], *d[:2]) if model == "omni" else unified_profile(*own)

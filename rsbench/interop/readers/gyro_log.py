@@ -1,7 +1,7 @@
-"""Logs of a gyroscope: gyroflow's text format ``.gcsv``, and ``.csv`` as the channel ``imu`` has it.
+"""Readers of gyroscope logs: gyroflow's text format ``.gcsv``, and the ``.csv`` of the channel ``imu``.
 
 ``.gcsv`` (docs.gyroflow.xyz, GCSV format): a line GYROFLOW IMU LOG or CAMERA IMU LOG, lines ``key,value``, the
-names of the columns from ``t`` on, numbers. ``tscale`` and ``gscale`` make seconds and rad/s of them;
+names of the columns from ``t`` on, numbers. ``tscale`` and ``gscale`` convert them to seconds and rad/s;
 ``orientation`` gives the column and the sign (lower case: minus) of each of gyroflow's axes: x up, y left, z
 backwards.
 """
@@ -30,7 +30,7 @@ class GyroLog(NamedTuple):
     """Measurements of a gyroscope, in the order of time."""
 
     times_s: FloatArray
-    """(n,) by its own clock, increasing."""
+    """(n,) seconds of the log's own clock, increasing."""
     rates: FloatArray
     """(n, 3) rad/s, in the axes of the camera: x right, y down, z forward."""
 
@@ -78,7 +78,7 @@ def _of_csv(text: Sequence[str], path: Path) -> tuple[list[int], FloatArray, Flo
 
 
 def _of_gcsv(text: Sequence[str], path: Path) -> tuple[list[int], FloatArray, FloatArray]:
-    """Absent keys and names as gyroflow's own reader takes them: milliseconds, scale 1, xzY, columns by place."""
+    """Defaults of absent keys are those of gyroflow: milliseconds, scale 1, xzY, columns 1 to 3."""
     start = next((k for k, line in enumerate(text) if _cells(line)[0] in ("t", "time")), None)
     if not text or not text[0].strip().startswith(_TITLES) or start is None:
         raise RsbenchError(f"{path}: must begin with {_TITLES[0]} and have a line t,gx,gy,gz")
@@ -113,7 +113,7 @@ def _cells(line: str) -> list[str]:
 def _table(text: Sequence[str], start: int, columns: Sequence[int], path: Path) -> tuple[list[int], FloatArray]:
     """Line numbers (n) and values (n, k) of some columns below the line ``start``, of lines that have all of them.
 
-    A logger that misses a reading leaves a cell empty, and one that is cut off an incomplete last line.
+    A missed reading leaves a cell empty, and an interrupted log ends with an incomplete line.
     """
     found, width = dict[int, list[str]](), len(_cells(text[start]))
     for number, line in enumerate(text[start + 1 :], start=start + 2):
@@ -129,9 +129,9 @@ def _table(text: Sequence[str], start: int, columns: Sequence[int], path: Path) 
 
 
 def _unrolled(ticks: FloatArray) -> FloatArray:
-    """Times of a counter that begins again at 0 after 2^16, 2^24 or 2^32 ticks, as one that does not.
+    """Continuous times of a counter that overflows after 2^16, 2^24 or 2^32 ticks.
 
-    A step back is taken for that where it leaves a step forward of at most ten usual ones; others stay.
+    A negative step is an overflow if the corrected step is at most ten times the median step; others stay.
     """
     steps = np.diff(ticks)
     if not np.any(steps < 0.0):

@@ -1,22 +1,22 @@
-"""Data in the layouts of other projects, read in place: what a layout contains, and nothing that it does not.
+"""Readers of datasets in the layouts of other projects; what a layout does not contain stays absent.
 
 **COLMAP**'s text model: cameras.txt, images.txt and, where they exist, points3D.txt, rigs.txt and frames.txt (of
-COLMAP 3.12: ``sensor_from_rig`` of each camera, and the images of one time). Its pixels are counted from the
-corner of the image, ours from the centre of the first pixel: half a pixel less. A quaternion is (w, x, y, z), and
-a pose ``cam_from_world``, as ours. The layout has no times: images are ordered by name, one pose each, without a
-shutter. A rig of two cameras is one recording; any other camera is one of its own.
+COLMAP 3.12: ``sensor_from_rig`` of each camera, and the images of one time). Its pixel origin is the corner of
+the image, ours the centre of the first pixel: half a pixel less. A quaternion is (w, x, y, z), and
+a pose ``cam_from_world``, as ours. The layout has no times: images are ordered by name, with one pose each and no
+shutter. A rig of two cameras becomes one recording, and so does each other camera.
 
 **EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the
 sensor's coordinates to the body's (where it is absent, a camchain of Kalibr nearby has them), ``data.csv`` times
 in nanoseconds and file names; poses are those of the body, p and q = (w, x, y, z), in ``mocap0`` or
 ``state_groundtruth_estimate0``. Times are whole numbers: as floats they would lose 256 ns. The layout does not
 describe a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1; camera 0 is global) is published beside
-it, and its times are taken as those of the first row.
+it, and its times are assumed to be those of the first row.
 
 **Carla-RS** (Liu et al., Deep Shutter Unrolling Network, CVPR 2020): a sequence is a folder with ``gt_vel.log``
 (wx, wy, wz in rad/s and x, y, z per second), ``%04d_rs.png``, and where depth was rendered ``%04d_rs.depth`` or
 ``.pdepth``; ``%04d_gs_f.png`` and ``%04d_gs_m.png`` are global-shutter images of the first row and of row ``height
-// 2``, ``%04d_mask.png`` the pixels that the authors score. The rest is known from its generator (UnrealCV of the
+// 2``, ``%04d_mask.png`` the pixels that the authors score. The rest follows from its generator (UnrealCV of the
 same authors, Python/capture_rolling_shutter.py):
 
 - exp([w t]x), v t is the pose of the camera at time t **in the camera at time 0**: ``cam_from_world`` is its
@@ -131,7 +131,7 @@ _CORNER = 0.5
 
 
 class Shot(NamedTuple):
-    """An image: its camera, its name, its pose, and a function that returns observed pixels and points."""
+    """An image: camera, name, pose, and a function that returns its observed pixels and their 3D points."""
 
     camera: str
     name: str
@@ -209,7 +209,7 @@ def _left_first(cameras: tuple[str, str], second_from_first: Pose) -> tuple[dict
 
 
 def _colmap_times(folder: Path, rig: str) -> list[list[str]]:
-    """Numbers of the images of each frame of a rig, by frames.txt."""
+    """Image numbers of each frame of a rig, from frames.txt."""
     found, path = list[list[str]](), only_file(folder, "frames.txt")
     for where, line in lines(path):
         words = line.split()
@@ -230,7 +230,7 @@ def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
 
 
 def _colmap_image_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Line of each image, and the line of its points below: empty without any, or absent, as some write it."""
+    """Line of each image with the line of its points, which is empty or, in some files, absent without points."""
     image = ""
     for line in read_text(path).splitlines():
         if line.lstrip().startswith("#"):
@@ -254,7 +254,7 @@ def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
 
 
 def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
-    """Pixels and points of a line of x, y and the number of a point, -1 for none."""
+    """Pixels and 3D points from a line of x, y, point number triples; -1 is a pixel without a point."""
     known, values = _colmap_points(points), numbers(line, where)
     if len(values) % 3:
         raise RsbenchError(f"{where}: its points must be x, y and a number each")
@@ -302,7 +302,7 @@ def _colmap_recording(
 
 
 def _pose_of_image(known: Mapping[int, Pose], tau: FloatArray) -> Pose:
-    """The pose of an image at its whole number; NaN between."""
+    """Pose of the image whose number is ``tau``; NaN between whole numbers."""
     tau = np.asarray(tau, dtype=np.float64)
     R, t = np.full((*tau.shape, 3, 3), np.nan), np.full((*tau.shape, 3), np.nan)
     for number, pose in known.items():
@@ -317,7 +317,7 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
     """The sequence of a folder that is or contains ``mav0``, or contains the cameras.
 
     Args:
-        line_delays_s: seconds between rows of a rolling shutter, 0 for a global one; without it not known.
+        line_delays_s: seconds between rows, 0 for a global shutter; if None, from the calibration.
 
     Raises:
         RsbenchError: files that are missing or malformed.
@@ -357,7 +357,7 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
 
 
 def _asl_cameras(root: Path, sensors: Mapping[Side, Path]) -> dict[Side, tuple[Table, Pose]]:
-    """Table and ``body_from_camera`` of each camera: of its sensor.yaml, or of a camchain of Kalibr beside.
+    """Table and ``body_from_camera`` of each camera, from sensor.yaml or a camchain of Kalibr.
 
     TUM VI and TUM RS-VI are distributed with ``dso/camchain.yaml`` in place of the first.
     """
@@ -373,13 +373,13 @@ def _asl_cameras(root: Path, sensors: Mapping[Side, Path]) -> dict[Side, tuple[T
 
 
 def _line_delays(known: Mapping[Side, tuple[Table, Pose]]) -> dict[Side, float]:
-    """Seconds between rows where all cameras have them."""
+    """Seconds between rows of each camera; empty unless all cameras have them."""
     found = {side: table["line_delay_s"] for side, (table, _) in known.items() if "line_delay_s" in table}
     return found if len(found) == len(known) else {}
 
 
 def _together(times: Mapping[Side, Mapping[int, Path]], height: int) -> list[dict[Side, int]]:
-    """Stamps of the cameras that are one time: the nearest to that of the left camera, within half a row.
+    """Time stamps of simultaneous images: those nearest to the left camera's, within half a row.
 
     Cameras with clocks of their own, or stamps that went through floats, differ by some nanoseconds.
     """
@@ -395,7 +395,7 @@ def _together(times: Mapping[Side, Mapping[int, Path]], height: int) -> list[dic
 
 
 def _euroc_times(folder: Path) -> dict[int, Path]:
-    """Files by nanosecond."""
+    """Image files by time stamp, nanoseconds."""
     out = {}
     for where, line in lines(folder / "data.csv"):
         stamp, _, name = line.partition(",")

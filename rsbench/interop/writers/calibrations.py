@@ -1,4 +1,4 @@
-"""A calibration in the files of other tools, whose conventions are in ``rsbench.interop.readers.calibrations``."""
+"""Writers of calibrations for other tools; ``rsbench.interop.readers.calibrations`` has the conventions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write_calibration(found: Calibration, kind: str, out: Path) -> list[Path]:
     """Write a calibration as one of ``WRITERS``; returns the files.
 
     Raises:
-        RsbenchError: sizes are not known, or the format has no place for a lens.
+        RsbenchError: image sizes are unknown, or the format does not support a lens.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     return WRITERS[kind](found, out)
@@ -48,7 +48,7 @@ def cameras_of(found: Calibration) -> dict[Side, PinholeCamera]:
 
 
 def rig_of(found: Calibration) -> StereoRig | None:
-    """The rig; None of one camera."""
+    """The rig; None for a single camera."""
     if found.right_from_left is None:
         return None
     cameras = cameras_of(found)
@@ -117,7 +117,7 @@ def _write_kalibr(found: Calibration, out: Path) -> list[Path]:
 
 
 def _line_delay(found: Calibration, side: Side, camera: PinholeCamera) -> float | None:
-    """Seconds from a row to the next; None where they are not known."""
+    """Seconds from one row to the next; None if unknown."""
     own = (found.left if side == "left" else found.right or {}).get("line_delay_s")
     if own is not None:
         return float(own)

@@ -1,4 +1,4 @@
-"""Datasets in the layouts of other projects: a table of the formats, and writing all of an export or nothing."""
+"""Export of datasets to the layouts of other projects: the table of formats, and atomic writing of an export."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def export_dataset(
         progress: called with the name of each sequence that is written.
 
     Returns:
-        What the format cannot represent of these sequences, in sentences; README.txt has them too.
+        Sentences on what the format cannot represent of these sequences; README.txt has them too.
 
     Raises:
         RsbenchError: no such format, no dataset, a sequence that the format cannot represent, or ``out`` cannot be

@@ -1,4 +1,4 @@
-"""Matches of a sequence for a viewer: strips whose colours show whether they are correct."""
+"""Matches of a sequence for a viewer, as lines whose colours show whether they are correct."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NAMES = {"left": "matches", "right": "matches", "stereo_0": "stereo", "stereo_1
 
 
 class Strips(NamedTuple):
-    """Matches that are drawn on one picture."""
+    """Matches drawn on one image."""
 
     name: str
     """``matches`` over time, ``stereo`` from left to right."""
@@ -35,7 +35,7 @@ class Strips(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A sequence and the parts that are shown."""
+    """A sequence and the parts of it that the viewer shows."""
 
     sequence: Sequence
     strips: tuple[Strips, ...]
@@ -61,7 +61,7 @@ def labelled_strips(sequence: Sequence) -> Iterator[Strips]:
 
 
 def found_strips(sequence: Sequence, features: str) -> Iterator[Strips]:
-    """Matches of a feature matcher in the first two frames; which are correct is not known.
+    """Matches of a feature matcher in the first two frames, without ground truth.
 
     Raises:
         RsbenchError: no such feature matcher.
