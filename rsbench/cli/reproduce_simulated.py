@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.simulated.run_sweep import errors_of_rows
-from rsbench.benchmark.simulated.sweep_card import load_sweep
+from rsbench.benchmark.simulated.sweep_card import SweepCard, load_sweep
 from rsbench.benchmark.studies.claims import (
     APART,
     GLOBAL,
@@ -30,13 +31,6 @@ from rsbench.cli.simulate import run_and_summarise
 from rsbench.report.claim_pages import claims_page, image_claims_page, readings_page, sweeps_page
 from rsbench.report.paper_figures import SWEEPS, draw_fig3, fig3_page, read_summaries, setting_table
 from rsbench.storage.files import save_arrays, write_bytes, write_json, write_table
-
-if TYPE_CHECKING:
-    import numpy as np
-    import pandas as pd
-    from numpy.typing import NDArray
-
-    from rsbench.benchmark.simulated.sweep_card import SweepCard
 
 _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-readout", "wrong-motion")
 
