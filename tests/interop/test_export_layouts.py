@@ -283,7 +283,7 @@ def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> No
         ("kitti", "none", {"right_delay": 0.1}, None, "late"),
         ("kitti", "none", {"right_scan": "bottom"}, "rs", "at one time"),
         ("nerfstudio", "brown", {}, None, "undistorts images before it trains"),
-        ("nerfstudio", "none", {"scan": "bottom"}, None, "from the top alone"),
+        ("nerfstudio", "none", {"scan": "bottom"}, None, "only rows that are read from the top"),
         ("carla-rs", "fisheye", {}, None, "no lens"),
         ("carla-rs", "none", {"scan": "left"}, None, "from the top"),
     ],
