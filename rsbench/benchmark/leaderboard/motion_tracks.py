@@ -50,17 +50,17 @@ from rsbench.benchmark.leaderboard.track import (
 )
 from rsbench.benchmark.scoring import answered, pose_errors
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.simulated.bound import Bound, Views, motion_bound
+from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_one_camera, motion_bound
 from rsbench.benchmark.simulated.contract import misreading
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.capture.model_choice import AUTO
-from rsbench.components.motion_models import TwistMotion, make_motion
+from rsbench.components.motion_models import TwistMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
-from rsbench.core.rig import StereoRig, View
+from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.matches import MATCHED, arranged, looks, seen_near
@@ -404,12 +404,11 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
     for number in range(count):
         problem, noise_px = exact_problem(seed, number, draws)
         tracks, motion = problem.correspondences.tracks, smooth(draws.motion(seed, number))
-        given, rig = problem.correspondences, problem.rig
-        if seen == "left":  # a rig of one, whose law is that of its own motion: no offset tells it a length
-            d = translation_of_offset(motion.w, motion.d, rig.offset("left"))
-            given, rig = Correspondences(left=track_pairs(tracks, "left")), StereoRig.of_one(rig.camera)
-            motion = make_motion(motion.name, motion.w, d, motion.parameters)
-        bounds.append(motion_bound(given, rig, problem.shutter, motion, noise_px, views))
+        rig, shutter = problem.rig, problem.shutter
+        if seen == "left":
+            bounds.append(bound_of_one_camera(track_pairs(tracks, "left"), rig, shutter, motion, noise_px))
+        else:
+            bounds.append(motion_bound(problem.correspondences, rig, shutter, motion, noise_px, views))
     return medians_of(bounds)
 
 

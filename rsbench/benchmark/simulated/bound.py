@@ -15,11 +15,13 @@ from typing import Literal
 
 import numpy as np
 
+from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import match_pose, ray_depths
 from rsbench.core.motion import Motion
+from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.projection import back_project
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -102,6 +104,18 @@ def motion_bound(
     if views != "pairs":
         roots.append(_track_root(tracks, views, rig, shutter, motion))
     return bound_from_root(joined(*roots) / noise_px, motion.w, motion.d)
+
+
+def bound_of_one_camera(
+    matches: FloatArray, rig: StereoRig, shutter: RollingShutter, motion: Motion, noise_px: float
+) -> Bound:
+    """Bound on the left camera's own motion from its exact matches (n, 4), as a rig of one under the same law.
+
+    As one of a rig it would know its place in the body, which tells it a length, and its direction less well.
+    """
+    d = translation_of_offset(motion.w, motion.d, rig.offset("left"))
+    own = make_motion(motion.name, motion.w, d, motion.parameters)
+    return motion_bound(Correspondences(left=matches), StereoRig.of_one(rig.eye("left")), shutter, own, noise_px)
 
 
 def joined(*roots: FloatArray) -> FloatArray:

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.seeds import generator
-from rsbench.benchmark.simulated.bound import Bound, bound_from_root, joined, motion_bound
+from rsbench.benchmark.simulated.bound import Bound, bound_from_root, bound_of_one_camera, joined, motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
-from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError
-from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.so3 import FloatArray
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.pipeline.isolated_components import GuardedSolver, SolverRunner
@@ -169,21 +167,11 @@ def _bounds(simulation: Simulation, kinds: set[Information]) -> dict[Information
     if "tracks" in kinds or "linked pairs" in kinds:
         found["tracks"] = found["linked pairs"] = of("tracks")
     if "left pairs" in kinds or "left and right pairs" in kinds:
-        left = of("left").root
-        found["left pairs"] = _of_left_camera(left, simulation)
+        found["left pairs"] = bound_of_one_camera(good["left"], rig, simulation.shutter, motion, 1.0)
         if "left and right pairs" in kinds:
-            both = joined(left, of("right").root)
+            both = joined(of("left").root, of("right").root)
             found["left and right pairs"] = bound_from_root(both, motion.w, motion.d)
     return found
-
-
-def _of_left_camera(root: FloatArray, simulation: Simulation) -> Bound:
-    """What a root (6, 6) of information on the body's motion says of the left camera's translation d + b - R b."""
-    motion, offset = simulation.motion, simulation.rig.offset("left")
-    d = translation_of_offset(motion.w, motion.d, offset)
-    T = np.eye(6)
-    T[3:, :3] = -so3.hat(so3.exp(motion.w) @ offset) @ so3.left_jacobian(motion.w)
-    return bound_from_root(root @ T, motion.w, d)
 
 
 def _timed(

@@ -7,7 +7,7 @@ import pytest
 from general_rigs import RIGS, SCANS
 
 from rsbench import estimate_motion
-from rsbench.benchmark.simulated.bound import Bound, Views, motion_bound, root_information
+from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_one_camera, motion_bound, root_information
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import LinearMotion, make_motion
 from rsbench.core.camera import PinholeCamera
@@ -202,7 +202,7 @@ def test_the_best_estimator_of_one_camera_is_at_the_bound_of_a_rig_of_one() -> N
     rig, rng, errors = StereoRig.of_one(RIG.camera), np.random.default_rng(3), list[float]()
     motion, options = LinearMotion(W, D), SimulationOptions(pairs=150, tracks=0, noise_px=0.0)
     left = simulate(rig, SHUTTER, motion, options, rng).correspondences.left
-    bound = motion_bound(Correspondences(left=left), rig, SHUTTER, motion, 0.1)
+    bound = bound_of_one_camera(left, rig, SHUTTER, motion, 0.1)
     for _ in range(40):
         noisy = Correspondences(left=left + 0.1 * rng.normal(size=left.shape))
         found = estimate_motion(noisy, RIG, SHUTTER, solver="rs-mono-refined")
