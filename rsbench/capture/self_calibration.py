@@ -19,7 +19,7 @@ import numpy as np
 from rsbench.capture.calibration import FOCAL, NO_ERRORS, OFFSET, RADIAL, CardSigma
 from rsbench.capture.hypotheses import Known, KnownInputs, Scans, scans_of
 from rsbench.capture.shutter_decision import as_global, examine_alone, known_of
-from rsbench.capture.two_frame_estimate import CERTAIN, Window, conclude, examine
+from rsbench.capture.two_frame_estimate import CERTAIN, Capture, Window, conclude, examine
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.errors import RsbenchError
@@ -198,6 +198,8 @@ _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
 """Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
 _SHARED = 0.05
 """Error that the pairs of a video have in common."""
+_SHARED_BY_TRACKS = 0.02
+"""The same of a trajectory through successive frames."""
 _LEAST_TURNING = 0.5
 """Share of the pairs: where few seem to turn, they do so by their errors."""
 _BROKEN, _LEAST_GOOD = 3.0, 0.75
@@ -267,6 +269,17 @@ def focal_of_pair(
         if abs(error) < _NEARBY or abs(found.log) > _BROKEN * PRIOR:
             break
     return found
+
+
+def focal_of_capture(capture: Capture, width: int) -> FoundFocal | None:
+    """The focal length found with the ratio, of images of this width; None: it is not determined."""
+    best = capture.likeliest
+    error, sigma = (0.0, 0.0) if best is None else (best.calibration[FOCAL], best.calibration_sigma[FOCAL])
+    log_sigma = float(np.hypot(sigma / (1.0 - error), _SHARED_BY_TRACKS))
+    if not sigma or log_sigma > _TELLING_PAIRS * PRIOR:
+        return None
+    focal = width / (1.0 - error)
+    return FoundFocal(focal=focal, sigma=focal * log_sigma, determined=True, pairs=capture.windows)
 
 
 def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:

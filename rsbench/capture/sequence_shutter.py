@@ -12,21 +12,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import scipy
 
+from rsbench.capture.calibration import FOCAL, NO_ERRORS
 from rsbench.capture.hypotheses import scans_of
 from rsbench.capture.shutter_decision import OPPOSITE, shutter_found, shutter_of
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions, noise_px
 from rsbench.capture.trajectory_fit import Fit, choose, first_curve, fit, log_evidence, window_motions
-from rsbench.capture.trajectory_spline import NotDefiniteError, span_of
-from rsbench.capture.trajectory_tracks import Tails, TimedTracks, is_of_one_camera, pack_windows, thinned
+from rsbench.capture.trajectory_spline import Curve, NotDefiniteError, make_curve, span_of
+from rsbench.capture.trajectory_tracks import (
+    Tails,
+    TimedTracks,
+    is_of_one_camera,
+    pack_windows,
+    thinned,
+    thinned_chains,
+)
 from rsbench.capture.two_frame_estimate import CERTAIN, MAX_SIGMA, Candidate, Capture, nearly_global
+from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import shared_error_factor, tiles, variance_factor
 
 LONGEST = 12
 """Successive windows that are used, at most: more would reduce the error by less than noise leaves."""
@@ -47,16 +59,18 @@ _WIDE = Tails(3.0, 0.3)
 something else."""
 _FEWEST, _SOME, _TRACKS = 15, 60, 150
 """Tracks of a window, about: fewest for an estimate, to estimate the scanning, and the ratio."""
-_SHARES_OF_ONE_CAMERA = 0.5, 0.15
-"""Weight of a match of one camera's dense flow, to estimate the scanning, and the ratio: neighbours have common
-errors. With a weight of 1, ratios of ten pieces of rendered video were off by 2.6 of their deviations (root of the
-mean square)."""
+_SHARE = 0.5
+"""Weight of a track beside the prior, see ``TrajectoryOptions``; common errors count in the ``dispersion``."""
+_COARSE_FOCAL, _FARTHEST = 0.3, 0.9
+"""Stride of the search in the logarithm of the focal length, and how far it goes."""
 _LEAST_SHARE = 0.2
 """Of the tracks must be right."""
 _PRECISION = 1e12
-_STEP, _STEPS, _ROUGH_STEPS = 0.05, 6, 2
-_NODES = np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
-"""Deviations from the peak at which the evidence is summed."""
+_BEYOND, _SHARED = 2.5, 0.02
+"""Variance over what common errors within tiles of the image explain, and error of a ratio that all flow of a
+video has in common: by twelve warped hand-held videos, seed 7 of ``benchmarks/handheld_warps.py``."""
+_STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS = 0.05, 0.1, 5, 2
+"""First differences of ratio and focal length, and how many steps of Newton's method."""
 _NOTHING = -1e12
 """Logarithm of evidence where there is no fit."""
 
@@ -87,19 +101,20 @@ def capture_of_sequence(
     rig: StereoRig,
     scannings: Sequence[Scanning] | None = None,
     seed: int = 0,
+    focal_sigma: float = 0.0,
 ) -> Capture:
     """The shutter from one trajectory through successive windows, without motion models.
 
     Args: capture: the one under motion models, which is returned where no trajectory explains the tracks. windows:
     of the frames 0 and 1, 1 and 2, ... scannings: how the cameras may read; None: both alike, at once, from one of
-    four sides, or as in ``capture``.
+    four sides, or as in ``capture``. focal_sigma: as of ``ratio_of_sequence``.
     """
     if scannings is None:
         best, scannings = capture.likeliest, _TOGETHER
         if best is not None and not best.scans.together and "global" not in astuple(best.scans):
             own = Scanning(scan=best.scans.left, right_scan=best.scans.right)  # pyrefly: ignore[bad-argument-type]
             scannings = (*_TOGETHER, own)
-    found = ratio_of_sequence(windows, rig, scannings, seed)
+    found = ratio_of_sequence(windows, rig, scannings, seed, focal_sigma)
     if found is None:
         return capture
     candidate = Candidate(
@@ -109,6 +124,8 @@ def capture_of_sequence(
         sigma=found.sigma,
         delay=found.scanning.right_delay,
         delay_sigma=0.0,
+        calibration=_shorter(1.0 - float(np.exp(-found.log_focal))),
+        calibration_sigma=_shorter(found.log_focal_sigma * float(np.exp(-found.log_focal))),
     )
     # Nearly without a readout it is all the same where it begins.
     near = nearly_global(replace(capture, candidates=(replace(candidate, probability=1.0),)))
@@ -129,6 +146,11 @@ def capture_of_sequence(
     )
 
 
+def _shorter(share: float) -> tuple[float, ...]:
+    """Errors of a calibration with focal lengths that are too short by this share."""
+    return (*NO_ERRORS[:FOCAL], share, *NO_ERRORS[FOCAL + 1 :])
+
+
 def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> RollingShutter:
     """The shutter of cameras that read alike, from the first successive windows of any motion.
 
@@ -139,17 +161,23 @@ def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed
 
 
 def capture_of_video(
-    windows: Sequence[FloatArray], camera: PinholeCamera, scan: Scan | None, seed: int = 0
+    windows: Sequence[FloatArray],
+    camera: PinholeCamera,
+    scan: Scan | None,
+    seed: int = 0,
+    focal_sigma: float = 0.0,
 ) -> Capture | None:
     """The shutter of one camera from a trajectory through successive frames; None where none explains the matches.
 
     Args:
         windows: matches (n, 4) x0, y0, x1, y1, px, of the frames 0 and 1, 1 and 2, ...; with outliers.
         scan: as in ``known_alone``.
+        focal_sigma: as of ``ratio_of_sequence``; the focal length is then among the errors of the calibration.
     """
     matches, scan = [Correspondences(left=each) for each in windows], scan or "top"
     scannings = Scanning(scan=scan), Scanning(scan=OPPOSITE[scan])
-    found = capture_of_sequence(_nothing_of(matches), matches, StereoRig.of_one(camera), scannings, seed)
+    rig = StereoRig.of_one(camera)
+    found = capture_of_sequence(_nothing_of(matches), matches, rig, scannings, seed, focal_sigma)
     return found if found.candidates else None
 
 
@@ -175,98 +203,137 @@ class SequenceRatio:
     used: int
     """Tracks that are right."""
     of: int
+    log_focal: float = 0.0
+    """Logarithm of the focal length over the rig's."""
+    log_focal_sigma: float = 0.0
+    """0: it is known."""
 
 
 def ratio_of_sequence(
-    windows: Sequence[Correspondences], rig: StereoRig, scannings: Sequence[Scanning], seed: int = 0
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    scannings: Sequence[Scanning],
+    seed: int = 0,
+    focal_sigma: float = 0.0,
 ) -> SequenceRatio | None:
     """How cameras read, by one of several scannings; None where no trajectory explains the tracks.
 
     Args:
         windows: of the frames 0 and 1, 1 and 2, ...; with outliers.
         seed: of the search for motions of single windows.
+        focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given.
     """
     alone = is_of_one_camera(windows)
     if sum(len(each.left if alone else each.tracks) for each in windows) < _FEWEST * len(windows):
         return None
-    few, found = thinned(windows, _SOME), dict[int, tuple[float, float]]()
-    rough, fine = _SHARES_OF_ONE_CAMERA if alone else (1.0, 1.0)
+    fewer = thinned_chains if alone else thinned
+    few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place]]()
     for number, scanning in enumerate(scannings):
         try:
-            profile = _Profile(few, rig, scanning, rough, (_FIRST, seed))
-            ratio = profile.climb(_FIRST)
+            profile = _Profile(few, rig, scanning, (_Place(_FIRST, 0.0), seed), focal_sigma)
+            profile.settle(profile.climb(_Place(_FIRST, 0.0)))
+            place = profile.summit(profile.climb(profile.settled), _ROUGH_STEPS)[0]
         except NotDefiniteError:
             continue
-        found[number] = profile.at(ratio), ratio
+        found[number] = profile.comparable(place), place
     if not found:
         return None
     best = max(found, key=lambda each: found[each][0])
-    others, ratio = sum(np.exp(found[each][0] - found[best][0]) for each in found), found[best][1]
     try:
-        profile = _Profile(thinned(windows, _TRACKS), rig, scannings[best], fine, (ratio, seed))
-        ratio = profile.peak(ratio, _ROUGH_STEPS)[0]
-        profile.settle(ratio)
-        estimate = profile.posterior(*profile.peak(ratio), 1.0 / float(others))
+        profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], (found[best][1], seed), focal_sigma)
+        profile.settle(found[best][1])
+        top, covariance = profile.summit(profile.climb(profile.settled))
+        dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
+    odds = sum(np.exp((each - found[best][0]) / dispersion) for each, _ in found.values())
+    estimate = profile.stated(top, covariance * dispersion, 1.0 / float(odds))
     # A trajectory explains two or three wrong matches exactly, or all of them by a scale that is no noise.
     right = estimate.used >= _LEAST_SHARE * estimate.of and estimate.noise_px <= MOST_NOISE_PX
     return estimate if right else None
 
 
+class _Place(NamedTuple):
+    """Where evidence is evaluated."""
+
+    ratio: float
+    log_focal: float
+    """As in ``SequenceRatio``."""
+
+
 class _Profile:
-    """Evidence of ratios, for the same tracks under the same tails."""
+    """Evidence of ratios and focal lengths, for the same tracks under the same tails."""
 
     def __init__(
         self,
         windows: Sequence[Correspondences],
         rig: StereoRig,
         scanning: Scanning,
-        share: float,
-        start: tuple[float, int],
+        start: tuple[_Place, int],
+        focal_sigma: float,
     ) -> None:
-        """With a first fit at a ratio, from motions of the windows; ``start`` is this ratio and a seed."""
-        self._windows, self._rig, self._share, self._scanning = windows, rig, share, scanning
-        self._fits = dict[float, Fit]()
-        self._values = dict[float, float]()
-        tracks, options = self._tracks(start[0]), TrajectoryOptions()
-        motions = window_motions(windows, rig, self._shutter(start[0]), start[1])
+        """With a first fit at a place, from motions of the windows; ``start`` is this place and a seed."""
+        self._windows, self._rig, self._scanning, self._focal_sigma = windows, rig, scanning, focal_sigma
+        self._linked = [np.ones(len(each.left)) for each in windows] if is_of_one_camera(windows) else None
+        self._fits = dict[_Place, Fit]()
+        self._values = dict[_Place, float]()
+        place = start[0]
+        tracks, options = self._tracks(place), TrajectoryOptions()
+        motions = window_motions(windows, self._rig_at(place), self._shutter(place.ratio), start[1])
         # The same knots whatever the ratio: what no track depends on adds the same to all.
         curve = first_curve(motions, tracks, span_of(len(windows), self._shutter(1.0)), _KNOTS)
-        self._near = fit(curve, tracks, options.prior, True, _WIDE, np.ones(len(tracks)))
+        self._near = place, fit(curve, tracks, options.prior, True, _WIDE, np.ones(len(tracks)))
 
     def _shutter(self, ratio: float) -> RollingShutter:
         return self._rig.shutter_of(self._scanning, ratio)
 
-    def _tracks(self, ratio: float) -> TimedTracks:
-        return pack_windows(self._windows, self._rig, self._shutter(ratio), share=self._share)
+    def _rig_at(self, place: _Place) -> StereoRig:
+        if not place.log_focal:
+            return self._rig
+        longer, camera = float(np.exp(place.log_focal)), self._rig.camera
+        return replace(self._rig, camera=replace(camera, fx=camera.fx * longer, fy=camera.fy * longer))
 
-    def _fit_near(self, ratio: float) -> Fit:
-        return self._fits[min(self._fits, key=lambda other: abs(other - ratio))]
+    def _tracks(self, place: _Place) -> TimedTracks:
+        rig, shutter = self._rig_at(place), self._shutter(place.ratio)
+        return pack_windows(self._windows, rig, shutter, self._linked, share=_SHARE)
 
-    def settle(self, ratio: float) -> None:
-        """Take tails, right tracks and kind of prior from the fit at a ratio.
+    @property
+    def settled(self) -> _Place:
+        """Where tails, right tracks and prior are from."""
+        return self._near[0]
+
+    def _fit_near(self, place: _Place) -> tuple[_Place, Fit]:
+        if not self._fits:
+            return self._near
+        near = min(self._fits, key=lambda other: float(np.hypot(*np.subtract(other, place))))
+        return near, self._fits[near]
+
+    def settle(self, place: _Place) -> None:
+        """Take tails, right tracks and kind of prior from the fit at a place.
 
         Knots stay fine: smoothness is for the prior to decide, and coarse knots would enforce it.
         """
-        tracks, last = self._tracks(ratio), self._fit_near(ratio)
-        self._near = choose(fit(last.curve, tracks, last.prior, tails=last.tails), tracks, ())
+        self.at(place)
+        tracks, (_, last) = self._tracks(place), self._fit_near(place)
+        self._near = place, choose(fit(last.curve, tracks, last.prior, tails=last.tails), tracks, ())
         self._fits.clear()
         self._values.clear()
 
-    def at(self, ratio: float) -> float:
-        """Logarithm of evidence."""
-        if ratio not in self._values:
-            start = self._fit_near(ratio) if self._fits else self._near
+    def at(self, place: _Place) -> float:
+        """Logarithm of evidence, and of the prior of the focal length."""
+        if place not in self._values:
+            near, start = self._fit_near(place)
+            curve = _turning_less(start.curve, float(np.exp(place.log_focal - near.log_focal)))
             try:
-                found = fit(start.curve, self._tracks(ratio), start.prior, True, start.tails, start.trust)
-                self._fits[ratio], self._values[ratio] = found, log_evidence(found, _PRECISION)
+                found = fit(curve, self._tracks(place), start.prior, True, start.tails, start.trust)
+                prior = -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
+                self._fits[place], self._values[place] = found, log_evidence(found, _PRECISION) + prior
             except NotDefiniteError:
-                self._values[ratio] = _NOTHING
-        return self._values[ratio]
+                self._values[place] = _NOTHING
+        return self._values[place]
 
-    def climb(self, start: float) -> float:
-        """From a ratio, by strides, to one with less evidence on both sides.
+    def climb(self, start: _Place) -> _Place:
+        """From a place, by strides, to one with less evidence on all sides.
 
         Raises:
             NotDefiniteError: there is no fit at the first.
@@ -274,55 +341,113 @@ class _Profile:
         best = start
         if self.at(best) == _NOTHING:
             raise NotDefiniteError("no trajectory explains the tracks")
-        for sign in (-1.0, 1.0):
-            while True:
-                other = float(np.clip(best + sign * _COARSE, _LEAST, 1.0))
-                if other == best or self.at(other) <= self.at(best):
-                    break
-                best = other
+        strides = [(-_COARSE, 0.0), (_COARSE, 0.0)]
+        strides += [(0.0, -_COARSE_FOCAL), (0.0, _COARSE_FOCAL)] if self._focal_sigma else []
+        moved = True
+        while moved:
+            moved = False
+            for ratio, log_focal in strides:
+                while True:
+                    other = _Place(float(np.clip(best.ratio + ratio, _LEAST, 1.0)), best.log_focal + log_focal)
+                    if other == best or abs(other.log_focal) > _FARTHEST or self.at(other) <= self.at(best):
+                        break
+                    best, moved = other, bool(self._focal_sigma)
         return best
 
-    def peak(self, start: float, steps: int = _STEPS) -> tuple[float, float]:
-        """Where the evidence is largest, and its deviation: parabolas through three ratios, ever closer."""
-        best, step = start, _STEP
-        sigma = step
+    def summit(self, start: _Place, steps: int = _STEPS) -> tuple[_Place, FloatArray]:
+        """Where the evidence is largest, and its covariance (2, 2) there: Newton's method on differences.
+
+        The second row and column are 0 where the focal length is known.
+        """
+        best, axes = start, 2 if self._focal_sigma else 1
+        reach, H = np.array([_STEP, _STEP_FOCAL]), np.eye(2)
         for number in range(steps):
-            low, high = max(best - step, _LEAST), min(best + step, 1.0)
-            middle = 0.5 * (low + high)
-            values = [self.at(each) for each in (low, middle, high)]
-            half = 0.5 * (high - low)
-            bend = (2.0 * values[1] - values[0] - values[2]) / half**2
-            if bend <= 0.0:
-                best = (low, middle, high)[int(np.argmax(values))]
-                continue
-            sigma = bend**-0.5
-            moved = float(np.clip(middle + 0.5 * (values[2] - values[0]) / half / bend, _LEAST, 1.0))
-            near = abs(moved - best) < 0.3 * sigma
-            best, step = moved, float(np.clip(sigma, 0.002, 0.1))
-            if near and number > 1:
+            middle = _Place(float(np.clip(best.ratio, _LEAST + reach[0], 1.0 - reach[0])), best.log_focal)
+
+            def beside(a: int, b: int, middle: _Place = middle, reach: FloatArray = reach) -> float:
+                return self.at(_Place(middle.ratio + a * reach[0], middle.log_focal + b * reach[1]))
+
+            ahead, behind = (np.array([beside(k, 0), beside(0, k) if axes > 1 else 0.0]) for k in (1, -1))
+            here = beside(0, 0)
+            H = np.diag((2.0 * here - ahead - behind)[:axes] / reach[:axes] ** 2)
+            if axes > 1:
+                H[0, 1] = H[1, 0] = (ahead[0] + ahead[1] - here - beside(1, 1)) / (reach[0] * reach[1])
+            values, vectors = np.linalg.eigh(H)
+            H = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
+            slope = ((ahead - behind)[:axes] / (2.0 * reach[:axes]))[:axes]
+            step = np.linalg.solve(H, slope)
+            step *= min(1.0, _COARSE / max(abs(step[0]), 1e-9), _COARSE_FOCAL / max(float(np.abs(step[-1])), 1e-9))
+            there = _Place(
+                float(np.clip(middle.ratio + step[0], _LEAST, 1.0)),
+                float(np.clip(middle.log_focal + step[1], -_FARTHEST, _FARTHEST)) if axes > 1 else 0.0,
+            )
+            moved, sigma = np.abs(np.subtract(there, best))[:axes], np.sqrt(np.diagonal(np.linalg.inv(H)))
+            best = there if self.at(there) >= here else middle
+            reach = np.clip(np.append(sigma, _STEP_FOCAL)[:2], [0.002, 0.02], [0.1, 0.3])
+            if number > 0 and np.all(moved < 0.3 * sigma):
                 break
-        return best, sigma
+        out = np.zeros((2, 2))
+        out[:axes, :axes] = np.linalg.inv(H)
+        return best, out
 
-    def posterior(self, peak: float, sigma: float, probability: float) -> SequenceRatio:
-        """Mean and standard deviation of the ratio over all ratios, by a curve without overshoot through
-        values."""
-        from scipy.interpolate import PchipInterpolator
+    def comparable(self, place: _Place) -> float:
+        """Logarithm of evidence with the normalisation of the tails, for profiles of the same tracks."""
+        value, (_, found) = self.at(place), self._fit_near(place)
+        tails, freedom = found.tails, self._tracks(place).freedom
+        each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
+        each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
+        wrong = -freedom * np.log(MOST_NOISE_PX)  # evenly spread, whatever the tails of the right ones
+        return value + _SHARE * float(np.sum(np.where(found.trust > 0.0, each, wrong)))
 
-        ratios = np.unique(np.clip(peak + sigma * _NODES, _LEAST, 1.0))
-        values = np.array([self.at(each) for each in ratios])
-        fine = np.linspace(ratios[0], ratios[-1], 601)
-        curve = PchipInterpolator(ratios, values)(fine) if len(ratios) > 1 else np.full(len(fine), values[0])
-        density = np.exp(curve - float(np.max(values)))
-        total = float(np.trapezoid(density, fine))
-        mean = float(np.trapezoid(density * fine, fine)) / total
-        spread = float(np.sqrt(np.trapezoid(density * (fine - mean) ** 2, fine) / total))
-        found = self._fit_near(mean)
+    def dispersion(self, top: _Place, covariance: FloatArray) -> float:
+        """Variance over that of the evidence: tracks of one part of the image have common errors."""
+        axes, tracks = 2 if self._focal_sigma else 1, self._tracks(top)
+        scores = np.zeros((len(tracks), axes))
+        for axis in range(axes):
+            step = float(np.sqrt(covariance[axis, axis])) * np.eye(2)[axis]
+            ends, costs = list[float](), list[FloatArray]()
+            for sign in (-1.0, 1.0):
+                ratio, log_focal = np.add(top, sign * step)
+                place = _Place(float(np.clip(ratio, _LEAST, 1.0)), float(log_focal))
+                self.at(place)
+                found = self._fit_near(place)[1]
+                factor = 0.5 * _SHARE * found.trust * (found.tails.nu + tracks.freedom)
+                spread = found.tails.nu * found.tails.scale**2
+                costs.append(factor * np.log1p(found.equations.squares / spread))
+                ends.append(place[axis])
+            scores[:, axis] = (costs[1] - costs[0]) / (ends[1] - ends[0])
+        inverse, groups = covariance[:axes, :axes], tiles(tracks.ends[tracks.starts[:-1], :2])
+        shared = shared_error_factor(scores @ inverse, groups, inverse, axes)
+        return _BEYOND * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
+
+    def stated(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:
+        """At a summit, with a covariance (2, 2) about it; the ratio is at most 1."""
+        ratio, deviation = _within(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), _SHARED)))
+        self.at(top)
+        found = self._fit_near(top)[1]
         return SequenceRatio(
             scanning=self._scanning,
             probability=probability,
-            ratio=mean,
-            sigma=spread,
+            ratio=ratio,
+            sigma=deviation,
             noise_px=noise_px(found.tails),
             used=int(np.count_nonzero(found.trust)),
             of=len(found.trust),
+            log_focal=top.log_focal,
+            log_focal_sigma=float(np.sqrt(covariance[1, 1])),
         )
+
+
+def _within(ratio: float, sigma: float) -> tuple[float, float]:
+    """Mean and standard deviation of a normal ratio that is known to be possible."""
+    fine = np.linspace(_LEAST, 1.0, 981)
+    density = np.exp(-0.5 * ((fine - ratio) / max(sigma, 1e-3)) ** 2)
+    mean = float(density @ fine / np.sum(density))
+    return mean, float(np.sqrt(density @ (fine - mean) ** 2 / np.sum(density)))
+
+
+def _turning_less(curve: Curve, factor: float) -> Curve:
+    """A spline with all turns divided by a factor, by which the focal length is longer."""
+    if factor == 1.0:
+        return curve
+    return make_curve(curve.first, curve.interval, so3.exp(so3.log(curve.R) / factor), curve.p)

@@ -280,14 +280,17 @@ def candidates_of(capture: Capture) -> list[dict[str, Any]]:
 # One camera
 
 
-def known_alone(scan: Scan | None = None) -> Known:
+def known_alone(scan: Scan | None = None, focal_sigma: float = 0.0) -> Known:
     """What is known of a camera whose readout ratio is not given, with its ``scan`` if that is.
 
     The opposite scan stays possible, because frames in the wrong order show it. Columns are possible only where
-    ``scan`` gives them: errors of the flow of one camera resemble them.
+    ``scan`` gives them: errors of the flow of one camera resemble them. ``focal_sigma`` is the relative prior
+    standard deviation of the focal length; 0: it is given.
     """
-    given = Scans(scan or "top", scan or "top")
-    return Known(scans=(GLOBAL, given, reversed_scans(given)), delay=0.0)
+    given, sigma = Scans(scan or "top", scan or "top"), np.array(NO_ERRORS)
+    sigma[FOCAL] = focal_sigma
+    scans = (GLOBAL, given, reversed_scans(given))
+    return Known(scans=scans, delay=0.0, calibration_sigma=tuple(sigma.tolist()))
 
 
 def examine_alone(

@@ -443,6 +443,15 @@ def thinned(windows: Sequence[Correspondences], count: int) -> list[Corresponden
     return [some if len(some.tracks) >= count else each for some, each in zip(few, windows, strict=True)]
 
 
+def thinned_chains(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
+    """About ``count`` pairs of one camera for each window, with those that go on from them in the next windows."""
+    pairs = [each.left for each in windows]
+    numbers, chains = _numbered(pairs, [np.ones(len(each), dtype=np.bool_) for each in pairs], 0)
+    every = max(sum(map(len, pairs)) // max(count * len(pairs), 1), 1)
+    kept = np.random.default_rng(0).permutation(chains) % every == 0
+    return [Correspondences(left=each[kept[own]]) for each, own in zip(pairs, numbers, strict=True)]
+
+
 def is_of_one_camera(windows: Sequence[Correspondences]) -> bool:
     """Whether there are matches of the left camera alone."""
     return not any(len(each.tracks) or len(each.right) for each in windows)

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import scans_of
-from rsbench.capture.self_calibration import FoundFocal, PairFocal, conclude_focal, focal_of_pair
+from rsbench.capture.self_calibration import (
+    PRIOR,
+    FoundFocal,
+    PairFocal,
+    conclude_focal,
+    focal_of_capture,
+    focal_of_pair,
+)
 from rsbench.capture.sequence_shutter import LONGEST, capture_of_video
 from rsbench.capture.shutter_decision import (
     LEAST_BACKWARDS,
@@ -127,6 +134,8 @@ class FoundShutter:
     shutter: RollingShutter
     capture: Capture | None
     """None where the card says it."""
+    focal: FoundFocal | None = None
+    """Of a focal length that was found with the shutter."""
 
     @property
     def scan(self) -> Scan:
@@ -190,10 +199,13 @@ def _found(
 ) -> FoundShutter:
     """The shutter that the frames show: from successive pairs along one trajectory, else from single pairs."""
     run, camera = _in_a_row(frames, card, seed, advance)
-    along = capture_of_video(run, camera, card.scan, seed) if len(run) >= _LEAST_IN_A_ROW else None
+    focal_sigma = PRIOR if card.focal_unknown else 0.0
+    many = len(run) >= _LEAST_IN_A_ROW
+    along = capture_of_video(run, camera, card.scan, seed, focal_sigma) if many else None
     if along is not None:
-        return _settled(along, camera, card)
-    known, windows, camera, why = known_alone(card.scan), list[Window](), None, ""
+        focal = focal_of_capture(along, camera.width) if card.focal_unknown else None
+        return replace(_settled(along, camera, card), focal=focal)
+    known, windows, camera, why = known_alone(card.scan, focal_sigma), list[Window](), None, ""
     for matches, reason, camera in matched_pairs(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
         why = why or reason
         if matches is not None:
@@ -278,18 +290,20 @@ def find_camera_alone(
     options: RobustOptions,
     seed: int = 0,
     advance: Callable[[str], None] = lambda word: None,
+    found: FoundFocal | None = None,
 ) -> tuple[PinholeCamera, FoundFocal | None]:
     """The camera, and what the frames say of its focal length; None where the card says that.
 
     Args:
         frames, count, card, options, seed, advance: as of ``find_shutter``.
         shutter: of the camera.
+        found: a focal length that was found with the shutter.
 
     Raises:
         RsbenchError: fewer than two frames, or frames of two sizes.
     """
     camera, pairs = None, list[PairFocal | None]()
-    wanted = PAIRS if card.focal_unknown else 0
+    wanted = PAIRS if card.focal_unknown and found is None else 0
     for matches, _, camera in matched_pairs(frames, card, max((count - 1) // PAIRS, 1), wanted, seed):
         if matches is not None:
             pairs.append(focal_of_pair(matches, (camera.width, camera.height), shutter, options, seed))
@@ -297,5 +311,5 @@ def find_camera_alone(
     assert camera is not None
     if not card.focal_unknown:
         return camera, None
-    found = conclude_focal(pairs, camera.width)
+    found = found or conclude_focal(pairs, camera.width)
     return PinholeCamera.centred(camera.width, camera.height, found.focal), found

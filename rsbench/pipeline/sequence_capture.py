@@ -154,11 +154,9 @@ def _know_camera(
         if unknown:
             advance("all pairs together")
     shutter = found.shutter
-    opened = (
-        progress("looking at the focal length", min(pairs, PAIRS)) if card.focal_unknown else no_progress("", 0)
-    )
-    with opened as advance:
-        camera, focal = find_camera_alone(frames, frames.count, card, shutter, robust, seed, advance)
+    wanted, words = card.focal_unknown and found.focal is None, "looking at the focal length"
+    with progress(words, min(pairs, PAIRS)) if wanted else no_progress("", 0) as advance:
+        camera, focal = find_camera_alone(frames, frames.count, card, shutter, robust, seed, advance, found.focal)
     samples, clock = None if gyro is None else gyro.samples, None
     if gyro is not None and gyro.clock_error > 0.0:
         with progress("looking at the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import rsbench.capture.two_frame_spline as two_frame_spline_module
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import MODELS, KnownInputs
+from rsbench.capture.self_calibration import focal_of_capture
 from rsbench.capture.sequence_shutter import capture_of_video
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.capture.trajectory_spline import ContinuousMotion
@@ -356,6 +358,19 @@ def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None
     assert best.scans.left == ("bottom" if backwards else "top") and best.probability > 0.99
     assert best.sigma < 0.05 and abs(best.ratio - 0.8) < 3.0 * best.sigma
     assert capture.matches == sum(map(len, windows)) > capture.used > 0.5 * capture.matches / 4
+
+
+@pytest.mark.slow
+def test_a_video_of_a_hand_shows_its_focal_length_with_its_ratio() -> None:
+    """Each within three stated deviations, though the search begins with a lens that is a third too long."""
+    windows, true = windows_of(7, 0.01, 0.1, np.random.default_rng(4)), CAMERA_RIG.camera
+    longer = replace(true, fx=1.35 * true.fx, fy=1.35 * true.fy)
+    capture = capture_of_video(windows, longer, None, focal_sigma=0.35)
+    assert capture is not None and capture.likeliest is not None
+    best, found = capture.likeliest, focal_of_capture(capture, true.width)
+    assert best.scans.left == "top" and abs(best.ratio - 0.8) < 3.0 * best.sigma < 0.3
+    assert found is not None and found.determined
+    assert abs(found.focal * longer.fx / true.width - true.fx) < 3.0 * found.sigma * longer.fx / true.width
 
 
 @pytest.mark.slow
