@@ -49,8 +49,8 @@ _CHECKED_TRACKS = 200
 _FAR_BETTER = 0.8
 """Scale of the errors about a trajectory over that about motion models, below which these are wrong."""
 _TOGETHER = tuple(Scanning(scan=scan) for scan in ("top", "bottom", "left", "right"))
-_FIRST, _COARSE, _LEAST = 0.6, 0.15, 0.02
-"""Where the search starts, its stride, and the least ratio of a rolling shutter."""
+_FIRST, _OTHERS, _COARSE, _LEAST = 0.6, (0.3, 0.85), 0.15, 0.02
+"""Where the search starts, of one camera alone also there, its stride, and the least ratio of a rolling shutter."""
 _KNOTS = 0.25
 """Frame periods between control poses to begin with: fine ones, because at a wrong ratio the trajectory is
 rough."""
@@ -69,8 +69,8 @@ _PRECISION = 1e12
 _BEYOND, _SHARED = 2.5, 0.02
 """Variance over what common errors within tiles of the image explain, and error of a ratio that all flow of a
 video has in common: by twelve warped hand-held videos, seed 7 of ``benchmarks/handheld_warps.py``."""
-_STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS = 0.05, 0.1, 5, 2
-"""First differences of ratio and focal length, and how many steps of Newton's method."""
+_STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS, _ROUNDS = 0.05, 0.1, 5, 2, 4
+"""First differences of ratio and focal length, how many steps of Newton's method, and how often tails are learned."""
 _NOTHING = -1e12
 """Logarithm of evidence where there is no fit."""
 
@@ -228,11 +228,14 @@ def ratio_of_sequence(
         return None
     fewer = thinned_chains if alone else thinned
     few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place]]()
+    # A spline that begins with motions under a wrong camera may stay where these lead it, whatever the camera then.
+    away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
+    first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
         try:
-            profile = _Profile(few, rig, scanning, (_Place(_FIRST, 0.0), seed), focal_sigma)
-            profile.settle(profile.climb(_Place(_FIRST, 0.0)))
-            place = profile.summit(profile.climb(profile.settled), _ROUGH_STEPS)[0]
+            starts = [_Profile(few, rig, scanning, (each, seed), focal_sigma) for each in first]
+            profile = max(starts, key=lambda each: each.at(each.start))
+            place = profile.ascended(profile.climb(profile.start))
         except NotDefiniteError:
             continue
         found[number] = profile.comparable(place), place
@@ -241,8 +244,7 @@ def ratio_of_sequence(
     best = max(found, key=lambda each: found[each][0])
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], (found[best][1], seed), focal_sigma)
-        profile.settle(found[best][1])
-        top, covariance = profile.summit(profile.climb(profile.settled))
+        top, covariance = profile.summit(profile.ascended(found[best][1]))
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
@@ -277,7 +279,7 @@ class _Profile:
         self._linked = [np.ones(len(each.left)) for each in windows] if is_of_one_camera(windows) else None
         self._fits = dict[_Place, Fit]()
         self._values = dict[_Place, float]()
-        place = start[0]
+        self.start = place = start[0]
         tracks, options = self._tracks(place), TrajectoryOptions()
         motions = window_motions(windows, self._rig_at(place), self._shutter(place.ratio), start[1])
         # The same knots whatever the ratio: what no track depends on adds the same to all.
@@ -296,11 +298,6 @@ class _Profile:
     def _tracks(self, place: _Place) -> TimedTracks:
         rig, shutter = self._rig_at(place), self._shutter(place.ratio)
         return pack_windows(self._windows, rig, shutter, self._linked, share=_SHARE)
-
-    @property
-    def settled(self) -> _Place:
-        """Where tails, right tracks and prior are from."""
-        return self._near[0]
 
     def _fit_near(self, place: _Place) -> tuple[_Place, Fit]:
         if not self._fits:
@@ -390,6 +387,18 @@ class _Profile:
         out[:axes, :axes] = np.linalg.inv(H)
         return best, out
 
+    def ascended(self, place: _Place) -> _Place:
+        """From a place to a summit, near which tails and right tracks are taken from the fit at it.
+
+        Those of a fit that is far off, whose errors are large, have a flat evidence with other summits.
+        """
+        for _ in range(_ROUNDS):
+            self.settle(place)
+            last, place = place, self.summit(self.climb(place), _ROUGH_STEPS)[0]
+            if abs(place.ratio - last.ratio) < _STEP and abs(place.log_focal - last.log_focal) < _STEP_FOCAL:
+                break
+        return place
+
     def comparable(self, place: _Place) -> float:
         """Logarithm of evidence with the normalisation of the tails, for profiles of the same tracks."""
         value, (_, found) = self.at(place), self._fit_near(place)
@@ -420,6 +429,11 @@ class _Profile:
         shared = shared_error_factor(scores @ inverse, groups, inverse, axes)
         return _BEYOND * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
 
+    def _spans(self, place: _Place) -> FloatArray:
+        """Windows that each track is seen through."""
+        tracks = self._tracks(place)
+        return np.maximum(np.round(np.diff(tracks.starts) / (1 if self._linked else 2)) - 1.0, 1.0)
+
     def stated(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:
         """At a summit, with a covariance (2, 2) about it; the ratio is at most 1."""
         ratio, deviation = _within(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), _SHARED)))
@@ -431,8 +445,8 @@ class _Profile:
             ratio=ratio,
             sigma=deviation,
             noise_px=noise_px(found.tails),
-            used=int(np.count_nonzero(found.trust)),
-            of=len(found.trust),
+            used=int(np.sum(self._spans(top)[found.trust > 0.0])),
+            of=int(np.sum(self._spans(top))),
             log_focal=top.log_focal,
             log_focal_sigma=float(np.sqrt(covariance[1, 1])),
         )

@@ -50,6 +50,8 @@ from rsbench.solvers.refined import RefinedSolver
 OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 """Largest standard deviation of a ratio that is used; a larger one is used where it moves no pixel by this."""
+_MAX_SHARE = 0.25
+"""The same of one camera's ratio, as a share of it: a correction by twice the true ratio is no better than none."""
 _PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
 """Prior standard deviation of each error of a calibration over the size of the row differences, its limits, px,
 and the left-right matches that it needs: the other errors come from the same calibration as these differences.
@@ -346,7 +348,7 @@ def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
         raise NoMotionError(f"cannot tell how the camera reads: {capture.reason}. {remedy}")
     certain = best.probability >= CERTAIN
     harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
-    if certain and (best.sigma <= _MAX_SIGMA or harmless):
+    if certain and (best.sigma <= min(_MAX_SIGMA, _MAX_SHARE * best.ratio) or harmless):
         return shutter_of(best, StereoRig.of_one(camera))
     if certain:
         how = f"{words(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"

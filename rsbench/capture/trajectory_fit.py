@@ -92,6 +92,9 @@ _SHORT = 0.03
 """Length to begin with of translations that matches determine but for their length: that of metres of a hand. The
 prior begins with metres too; translations of length 1 had accelerations that it kept as they were, and errors of
 0.28 px in place of 0.05."""
+_WEAKEST = 100.0
+"""Precision of poses in the evidence, at least: nothing else bounds the length of an even translation of one camera,
+and 0.1 beside ``_SHORT`` is no bound."""
 _SUSPECT = 4.0
 """A window's own motion is wrong where its error is so many times that of one interpolated from its neighbours."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -264,6 +267,7 @@ def log_evidence(found: Fit, precision: float) -> float:
     """
     curve, equations = found.curve, found.equations
     anchor = anchors(curve, equations.band.shape[1], precision)
+    anchor[:, 0] += _WEAKEST
     lower = band_factor(equations.band + anchor)
     after = band_log_determinant(lower)
     if equations.sensed is not None and equations.border is not None and found.drift is not None:

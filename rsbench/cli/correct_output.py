@@ -73,10 +73,10 @@ def readout_words(shutter: RollingShutter, capture: Capture | None, rig: StereoR
     best = None if capture is None else capture.likeliest
     if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
-    odds = f"probability that the cameras read so {best.probability:.0%}"
     if not rig.metric:
-        odds = odds.replace("cameras read", "camera reads")
-        return f"{best.ratio:.3f} +- {best.sigma:.3f}, from the {shutter.scan_of('left')} (found, {odds})"
+        side = f"from the {shutter.scan_of('left')}, which is the right side with a probability of"
+        return f"{best.ratio:.3f} +- {best.sigma:.3f} (found), {side} {best.probability:.0%}"
+    odds = f"probability that the cameras read so {best.probability:.0%}"
     odds += "".join(f"; else {each.scans}" for each in capture.candidates[1:2])
     text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {odds})"
     if not capture.determined and capture.moved_px < 1.0:

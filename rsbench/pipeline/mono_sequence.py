@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,7 +45,7 @@ from rsbench.pipeline.mono_correction import (
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.vision.corrector import load_corrector
-from rsbench.vision.images import map_ahead
+from rsbench.vision.images import grey_u8, map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
 _AT_ONCE = 2
@@ -279,9 +280,69 @@ def _moment(each: _Frame, turn: Turned, options: CorrectionOptions) -> Corrected
     if stays or not good:
         return replace(moment, reason=why or (each.after.reason if each.after else ""))
     fusion, place, found = good[0]
+    if fusion.own.shutter.readout_ratio > 0.0:
+        drawn = fusion.places(place, _target(fusion, place, line))[..., :2]
+        errors = expected_errors(turn.image(each.image), drawn, [pair[:2] for pair in good], line)
+        if errors[0] > _TRUSTED[len(good)] * errors[1]:
+            return replace(moment, reason=UNTRUSTED)
     beyond = Beyond(*good[1][:2], _target(*good[1][:2], line)) if len(good) > 1 else None
     fused = inpainted(turn.back(fusion.corrected(place, _target(fusion, place, line), beyond)), options)
     return replace(moment, frames={"left": fused}, found=turn.found(found))
+
+
+# Whether a corrected frame is nearer to the truth than the one that was read.
+
+
+_TRUSTED = {2: 0.9, 1: 1.5}
+"""Largest error that is expected of a corrected frame, over that of the one that was read, in squares of grey levels,
+by the number of neighbours: of one alone the line errs by what speed changes. Chosen on seed 7 of
+``benchmarks/uncalibrated_video.py``."""
+_CONSISTENT_PX, _CLIPPED_PX, _SMOOTHED_PX = 0.5, 4.0, 1.5
+"""Distance from where it began at which flow there and back ends, up to which it counts; so many px off, a pixel
+shows something else, and errors grow no more; and blur of the image whose gradients turn px into grey levels."""
+UNTRUSTED = "its correction cannot be trusted more than the frame that was read, which is kept"
+
+
+def expected_errors(
+    image: NDArray[Any], drawn: FloatArray, seen: Sequence[tuple[MonoFusion, int]], line: float
+) -> tuple[float, float]:
+    """Mean square errors, grey levels, of a corrected frame and of the frame that was read, by how its pixels move.
+
+    The truth is where each pixel's path in the image is at the target's time: a parabola through its places in the
+    frame and in both neighbours, by the flow to each; a line, where there is one neighbour. It knows no depth, focal
+    length, law or trajectory, so that it is independent of all by which geometry may err.
+
+    Args:
+        image: the frame (H, W[, C]), rows read from the top.
+        drawn: (H, W, 2) px, where each of its pixels is drawn.
+        seen: the pairs that contain it, and which of their frames it is.
+        line: whose time is the target's.
+    """
+    grey = cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _SMOOTHED_PX)
+    height, width = grey.shape
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    ahead, good = (line - y) / height, np.ones(grey.shape, dtype=np.bool_)
+    ends = list[tuple[FloatArray, FloatArray]]()
+    for fusion, place in seen:
+        # Times in readouts: the unit that pairs of different lengths share.
+        flow, period = fusion.flows.flow[place], (1.0 - 2.0 * place) / fusion.own.shutter.readout_ratio
+        ends.append((period + flow[..., 1] / height, flow))
+        good &= fusion.flows.returns[place] < _CONSISTENT_PX
+    (a, first), (b, second) = ends[0], ends[-1]
+    share = ahead / a if len(ends) == 1 else ahead * (ahead - b) / (a * (a - b))
+    moved = share[..., None] * first
+    if len(ends) > 1:
+        moved = moved + (ahead * (ahead - a) / (b * (b - a)))[..., None] * second
+    slopes = np.stack(
+        [cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)]
+    )
+    errors = []
+    for off in (drawn - np.stack([x, y], axis=-1) - moved, moved):
+        length = np.linalg.norm(off, axis=-1, keepdims=True)
+        off = off * np.minimum(1.0, _CLIPPED_PX / np.maximum(length, 1e-6))
+        levels = np.sum(np.moveaxis(slopes, 0, -1) * off, axis=-1)
+        errors.append(float(np.mean(levels[good] ** 2)) if np.any(good) else 0.0)
+    return errors[0], errors[1]
 
 
 def _target(fusion: MonoFusion, place: int, line: float) -> float:
