@@ -50,7 +50,7 @@ _FAR_BETTER = 0.8
 """Scale of the errors about a trajectory over that about motion models, below which these are wrong."""
 _TOGETHER = tuple(Scanning(scan=scan) for scan in ("top", "bottom", "left", "right"))
 _FIRST, _OTHERS, _COARSE, _LEAST = 0.6, (0.3, 0.85), 0.15, 0.02
-"""Where the search starts, of one camera alone also there, its stride, and the least ratio of a rolling shutter."""
+"""Where the search starts, of one camera also there, its stride, and the least ratio of a rolling shutter."""
 _KNOTS = 0.25
 """Frame periods between control poses to begin with: fine ones, because at a wrong ratio the trajectory is
 rough."""
@@ -68,9 +68,10 @@ _LEAST_SHARE = 0.2
 _PRECISION = 1e12
 _BEYOND, _SHARED = 2.5, 0.02
 """Variance over what common errors within tiles of the image explain, and error of a ratio that all flow of a
-video has in common: by twelve warped hand-held videos, seed 7 of ``benchmarks/handheld_warps.py``."""
+video has in common: by twelve warped hand-held videos of 320 x 240 px, seed 7 of what became
+``benchmarks/uncalibrated_video.py``."""
 _STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS, _ROUNDS = 0.05, 0.1, 5, 2, 4
-"""First differences of ratio and focal length, how many steps of Newton's method, and how often tails are learned."""
+"""First differences of ratio and focal length, steps of Newton's method, and how often tails are learned."""
 _NOTHING = -1e12
 """Logarithm of evidence where there is no fit."""
 
@@ -201,7 +202,7 @@ class SequenceRatio:
     sigma: float
     noise_px: float
     used: int
-    """Tracks that are right."""
+    """Matches of tracks that are right."""
     of: int
     log_focal: float = 0.0
     """Logarithm of the focal length over the rig's."""
@@ -228,7 +229,7 @@ def ratio_of_sequence(
         return None
     fewer = thinned_chains if alone else thinned
     few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place]]()
-    # A spline that begins with motions under a wrong camera may stay where these lead it, whatever the camera then.
+    # A spline that begins with motions under a wrong camera may stay where these lead it under any other.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
     first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):

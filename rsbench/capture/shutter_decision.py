@@ -51,7 +51,7 @@ OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right",
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
 """Largest standard deviation of a ratio that is used; a larger one is used where it moves no pixel by this."""
 _MAX_SHARE = 0.25
-"""The same of one camera's ratio, as a share of it: a correction by twice the true ratio is no better than none."""
+"""The same as a share of one camera's ratio: a correction by twice the true ratio is no better than none."""
 _PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
 """Prior standard deviation of each error of a calibration over the size of the row differences, its limits, px,
 and the left-right matches that it needs: the other errors come from the same calibration as these differences.

@@ -93,8 +93,8 @@ _SHORT = 0.03
 prior begins with metres too; translations of length 1 had accelerations that it kept as they were, and errors of
 0.28 px in place of 0.05."""
 _WEAKEST = 100.0
-"""Precision of poses in the evidence, at least: nothing else bounds the length of an even translation of one camera,
-and 0.1 beside ``_SHORT`` is no bound."""
+"""Least precision of poses in the evidence: nothing else bounds the length of one camera's even translation, and
+0.1 beside ``_SHORT`` hardly does."""
 _SUSPECT = 4.0
 """A window's own motion is wrong where its error is so many times that of one interpolated from its neighbours."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)

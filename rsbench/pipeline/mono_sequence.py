@@ -294,8 +294,8 @@ def _moment(each: _Frame, turn: Turned, options: CorrectionOptions) -> Corrected
 
 
 _TRUSTED = {2: 0.9, 1: 1.5}
-"""Largest error that is expected of a corrected frame, over that of the one that was read, in squares of grey levels,
-by the number of neighbours: of one alone the line errs by what speed changes. Chosen on seed 7 of
+"""Largest error that is expected of a corrected frame, over that of the one that was read, in squares of grey
+levels, by the number of neighbours: beside one alone a change of speed makes the line err. Chosen on seed 7 of
 ``benchmarks/uncalibrated_video.py``."""
 _CONSISTENT_PX, _CLIPPED_PX, _SMOOTHED_PX = 0.5, 4.0, 1.5
 """Distance from where it began at which flow there and back ends, up to which it counts; so many px off, a pixel
@@ -306,41 +306,38 @@ UNTRUSTED = "its correction cannot be trusted more than the frame that was read,
 def expected_errors(
     image: NDArray[Any], drawn: FloatArray, seen: Sequence[tuple[MonoFusion, int]], line: float
 ) -> tuple[float, float]:
-    """Mean square errors, grey levels, of a corrected frame and of the frame that was read, by how its pixels move.
+    """Mean square errors, grey levels, of a corrected frame and of the one that was read, by how pixels move.
 
-    The truth is where each pixel's path in the image is at the target's time: a parabola through its places in the
-    frame and in both neighbours, by the flow to each; a line, where there is one neighbour. It knows no depth, focal
-    length, law or trajectory, so that it is independent of all by which geometry may err.
+    Taken for true is where each pixel's path in the image is at the target's time: a parabola through its places
+    in the frame and in both neighbours, by the flow to each; a line, where there is one neighbour. It knows no
+    depth, focal length, law or trajectory, by which geometry may err; it shares the readout ratio with it.
 
     Args:
         image: the frame (H, W[, C]), rows read from the top.
         drawn: (H, W, 2) px, where each of its pixels is drawn.
-        seen: the pairs that contain it, and which of their frames it is.
+        seen: the pairs that contain it, and which of their frames it is; with a ratio above 0.
         line: whose time is the target's.
     """
     grey = cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _SMOOTHED_PX)
     height, width = grey.shape
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    ahead, good = (line - y) / height, np.ones(grey.shape, dtype=np.bool_)
-    ends = list[tuple[FloatArray, FloatArray]]()
-    for fusion, place in seen:
-        # Times in readouts: the unit that pairs of different lengths share.
+    ahead, good, ends = (line - y) / height, np.ones(grey.shape, dtype=np.bool_), list[tuple[Any, Any]]()
+    for fusion, place in seen:  # times in readouts, which pairs of different lengths share
         flow, period = fusion.flows.flow[place], (1.0 - 2.0 * place) / fusion.own.shutter.readout_ratio
         ends.append((period + flow[..., 1] / height, flow))
         good &= fusion.flows.returns[place] < _CONSISTENT_PX
-    (a, first), (b, second) = ends[0], ends[-1]
-    share = ahead / a if len(ends) == 1 else ahead * (ahead - b) / (a * (a - b))
-    moved = share[..., None] * first
-    if len(ends) > 1:
-        moved = moved + (ahead * (ahead - a) / (b * (b - a)))[..., None] * second
-    slopes = np.stack(
-        [cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)]
-    )
+    (a, to_first), (b, to_last) = ends[0], ends[-1]
+    if len(ends) == 1:
+        moved = (ahead / a)[..., None] * to_first
+    else:
+        moved = (ahead * (ahead - b) / (a * (a - b)))[..., None] * to_first
+        moved = moved + (ahead * (ahead - a) / (b * (b - a)))[..., None] * to_last
+    slopes = [cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125) for dx in (1, 0)]
     errors = []
     for off in (drawn - np.stack([x, y], axis=-1) - moved, moved):
-        length = np.linalg.norm(off, axis=-1, keepdims=True)
-        off = off * np.minimum(1.0, _CLIPPED_PX / np.maximum(length, 1e-6))
-        levels = np.sum(np.moveaxis(slopes, 0, -1) * off, axis=-1)
+        length = np.linalg.norm(off, axis=-1)
+        levels = slopes[0] * off[..., 0] + slopes[1] * off[..., 1]
+        levels *= np.minimum(1.0, _CLIPPED_PX / np.maximum(length, 1e-6))
         errors.append(float(np.mean(levels[good] ** 2)) if np.any(good) else 0.0)
     return errors[0], errors[1]
 
