@@ -132,7 +132,7 @@ def video(case: Case, seed: int) -> tuple[list[NDArray[np.uint8]], list[NDArray[
     textures = wall, floor, picture(SCENES[(scene + 2) % len(SCENES)][0])
     moves, rows = hand(rng), ratio * np.arange(SIZE[1]) / SIZE[1]
     taken = [view(k + rows, moves, textures, focal) for k in range(FRAMES)]
-    still = [view(np.full(len(rows), k + np.mean(rows)), moves, textures, focal) for k in range(FRAMES)]
+    still = [view(k + np.full_like(rows, np.mean(rows)), moves, textures, focal) for k in range(FRAMES)]
     noisy = [np.clip(each + rng.normal(0.0, NOISE, each.shape) + 0.5, 0, 255).astype(np.uint8) for each in taken]
     return noisy, still
 

@@ -60,7 +60,7 @@ something else."""
 _FEWEST, _SOME, _TRACKS = 15, 60, 150
 """Tracks of a window, about: fewest for an estimate, to estimate the scanning, and the ratio."""
 _SHARE = 0.5
-"""Weight of a track beside the prior, see ``TrajectoryOptions``; common errors count in the ``dispersion``."""
+"""Weight of one camera's track beside the prior, see ``TrajectoryOptions``; common errors count in the ``dispersion``."""
 _COARSE_FOCAL, _FARTHEST = 0.3, 0.9
 """Stride of the search in the logarithm of the focal length, and how far it goes."""
 _LEAST_SHARE = 0.2
@@ -278,6 +278,9 @@ class _Profile:
         """With a first fit at a place, from motions of the windows; ``start`` is this place and a seed."""
         self._windows, self._rig, self._scanning, self._focal_sigma = windows, rig, scanning, focal_sigma
         self._linked = [np.ones(len(each.left)) for each in windows] if is_of_one_camera(windows) else None
+        # Dense flow errs together; features do not.
+        flow = self._linked is not None
+        self._share, self._beyond, self._shared = (_SHARE, _BEYOND, _SHARED) if flow else (1.0, 1.0, 0.0)
         self._fits = dict[_Place, Fit]()
         self._values = dict[_Place, float]()
         self.start = place = start[0]
@@ -298,7 +301,7 @@ class _Profile:
 
     def _tracks(self, place: _Place) -> TimedTracks:
         rig, shutter = self._rig_at(place), self._shutter(place.ratio)
-        return pack_windows(self._windows, rig, shutter, self._linked, share=_SHARE)
+        return pack_windows(self._windows, rig, shutter, self._linked, share=self._share)
 
     def _fit_near(self, place: _Place) -> tuple[_Place, Fit]:
         if not self._fits:
@@ -407,7 +410,7 @@ class _Profile:
         each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
         each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
         wrong = -freedom * np.log(MOST_NOISE_PX)  # evenly spread, whatever the tails of the right ones
-        return value + _SHARE * float(np.sum(np.where(found.trust > 0.0, each, wrong)))
+        return value + self._share * float(np.sum(np.where(found.trust > 0.0, each, wrong)))
 
     def dispersion(self, top: _Place, covariance: FloatArray) -> float:
         """Variance over that of the evidence: tracks of one part of the image have common errors."""
@@ -421,14 +424,14 @@ class _Profile:
                 place = _Place(float(np.clip(ratio, _LEAST, 1.0)), float(log_focal))
                 self.at(place)
                 found = self._fit_near(place)[1]
-                factor = 0.5 * _SHARE * found.trust * (found.tails.nu + tracks.freedom)
+                factor = 0.5 * self._share * found.trust * (found.tails.nu + tracks.freedom)
                 spread = found.tails.nu * found.tails.scale**2
                 costs.append(factor * np.log1p(found.equations.squares / spread))
                 ends.append(place[axis])
             scores[:, axis] = (costs[1] - costs[0]) / (ends[1] - ends[0])
         inverse, groups = covariance[:axes, :axes], tiles(tracks.ends[tracks.starts[:-1], :2])
         shared = shared_error_factor(scores @ inverse, groups, inverse, axes)
-        return _BEYOND * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
+        return self._beyond * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
 
     def _spans(self, place: _Place) -> FloatArray:
         """Windows that each track is seen through."""
@@ -437,7 +440,7 @@ class _Profile:
 
     def stated(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:
         """At a summit, with a covariance (2, 2) about it; the ratio is at most 1."""
-        ratio, deviation = _within(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), _SHARED)))
+        ratio, deviation = _within(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), self._shared)))
         self.at(top)
         found = self._fit_near(top)[1]
         return SequenceRatio(

@@ -60,8 +60,9 @@ def test_no_frame_of_a_camera_that_is_wrong_comes_out_worse(monkeypatch: pytest.
     """A lens 2.5 times too long, under which some frames come out worse if all are believed; 0.2 dB is allowed."""
     bench = programs.program("benchmarks/uncalibrated_video.py")
     frames, truths = bench.video((2, 0.65, 0.75), 7)
-    wrong = PinholeCamera.centred(*bench.SIZE, 2.5 * 0.75 * bench.SIZE[0])
-    shutter = RollingShutter(height=bench.SIZE[1], readout_ratio=0.65)
+    width, height = bench.SIZE
+    wrong = PinholeCamera.centred(width, height, 2.5 * 0.75 * width)
+    shutter = RollingShutter(height=height, readout_ratio=0.65)
     gains, left = bench.gains(frames, truths, wrong, shutter)
     assert min(gains) >= -0.2
     for gain, reason in zip(gains, left, strict=True):
