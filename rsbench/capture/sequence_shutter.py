@@ -60,7 +60,7 @@ something else."""
 _FEWEST, _SOME, _TRACKS = 15, 60, 150
 """Tracks of a window, about: fewest for an estimate, to estimate the scanning, and the ratio."""
 _SHARE = 0.5
-"""Weight of one camera's track beside the prior, see ``TrajectoryOptions``; common errors count in the ``dispersion``."""
+"""Weight of one camera's track beside the prior; common errors count in ``dispersion``."""
 _COARSE_FOCAL, _FARTHEST = 0.3, 0.9
 """Stride of the search in the logarithm of the focal length, and how far it goes."""
 _LEAST_SHARE = 0.2
