@@ -113,9 +113,10 @@ def bound_of_one_camera(
 
     As one of a rig it would know its place in the body, which tells it a length, and its direction less well.
     """
-    d = translation_of_offset(motion.w, motion.d, rig.offset("left"))
-    own = make_motion(motion.name, motion.w, d, motion.parameters)
-    return motion_bound(Correspondences(left=matches), StereoRig.of_one(rig.eye("left")), shutter, own, noise_px)
+    R, d = rig.own("left").R, translation_of_offset(motion.w, motion.d, rig.offset("left"))
+    own = make_motion(motion.name, R @ motion.w, R @ d, motion.parameters)
+    alone = StereoRig.of_one(rig.sensor("left"))
+    return motion_bound(Correspondences(left=matches), alone, shutter, own, noise_px)
 
 
 def joined(*roots: FloatArray) -> FloatArray:
