@@ -523,7 +523,7 @@ def _arguments(folder: Path) -> Loader:
         except ValueError as error:
             raise RsbenchError(f"{path}: {error}") from error
         numbers = camera.fx, camera.cx, rig.baseline, shutter.readout_ratio
-        if {type(number) for number in numbers} != {float} or type(shutter.height) is not int:
+        if not {type(number) for number in numbers} <= {float, int} or type(shutter.height) is not int:
             raise AssertionError(f"stored as given: {rig}, {shutter}")
         if not np.isfinite(rig.depth(1.0)):
             raise AssertionError(f"depth of {rig} is {rig.depth(1.0)}")
