@@ -71,7 +71,7 @@ def test_no_frame_of_a_camera_that_is_wrong_comes_out_worse(monkeypatch: pytest.
 
 
 def test_a_frame_that_is_not_trusted_is_the_one_that_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mono_sequence, "expected_errors", lambda *_: (3.0, 1.0))
+    monkeypatch.setattr(mono_sequence, "expected_errors", lambda *_: (4.0, 1.0))
     rng = np.random.default_rng(0)
     wide = np.kron(rng.integers(0, 255, (30, 50)), np.ones((8, 8))).astype(np.uint8)
     frames = [np.ascontiguousarray(wide[:160, 6 * k : 6 * k + 200]) for k in range(3)]

@@ -49,6 +49,11 @@ FEWEST_FRAMES, MOST_FRAMES = 4, 250
 # Simulated points
 
 
+def _no_kinds(seed: int, number: int) -> dict[str, float | str]:
+    """A function by name: processes are handed it."""
+    return {}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Draws:
     """The problems of a protocol, by a seed and their numbers."""
@@ -59,7 +64,7 @@ class Draws:
     setting: Callable[[int, int], Setting]
     """Setting of a problem by seed and number."""
     outlier_images: OutlierImages
-    kinds: Callable[[int, int], dict[str, float | str]] = lambda seed, number: {}
+    kinds: Callable[[int, int], dict[str, float | str]] = _no_kinds
     """Further properties, beside sizes, against which scores are plotted, by seed and number."""
 
     def rng(self, seed: int, what: str, number: int) -> np.random.Generator:

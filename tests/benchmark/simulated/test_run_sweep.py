@@ -30,6 +30,7 @@ from rsbench.components.motion_models import LinearMotion
 from rsbench.components.rig_tables import load_rig
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import StereoRig
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.essential_matrix import EightPointSolver
@@ -333,34 +334,30 @@ def test_rigs_of_settings_are_those_of_their_cards() -> None:
 
 
 def test_bound_of_the_left_camera_agrees_with_finite_differences_of_its_residuals() -> None:
-    """Fisher information of (w, left translation) from numerical derivatives of the exact Sampson error."""
+    """Fisher information of a rig of one, whose length is free, by numerical derivatives of the Sampson error."""
     bounds = run_bounds(SETTING, ("gs-8pt",), 0, 0, 1)
     from rsbench.benchmark.simulated.trials import _simulation
 
     simulation = _simulation(SETTING.exact(), [enter(load_solver_entry("gs-8pt"))], 0, 0)
     rig, shutter, motion = simulation.rig, simulation.shutter, simulation.motion
-    left = simulation.correspondences.left
+    left, alone = simulation.correspondences.left, StereoRig.of_one(rig.camera)
+    start, end = (rig.cam_from_world(motion, tau, "left") for tau in (0.0, 1.0))
+    d = end.t - end.R @ start.R.T @ start.t
 
     def residuals(theta: np.ndarray) -> np.ndarray:
-        return rs_sampson_error(rig, shutter, LinearMotion(theta[:3], theta[3:]), "left", left)
+        return rs_sampson_error(alone, shutter, LinearMotion(theta[:3], theta[3:]), "left", left)
 
-    def left_translation(theta: np.ndarray) -> np.ndarray:
-        start, end = (rig.cam_from_world(LinearMotion(theta[:3], theta[3:]), tau, "left") for tau in (0.0, 1.0))
-        return end.t - end.R @ start.R.T @ start.t
-
-    theta, step = np.concatenate([motion.w, motion.d]), 1e-6
-    J, D = (
-        np.stack([(f(theta + step * e) - f(theta - step * e)) / (2 * step) for e in np.eye(6)], axis=-1)
-        for f in (residuals, left_translation)
-    )
-    d = left_translation(theta)
-    across = np.eye(3) - np.outer(d, d) / (d @ d)
-    covariance = np.linalg.inv(J.T @ J)
-    direction = np.sqrt(np.trace(across @ D @ covariance @ D.T @ across)) / np.linalg.norm(d)
-    # The two kinds of information are equal at exact matches; finite differences are good to 1e-5.
-    assert np.linalg.norm(bounds["direction"][0, 0]) == pytest.approx(direction, rel=1e-3)
+    theta, step = np.concatenate([motion.w, d]), 1e-6
+    J = np.stack([(residuals(theta + step * e) - residuals(theta - step * e)) / (2 * step) for e in np.eye(6)], -1)
+    # Without the length of d, which changes no residual.
+    basis = np.eye(6)[:, :5].copy()
+    basis[3:, 3:] = np.linalg.svd(d[None])[2][1:].T
+    covariance = basis @ np.linalg.inv((J @ basis).T @ (J @ basis)) @ basis.T
+    direction = np.sqrt(np.trace(covariance[3:, 3:])) / np.linalg.norm(d)
+    # The matches follow the law of the rig's middle, which differs by the square of the angle.
+    assert np.linalg.norm(bounds["direction"][0, 0]) == pytest.approx(direction, rel=1e-2)
     assert np.linalg.norm(bounds["rotation"][0, 0]) == pytest.approx(
-        np.sqrt(np.trace(covariance[:3, :3])), rel=1e-3
+        np.sqrt(np.trace(covariance[:3, :3])), rel=1e-2
     )
 
 
