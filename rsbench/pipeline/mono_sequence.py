@@ -295,7 +295,7 @@ def _moment(each: _Frame, turn: Turned, options: CorrectionOptions) -> Corrected
 # Whether a corrected frame is nearer to the truth than the one that was read.
 
 
-_TRUSTED = {2: 2.0, 1: 3.0}
+_TRUSTED = {2: 1.3, 1: 2.0}
 """Largest error that is expected of a corrected frame, over that of the one that was read, in squares of grey
 levels, by the number of neighbours: a change of speed makes the path err, beside one neighbour more. A video that
 shakes within each frame has up to 1.2 and 1.7 where its corrected frames err by a third of what they did."""
