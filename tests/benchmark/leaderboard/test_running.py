@@ -320,6 +320,7 @@ def _nothing_left(serve: Any, jobs: Any, *arguments: object) -> Any:
     yield from ()
 
 
+@pytest.mark.timeout(1500)
 def test_one_command_makes_all_boards_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, str]] = []
 
