@@ -31,7 +31,7 @@ from rsbench.benchmark.leaderboard.picture_track import _serve_rows
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_oracles, write_truth
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
-from rsbench.cli import generate, reproduce_leaderboard
+from rsbench.cli import reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import Outcome, decode, encode
@@ -320,7 +320,6 @@ def _nothing_left(serve: Any, jobs: Any, *arguments: object) -> Any:
     yield from ()
 
 
-@pytest.mark.timeout(1500)
 def test_one_command_makes_all_boards_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, str]] = []
 
@@ -329,7 +328,7 @@ def test_one_command_makes_all_boards_and_goes_on(tmp_path: Path, monkeypatch: p
         if len(asked) == 1:
             write_analytic_dataset(Path(out), *PLANES, twins=(40,))
 
-    monkeypatch.setattr(generate, "generate", render)
+    monkeypatch.setattr(reproduce_leaderboard, "generate", render)
     monkeypatch.setattr(reproduce_leaderboard, "entries_of_laws", lambda: ENTRIES)
     monkeypatch.setattr(running, "finished_jobs", jobs_here)
     out, data = tmp_path / "results", tmp_path / "data"
