@@ -199,7 +199,7 @@ _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
 _SHARED = 0.05
 """Error that the pairs of a video have in common."""
 _SHARED_BY_TRACKS = 0.02
-"""The same of a trajectory through successive frames."""
+"""Error that the frames of a video have in common where one trajectory explains them."""
 _LEAST_TURNING = 0.5
 """Share of the pairs: where few seem to turn, they do so by their errors."""
 _BROKEN, _LEAST_GOOD = 3.0, 0.75

@@ -68,8 +68,7 @@ _LEAST_SHARE = 0.2
 _PRECISION = 1e12
 _BEYOND, _SHARED = 2.5, 0.02
 """Variance over what common errors within tiles of the image explain, and error of a ratio that all flow of a
-video has in common: by twelve warped hand-held videos of 320 x 240 px, seed 7 of what became
-``benchmarks/uncalibrated_video.py``."""
+video has in common. Chosen on twelve warped hand-held videos of 320 x 240 px (seed 7)."""
 _STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS, _ROUNDS = 0.05, 0.1, 5, 2, 4
 """First differences of ratio and focal length, steps of Newton's method, and how often tails are learned."""
 _NOTHING = -1e12

@@ -54,7 +54,8 @@ FEWEST_PER_PARAMETER = 3.0
 """K over p below which no covariance should be stated: wrong matches may outvote the right ones unseen."""
 SHIFT_PX, _SHIFT_SHARE = 0.01, 0.25
 """Standard deviation of the shift that the matches of a tile share in one view, pixels, and its largest share of
-the standard deviation of a match. Rendered frames of nine scenes have 0.01 to 0.03 between left and right."""
+the standard deviation of a match. Chosen for the coverage of the frames of the track pose-1; errors of matches of
+rendered frames have common parts of 0.01 to 0.03 between left and right."""
 _LEAST_FREEDOM = 3.0
 """Of the denominator of F: fewer have quantiles that say nothing."""
 _MOST_FOLLOWED = 0.5
@@ -94,7 +95,7 @@ def stated_covariance(
         leverages: (n,) h_i.
         places: (n, 2) where in the image each measurement is, in any unit.
         parameters: that the measurements determine, p or fewer.
-        shifts: (k, n, p) derivatives of g_i by k ways to shift all measurements by a pixel; None: no point 4.
+        shifts: (k, n, p) derivatives of g_i by k kinds of shift by a pixel; None: no point 4.
         sigma_px: standard deviation of a measurement.
     """
     kept = 1.0 - np.minimum(leverages, _MOST_FOLLOWED)
@@ -111,7 +112,7 @@ def common_shifts(shares: FloatArray, groups: NDArray[np.int64], sigma_px: float
     """Covariance (p, p) that shifts common to the measurements of a tile cause, point 4 above.
 
     Args:
-        shares: (k, n, p) by how much the estimate moves when each measurement is shifted by a pixel, in k ways.
+        shares: (k, n, p) by how much the estimate moves when a measurement is shifted by a pixel, by kind.
         groups: (n,) tile of each.
         sigma_px: standard deviation of a measurement.
     """

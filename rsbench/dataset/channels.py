@@ -625,7 +625,7 @@ class ChannelReader:
         """Surface points and where the frames see them; RsbenchError as of ``channel_values``."""
         found, views = Tracks.read(path := self._path("tracks", TRACKS)), len(SIDES) * self.frames
         if found.tau.shape[1] != views:
-            raise RsbenchError(f"{path}: is of {found.tau.shape[1]} views, the sequence has {views}")
+            raise RsbenchError(f"{path}: holds {found.tau.shape[1]} views, but the sequence has {views}")
         return found
 
     def affine(self) -> AffineFrames:

@@ -167,8 +167,8 @@ def check_cameras(
     """Whether these cameras can be corrected with these options.
 
     Raises:
-        RsbenchError: depth is to be found where a pair is of two times, and no motion; or an offset is given, of
-            cameras with a lens or another scan, or with a matcher that needs the motion.
+        RsbenchError: depth is requested without motion where the two images of a pair have different times; or an
+            offset is given for cameras with a lens or another scan, or for a matcher that needs the motion.
     """
     needs = options.corrector.component.spec.needs
     if not depth_is_known and "depth" in needs:

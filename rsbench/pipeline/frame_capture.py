@@ -212,9 +212,9 @@ def find_matches_of_rig(
 ) -> Correspondences:
     """``find_matches`` of cameras as they are, in pixels of their images.
 
-    Other matchers see images without distortion. Where the cameras do not read rows together, a left-right match
-    is of two times, and its ends of two rows: rsbench's own looks for it anywhere, and of others, which may look
-    along the row, only matches over time are kept.
+    Other matchers get images without distortion. Where the cameras do not read rows together, the two ends of a
+    left-right match have two times and lie on two rows: rsbench's matchers search the whole image for it, and
+    those of other packages, which may search the row alone, give only their matches over time.
 
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.

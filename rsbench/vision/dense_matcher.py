@@ -143,7 +143,7 @@ _FLOOR_PX = 0.02
 _SMALLEST, _SMALLEST_CELL = 64, 6
 """Width or height of a level, and of a cell, px."""
 _TRIED = 2.5
-"""Places that are tried for a track that is asked for."""
+"""Places that are tried for each requested track."""
 _REMEMBERED, _LARGE = 4, 2_500_000
 """Pairs of images whose flow is remembered, and pixels above which it is not."""
 
