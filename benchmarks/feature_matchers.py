@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from rsbench.benchmark.leaderboard.motion_tracks import match_scores
 from rsbench.benchmark.scoring import pose_errors
@@ -111,7 +112,7 @@ def row_of(case: Case, features: str, model: str, most: int, seed: int) -> dict[
     solving = time.process_time()
     with SolverRunner() as runner:
         entry = load_solver_entry("rs-stereo-refined")
-        found = solve_problem(problem, entry, RobustOptions(), runner, seed, (), model)
+        found = solve_problem(problem, entry, RobustOptions(), runner, seed, ("covariance",), model)
     solved = time.process_time()
     w, d = (np.full(3, np.nan) if found[key] is None else np.array(found[key]) for key in ("w", "d"))
     errors = pose_errors(
@@ -125,7 +126,10 @@ def row_of(case: Case, features: str, model: str, most: int, seed: int) -> dict[
         reference_point=found["reference_point"],
     )
     e_R, e_T = float(errors["e_R_deg"]), float(errors["e_T_deg"])
-    wrong = float("nan")
+    wrong = square = float("nan")
+    if found["success"] and found["metric"] and found["covariance"] is not None:
+        error = np.concatenate([w - case.w, d - case.d])
+        square = float(error @ np.linalg.solve(np.array(found["covariance"]), error))
     if case.sequence is not None and case.rig.rectified:
         wrong = 1.0 - match_scores(case.sequence, Correspondences(tracks=matches.tracks))["matches_1px"]
     return {
@@ -138,17 +142,28 @@ def row_of(case: Case, features: str, model: str, most: int, seed: int) -> dict[
         "e_R": e_R,
         "e_T": e_T,
         "score": 0.5 * (max(0.0, 1.0 - e_R / 0.1) + max(0.0, 1.0 - e_T)),
+        "square": square,
         "model": str(found["motion_model"]),
         "matching_s": matched - begin,
         "solving_s": solved - solving,
     }
 
 
+_LEVEL, _MEDIAN = chi2.ppf([0.95, 0.5], 6)
+
+
 def summary(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Means of score, share of wrong ends and seconds; medians of tracks; geometric means of the errors."""
+    """Means of score, share of wrong ends and seconds; medians of tracks; geometric means of the errors.
+
+    Also how many motions have a stated covariance, how many of their 95 % ellipsoids hold the truth, and the size
+    of their axes over the actual scatter, by medians.
+    """
     groups = table.groupby([*by, "features"], sort=False)
     found = groups[["score", "wrong", "matching_s", "solving_s"]].mean()
     found["tracks"] = groups["tracks"].median()
+    found["stated"] = groups["square"].count()
+    found["in_95"] = groups["square"].agg(lambda each: float(np.mean(each.dropna() <= _LEVEL)))
+    found["size"] = groups["square"].agg(lambda each: float(np.sqrt(_MEDIAN / each.median())))
     for name in ("e_R", "e_T"):
         found[name] = groups[name].agg(lambda each: float(np.exp(np.mean(np.log(np.maximum(each, 1e-9))))))
     found["sequences"] = groups.size()
