@@ -252,13 +252,16 @@ def _connected(cluster: Cluster) -> Iterator[Any]:
         client = Client(**where, timeout=_CONNECT_S, name="rsbench")
     except (OSError, ValueError) as error:
         raise RsbenchError(f"--scheduler {cluster.address}: {error or 'no answer'}") from error
-    with client:
+    try:
         if not client.scheduler_info(n_workers=-1)["workers"]:
             try:
                 client.wait_for_workers(1, timeout=_CONNECT_S)
             except TimeoutError as error:
                 raise RsbenchError(f"--scheduler {cluster.address}: has no workers") from error
         yield client
+    finally:
+        with contextlib.suppress(Exception):  # distributed may raise where the scheduler is gone
+            client.close()
 
 
 # On the machines of the cluster

@@ -343,7 +343,7 @@ def test_the_key_of_an_entry_signs_its_updates(board: Path, tmp_path: Path) -> N
     for wrong in (
         signed(board, unsigned, other, line),
         signed(board, unsigned, mine, line, namespace="git"),
-        signed(board, unsigned, mine, line[:-1] + "0"),
+        signed(board, unsigned, mine, line[:-1] + ("1" if line.endswith("0") else "0")),
         commit(board, second, {MINE: b"third"}),
         commit(board, unsigned, {b"submissions/mine/update.sig": b"no signature"}),
         signed(
