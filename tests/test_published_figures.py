@@ -23,10 +23,10 @@ README_ROWS = {
     "8-point, global shutter (`gs-8pt`)": "gs-8pt",
     "linear, Wang et al. 2020 (`rs-stereo-linear`)": "rs-stereo-linear",
     "**maximum likelihood** (`rs-stereo-refined`)": "rs-stereo-refined",
-    "as it was read": "uncorrected",
-    "by global shutter, scaled matches": "GS motion of scaled matches, SGM depth",
-    "**by rsbench**, model chosen by evidence": "**ours**",
-    "by true motion and depth": "true motion, true depth",
+    "nothing": "uncorrected",
+    "global-shutter motion, scaled matches": "GS motion of scaled matches, SGM depth",
+    "**our motion**, model chosen by default": "**ours**",
+    "true motion and depth (limit)": "true motion, true depth",
 }
 """What README calls a row, and the results pages."""
 
