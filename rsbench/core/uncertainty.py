@@ -5,15 +5,18 @@ curvatures H_i at the minimum. Four things make the inverse curvature too small 
 function here.
 
 1. The model of the noise is approximate. The sandwich A^-1 (sum g_i g_i^T) A^-1 holds whatever the noise is (P.
-   Huber, Proc. Fifth Berkeley Symposium, 1967; H. White, Econometrica 1980), with each g_i divided by 1 - h_i for
-   the part of its error that the fit has followed (HC3: J. MacKinnon, H. White, J. Econometrics 1985), h_i = tr
-   (H^-1 H_i) being the leverage of the measurement. By chance it is too small in some directions when measurements
-   are few, so it is replaced by the inverse information wherever that is larger (``larger``).
+   Huber, Proc. Fifth Berkeley Symposium, 1967; H. White, Econometrica 1980), with each g_i divided by the root of
+   1 - h_i for the part of its error that the fit has followed (HC2: J. MacKinnon, H. White, J. Econometrics 1985),
+   h_i = tr (H^-1 H_i) being the leverage of the measurement. From few measurements it is itself uncertain:
+   ``shrunk`` takes it towards a multiple of the inverse information, as far as its own scatter calls for (O.
+   Ledoit, M. Wolf, J. Multivariate Analysis 2004). Along each axis the larger one of it and of the inverse
+   information is stated (``larger``).
 2. Few measurements carry the information. With leverages that add up to p, as many equal measurements as K = p^2
    / sum h_i^2 would have the same spread of information (L. Kish, Survey Sampling, 1965). A covariance from K
    samples has squared errors as T^2 of H. Hotelling (Annals of Mathematical Statistics 1931), not as chi-squared;
    ``small_sample_factor`` is the ratio of their quantiles. The ellipsoid of chi-squared then covers at that level.
-   Smaller ellipsoids (one deviation) cover slightly more than they name.
+   Smaller ellipsoids (one deviation) cover slightly more than they name. A shrunk sandwich of which the share r
+   is left has the scatter of K / r^2 samples.
 3. Neighbouring measurements have common errors. The sandwich over tiles of the image as clusters (K.-Y. Liang, S.
    Zeger, Biometrika 1986) has few degrees of freedom, so that it is summarised by one number: its mean variance
    over that of independent measurements, at least 1 (``shared_error_factor``). It multiplies covariances, and it
@@ -59,7 +62,9 @@ rendered frames have common parts of 0.01 to 0.03 between left and right."""
 _LEAST_FREEDOM = 3.0
 """Of the denominator of F: fewer have quantiles that say nothing."""
 _MOST_FOLLOWED = 0.5
-"""Largest leverage for which HC3 corrects."""
+"""Largest leverage for which HC2 corrects."""
+_LEAST_LEFT = 1e-3
+"""Of a sandwich's own scatter: with less it has as many degrees of freedom as anyone needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +103,13 @@ def stated_covariance(
         shifts: (k, n, p) derivatives of g_i by k kinds of shift by a pixel; None: no point 4.
         sigma_px: standard deviation of a measurement.
     """
-    kept = 1.0 - np.minimum(leverages, _MOST_FOLLOWED)
+    kept = np.sqrt(1.0 - np.minimum(leverages, _MOST_FOLLOWED))
     shares = gradients / kept[:, None] @ inverse
-    covariance = larger(shares.T @ shares, information)
+    sandwich, left = shrunk(shares, information)
+    covariance = larger(sandwich, information)
     groups, count = tiles(places), effective_count(leverages)
     shared = shared_error_factor(shares, groups, covariance, parameters)
-    covariance = covariance * shared * small_sample_factor(count, parameters)
+    covariance = covariance * shared * small_sample_factor(count / max(left, _LEAST_LEFT) ** 2, parameters)
     shifted = np.zeros_like(covariance) if shifts is None else common_shifts(shifts @ inverse, groups, sigma_px)
     return Stated(covariance=covariance + shifted, count=count, shared=shared, shifted=shifted)
 
@@ -121,6 +127,23 @@ def common_shifts(shares: FloatArray, groups: NDArray[np.int64], sigma_px: float
         np.add.at(out, groups, each)
     moved = sums.reshape(-1, shares.shape[-1])
     return np.asarray(moved.T @ moved) * min(SHIFT_PX, _SHIFT_SHARE * sigma_px) ** 2
+
+
+def shrunk(shares: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
+    """Covariance (p, p) of a sum of independent shares (n, p), and how much of their own scatter is left in it.
+
+    Their second moments S, in units in which ``target`` is the identity, are taken towards a multiple of it: mu I
+    + r (S - mu I), mu = tr S / p. The share r that is left minimises the expected squared distance to the truth.
+    """
+    size = np.sqrt(np.diagonal(target))
+    half = size[:, None] * np.linalg.cholesky(target / np.outer(size, size))
+    scaled = np.linalg.solve(half, shares.T).T
+    moments = scaled.T @ scaled
+    mean = np.trace(moments) / len(moments) * np.eye(len(moments))
+    scatter = np.sum(np.sum(scaled**2, axis=1) ** 2) - np.sum(moments**2) / max(len(shares), 1)
+    distance = np.sum((moments - mean) ** 2)
+    left = max(0.0, 1.0 - float(scatter / distance)) if distance > 0.0 else 0.0
+    return half @ (mean + left * (moments - mean)) @ half.T, left
 
 
 def larger(covariance: FloatArray, other: FloatArray) -> FloatArray:

@@ -91,6 +91,40 @@ def test_a_regression_is_covered_with_unequal_noise_and_few_measurements() -> No
     assert 0.93 < held["stated"] / 600 < 0.985 and held["plain"] / 600 < 0.9
 
 
+def test_the_ellipsoid_of_few_measurements_of_equal_noise_is_not_too_large_either() -> None:
+    """Forty-two measurements of six parameters: one-sided corrections alone make axes of 1.3 deviations."""
+    nees, old = [], []
+    for seed in range(1000):
+        rng = np.random.default_rng([1, seed])
+        places, noise = rng.uniform(-1.0, 1.0, (42, 2)), rng.normal(size=42)
+        X = np.column_stack([np.ones(42), places, places**2, places[:, 0] * places[:, 1]])
+        inverse = np.asarray(np.linalg.inv(X.T @ X), dtype=np.float64)
+        error = inverse @ X.T @ noise
+        left = noise - X @ error
+        h = np.einsum("ni,ij,nj->n", X, inverse, X)
+        information = float(left @ left) / 36.0 * inverse
+        stated = u.stated_covariance(X * left[:, None], inverse, information, h, places, 6).covariance
+        nees.append(error @ np.linalg.solve(stated, error))
+        shares = X * (left / (1.0 - h))[:, None] @ inverse
+        sampled = u.larger(shares.T @ shares, information) * u.small_sample_factor(u.effective_count(h), 6)
+        old.append(error @ np.linalg.solve(sampled, error))
+    size, before = (float(np.sqrt(scipy.stats.chi2.ppf(0.5, 6) / np.median(each))) for each in (nees, old))
+    assert 0.95 < size < 1.2 < 1.3 < before
+    assert 0.93 < np.mean(np.array(nees) <= scipy.stats.chi2.ppf(0.95, 6)) < 0.98
+
+
+def test_what_is_shrunk_is_nearer_to_the_truth() -> None:
+    """Mean squared distance of covariances from 20 samples: equal axes, and one of nine times the variance."""
+    for variances, most in ((np.ones(5), 0.3), (np.array([9.0, 1.0, 1.0, 1.0, 1.0]), 1.0)):
+        away = np.zeros(2)
+        for seed in range(300):
+            draws = np.random.default_rng([2, seed]).normal(size=(20, 5)) * np.sqrt(variances / 20)
+            C, left = u.shrunk(draws, np.diag([2.0] * 5))
+            assert 0.0 <= left <= 1.0
+            away += [np.sum((each - np.diag(variances)) ** 2) for each in (draws.T @ draws, C)]
+        assert away[1] < most * away[0]
+
+
 def test_common_shifts_of_tiles_are_covered_where_plain_deviations_are_a_third() -> None:
     """A mean of 1200 places whose tiles are shifted: the shift of a tile does not average out within it."""
     rng, n = np.random.default_rng(0), 1200
