@@ -225,9 +225,9 @@ CHECKS = (
         name="dataset",
         stage="dataset",
         reads="`dataset.json`, names of the files on disk",
-        finds="keys and sequences that are not those of the card, other units, a name that stands there twice "
-        "or is a path, files that are listed and belong to no sequence, or lie there and are not listed; names "
-        "with a dot in front are left out",
+        finds="keys and sequences that differ from the card, other units, duplicate names or names that "
+        "are paths, listed files that belong to no sequence, and files on disk that are not listed (names "
+        "that begin with a dot are ignored)",
         costs="one listing of the folder",
         run=lambda state: dataset_faults(state.listing),
     ),
@@ -243,10 +243,10 @@ CHECKS = (
         name="manifest",
         stage="sequence",
         reads="`sequence.json`, the card in `dataset.json`",
-        finds="camera or both cameras, baseline, shutter, motion, seed, viewpoint and times that are not those of "
-        "the card, the folder or the rest of the file; a `right_from_left` that is no rotation, contradicts "
-        "`rotation_from_body` or puts the right camera on the left; options of the renderer where this version "
-        "wrote the file",
+        finds="cameras, baseline, shutter, motion, seed, viewpoint and times that differ from the card, "
+        "the folder or the rest of the file; a `right_from_left` that is no rotation, contradicts "
+        "`rotation_from_body` or puts the right camera on the left; renderer options, if this version wrote "
+        "the file",
         costs="almost nothing",
         run=lambda state: sequence_faults(state.sequence, state.name, state.listing),
     ),
@@ -254,8 +254,8 @@ CHECKS = (
         name="poses",
         stage="sequence",
         reads="`poses/*.csv`",
-        finds="poses that are not the motion at the row times, to 1e-12; quaternions that are not of length 1 or "
-        "have w < 0; rows that are missing or hold what is no number",
+        finds="poses that differ from the motion at the row times by more than 1e-12; quaternions that "
+        "are not of length 1 or have w < 0; missing rows, values that are not numbers",
         costs="one pose per row",
         run=lambda state: pose_faults(state.sequence),
     ),
@@ -271,8 +271,8 @@ CHECKS = (
         name="imu",
         stage="sequence",
         reads="channel `imu`",
-        finds="rates and forces that are not those of motion, gravity and times; noise, or steps of the bias, "
-        "beyond 6 sigma of the stated densities, or not white",
+        finds="rates and forces that contradict motion, gravity and times; noise or steps of the bias "
+        "that exceed 6 sigma of the stated densities, or are not white",
         costs="one pose per sample",
         run=lambda state: imu_faults(state.sequence, state.reported),
     ),
@@ -280,30 +280,30 @@ CHECKS = (
         name="gloss masks by rays",
         stage="masks",
         reads="masks of [glossy surfaces](../reference/dataset-format.md#glossy-surfaces)",
-        finds="masks that are not what rays meet, at every pixel, where the scene can be built; the other checks "
-        "then read what the rays met",
+        finds="masks that differ at any pixel from those of traced rays, if the scene can be built; the "
+        "other checks then use the traced masks",
         costs="one ray per pixel, with `--rerender auto` or `all`",
         run=_masks_by_rays,
     ),
     Check(
         name="gloss masks",
         stage="frames",
-        reads="the same masks and depth, where no rays were traced",
-        finds="masks where there is no surface, that differ between twins in the row that they share, that mark "
-        "other surfaces in other pictures, or leave less than 5 % of the surfaces to be compared. Colours within "
-        "a pixel of gloss are compared with rows rendered again alone, and blur is not judged there",
-        costs="each map is projected into its partners, at 60 000 pixels at most",
+        reads="the same masks and depth, if no rays were traced",
+        finds="masks where there is no surface, that differ between twins in their shared row, that mark "
+        "different surfaces in different images, or that leave less than 5 % of the surfaces to compare. "
+        "Colours within a pixel of gloss are checked only by rendering rows again, and blur is not checked "
+        "there",
+        costs="each map is projected into the others, at 60 000 pixels at most",
         run=_masks,
     ),
     Check(
         name="labels",
         stage="frames",
         reads="labels of [moving objects](../reference/dataset-format.md#objects-that-move), depth",
-        finds="labels where there is no surface, that differ between twins in the row that they share, or of "
-        "pixels through which other frames see, and which they see where another label would take them. In all "
-        "other checks a surface lies where its label takes it; colours of what moves, and of its shadow, are "
-        "compared between the cameras of one time only",
-        costs="each map is projected into its partners, at 60 000 pixels at most",
+        finds="labels where there is no surface, that differ between twins in their shared row, or that "
+        "other frames contradict. All other checks move a surface with its label; colours of moving objects "
+        "and of their shadows are compared only between the cameras at one time",
+        costs="each map is projected into the others, at 60 000 pixels at most",
         run=lambda state: label_faults(state.content, state.fresh, state.twins),
     ),
     Check(
@@ -311,16 +311,16 @@ CHECKS = (
         stage="frames",
         reads="images by their headers, then all pixels; depth maps",
         finds="files that cannot be read, images that are not 8-bit RGB of their camera's size",
-        costs="every picture is read once",
+        costs="every image is read once",
         run=lambda state: state.fresh.faults,
     ),
     Check(
         name="first row",
         stage="frames",
         reads="images and depth of a frame and its global-shutter twin",
-        finds="a first row that differs between them, bit for bit; where columns are read, a first column that "
-        "differs by more than 1 code or 1e-6 of the depth on more than 5 % of its pixels, as rays are rounded "
-        "with those beside them",
+        finds="a first row that is not identical in both; if columns are read, a first column that "
+        "differs by more than 1 code or 1e-6 of the depth on more than 5 % of its pixels, because rays are "
+        "rounded in groups",
         costs="almost nothing",
         run=lambda state: twin_faults(state.fresh),
     ),
@@ -328,8 +328,8 @@ CHECKS = (
         name="stacks",
         stage="frames",
         reads="channel `gs_stack`",
-        finds="images whose row y is not row y of the clean rolling-shutter frame, or of which the first is not "
-        "the global-shutter twin, bit for bit",
+        finds="images whose row y is not identical to row y of the clean rolling-shutter frame, or whose "
+        "first image is not the global-shutter twin",
         costs="every `--stride`-th image is read",
         run=lambda state: stack_faults(state.fresh, state.missing, state.stride),
     ),
@@ -337,9 +337,10 @@ CHECKS = (
         name="sensor",
         stage="frames",
         reads="`rs/*.png` of a `[sensor]`, their clean twins; `gs_exposed/*.png` beside `gs/*.png`",
-        finds="blur and noise that the sensor does not make of the clean twin, which stands for the frame in all "
-        "other checks; with a `mosaic`, values that are neither read nor the mean of their neighbours of that "
-        "colour; with `jpeg_quality`, blocks that are not of whole steps of that quality",
+        finds="blur and noise that the sensor cannot have made from the clean twin, which replaces the "
+        "frame in all other checks; with a `mosaic`, values that are neither read nor the mean of neighbours "
+        "of that colour; with `jpeg_quality`, blocks whose coefficients are not multiples of that quality's "
+        "steps",
         costs="filters over the whole frame",
         run=_sensor,
     ),
@@ -347,12 +348,11 @@ CHECKS = (
         name="depth and colours",
         stage="frames",
         reads="depth maps and images of each two successive frames, eight of each",
-        finds="surfaces that the twin, the other camera or the other time see elsewhere, each in its own axes "
-        "and by its own lens and readout; under diffuse light, "
-        "colours that these see otherwise, of the sky too; in sequences of "
-        "[many](../reference/dataset-format.md#many-frames), frames of another time, which are tried at other "
-        "places and named",
-        costs="every pixel is projected into three other pictures, N squared times fewer with `--stride N`",
+        finds="surfaces that the twin, the other camera or the other time see elsewhere (each with its "
+        "own axes, lens and readout); under diffuse light, colours that differ between them, including the "
+        "sky; in sequences of [many frames](../reference/dataset-format.md#many-frames), frames of another "
+        "time, with the time that fits",
+        costs="every pixel is projected into three other images, N squared times fewer with `--stride N`",
         run=picture_faults,
         at_end=geometry_faults,
     ),
@@ -360,17 +360,18 @@ CHECKS = (
         name="twins",
         stage="frames",
         reads="channel `gs_twin`",
-        finds="a twin whose own row differs from that row of the rolling-shutter frame, bit for bit, or whose "
-        "surfaces are not those of the frame",
+        finds="a twin whose own row is not identical to that row of the rolling-shutter frame, or whose "
+        "surfaces differ from those of the frame",
         costs="each twin is projected into its frame",
         run=_twins,
     ),
     Check(
         name="flow, disparity and masks",
         stage="channels",
-        reads="channels between two pictures, depth",
-        finds="values that depth and motion do not make, to 1.5e-3 px on 99.9 % of the pixels; sky and view "
-        "likewise; visible or hidden pixels that are not, where the target is one flat surface",
+        reads="channels between two images, depth",
+        finds="values that differ from those of depth and motion by more than 1.5e-3 px on more than 0.1 "
+        "% of the pixels; wrong masks of sky and view; wrong visible or hidden pixels, where the target is "
+        "one flat surface",
         costs="every pixel is projected once per channel, N squared times fewer with `--stride N`",
         run=_channels,
     ),
@@ -378,8 +379,8 @@ CHECKS = (
         name="tracks",
         stage="channels",
         reads="channel `tracks`, depth",
-        finds="points that are not what the depth map sees at the pixels of the draw, places and times that the "
-        "row equation does not make, and points hidden or visible against the depths around",
+        finds="points that are not on the depth map at the drawn pixels, places and times that contradict"
+        " the row equation, and points whose visibility contradicts the depths around them",
         costs="the row equation of every point in every view",
         run=lambda state: track_faults(state.sequence, state.fresh.maps, state.reported, state.fresh.times),
     ),
@@ -387,8 +388,8 @@ CHECKS = (
         name="affine",
         stage="channels",
         reads="channels `affine` and `tracks`, depth",
-        finds="derivatives that normals, tracks and row times do not make, to 1e-6, and normals that are not "
-        "upright on the surface of the depth map",
+        finds="derivatives that differ by more than 1e-6 from those of normals, tracks and row times, and"
+        " normals that are not perpendicular to the surface of the depth map",
         costs="one derivative per point and view",
         run=lambda state: affine_faults(state.sequence, state.fresh.maps, state.reported, state.fresh.times),
     ),
@@ -396,16 +397,16 @@ CHECKS = (
         name="normals and instances",
         stage="channels",
         reads="channels `normals` and `instances`, depth",
-        finds="normals that are not upright on the surface of the depth map or do not face the camera; surfaces "
-        "that have another number in another picture",
-        costs="every picture is projected into its partners",
+        finds="normals that are not perpendicular to the surface of the depth map or do not face the "
+        "camera; surfaces that have different numbers in different images",
+        costs="every image is projected into the others",
         run=_surfaces,
     ),
     Check(
         name="hdr",
         stage="channels",
         reads="channel `hdr`, images",
-        finds="linear light that is not that of the clean image, to a code",
+        finds="linear light that differs from the clean image by more than a code",
         costs="almost nothing",
         run=lambda state: hdr_faults(state.sequence, state.fresh.pictures, state.reported),
     ),
@@ -413,8 +414,8 @@ CHECKS = (
         name="matches",
         stage="channels",
         reads="channel `matches`, depth",
-        finds="keypoints of another depth than the pixels around, true places that the row equation does not "
-        "make, and errors, classes and labels that these places and the depths around do not make",
+        finds="keypoints whose depth differs from that of the pixels around, true places that contradict "
+        "the row equation, and errors, classes and labels that contradict these places and the depths around",
         costs="the row equation of every match",
         run=_matches,
     ),
@@ -422,8 +423,8 @@ CHECKS = (
         name="matcher",
         stage="matcher",
         reads="channel `matches`, images",
-        finds="matches that the stated matcher does not find in the images, where it is rsbench's own and the "
-        "versions are the same",
+        finds="matches that the stated matcher does not find in the images, if it is one of rsbench and "
+        "the versions are the same",
         costs="features of four images per two frames",
         run=_matcher,
     ),
@@ -431,10 +432,10 @@ CHECKS = (
         name="rows rendered again",
         stage="rays",
         reads="all images, depth maps, labels and channels, the card of the scene",
-        finds="rows that differ when they are rendered again, bit for bit, on other machines, versions or "
-        "variants to rounding: with the sensor's noise, at the poses of other rows for a stack, and the channels "
-        "by rays",
-        costs="16 rows of each picture with `--rerender auto`, all with `all`, and the scene is built once",
+        finds="rows that are not identical when rendered again (on other machines, versions or variants: "
+        "up to rounding): with the noise of the sensor, for a stack at the poses of other rows, and the "
+        "channels by rays",
+        costs="16 rows of each image with `--rerender auto`, all with `all`, and the scene is built once",
         run=_render_rows,
         at_end=_rendered_rows,
     ),
