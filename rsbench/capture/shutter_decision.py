@@ -234,11 +234,14 @@ def scans_by_laws(
     neither.
 
     Only near the given ratio: where no model holds, any ratio may come out. For most frames a part of the matches
-    shows the given scans; otherwise all matches are used. ``start`` is as in ``examine``.
+    shows the given scans under the model of ``start``; otherwise all models and then all matches are used.
+    ``start`` is as in ``examine``.
     """
     few, found = thinned([matches], _FEW)[0], None
-    for part in (matches,) if few is matches else (few, matches):
-        given = known_of(part, rig, KnownInputs(models=models)).with_shutter(shutter)
+    alone = (start.name,) if start is not None and start.name in models else models
+    tries = [(few, laws) for laws in dict.fromkeys((alone, models))]
+    for part, laws in tries if few is matches else [*tries, (matches, models)]:
+        given = known_of(part, rig, KnownInputs(models=laws)).with_shutter(shutter)
         known = replace(given, ratio=None, scans=(GLOBAL, *given.scans, reversed_scans(given.scans[0])))
         best = conclude([examine(part, rig, known, options, seed, start)]).likeliest
         certain = best is not None and best.probability > _CLEARLY and best.sigma <= _NEAR
