@@ -25,7 +25,7 @@ README_ROWS = {
     "**maximum likelihood** (`rs-stereo-refined`)": "rs-stereo-refined",
     "nothing": "uncorrected",
     "global-shutter motion, scaled matches": "GS motion of scaled matches, SGM depth",
-    "**our motion**, model chosen by default": "**ours**",
+    "**our motion**, best-fitting model": "**ours**",
     "true motion and depth (limit)": "true motion, true depth",
 }
 """What README calls a row, and the results pages."""

@@ -312,7 +312,7 @@ def _row(answer: dict[str, Any]) -> dict[str, str]:
         "left": answer["left"] or "cannot tell",
         "right": answer["right"] or "cannot tell",
         "readout ratio": ratio,
-        "said": "-" if given is None else f"{given['left']}, {given['right']}, {given['readout_ratio']:.2f}",
+        "given": "-" if given is None else f"{given['left']}, {given['right']}, {given['readout_ratio']:.2f}",
         "matches": f"{answer['used']}/{answer['matches']}",
         "moved (px)": f"{answer['moved_px']:.1f}",
         "note": note,
