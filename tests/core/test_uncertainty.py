@@ -93,7 +93,7 @@ def test_a_regression_is_covered_with_unequal_noise_and_few_measurements() -> No
 
 def test_the_ellipsoid_of_few_measurements_of_equal_noise_is_not_too_large_either() -> None:
     """Forty-two measurements of six parameters: one-sided corrections alone make axes of 1.3 deviations."""
-    nees, old = [], []
+    nees, old = list[float](), list[float]()
     for seed in range(1000):
         rng = np.random.default_rng([1, seed])
         places, noise = rng.uniform(-1.0, 1.0, (42, 2)), rng.normal(size=42)
@@ -104,10 +104,10 @@ def test_the_ellipsoid_of_few_measurements_of_equal_noise_is_not_too_large_eithe
         h = np.einsum("ni,ij,nj->n", X, inverse, X)
         information = float(left @ left) / 36.0 * inverse
         stated = u.stated_covariance(X * left[:, None], inverse, information, h, places, 6).covariance
-        nees.append(error @ np.linalg.solve(stated, error))
+        nees.append(float(error @ np.linalg.solve(stated, error)))
         shares = X * (left / (1.0 - h))[:, None] @ inverse
         sampled = u.larger(shares.T @ shares, information) * u.small_sample_factor(u.effective_count(h), 6)
-        old.append(error @ np.linalg.solve(sampled, error))
+        old.append(float(error @ np.linalg.solve(sampled, error)))
     size, before = (float(np.sqrt(scipy.stats.chi2.ppf(0.5, 6) / np.median(each))) for each in (nees, old))
     assert 0.95 < size < 1.2 < 1.3 < before
     assert 0.93 < np.mean(np.array(nees) <= scipy.stats.chi2.ppf(0.95, 6)) < 0.98
