@@ -16,7 +16,7 @@ REPORT = (ROOT / "docs" / "report.md").read_text("utf-8")
 TEXT = " ".join(REPORT.split())
 SETTINGS = (
     *("release 1.0", "2020", "0.001 px", "0.81 px", "0.3 px, 100 matches", "rotation of 2 deg", "twist of 2 deg"),
-    *("up to 5 deg", "AUC@5", "Figure 3", "Figure 4", "x86-64", "by 30 dB on what"),
+    *("up to 5 deg", "AUC@5", "Figure 3", "Figure 4", "x86-64", "30 dB on the pixels"),
 )
 """Sizes of experiments, names and years."""
 
@@ -103,7 +103,7 @@ def literal() -> Iterator[str]:
 def corrections() -> Iterator[str]:
     rows = {(row["stratum"], row["method"]): float(row["psnr_covered"]) for row in table("correction/summary.csv")}
     methods = {
-        "frame as it is": "none",
+        "uncorrected": "none",
         "one camera, constant velocity": "mono",
         "two cameras": "ours",
         "true motion, true depth": "truth",
