@@ -180,6 +180,24 @@ def test_no_motion_explains_only_matches_that_stay(model: str) -> None:
     assert np.max(pack(Correspondences(left=still), RIG, SHUTTER, model).pair_residuals(np.zeros(6))) < 1e-9
 
 
+@pytest.mark.parametrize("shutter", [SHUTTER, replace(SHUTTER, right_delay=0.05)])
+def test_a_point_that_comes_up_to_the_camera_ends_no_search(shutter: RollingShutter) -> None:
+    """The covariance of its image grows until floats show it singular: it is refused, without an error."""
+    rng, camera = np.random.default_rng(0), PinholeCamera.centred(640, 480, 300.0)
+    rig, shutter = StereoRig(camera=camera, baseline=0.02), replace(shutter, height=480)
+    tracks = simulate(
+        rig, shutter, random_motion(rng, 0.05, 0.3), SimulationOptions(tracks=30), rng
+    ).correspondences
+    for track in tracks.tracks:
+        one = pack(Correspondences(tracks=track[None]), rig, shutter)
+        between = shutter.pixel_time(track[4:6], 1, "left") - shutter.pixel_time(track[:2], 0, "left")
+        towards = -rig.depth(track[0] - track[2]) / between
+        for left in 10.0 ** np.arange(-6.0, 0.0, 0.1):
+            theta = np.array([0.0, 0.0, 0.0, *(0.5 * towards * rng.normal(size=2)), towards * (1.0 - left)])
+            cost, gradient, H = one.normal_equations(theta)
+            assert cost >= 0.0 and np.all(np.isfinite(gradient)) and np.all(np.isfinite(H))
+
+
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10**6), damping=st.sampled_from([0.0, 1e-4, 1.0]))
 def test_step_solves_the_damped_normal_equations(seed: int, damping: float) -> None:

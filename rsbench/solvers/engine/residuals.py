@@ -340,8 +340,8 @@ def _linearise(
         vx, vy = focal[0] * (moved[0] - u * moved[2]) / p[2], focal[1] * (moved[1] - v * moved[2]) / p[2]
         if i > 0:
             _fill_velocities(plus(times(rho, rate0), 1.0, cross(spin0, turned)), p, vx, vy, focal, work, i - 1)
-        if weigh:
-            _fill_weight(ends[i], vx, vy, W[i])
+        if weigh and not _fill_weight(ends[i], vx, vy, W[i]):
+            return False
         whiten(W[i], focal[0] * (ends[i, 0] - u), focal[1] * (ends[i, 1] - v), i, e)
         by_rho = plus(plus(T, 1.0, (offset, 0.0, 0.0)), -half, (R[0, 0], R[1, 0], R[2, 0]))
         for j in range(9):
@@ -374,12 +374,18 @@ def _of(M: FloatArray, j: int) -> Vector:
 
 
 @compiled
-def _fill_weight(end: FloatArray, vx: float, vy: float, W: FloatArray) -> None:
-    """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s."""
+def _fill_weight(end: FloatArray, vx: float, vy: float, W: FloatArray) -> bool:
+    """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s.
+
+    False when there is none: the prediction moves with the line that is read.
+    """
     a, b = end[3] - vx * end[7], end[4] - vx * end[8]
     c, d = end[5] - vy * end[7], end[6] - vy * end[8]
     det = a * d - b * c
+    if not abs(det) > 0.0:
+        return False
     W[0, 0], W[0, 1], W[1, 0], W[1, 1] = d / det, -b / det, -c / det, a / det
+    return True
 
 
 @compiled
@@ -436,17 +442,20 @@ _VARIANCE = (0.5, 0.5, 2.0)
 
 
 @compiled
-def _invert_symmetric(S: FloatArray, out: FloatArray) -> None:
-    """Inverse of a symmetric positive definite (3, 3) matrix by cofactors."""
+def _invert_symmetric(S: FloatArray, out: FloatArray) -> bool:
+    """Inverse of a symmetric positive definite (3, 3) matrix by cofactors; False when floats do not tell it from a singular one."""
     c00 = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
     c01 = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
     c02 = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
     det = S[0, 0] * c00 + S[0, 1] * c01 + S[0, 2] * c02
+    if not det > 1e-14 * S[0, 0] * S[1, 1] * S[2, 2]:
+        return False
     out[0, 0], out[0, 1], out[0, 2] = c00 / det, c01 / det, c02 / det
     out[1, 1] = (S[0, 0] * S[2, 2] - S[0, 2] * S[0, 2]) / det
     out[1, 2] = (S[0, 1] * S[0, 2] - S[0, 0] * S[1, 2]) / det
     out[2, 2] = (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]) / det
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+    return True
 
 
 @compiled
@@ -504,7 +513,9 @@ def track_terms(
         rate0 = plus(times(rho, rate0), 1.0, cross(spin0, turned))
         rate1 = plus(times(rho, rate1), 1.0, cross(spin1, turned))
         _track_gradients(R, T, rate0, rate1, p[2], by_p, focal, h, baseline, D0, D1)
-        _whitening(D0, D1, S, W)
+        if not _whitening(D0, D1, S, W):
+            squares[k] = BEHIND
+            continue
         lam = apply(W, c)
         squares[k] = dot(c, lam)
         if not want:
@@ -522,15 +533,15 @@ def apply_variance(a: Vector) -> Vector:
 
 
 @compiled
-def _whitening(D0: FloatArray, D1: FloatArray, S: FloatArray, W: FloatArray) -> None:
-    """Fill the covariance S (3, 3) of the three equations and its inverse W."""
+def _whitening(D0: FloatArray, D1: FloatArray, S: FloatArray, W: FloatArray) -> bool:
+    """Fill the covariance S (3, 3) of the three equations and its inverse W; False when there is none."""
     for i in range(3):
         for j in range(i, 3):
             S[i, j] = 0.0
             for n in range(3):
                 S[i, j] += _VARIANCE[n] * (D0[i, n] * D0[j, n] + D1[i, n] * D1[j, n])
             S[j, i] = S[i, j]
-    _invert_symmetric(S, W)
+    return _invert_symmetric(S, W)
 
 
 @compiled
