@@ -40,6 +40,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, without_len
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import variance_factor
 from rsbench.solvers.engine.packed import HeavyTailed, each_term, heavy_tailed
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
@@ -314,7 +315,8 @@ class WindowEvidence:
     of: int
     noise_px: float
     dispersion: float
-    """Factor on all variances, for matches of one part of the image that have common errors."""
+    """Factor on all variances, for matches of one part of the image that have common errors, and for rows that
+    disagree."""
 
 
 def window_evidence(
@@ -333,14 +335,20 @@ def window_evidence(
         return None
     full, near = sharpened
     sharp = _Slope(comparison.cost(full, near[0].hypothesis), near[0])
-    dispersion = (
-        _dispersion(sharp, first.pixels[full.chosen]) if sharp.varies else comparison.shared(full, sharp.best)
-    )
+    tailed = comparison.tailed(full, sharp.best)
+    if sharp.varies:
+        rows = tailed.by_rows(sharp.best.theta)
+        dispersion = _dispersion(sharp, first.pixels[full.chosen])
+        dispersion *= 1.0 if rows is None else rows.dispersion(dispersion)
+    else:
+        rows, stated = None, tailed.stated(sharp.best.theta)
+        dispersion = 1.0 if stated is None else stated.shared
     near = _near(near, full.scale, _LIKELY * dispersion)
     slopes = [sharp, *(_Slope(comparison.cost(full, fit.hypothesis), fit) for fit in near[1:])]
     reference, unit = min(slope.best.cost for slope in slopes), full.scale**2 * dispersion
+    shown = rows is None or not rows.contradict  # where no model holds, any ratio may fit best
     return WindowEvidence(
-        peaks={slope.best.hypothesis: slope.peak(reference, unit) for slope in slopes},
+        peaks={slope.best.hypothesis: slope.peak(reference, unit, shown) for slope in slopes},
         lost=_LIKELY,
         used=int(np.count_nonzero(full.chosen)),
         of=first.count,
@@ -484,14 +492,12 @@ class _Comparison:
             scale = full.scale
         return full, _near(fits, full.scale)
 
-    def shared(self, likelihood: Likelihood, fit: CaptureFit) -> float:
-        """Variance of the motion over the one that independent errors would give, at least 1."""
+    def tailed(self, likelihood: Likelihood, fit: CaptureFit) -> HeavyTailed:
+        """The measurements as a fit reads them, with the distribution of their errors."""
         read = self.timed[fit.hypothesis.motion_model].read(fit.hypothesis.scans, likelihood.chosen)
-        packed, trust = read.packed(fit.unknowns), likelihood.trust
-        trust = np.ones(read.count) if trust is None else trust
-        tailed = HeavyTailed(**vars(packed), nu=likelihood.nu, scale=likelihood.scale, trust=trust)
-        stated = tailed.stated(fit.theta)
-        return 1.0 if stated is None else stated.shared
+        trust = np.ones(read.count) if likelihood.trust is None else likelihood.trust
+        packed = vars(read.packed(fit.unknowns))
+        return HeavyTailed(**packed, nu=likelihood.nu, scale=likelihood.scale, trust=trust)
 
     def distribution(self, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:
         """Of the errors under one fit, of the chosen matches that are not wrong."""
@@ -562,8 +568,12 @@ class _Slope:
         unknowns[RATIO] = ratio
         return fit_capture(self._cost, self.best.theta, unknowns, fix_ratio=True)
 
-    def peak(self, reference: float, unit: float) -> Peak:
-        """In units of the errors' variance, px^2."""
+    def peak(self, reference: float, unit: float, shown: bool = True) -> Peak:
+        """In units of the errors' variance, px^2.
+
+        Args:
+            shown: whether the matches show the ratio; otherwise any is as likely.
+        """
         spread = float(np.sqrt(unit)) / self.scale
         others = sum(k != RATIO for k in self._cost.free)
         low, high = (np.concatenate([fit.theta, fit.unknowns]) for fit in self._beside)
@@ -571,7 +581,7 @@ class _Slope:
         return Peak(
             value=(reference - self.least) / unit + self.best.occam + others * float(np.log(spread)),
             at=self.at,
-            information=self.curvature / unit + 1.0 / _WIDE**2 if self.varies else 0.0,
+            information=(self.curvature / unit if shown else 0.0) + 1.0 / _WIDE**2 if self.varies else 0.0,
             fit=replace(self.best, sigma=self.best.sigma * spread, spread=self.best.spread * spread**2),
             trade=(high - low) / apart if apart > 0.0 else np.zeros_like(high),
         )
@@ -595,4 +605,4 @@ def _dispersion(slope: _Slope, pixels: FloatArray) -> float:
     scores, used = slope.scores(), len(np.unique(tiles))
     together = np.bincount(tiles, weights=scores - np.mean(scores))
     variance = float(np.sum(together**2)) * used / max(used - 1, 1) / slope.curvature
-    return max(variance / slope.scale**2, 1.0)
+    return max(variance / slope.scale**2, 1.0) * variance_factor(used - 1.0, 1)

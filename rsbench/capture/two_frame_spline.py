@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -50,10 +49,6 @@ _KNOTS = 0.25
 """Frame periods between control poses."""
 _DEPTHS = 3.0
 """Deviations of a disparity by which depth is observed: half of the disparities must be larger."""
-_PARTS, _OF_A_PART = 6, 10
-"""Parts of the rows, at most, and tracks in one, at least, whose motions are compared."""
-_DISPERSION, _CHANCE = 1.5, 1e-3
-"""Dispersion by common errors of neighbours, and the probability, under a law, to ask for a spline."""
 _APART = 6.0
 """Squared deviations, in sum over the six, within which two splines are one."""
 _MEDIAN = 4.35
@@ -139,63 +134,30 @@ def two_frame_spline(
     )
 
 
-class _Rows(NamedTuple):
-    """What the tracks of each part of the rows say against one law for all, see ``_by_rows``."""
-
-    square: float
-    freedom: int
-    depth: bool
-    """Whether depth is observed."""
-
-
 def dispersion_of_rows(matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> float:
-    """Variance by which motions that parts of the rows ask for scatter, over that which noise leaves; at least 1.
-
-    Errors that the rows of a region share, and a law that the rig does not quite follow, both show there.
+    """Factor on a motion's covariance for what rows show against its law, see ``Rows.dispersion``.
 
     Args:
         law: as of ``two_frame_spline``.
     """
-    rows = None if shutter.still else _by_rows(informative(matches), rig, shutter, law)
-    return 1.0 if rows is None else max(1.0, rows.square / rows.freedom)
+    tailed = None if shutter.still else _under_law(informative(matches), rig, shutter, law)
+    theta = None if tailed is None else tailed.theta(law.w, law.d)
+    rows = None if tailed is None or theta is None else tailed.by_rows(theta)
+    if tailed is None or theta is None or rows is None:
+        return 1.0
+    stated = tailed.stated(theta)
+    return rows.dispersion(1.0 if stated is None else stated.shared)
 
 
 def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:
-    """Whether depth is observed, and rows ask for more motions than errors that neighbours share would."""
-    rows = _by_rows(window, rig, shutter, law)
-    if rows is None or not rows.depth:
-        return False
-    return rows.square > _DISPERSION * float(scipy.special.chdtri(rows.freedom, _CHANCE))
-
-
-def _by_rows(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> _Rows | None:
-    """Whether what a law leaves of the tracks depends on when their rows were read.
-
-    Tracks of a part of the rows would each like another motion. The squared steps to it, over the information, are
-    chi-squared of six for each part but one under the law (score test, C. Rao, Proc. Cambridge Philosophical
-    Society 1948). None for few tracks, or a law without equations.
-    """
+    """Whether depth is observed, and rows contradict the law."""
     tailed = _under_law(window, rig, shutter, law)
-    if tailed is None:
-        return None
-    each, ends, timed = (
-        each_term(tailed, tailed.theta(law.w, law.d)),
-        tailed.tracks,
-        tailed.tracks.ndim == 3,
-    )
-    disparities = rig.camera.fx * (ends[:, 0, 0] - ends[:, 1, 0]) if timed else ends[:, 2]
-    times = ends[:, 0, 2] if timed else ends[:, 6]
-    count = min(_PARTS, len(times) // _OF_A_PART)
-    parts = np.argsort(np.argsort(times, kind="stable"), kind="stable") * count // len(times)
-    slopes = tailed.weights(each.squares)[:, None] * each.gradients
-    expected = tailed.trust * (tailed.nu + tailed.freedom) / (tailed.nu + tailed.freedom + 2.0)
-    square = 0.0
-    for own in (parts == number for number in range(count)):
-        slope = np.sum(slopes[own], axis=0)
-        information = np.tensordot(expected[own], each.hessians[own], 1)
-        square += float(slope @ np.linalg.pinv(information, hermitian=True) @ slope) / tailed.scale**2
-    deep = float(np.median(disparities)) >= _DEPTHS * tailed.scale * np.sqrt(2.0)
-    return _Rows(square=square, freedom=6 * (count - 1), depth=deep)
+    rows = None if tailed is None else tailed.by_rows(tailed.theta(law.w, law.d))
+    if tailed is None or rows is None or not rows.contradict:
+        return False
+    ends = tailed.tracks
+    disparities = rig.camera.fx * (ends[:, 0, 0] - ends[:, 1, 0]) if ends.ndim == 3 else ends[:, 2]
+    return float(np.median(disparities)) >= _DEPTHS * tailed.scale * np.sqrt(2.0)
 
 
 def _under_law(
