@@ -16,9 +16,10 @@ from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import MODELS, KnownInputs
 from rsbench.capture.self_calibration import focal_of_capture
 from rsbench.capture.sequence_shutter import capture_of_video
-from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.capture.shutter_decision import NoMotionError, known_of
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.trajectory_tracks import informative
+from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.capture.two_frame_spline import camera_trajectory, camera_two_frame_spline, two_frame_spline
 from rsbench.components.motion_models import InertialMotion, make_motion
 from rsbench.core import so3
@@ -179,6 +180,15 @@ def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
         with SolverRunner() as runner:
             answer = solve_problem(problem, OPTIONS.solver, OPTIONS.robust, runner, motion_model="auto")
         assert not answer["success"] and "cannot tell" in answer["reason"] and answer["w"] is None
+
+
+def test_where_no_law_holds_for_all_rows_any_ratio_is_as_likely() -> None:
+    for seed in (0, 1):
+        rng = np.random.default_rng(seed)
+        (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=200)
+        capture = conclude([examine(window, RIG, known_of(window, RIG, KnownInputs()))])
+        assert capture.likeliest is not None and not capture.determined
+        assert capture.likeliest.sigma > 0.5
 
 
 def test_few_tracks_and_a_global_shutter_ask_for_none() -> None:
