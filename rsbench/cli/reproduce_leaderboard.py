@@ -146,11 +146,14 @@ def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboar
         for entry in entries_of(board, protocol, split)
     }
     former = read_json(path).get("entries", {}) if path.is_file() else {}
-    kept = {name: each for name, each in former.items() if tuple(name.split("/")[:2]) not in splits}
+    kept = {
+        name: each for name, each in former.items() if name in made or tuple(name.split("/")[:2]) not in splits
+    }
     brief = {
         name: {key: record[key] for key in ("command", "commit", "source", "date") if key in record}
         for name, record in made.items()
         if isinstance(record, dict)
+        and not (name in former and "commit" not in record)  # restored from its answers
     }
     write_json(path, {**provenance(command), "entries": dict(sorted((kept | brief).items()))})
     echo(f"page: {page}")
