@@ -317,6 +317,14 @@ class WindowEvidence:
     dispersion: float
     """Factor on all variances, for matches of one part of the image that have common errors, and for rows that
     disagree."""
+    contradicted: bool
+    """Whether no motion model holds for all rows: then any ratio may fit best."""
+
+    @property
+    def of_any_ratio(self) -> WindowEvidence:
+        """The evidence without what it says of the ratio."""
+        peaks = {key: replace(p, information=min(p.information, _WIDE**-2.0)) for key, p in self.peaks.items()}
+        return replace(self, peaks=peaks)
 
 
 def window_evidence(
@@ -346,14 +354,14 @@ def window_evidence(
     near = _near(near, full.scale, _LIKELY * dispersion)
     slopes = [sharp, *(_Slope(comparison.cost(full, fit.hypothesis), fit) for fit in near[1:])]
     reference, unit = min(slope.best.cost for slope in slopes), full.scale**2 * dispersion
-    shown = rows is None or not rows.contradict  # where no model holds, any ratio may fit best
     return WindowEvidence(
-        peaks={slope.best.hypothesis: slope.peak(reference, unit, shown) for slope in slopes},
+        peaks={slope.best.hypothesis: slope.peak(reference, unit) for slope in slopes},
         lost=_LIKELY,
         used=int(np.count_nonzero(full.chosen)),
         of=first.count,
         noise_px=full.scale,
         dispersion=dispersion,
+        contradicted=rows is not None and rows.contradict,
     )
 
 
@@ -568,12 +576,8 @@ class _Slope:
         unknowns[RATIO] = ratio
         return fit_capture(self._cost, self.best.theta, unknowns, fix_ratio=True)
 
-    def peak(self, reference: float, unit: float, shown: bool = True) -> Peak:
-        """In units of the errors' variance, px^2.
-
-        Args:
-            shown: whether the matches show the ratio; otherwise any is as likely.
-        """
+    def peak(self, reference: float, unit: float) -> Peak:
+        """In units of the errors' variance, px^2."""
         spread = float(np.sqrt(unit)) / self.scale
         others = sum(k != RATIO for k in self._cost.free)
         low, high = (np.concatenate([fit.theta, fit.unknowns]) for fit in self._beside)
@@ -581,7 +585,7 @@ class _Slope:
         return Peak(
             value=(reference - self.least) / unit + self.best.occam + others * float(np.log(spread)),
             at=self.at,
-            information=(self.curvature / unit if shown else 0.0) + 1.0 / _WIDE**2 if self.varies else 0.0,
+            information=self.curvature / unit + 1.0 / _WIDE**2 if self.varies else 0.0,
             fit=replace(self.best, sigma=self.best.sigma * spread, spread=self.best.spread * spread**2),
             trade=(high - low) / apart if apart > 0.0 else np.zeros_like(high),
         )

@@ -243,7 +243,8 @@ def scans_by_laws(
     for part, laws in tries if few is matches else [*tries, (matches, models)]:
         given = known_of(part, rig, KnownInputs(models=laws)).with_shutter(shutter)
         known = replace(given, ratio=None, scans=(GLOBAL, *given.scans, reversed_scans(given.scans[0])))
-        best = conclude([examine(part, rig, known, options, seed, start)]).likeliest
+        window = examine(part, rig, known, options, seed, start)
+        best = conclude([window], under_laws=True).likeliest
         certain = best is not None and best.probability > _CLEARLY and best.sigma <= _NEAR
         found = best.scans if best and certain and abs(best.ratio - (given.ratio or 0.0)) <= _NEAR else None
         if found == scans_of(shutter):

@@ -166,13 +166,15 @@ def examine(
     return Window(evidence=evidence, reason=reason, matches=count, moved_px=moved)
 
 
-def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture:
+def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA, *, under_laws: bool = False) -> Capture:
     """What all windows of one rig show together, at least one.
 
     Args:
         max_sigma: largest standard deviation of a determined readout ratio.
+        under_laws: whether windows whose rows contradict every motion model count for the ratio too.
     """
     used = [window.evidence for window in windows if window.evidence is not None]
+    used = [each.of_any_ratio if each.contradicted and not under_laws else each for each in used]
     moved = float(np.median([window.moved_px for window in windows]))
     matches = sum(window.matches for window in windows)
     if not used:
@@ -192,7 +194,7 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA) -> Capture
         candidates=tuple(each for each in candidates if each.probability >= _UNLIKELY),
         models=dict(sorted(models.items(), key=lambda each: -each[1])),
         peaks={key.motion_model: sums[key].last for key in likely},
-        reason=_doubt(candidates, share, moved, max_sigma),
+        reason=_doubt(candidates, share, moved, max_sigma, all(each.contradicted for each in used)),
         named=share >= _LEAST_SHARE and candidates[0].probability >= CERTAIN,
         windows=len(used),
         matches=matches,
@@ -299,7 +301,9 @@ def _mixture(weights: FloatArray, parts: Sequence[tuple[Any, Any]]) -> tuple[Flo
     return mean, np.sqrt(weights @ (sigmas**2 + (means - mean) ** 2))
 
 
-def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_sigma: float) -> str:
+def _doubt(
+    candidates: Sequence[Candidate], share: float, moved_px: float, max_sigma: float, contradicted: bool
+) -> str:
     """Why the best candidate is not determined; empty where it is."""
     best = candidates[0]
     if share < _LEAST_SHARE:
@@ -308,6 +312,8 @@ def _doubt(candidates: Sequence[Candidate], share: float, moved_px: float, max_s
         return ""
     still = f"; matches move by {moved_px:.1f} px only" if moved_px < _STILL_PX else ""
     if best.probability >= CERTAIN:
+        if contradicted:
+            return f"{best.scans}, but no motion model holds for all rows, so that any ratio is as likely{still}"
         ratio = f"{best.ratio:.2f} +- {best.sigma:.2f}"
         return f"{best.scans}, but the matches do not determine how fast: {ratio}{still}"
     allowed = [f"{each.scans} ({each.probability:.0%})" for each in candidates if each.probability > 0.1]
