@@ -134,10 +134,10 @@ def parts() -> list[Callable[[], object]]:
     known = KnownInputs(readout_ratio=shutter.readout_ratio)
     few = SimulationOptions(pairs=80, tracks=80, noise_px=0.1)
     shaken = SplineMotion([0.03, 0.05, 0.0], [0.1, 0.0, 0.2], preset="handheld")
-    # A law without a kernel of its own, and shakes that need a spline.
-    turning, shaking = (
+    # Two laws, and shakes that need a spline.
+    straight, turning, shaking = (
         simulate(rig, shutter, each, few, np.random.default_rng(0)).correspondences
-        for each in (InertialMotion([0.05, 0.12, 0.05], [0.1, 0.0, 0.2]), shaken)
+        for each in (motion, InertialMotion([0.05, 0.12, 0.05], [0.1, 0.0, 0.2]), shaken)
     )
     wall = [np.full((_HEIGHT, _WIDTH), 9.0, dtype=np.float32)] * 2
     wall[0][40:60, 40:60] = np.nan
@@ -153,7 +153,7 @@ def parts() -> list[Callable[[], object]]:
         lambda: two_frame_spline(shaking, rig, shutter, LinearMotion(shaken.w, shaken.d)),
         lambda: find_depth(images, rig, shutter, motion, options),
         corrected,
-        lambda: solve_frames(*know_matches(turning, rig, known, options), options),
+        lambda: [solve_frames(*know_matches(each, rig, known, options), options) for each in (straight, turning)],
         lambda: match_frames(images, rig, options),
     ]
 

@@ -308,9 +308,9 @@ def test_results_tell_what_laws_cost() -> None:
     ranked = pd.read_csv(path, index_col="method").dropna(subset="rank")
     words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
     by_law = {law: ranked[f"near_bound_{law}"] for law in MODELS_DRAWN}
-    for law, where in (("accelerated", "motions accelerate"), ("spline", "hands shake")):
+    for law, where in (("accelerated", "accelerated motion"), ("spline", "shaking hands")):
         auto, others = by_law[law][CHOOSES], by_law[law].drop(CHOOSES)
-        assert f"where {where}, {auto:.2f} there, the next {others.max():.2f}" in words
+        assert f"on {where} ({auto:.2f}, the next {others.max():.2f})" in words
     rest = np.mean([by_law[law] for law in ("linear", "twist", "inertial")], axis=0)
     mean = dict(zip(ranked.index, rest, strict=True))
     auto, twist, scaled = (f"{mean[name]:.3f}" for name in (CHOOSES, *RIVALS))
@@ -334,7 +334,8 @@ def test_results_tell_what_laws_cost_on_frames() -> None:
     own, best = (
         {law: row[f"auc_apart_{law}"] for law in MODELS_DRAWN} for row in (auto, others.max(numeric_only=True))
     )
-    assert f"a law that it tries: {own['accelerated']:.2f} there, the next {best['accelerated']:.2f}." in words
+    assert f"one of its models: {own['accelerated']:.2f}, the next" in words
+    assert f"with free velocities in each frame) {best['accelerated']:.2f};" in words
     assert f"{best['linear']:.2f} to {own['linear']:.2f} (`linear`) and" in words
     assert f"{best['twist']:.2f} to {own['twist']:.2f} (`twist`)" in words
     assert f"the hardest here too**, {own['spline']:.2f}, the next {best['spline']:.2f}." in words
@@ -349,24 +350,19 @@ def test_results_tell_what_laws_cost_readers_of_the_ratio(tmp_path: Path) -> Non
     words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
     skill = table_of["skill"]
     laws = sorted((skill["rs-stereo-refined-twist"], skill["rs-stereo-refined"]), reverse=True)
-    assert f"with {skill[CHOOSES]:.2f}; those that assume one have {laws[0]:.2f} and {laws[1]:.2f}:" in words
-    spline = table_of["skill_spline"]
+    assert f"with {skill[CHOOSES]:.2f}; solvers that assume a model have {laws[0]:.2f} and {laws[1]:.2f}:" in words
+    assert table_of["skill_spline"].to_dict()[CHOOSES] == 0.0, "all refused"
     assert (
-        f"there: {spline[CHOOSES]:.2f}, below a refusal and near a blind constant ({spline['constant']:.2f})"
+        f"95 % intervals contain the ratio in {100.0 * float(table_of['covers_95'].to_dict()[CHOOSES]):.0f} %"
         in words
     )
-    assert f"intervals of 95 % hold {100.0 * float(table_of['covers_95'].to_dict()[CHOOSES]):.0f} %" in words
     split = _without_frames("readout-3")
     restore(LAWS_FOLDER / "predictions" / "readout-3", split, tmp_path / "board")
     (entry,) = (e for e in entries_of(tmp_path / "board", "readout-3", split.name) if e.header.method == CHOOSES)
     scores = entry.scores.set_index("problem")
-    silent, ideal = ~scores["success"].astype(bool), scores.index.str.contains("-ideal-")
-    shares = [f"{100.0 * share:.0f} %" for share in (silent.mean(), silent[ideal].mean(), silent[~ideal].mean())]
-    assert (
-        f"of {shares[0]} that it cannot tell: {shares[1]} with an ideal sensor, {shares[2]} with a real" in words
-    )
-    assert f"{int(scores['wrong'].sum())} of its {int(np.sum(~silent))} ratios are off by more than 0.1" in words
-    assert 0.03 < np.median(scores["e_readout"][~silent]) <= 0.04
+    silent = ~scores["success"].astype(bool)
+    assert f"It refuses {100.0 * silent.mean():.0f} %, among them all hand-held motion" in words
+    assert np.all(silent[scores.index.str.contains("-spline-")])
 
 
 @pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
@@ -376,10 +372,10 @@ def test_results_tell_what_a_second_camera_is_worth() -> None:
     ranked = pd.read_csv(path, index_col="method")
     words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
     score = ranked["corrected"]
-    assert f"`fusion` has {score['fusion']:.2f}, and `mono-fusion`, which sees one" in words
-    assert f"camera, {score['mono-fusion']:.2f}; the data do not tell them apart" in words
+    assert f"`fusion` has {score['fusion']:.2f}, and `mono-fusion`, with one camera," in words
+    assert f"camera, {score['mono-fusion']:.2f}, which is not significant" in words
     assert "mono-fusion" in str(ranked.loc["fusion", "ties"]) and ranked["rank_high"].to_dict()["fusion"] > 1
-    assert f"A rotation alone is worth {score['rotation-only']:.2f}." in words
+    assert f"Rotation alone has {score['rotation-only']:.2f}." in words
     assert np.all(ranked["corrected"] <= ranked["placed"])
 
 
