@@ -23,7 +23,7 @@ import pandas as pd
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.simulated.run_sweep import read_card, read_sweep, read_trials, score_trials
 from rsbench.benchmark.simulated.sweep_card import load_sweep
-from rsbench.benchmark.statistics import bootstrap_interval, in_words, typical_interval
+from rsbench.benchmark.statistics import bootstrap_interval, format_interval, typical_interval
 from rsbench.core.so3 import FloatArray
 from rsbench.storage.files import write_json, write_table
 
@@ -126,7 +126,7 @@ def shown(crossings: pd.DataFrame) -> list[str]:
     for (sweep, variant, measure), rows in angles.groupby(["sweep", "variant", "measure"], sort=False):
         most = max(load_sweep(str(sweep)).values) * FACTORS[str(sweep)]
         cells = [
-            in_words(row.crossing, row.low, row.high) if np.isfinite(row.low) else f"beyond {most:g}"
+            format_interval(row.crossing, row.low, row.high) if np.isfinite(row.low) else f"beyond {most:g}"
             for row in rows.itertuples(index=False)
         ]
         name = str(sweep).removeprefix("gyro-") + ("" if variant == "all" else f", {variant}")

@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
-from rsbench.benchmark.statistics import in_words, median_interval, share_interval
+from rsbench.benchmark.statistics import format_interval, median_interval, share_interval
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
@@ -91,7 +91,7 @@ def minimal(trials: int) -> str:
             pose = newton(features.triplets(np.arange(3), PATTERNS[seed % 2], RIG))
             off = max(np.abs(pose.R - true.R).max(), np.abs(pose.t - true.t).max())
             found[points, lines].append(bool(off < FOUND))
-        cells = [in_words(np.mean(each), *share_interval(sum(each), len(each))) for each in found.values()]
+        cells = [format_interval(np.mean(each), *share_interval(sum(each), len(each))) for each in found.values()]
         out.append(f"| {degrees} deg, {metres} m | {' | '.join(cells)} |")
     return "\n".join(out)
 
@@ -144,10 +144,10 @@ def told(table: pd.DataFrame) -> str:
         if "lines" in group and group["lines"].notna().all():
             count, right = int(group["lines"].sum()), int(group["right"].sum())
             cells[2] = f"{group['tracks'].median():.0f}, {group['lines'].median():.0f}"
-            cells[3] = in_words(right / count, *share_interval(right, count))
+            cells[3] = format_interval(right / count, *share_interval(right, count))
         for key in kinds:
             values = group[key].to_numpy(float)
-            cells.append(in_words(float(np.median(values)), *median_interval(values)))
+            cells.append(format_interval(float(np.median(values)), *median_interval(values)))
         cells.append(f"{group['ms_both'].median():.0f}")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

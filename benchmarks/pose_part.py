@@ -28,7 +28,7 @@ from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES, MotionTrack
 from rsbench.benchmark.leaderboard.submissions import method_header, read_submission, submission_text
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
-from rsbench.benchmark.statistics import in_words
+from rsbench.benchmark.statistics import format_interval
 from rsbench.pipeline.isolated_components import SolverRunner
 
 
@@ -73,7 +73,7 @@ def line_of(title: str, scores: pd.DataFrame) -> str:
     found = calibration(scores, 6)
     assert found is not None and found.log_score is not None
     medians = ", ".join(f"{scores[name].median():.4g}" for name in ("e_R_deg", "e_T_deg"))
-    covers, gain = in_words(*found.covers[-1]), in_words(*found.log_score)
+    covers, gain = format_interval(*found.covers[-1]), format_interval(*found.log_score)
     return f"| {title} | {len(scores)} | {medians} | {scores['auc_apart'].mean():.3f} | {covers} | {gain} |"
 
 

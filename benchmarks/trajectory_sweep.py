@@ -28,7 +28,7 @@ import pandas as pd
 from foreign_motion import SINES, Array, Law, Shaken, direction
 
 from rsbench.benchmark.provenance import provenance
-from rsbench.benchmark.statistics import in_words, typical_interval
+from rsbench.benchmark.statistics import format_interval, typical_interval
 from rsbench.benchmark.trajectory_scores import METHODS, Estimate, Given, along
 from rsbench.capture.trajectory_estimate import Trajectory, estimate_trajectory
 from rsbench.core.camera import PinholeCamera
@@ -198,7 +198,7 @@ def table(sweep: str, trials: int) -> pd.DataFrame:
 
 def _words(of: pd.Series) -> str:
     value, low, high = (float(each) for each in of)
-    return in_words(value, low, high) if low < high else f"{value:.3g}"
+    return format_interval(value, low, high) if low < high else f"{value:.3g}"
 
 
 def shown(found: pd.DataFrame) -> list[str]:

@@ -113,7 +113,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     ),
     "disparity mask: all that is hidden is visible": (
         mask_of("disparity_mask/left_0.png", of_class(PixelClass.OCCLUDED, PixelClass.VISIBLE)),
-        ("disparity_mask/left_0.png", "made again"),
+        ("disparity_mask/left_0.png", "new computation"),
     ),
     "flow x and y exchanged": (
         values_of("flow/left_0.exr", lambda values: values[..., ::-1]),
@@ -195,7 +195,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
             "gs_flow_mask/right_1.png",
             lambda classes: np.where(classes == 1, 2, np.where(classes == 2, 1, classes)).astype(np.uint8),
         ),
-        ("gs_flow_mask/right_1.png", "hidden, but visible by gs_depth/right_1.exr"),
+        ("gs_flow_mask/right_1.png", "marked hidden, but visible according to gs_depth/right_1.exr"),
     ),
 }
 
@@ -292,22 +292,22 @@ FAULTS |= {
         affine_of("jacobians", lambda J: J @ np.diag([1.0, 1.01])),
         (AFFINE, "right_1", "not those of plane, motion and row times"),
     ),
-    "affine frames on another plane": (on_another_plane, (AFFINE, "left_0", "not upright on the surface")),
+    "affine frames on another plane": (on_another_plane, (AFFINE, "left_0", "not perpendicular to the surface")),
     "matches moved by half a pixel": (
         matches_of("pixels", lambda pixels: pixels + 0.5),
-        (_MATCHES, "left", "not where their row sees the point"),
+        (_MATCHES, "left", "not those of the point in their row"),
     ),
     "matches without errors": (
         matches_of("error", lambda error: 0.1 * error),
-        (_MATCHES, "stereo_0", "not the distance from the true place"),
+        (_MATCHES, "stereo_0", "not the distance from the true pixel"),
     ),
     "matches: all that is seen is right": (
         matches_of("classes", lambda classes: np.where(classes == 5, 1, classes).astype(np.uint8)),
-        (_MATCHES, "not what error and depth make, within 3 px"),
+        (_MATCHES, "do not follow from error and depth, with a bound of 3 px"),
     ),
     "matches: all is hidden": (
         matches_of("classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),
-        (_MATCHES, "are hidden, but in sight by rs_depth/left_1.exr"),
+        (_MATCHES, "are marked hidden, but visible according to rs_depth/left_1.exr"),
     ),
     "matches that nobody found, all of them right": (
         arrays_of(_MATCHES, perfect),
@@ -335,7 +335,7 @@ FAULTS |= {
     "points scaled": (tracks_of("points", lambda X: 1.001 * X), (TRACKS, "left_0", "scaled by 1.001")),
     "pixels of one frame moved by 0.1 px": (
         tracks_of("pixels", one_view(3, lambda pixels: pixels + 0.1)),
-        (TRACKS, "right_1", "not where their row sees them"),
+        (TRACKS, "right_1", "not at the pixel in their row"),
     ),
     "frames of tracks exchanged": (
         tracks_of("pixels", lambda pixels: pixels[:, [2, 1, 0, 3]]),
@@ -347,11 +347,11 @@ FAULTS |= {
     ),
     "tracks: nothing is hidden": (
         tracks_of("classes", lambda classes: np.where(classes == 2, 1, classes).astype(np.uint8)),
-        (TRACKS, "are visible, but hidden by"),
+        (TRACKS, "are marked visible, but hidden according to"),
     ),
     "tracks: all is hidden": (
         tracks_of("classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),
-        (TRACKS, "are hidden, but visible by"),
+        (TRACKS, "are marked hidden, but visible according to"),
     ),
     "tracks without points": (
         lambda folder: save_arrays(
@@ -381,7 +381,10 @@ FAULTS |= {
     ),
     "a twin's mask: all is hidden": (
         mask_of("gs_twin_flow_mask/0047/right_0.png", of_class(PixelClass.VISIBLE, PixelClass.OCCLUDED)),
-        ("gs_twin_flow_mask/0047/right_0.png", "hidden, but visible by gs_twin_depth/0047/right_0.exr"),
+        (
+            "gs_twin_flow_mask/0047/right_0.png",
+            "marked hidden, but visible according to gs_twin_depth/0047/right_0.exr",
+        ),
     ),
     "a twin that is not there": (
         lambda folder: (folder / "gs_twin/0024/left_0.png").unlink(),

@@ -81,7 +81,7 @@ def stamped_late(samples: ImuSamples, late: Array) -> ImuSamples:
 FAULTS: dict[str, tuple[Plant, Words]] = {
     "matches moved by half a pixel": (
         matches_of(2, "pixels", lambda pixels: pixels + 0.5),
-        (matches_file(2), "not where their row sees the point"),
+        (matches_file(2), "not those of the point in their row"),
     ),
     "matches with a tenth of the error": (
         matches_of(1, "error", lambda error: 0.1 * error),
@@ -89,7 +89,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "matches that are all hidden": (
         matches_of(2, "classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),
-        (matches_file(2), "are hidden, but in sight by rs_depth/left_3.exr"),
+        (matches_file(2), "are marked hidden, but visible according to rs_depth/left_3.exr"),
     ),
     "matches of the frames before": (
         copied(matches_file(1), matches_file(2)),
@@ -97,7 +97,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "tracks moved by 0.1 px": (
         tracks_of("pixels", one_view(7, lambda pixels: pixels + 0.1)),
-        (TRACKS, "right_3", "not where their row sees them"),
+        (TRACKS, "right_3", "not at the pixel in their row"),
     ),
     "tracks of another time": (
         tracks_of("tau", one_view(4, lambda tau: tau - 1.0)),
@@ -109,11 +109,11 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "tracks that are all hidden": (
         tracks_of("classes", one_view(5, lambda classes: np.where(classes == 1, 2, classes))),
-        (TRACKS, "right_2", "are hidden, but visible by rs_depth/right_2.exr"),
+        (TRACKS, "right_2", "are marked hidden, but visible according to rs_depth/right_2.exr"),
     ),
     "points of the last frame scaled": (
         arrays_of(TRACKS, last_points_scaled),
-        (TRACKS, "points are not where their row sees them"),
+        (TRACKS, "points are not at the pixel in their row"),
     ),
     "affine frames transposed": (
         affine_of("jacobians", one_view(6, lambda J: np.swapaxes(J, 1, 2))),
@@ -125,7 +125,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "affine frames exchanged": (
         affine_of("jacobians", swapped),
-        (AFFINE, "left_3", "derivatives"),  # there without a pixel, or of another frame
+        (AFFINE, "left_3", "derivatives"),  # present without a pixel, or of another frame
     ),
     "inertial samples a sample late": (
         samples_of(late_by_a_sample),

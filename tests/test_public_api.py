@@ -167,7 +167,7 @@ def test_the_motion_model_is_chosen_where_that_is_asked_for() -> None:
     assert linear.motion_model == "" and linear.estimate.covariance is not None
     e_T = [rsbench.pose_errors(each, motion, RIG)["e_T_deg"] for each in (found, linear)]
     assert e_T[0] < 0.3 * e_T[1]
-    with pytest.raises(rsbench.RsbenchError, match="knows only linear motion"):
+    with pytest.raises(rsbench.RsbenchError, match="supports only linear motion"):
         rsbench.estimate_motion(matches, RIG, SHUTTER, "rs-stereo-linear", motion_model="auto")
 
 

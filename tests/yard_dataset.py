@@ -75,7 +75,7 @@ def rounds() -> list[list[str]]:
     """
     found: list[dict[str, str]] = []
     for name, (_, words) in FAULTS.items():
-        alone = "made again" in words or name in ALONE
+        alone = "new computation" in words or name in ALONE
         fits = [each for each in found if words[0] not in each and "" not in each]
         if alone or not fits:
             found.append({})

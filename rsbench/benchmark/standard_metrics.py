@@ -101,7 +101,7 @@ class Ssim(ImageMetric):
 @final
 @dataclass(frozen=True)
 class Flip(ImageMetric):
-    """Mean FLIP error: see ``vision.legacy_quality``. Raises RsbenchError where its package has no wheel."""
+    """Mean FLIP error, see ``vision.quality``; raises RsbenchError if its package has no wheel."""
 
     columns = (Column(name="flip", better="lower", worst=1.0, title="FLIP"),)
 

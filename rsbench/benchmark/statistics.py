@@ -196,7 +196,7 @@ def _middle_part(drawn: FloatArray) -> Interval:
     return Interval(float(low), float(high))
 
 
-def in_words(value: float, low: float, high: float) -> str:
+def format_interval(value: float, low: float, high: float) -> str:
     """``value [low, high]`` with the digits that the interval leaves: the last is below a third of half of it."""
     if low == high or not all(map(math.isfinite, (value, low, high))):
         return f"{value:.3g} [{low:.3g}, {high:.3g}]"

@@ -1,8 +1,8 @@
-"""Hypotheses on how the cameras read their lines and how the rig moves, and the best fit of one of them.
+"""Hypotheses about how the cameras read their lines and how the rig moves, and the best fit of each.
 
-A hypothesis names the scan of each camera, the motion model, and whether the right camera may be late. Its six
-motion parameters and its unknowns (readout ratio, delay, acceleration, errors of the calibration) are fitted
-together by a damped Newton method on compiled equations, under heavy-tailed errors.
+A hypothesis names the scan of each camera, the motion model, and whether the right camera may be delayed.
+``fit_capture`` fits its six motion parameters and its unknowns (readout ratio, delay, acceleration, calibration
+errors) jointly, by a damped Newton method on compiled equations with a heavy-tailed error distribution.
 """
 
 from __future__ import annotations
@@ -35,59 +35,59 @@ _LINES: dict[Start, tuple[float, float, float]] = {
     "left": (0.0, 1.0, 0.0),
     "right": (1.0, -1.0, 0.0),
 }
-"""Time of a pixel per readout ratio: constant, per image width, per image height."""
+"""Readout time of a pixel for a ratio of 1: a constant, and slopes per image width and per image height."""
 _FRAMES = np.array([0.0, 1.0])
 _FRAMES_OF_TRACKS, _LATE_OF_TRACKS = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0])
-"""For the ends of a track: the frame, and 1 for the right camera."""
+"""For the four image points of a track: the frame index; and 1 where the right camera sees the point."""
 RATIO, DELAY, ACCELERATION = range(3)
 """Indices of the first unknowns: readout ratio, delay of the right camera (frame periods), k."""
 CALIBRATION = slice(3, 3 + len(TERMS))
-"""Indices of the errors of the calibration, see ``calibration.TERMS``."""
+"""Indices of the calibration errors, see ``calibration.TERMS``."""
 UNKNOWNS = CALIBRATION.stop
 LEAST_RATIO = 0.05
-"""Smaller readout ratios are treated as a global shutter's."""
+"""A camera with a smaller readout ratio is treated as one with a global shutter."""
 MODELS = ("linear", "twist", "inertial", "accelerated")
 """Motion models that are compared."""
 DELAY_SIGMA = 0.3
-"""Prior standard deviation of the delay of a right camera that is late or early, frame periods."""
+"""Prior standard deviation of the right camera's delay, where there is one, frame periods."""
 ACCELERATION_SIGMA = 0.2
-"""Prior standard deviation of k for motions that accelerate."""
+"""Prior standard deviation of the acceleration k of the accelerated motion model."""
 BEYOND_RATIO = 1.2
-"""No ratio exceeds 1, but the fitted maximum may, because of noise."""
+"""Upper limit of a fitted ratio: true ratios are at most 1, but noise may move the best fit beyond that."""
 _MAX_TRANSLATION_M = 50.0
-_LEAST = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], *3 * [-2.0], -0.4])
-_MOST = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0], 0.4])
-_LONGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2], 0.1])
+_LOWER = np.array([LEAST_RATIO, -1.0, -0.45, *10 * [-50.0], *3 * [-2.0], -0.4])
+_UPPER = np.array([BEYOND_RATIO, 1.0, 3.0, *10 * [50.0], *3 * [2.0], 0.4])
+_LARGEST_STEP = np.array([0.4, 0.4, 0.3, 2.0, *9 * [20.0], *3 * [0.2], 0.1])
 _DAMPING = Damping(least=1e-8, first=1e-4, largest=1e6)
-"""A motion compensates for most of a wrong ratio: more damping than this would keep the ratio where it is."""
+"""A change of the motion makes up for most of a wrong ratio, so stronger damping would freeze the ratio."""
 _MOTION = 6
 _STRETCHING = tuple(CALIBRATION.start + term for term in STRETCHING)
 _STEP = 1e-7
-_OVER = 5.0
-"""Largest decrease of a cost, as a multiple of Newton's prediction."""
+_EXPECTED_GAIN = 5.0
+"""Largest decrease of the cost that is expected of a descent, as a multiple of Newton's prediction."""
 _MEDIAN, LEAST_SCALE_PX = 0.6, 0.005
-"""Median of squared normal errors, one or five together; and the scale that exact matches are given."""
+"""Median of the mean of one or of five squared normal errors; smallest error scale, used for exact matches."""
 
 
 @dataclass(frozen=True, order=True)
 class Scans:
-    """Where each camera begins to read; cameras that roll share one readout ratio, unless both are given."""
+    """The side at which each camera begins to read; rolling cameras have one ratio, unless both are given."""
 
     left: Start
     right: Start
 
     @property
     def rolls(self) -> bool:
-        """Whether any camera does."""
+        """Whether any camera has a rolling shutter."""
         return self != GLOBAL
 
     @property
     def together(self) -> bool:
-        """Whether both read alike."""
+        """Whether both cameras read in the same direction."""
         return self.left == self.right
 
     def start(self, side: Side) -> Start:
-        """Where one camera begins."""
+        """The side at which one camera begins to read."""
         return self.left if side == "left" else self.right
 
     def __str__(self) -> str:
@@ -99,7 +99,7 @@ class Scans:
 
 GLOBAL = Scans("global", "global")
 ALL_SCANS = tuple(Scans(*starts) for starts in product(get_args(Start), repeat=2))
-"""All 25."""
+"""All 25 combinations of a left and a right start."""
 
 
 def scans_of(shutter: RollingShutter) -> Scans:
@@ -111,7 +111,7 @@ def scans_of(shutter: RollingShutter) -> Scans:
 def shutter_under(
     scans: Scans, ratio: float, rig: StereoRig, delay: float = 0.0, right_share: float = 1.0
 ) -> RollingShutter:
-    """The shutter of these scans; ``right_share`` as of ``Known``."""
+    """The shutter with these scans; ``right_share`` is explained at ``Known``."""
     sides = [None if scans.start(side) == "global" else scans.start(side) for side in SIDES]
     left, right = (0.0 if side is None else ratio for side in sides)
     scanning = Scanning(
@@ -124,44 +124,44 @@ def shutter_under(
 
 
 def line_of(scans: Scans, side: Side) -> FloatArray:
-    """Time (3,) of one camera's pixels per readout ratio: constant, per image width, per image height."""
+    """(3,) readout time of a camera's pixels for a ratio of 1: constant, slope per width, slope per height."""
     return np.array(_LINES[scans.start(side)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hypothesis:
-    """How the cameras read and how the rig moves, and which of the unknowns are free beside the motion."""
+    """One assumption about how the cameras read and how the rig moves."""
 
     scans: Scans
     motion_model: str
     delayed: bool = False
-    """Whether the right camera may be late."""
+    """Whether the right camera's delay is a free unknown."""
 
     @property
     def accelerations(self) -> tuple[float, ...]:
-        """Values of k from which fits start: from 0 alone, two of eighteen rigs that turned by 6 deg and slowed
-        down were estimated as moving in reverse."""
+        """Values of k at which fits start. When all started at 0, two of eighteen rigs that turned by 6 deg and
+        slowed down were estimated as moving in reverse."""
         return (0.0, -0.3, 0.3) if self.motion_model == "accelerated" else (0.0,)
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownInputs:
-    """What a caller gives of a capture, in one object; None: it is estimated."""
+    """What the caller knows about a capture; None: the value is estimated."""
 
     readout_ratio: float | None = None
     scanning: Scanning | None = None
-    """How the cameras read."""
+    """Scan of each camera, delay and ratio of the right one."""
     calibration: tuple[float, ...] | None = None
-    """Errors of the calibration, see ``calibration.TERMS``."""
+    """Calibration errors, see ``calibration.TERMS``."""
     models: tuple[str, ...] = MODELS
 
     @property
     def reading(self) -> Scanning:
-        """How the cameras read; without a scanning, rows from the top."""
+        """The given scanning; without one, both cameras read rows from the top."""
         return self.scanning or Scanning()
 
     def shutter_of(self, rig: StereoRig) -> RollingShutter:
-        """The shutter of a given readout ratio; ValueError where there is none."""
+        """The shutter with the given readout ratio; ValueError if none is given."""
         if self.readout_ratio is None:
             raise ValueError("readout_ratio: must be given")
         return rig.shutter_of(self.reading, self.readout_ratio)
@@ -169,24 +169,24 @@ class KnownInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class Known:
-    """What is known of a capture before its matches are fitted; None: it is estimated."""
+    """What is known about a capture before its matches are fitted; None: the value is estimated."""
 
     ratio: float | None = None
-    """Of the left camera, or of the right one where it alone rolls."""
+    """Readout ratio of the left camera, or of the right one if only that one has a rolling shutter."""
     right_share: float = 1.0
-    """Readout ratio of the right camera over the left one's, where both roll."""
+    """Readout ratio of the right camera divided by that of the left one, if both have a rolling shutter."""
     scans: tuple[Scans, ...] = ALL_SCANS
-    """Possible ones."""
+    """The scans that are compared."""
     delay: float | None = None
-    """Frame periods by which the right camera is late."""
+    """Delay of the right camera, frame periods."""
     calibration: tuple[float, ...] = NO_ERRORS
-    """Errors of the calibration, see ``calibration.TERMS``."""
+    """Calibration errors, see ``calibration.TERMS``."""
     calibration_sigma: tuple[float, ...] = NO_ERRORS
-    """Prior standard deviation of each of them, about 0; 0: it is known."""
+    """Prior standard deviation of each calibration error about 0; 0: the error is known."""
     models: tuple[str, ...] = MODELS
 
     def with_shutter(self, shutter: RollingShutter) -> Known:
-        """With all of a shutter known."""
+        """The same knowledge plus that of the whole shutter."""
         left, right = (shutter.ratio_of(side) for side in SIDES)
         return replace(
             self,
@@ -197,20 +197,20 @@ class Known:
         )
 
     def shutter(self, rig: StereoRig) -> RollingShutter | None:
-        """The shutter where it is ``shutter_known``."""
+        """The shutter if it is known (``shutter_known``), else None."""
         if self.ratio is None or not self.shutter_known:
             return None
         return shutter_under(self.scans[0], self.ratio, rig, self.delay or 0.0, self.right_share)
 
     def prior(self, hypothesis: Hypothesis) -> FloatArray:
-        """(17,) standard deviations of the unknowns, as ``CaptureCost`` takes them."""
+        """(17,) prior standard deviations of the unknowns, as ``CaptureCost`` takes them."""
         ratio = np.inf if self.ratio is None and hypothesis.scans.rolls else 0.0
         delay = DELAY_SIGMA if hypothesis.delayed else 0.0
         acceleration = ACCELERATION_SIGMA if hypothesis.motion_model == "accelerated" else 0.0
         return np.array([ratio, delay, acceleration, *self.calibration_sigma])
 
     def start(self, hypothesis: Hypothesis, ratio: float, delay: float) -> FloatArray:
-        """(17,) unknowns of a hypothesis, with guesses of these two where they are free."""
+        """(17,) unknowns at which the fit of a hypothesis starts; ``ratio`` and ``delay`` are used if unknown."""
         out = np.zeros(UNKNOWNS)
         if hypothesis.scans.rolls:
             out[RATIO] = ratio if self.ratio is None else self.ratio
@@ -220,21 +220,21 @@ class Known:
 
     @property
     def shutter_known(self) -> bool:
-        """Whether only the motion and its model are estimated."""
+        """Whether the shutter is known, so that only the motion and its model are estimated."""
         return len(self.scans) == 1 and self.ratio is not None and self.delay is not None
 
     @property
     def delays(self) -> tuple[bool, ...]:
-        """Whether the right camera may be late."""
+        """The values of ``Hypothesis.delayed`` that are compared."""
         return (False, True) if self.delay is None else (False,)
 
 
 _Masks = tuple[BoolArray, BoolArray]
-"""(n,) of pairs and (m,) of tracks."""
+"""Masks (n,) over the pairs and (m,) over the tracks."""
 
 
 class _Ends(NamedTuple):
-    """A quantity of the ends of n pairs (n, ...) and of the ends left 0, right 0, left 1, right 1 of m tracks."""
+    """A value per image point: (n, 2, ...) of pairs; (m, 4, ...) of tracks: left 0, right 0, left 1, right 1."""
 
     pairs: FloatArray
     tracks: FloatArray
@@ -244,22 +244,21 @@ class _Ends(NamedTuple):
 
 
 class TimedMatches:
-    """Matches whose ends can be given the times of any scans.
+    """Matches for which the readout times under any scans can be computed.
 
-    Every end has a time of its own here (``timed_tracks``), whatever the scans, so that all scans are judged
-    by the same errors.
+    Each image point has its own time under all scans, so that all are compared by the same errors.
 
     Args:
-        right_share: as of ``Known``.
+        right_share: see ``Known``.
     """
 
     def __init__(
         self, matches: Correspondences, rig: StereoRig, motion_model: str = "linear", right_share: float = 1.0
     ) -> None:
-        packs = {scan: pack(matches, rig, _late(rig, scan), motion_model) for scan in get_args(Scan)}
+        packs = {scan: pack(matches, rig, _distinct_times(rig, scan), motion_model) for scan in get_args(Scan)}
         self._base = base = next(iter(packs.values()))
         self.left: BoolArray = base.pairs[:, 6] >= 0.0
-        """(n,) which pairs are the left camera's."""
+        """(n,) whether a pair belongs to the left camera."""
         late = np.where(self.left, 0.0, 1.0)[:, None]
         pairs, tracks = np.where(self.left, 1.0, right_share)[:, None], np.array([[1.0], [right_share]] * 2)
         self._times: dict[Start, tuple[_Ends, _Ends]] = {
@@ -272,20 +271,20 @@ class TimedMatches:
             )
             for scan, each in packs.items()
         }
-        """Per readout ratio: times of the ends after the start of their frame, and their slopes by the pixel."""
+        """For a ratio of 1: times of the points after their frame begins, and the derivatives by the pixel."""
         times, slopes = (_Ends(*map(np.zeros_like, each)) for each in self._times["top"])
         self._times["global"] = times, slopes
         self.count = len(base.pairs) + len(base.tracks)
-        """Measurements: pairs that no track repeats, then tracks."""
+        """Number of measurements: the pairs that are not part of a track come first, then the tracks."""
         sets = [getattr(matches, side)[unlinked_pairs(matches, side)] for side in SIDES]
         self.pixels: FloatArray = np.concatenate([*(each[:, :2] for each in sets), matches.tracks[:, :2]])
-        """(count, 2) where each is seen in frame 0."""
+        """(count, 2) pixel of each measurement in frame 0."""
         lens, rays = rig.camera.lens, _Ends(base.pairs[:, :4].reshape(-1, 2, 2), base.tracks[:, :, :2])
         either = [ray_shifts(rays.pairs, side, float(base.focal[0]), lens) for side in SIDES]
         four = [ray_shifts(rays.tracks[:, k], SIDES[k % 2], float(base.focal[0]), lens) for k in range(4)]
         shifts = np.where(self.left[:, None, None, None], *either), np.stack(four, axis=1)
         self._shifts = _Ends(*(np.ascontiguousarray(each.swapaxes(2, 3)) for each in shifts))
-        """(n, 2, 2, 14) and (m, 4, 2, 14): ``ray_shifts``, the errors last."""
+        """(n, 2, 2, 14) and (m, 4, 2, 14): ``ray_shifts`` with the errors as the last axis."""
         self._stretches = _Ends(*(ray_stretches(each, lens) for each in rays))
         """(n, 2, 2, 2, 2) and (m, 4, 2, 2, 2), see ``ray_stretches``."""
 
@@ -296,7 +295,7 @@ class TimedMatches:
         return other
 
     def read(self, scans: Scans, chosen: BoolArray | None = None) -> ReadMatches:
-        """Those of a mask (count,), by default all, with the times of some scans."""
+        """The matches selected by a mask (count,), by default all, with their times under the scans."""
         chosen = np.ones(self.count, dtype=np.bool_) if chosen is None else chosen
         pairs, tracks = np.split(chosen, [len(self._base.pairs)])
         masks, is_left, of_left = (pairs, tracks), self.left[pairs], np.array([True, False, True, False])
@@ -314,16 +313,16 @@ class TimedMatches:
         return ReadMatches(self._base.only(chosen), is_left, (times, slopes), optics)
 
     def packed(self, scans: Scans, unknowns: FloatArray) -> Packed:
-        """All measurements with the times of some scans, see ``ReadMatches.packed``."""
+        """All measurements with their times under the scans, see ``ReadMatches.packed``."""
         return self.read(scans).packed(unknowns)
 
     def kernel(self, unknowns: FloatArray) -> MotionKernel:
-        """Of the motion model, with the acceleration among some unknowns (17,)."""
+        """The kernel of the motion model, with the acceleration from the unknowns (17,)."""
         return _accelerated(self._base.kernel, float(unknowns[ACCELERATION]))
 
 
 class ReadMatches:
-    """Matches with the times of one scan of each camera, as a function of the unknowns of the capture."""
+    """Matches with their times under given scans, as a function of the unknowns of the capture."""
 
     def __init__(
         self, base: Packed, left: BoolArray, times: tuple[_Ends, _Ends], optics: tuple[_Ends, _Ends]
@@ -331,15 +330,15 @@ class ReadMatches:
         self._base, (self._times, self._slopes), (self._shifts, self._stretches) = base, times, optics
         self.count = len(base.pairs) + len(base.tracks)
         self._late = np.where(left, 0.0, 1.0)[:, None]
-        """(n, 1) of the pairs, 1 for the right camera."""
+        """(n, 1) 1 for pairs of the right camera, 0 for those of the left one."""
         self._constant: tuple[list[int], FloatArray, FloatArray] | None = None
 
     def packed(self, unknowns: FloatArray) -> Packed:
-        """The measurements at some unknowns.
+        """The measurements for given unknowns.
 
         Args:
-            unknowns: (17,) readout ratio; frame periods by which the right camera is late; the motion's
-                acceleration, 0 for a model without one; errors of the calibration.
+            unknowns: (17,) readout ratio; delay of the right camera, frame periods; acceleration of the motion,
+                0 for a model without one; calibration errors.
         """
         ratio, delay, acceleration, *errors = map(float, unknowns)
         pairs, tracks = self._base.pairs.copy(), self._base.tracks.copy()
@@ -358,17 +357,17 @@ class ReadMatches:
         return replace(self._base, pairs=pairs, tracks=tracks, h=0.0, kernel=kernel)
 
     def _stretched(self, by_pixel: FloatArray, stretches: FloatArray, errors: list[float]) -> FloatArray:
-        """Derivatives (n, k, 4) of the ideal pixels by the pixels, for rays that errors shift unevenly."""
+        """Derivatives (n, k, 4) of the ideal pixels by the pixels, where the rays' shifts vary over the image."""
         fx, fy = self._base.focal
         by_ray = np.eye(2) - np.einsum("k,...kij->...ij", errors, stretches)
         by_ray = by_ray * [[1.0, fx / fy], [fy / fx, 1.0]]
         return np.asarray((by_ray @ by_pixel.reshape(*by_pixel.shape[:-1], 2, 2)).reshape(by_pixel.shape))
 
     def derivatives(self, packed: Packed, acceleration: float, free: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Of the ends' rays and times by k free unknowns: (n, 2, k, 3) of pairs, (m, 4, k, 3) of tracks.
+        """Derivatives of rays and times by k free unknowns: (n, 2, k, 3) for pairs, (m, 4, k, 3) for tracks.
 
-        The acceleration changes all times: the motion is at beta(tau), see ``AcceleratedKernel``. The next call
-        may write into the arrays of this one.
+        The acceleration changes all times: the motion is evaluated at beta(tau), see ``AcceleratedKernel``. The
+        next call may overwrite the returned arrays.
         """
         if self._constant is None or self._constant[0] != free:
             self._constant = (free, *self._constant_derivatives(free))
@@ -380,7 +379,7 @@ class ReadMatches:
         return pairs, tracks
 
     def _constant_derivatives(self, free: list[int]) -> tuple[FloatArray, FloatArray]:
-        """By all unknowns but an acceleration."""
+        """The derivatives by the free unknowns, 0 for the acceleration."""
         pairs = np.zeros((len(self._base.pairs), 2, len(free), 3))
         tracks = np.zeros((len(self._base.tracks), 4, len(free), 3))
         for k, unknown in enumerate(free):
@@ -398,22 +397,22 @@ def _accelerated(kernel: MotionKernel, acceleration: float) -> MotionKernel:
     return AcceleratedKernel(acceleration=acceleration) if isinstance(kernel, AcceleratedKernel) else kernel
 
 
-def _late(rig: StereoRig, scan: Scan) -> RollingShutter:
-    """Both cameras read alike, the right one a period late: no two ends of a match are of one time."""
+def _distinct_times(rig: StereoRig, scan: Scan) -> RollingShutter:
+    """Both cameras read alike, the right one a frame period later: all points of a match have different times."""
     return rig.shutter_of(Scanning(scan=scan, right_delay=1.0), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Likelihood:
-    """Which measurements count, and the distribution of their errors (``heavy_tails``)."""
+    """The measurements that are used, and the distribution of their errors (``heavy_tailed``)."""
 
     nu: float
     scale: float
     """px."""
     chosen: BoolArray
-    """(n + m,) of the pairs and tracks."""
+    """(n + m,) which of the pairs and tracks are used."""
     trust: FloatArray | None = None
-    """Weights of the chosen ones; None: 1."""
+    """Weights of the used measurements; None: 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -422,25 +421,24 @@ class CaptureFit:
 
     hypothesis: Hypothesis
     theta: FloatArray
-    """(6,) of the motion."""
+    """(6,) motion parameters."""
     unknowns: FloatArray
-    """(17,)."""
+    """(17,), in the order of ``RATIO``, ``DELAY``, ``ACCELERATION``, ``CALIBRATION``."""
     cost: float
-    """Negative logarithm of likelihood and prior, times the squared scale, px^2."""
+    """Negative logarithm of likelihood times prior, multiplied by the squared scale, px^2."""
     sigma: FloatArray
     """(17,) standard deviations of the unknowns; 0 for a ratio that was fixed."""
     spread: FloatArray
-    """(6, 6) what uncertain unknowns, except a fixed ratio, add to the covariance of theta."""
+    """(6, 6) part of the covariance of theta that the uncertain unknowns cause, except a fixed ratio."""
     occam: float
-    """Logarithm of the posterior volume of the unknowns beside the ratio over their prior volume."""
+    """Logarithm of posterior over prior volume of all free unknowns but the ratio (Occam factor)."""
 
 
 class CaptureCost:
     """The cost of one hypothesis as a function of the motion and the unknowns.
 
     Args:
-        prior: (17,) standard deviations of the unknowns about 0; 0 fixes an unknown where it starts, and infinity
-            means no prior.
+        prior: (17,) standard deviations of the unknowns about 0; 0: the unknown is fixed; infinity: no prior.
     """
 
     def __init__(
@@ -455,19 +453,19 @@ class CaptureCost:
         self._trust = np.ones(count) if likelihood.trust is None else likelihood.trust
 
     def _squares(self, theta: FloatArray, unknowns: FloatArray) -> tuple[HeavyTailed, FloatArray]:
-        """The measurements at some unknowns (17,), and their squared errors (n,), px^2."""
+        """The measurements for given unknowns (17,), and their squared errors (n,), px^2."""
         packed, likelihood = self._matches.packed(unknowns), self.likelihood
         tailed = HeavyTailed(**vars(packed), nu=likelihood.nu, scale=likelihood.scale, trust=self._trust)
         return tailed, np.concatenate([tailed.pair_residuals(theta) ** 2, tailed.track_squares(theta)])
 
     def each(self, theta: FloatArray, unknowns: FloatArray) -> FloatArray:
-        """(n,) what each measurement adds."""
+        """(n,) contribution of each measurement to the cost, px^2."""
         tailed, squares = self._squares(theta, unknowns)
         factor = 0.5 * tailed.scale**2 * tailed.trust * (tailed.nu + tailed.freedom)
         return np.asarray(factor * np.log1p(squares / (tailed.nu * tailed.scale**2)))
 
     def typical_error(self, theta: FloatArray, unknowns: FloatArray) -> float:
-        """Scale of the errors, px, by their median: up to half of them may be wrong."""
+        """Scale of the errors, px, from their median, which tolerates up to half of wrong matches."""
         tailed, squares = self._squares(theta, unknowns)
         return max(float(np.sqrt(np.median(squares / tailed.freedom) / _MEDIAN)), LEAST_SCALE_PX)
 
@@ -477,7 +475,7 @@ class CaptureCost:
     def local(
         self, theta: FloatArray, unknowns: FloatArray, free: list[int]
     ) -> tuple[float, FloatArray, FloatArray]:
-        """The cost, its gradient and its Hessian by theta and the free unknowns."""
+        """The cost, and its gradient and Hessian with respect to theta and the free unknowns."""
         packed, size = self._matches.packed(unknowns), _MOTION + len(free)
         by = self._matches.derivatives(packed, float(unknowns[ACCELERATION]), free)
         tails, trust = np.array([self.likelihood.nu, self.likelihood.scale]), self._trust
@@ -485,9 +483,9 @@ class CaptureCost:
         at, focal, baseline = (theta, any_law(packed.kernel)), packed.focal, packed.baseline
         cost = add_pairs(*at, packed.pairs, by[0], focal, tails, trust[:n], gradient, H)
         cost += add_tracks(*at, packed.tracks, by[1], focal, baseline, tails, trust[n:], gradient, H)
-        for unknown in set(_STRETCHING) & set(free):  # which also change how many pixels an error of a ray is
+        for unknown in set(_STRETCHING) & set(free):  # these also scale the conversion from rays to pixels
             ahead = float(np.sum(self.each(theta, unknowns + _STEP * np.eye(UNKNOWNS)[unknown])))
-            gradient[_MOTION + free.index(unknown)] = (ahead - cost) / _STEP  # finds it to half a step
+            gradient[_MOTION + free.index(unknown)] = (ahead - cost) / _STEP  # moves the minimum by half a step
         gradient[_MOTION:] += self._weight[free] * unknowns[free]
         H[range(_MOTION, size), range(_MOTION, size)] += self._weight[free]
         return cost + 0.5 * float(self._weight @ unknowns**2), gradient, H
@@ -495,7 +493,7 @@ class CaptureCost:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Place:
-    """Where a descent is: parameters, and the cost with its derivatives by theta and the free unknowns."""
+    """A point of a descent: the parameters, and the cost with its derivatives by theta and the free unknowns."""
 
     theta: FloatArray
     unknowns: FloatArray
@@ -506,19 +504,20 @@ class _Place:
 
     @cached_property
     def _newton(self) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Which parameters move, an unknown at its limit does not; their sizes, eigenvalues, vectors, slopes."""
+        """Mask of parameters that may move (unknowns at a limit may not); their scales; eigenvalues and vectors
+        of the scaled Hessian; the gradient in that eigenbasis."""
         out, outwards = self.unknowns[self.free], -self.gradient[_MOTION:]
-        at_limit = (out <= _LEAST[self.free]) & (outwards < 0.0) | (out >= _MOST[self.free]) & (outwards > 0.0)
+        at_limit = (out <= _LOWER[self.free]) & (outwards < 0.0) | (out >= _UPPER[self.free]) & (outwards > 0.0)
         moves = np.concatenate([np.ones(_MOTION, dtype=np.bool_), ~at_limit])
         A, g = self.H[np.ix_(moves, moves)], self.gradient[moves]
         size = np.sqrt(np.maximum(np.abs(np.diagonal(A)), 1e-12 * np.abs(A).max()) + 1e-300)
         values, vectors = np.linalg.eigh(A / np.outer(size, size))
-        values = np.maximum(np.abs(values), 1e-9)  # downhill, whatever the curvature
+        values = np.maximum(np.abs(values), 1e-9)  # so that the step decreases the cost at any curvature
         return moves, size, values, vectors, vectors.T @ (g / size)
 
     @property
     def gain(self) -> float:
-        """Decrease of the cost at Newton's step, if it were quadratic."""
+        """Decrease of the cost by a full Newton step if the cost were quadratic."""
         _, _, values, _, slopes = self._newton
         return 0.5 * float(np.sum(slopes**2 / values))
 
@@ -528,7 +527,7 @@ class _Place:
         step = np.zeros(len(moves))
         step[moves] = -(vectors @ (slopes / (values + damping))) / size
         theta, unknowns, free = self.theta + step[:_MOTION], self.unknowns.copy(), self.free
-        unknowns[free] += np.clip(step[_MOTION:], -_LONGEST_STEP[free], _LONGEST_STEP[free])
+        unknowns[free] += np.clip(step[_MOTION:], -_LARGEST_STEP[free], _LARGEST_STEP[free])
         length = float(np.linalg.norm(theta[3:]))
         theta[3:] *= min(1.0, _MAX_TRANSLATION_M / max(length, _MAX_TRANSLATION_M))
         return theta, _within(unknowns, free)
@@ -536,7 +535,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Problem:
-    """A ``CaptureCost`` over some free unknowns, for ``descend``."""
+    """A ``CaptureCost`` as a function of theta and the free unknowns, in the form that ``descend`` takes."""
 
     cost: CaptureCost
     free: list[int]
@@ -548,7 +547,7 @@ class _Problem:
         return _Place(theta=theta, unknowns=unknowns, cost=now, gradient=gradient, H=H, free=self.free)
 
     def stepped(self, here: _Place, damping: float) -> _Place | None:
-        if here.cost - _OVER * here.gain > self.hopeless:
+        if here.cost - _EXPECTED_GAIN * here.gain > self.hopeless:
             return None
         there = self.place(*here.stepped(damping))
         return there if there.cost <= here.cost else None
@@ -567,12 +566,12 @@ def fit_capture(
     fix_ratio: bool = False,
     hopeless: float = np.inf,
 ) -> CaptureFit:
-    """Newton's method, damped, from a start (6,), (17,).
+    """Minimise the cost by a damped Newton method that starts at theta (6,) and unknowns (17,).
 
     Args:
-        still: decrease of the cost, in squared scales of the errors, at which to stop.
-        fix_ratio: whether the ratio stays as it is.
-        hopeless: the descent ends where the cost cannot fall below this.
+        still: the descent stops when a step decreases the cost by less than this times the squared error scale.
+        fix_ratio: whether the readout ratio keeps its start value.
+        hopeless: the descent stops when the cost is not expected to fall below this.
     """
     free = [k for k in cost.free if k != RATIO or not fix_ratio]
     problem = _Problem(cost, free, still, hopeless)
@@ -596,7 +595,7 @@ def fit_capture(
 
 
 def _within(unknowns: FloatArray, free: list[int]) -> FloatArray:
-    """With the free ones within their limits."""
+    """The unknowns (17,) with the free ones clipped to their limits."""
     out = unknowns.copy()
-    out[free] = np.clip(unknowns[free], _LEAST[free], _MOST[free])
+    out[free] = np.clip(unknowns[free], _LOWER[free], _UPPER[free])
     return out

@@ -1,9 +1,10 @@
-"""Hypotheses compared on the matches of one window: the error that each leaves, and how sharply.
+"""Ranking of capture hypotheses by the matches of one window (two frame times).
 
-Where the comparison starts: a point that moves by v_y rows per frame period lies dt v_y rows apart in two cameras
-that see it dt apart. So the row differences of left-right matches show, by least squares, how the times of the two
-cameras differ (``find_lag``). With that removed, the matches are nearly those of cameras that read together, and a
-robust search finds the motion (``find_start``).
+A point that moves by v_y rows per frame period appears dt v_y rows apart in two cameras that see it dt frame
+periods apart. ``find_lag`` therefore estimates the time difference of the cameras from the row differences of
+left-right matches, by least squares. ``find_start`` removes it from the matches, which are then nearly those of
+synchronous cameras, and finds the motion by a robust search. ``window_evidence`` fits every hypothesis from there
+and returns the log-likelihood of each as a function of the readout ratio.
 """
 
 from __future__ import annotations
@@ -52,35 +53,35 @@ COARSE: tuple[tuple[Scan, float], ...] = (
     ("left", 0.5),
     ("right", 0.5),
 )
-"""Shutters of cameras that read together, for the search for a motion: errors between them are small."""
+"""Shutters under which the motion is searched for, the same for both cameras; those between them are near one."""
 _LAG_SAMPLES, _LAG_ROUNDS = 400, 6
 _NOISE_PX, _TIME_SIGMA = 0.5, 0.5
-"""Expected noise of a row difference, and expected size of a difference of times, frame periods."""
+"""Expected noise of a row difference, px, and prior standard deviation of a lag, frame periods."""
 _LEAST_PX, _GRID = 0.1, 9
 _LONGEST_LEAP = 0.75
-"""Of the image's width or height, over a frame period: far from the reciprocal of the largest ratio, 1 / 1.2."""
+"""Longest accepted displacement, as a share of the width or height; below 1 / 1.2, see ``without_leaps``."""
 _BEND, _FAR = 0.1, 40.0
-"""Error of a lag, frame periods, and squared deviations beyond which scans disagree with it."""
+"""Model error of a lag, frame periods, and the squared normalised difference beyond which scans contradict it."""
 
 
 class Lag(NamedTuple):
-    """Time of the left camera less that of the right one at one place, frame periods."""
+    """Readout time of the left camera minus that of the right one, frame periods, linear in the left image."""
 
     line: FloatArray
-    """(3,) constant, per width, per height of the left image."""
+    """(3,) constant, slope per width, slope per height of the left image."""
     H: FloatArray
-    """(3, 3) how well the matches determine it: inverse covariance."""
+    """(3, 3) inverse covariance of ``line``."""
     right: FloatArray = np.eye(3)
-    """(3, 3) constant, share of width, of height in the right image, of those in the left one; far away."""
+    """(3, 3) maps (1, x / width, y / height) of a distant point from the left image to the right one."""
 
     def at(self, pixels: FloatArray, rig: StereoRig, side: Side = "left") -> FloatArray:
-        """(n,) at pixels (n, 2) of a camera."""
+        """(n,) lag at pixels (n, 2) of a camera."""
         line = self.line if side == "left" else np.linalg.solve(self.right.T, self.line)
         return np.asarray(_columns(pixels, rig, side) @ line)
 
 
 def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
-    """From tracks (n, 8) with outliers; 0 where nothing moves across the rows."""
+    """Robust estimate of the lag from tracks (n, 8) with outliers; 0 where nothing moves across the rows."""
     prior, right = np.eye(3) / _TIME_SIGMA**2, _right_columns(rig)
     if len(tracks) < 3:
         return Lag(np.zeros(3), prior, right)
@@ -90,7 +91,7 @@ def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
     moved = 0.5 * (tracks[:, 5] - tracks[:, 1] + tracks[:, 7] - tracks[:, 3])
     A = np.concatenate([moved[:, None] * each for each in places])
     e = np.concatenate([tracks[:, 1] - tracks[:, 3], tracks[:, 5] - tracks[:, 7]])
-    line, H = _sampled(A, e), prior
+    line, H = _least_median_lag(A, e), prior
     for _ in range(_LAG_ROUNDS):
         left = e - A @ line
         scale = max(1.4826 * float(np.median(np.abs(left))), _LEAST_PX)
@@ -100,8 +101,8 @@ def find_lag(tracks: FloatArray, rig: StereoRig) -> Lag:
     return Lag(line, H, right)
 
 
-def _sampled(A: FloatArray, e: FloatArray) -> FloatArray:
-    """The line of the smallest median error, of those through three row differences and of none."""
+def _least_median_lag(A: FloatArray, e: FloatArray) -> FloatArray:
+    """Least median of errors among lags (3,) fitted to random samples of four row differences, and no lag."""
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, len(e), (_LAG_SAMPLES, 4))
     ridge = (_NOISE_PX / _TIME_SIGMA) ** 2 * np.eye(3)
@@ -119,7 +120,7 @@ def _columns(pixels: FloatArray, rig: StereoRig, side: Side = "left") -> FloatAr
 
 
 def _right_columns(rig: StereoRig) -> FloatArray:
-    """``Lag.right`` of a rig."""
+    """``Lag.right`` for a rig, by least squares over a grid of directions."""
     if rig.aligned:
         return np.eye(3)
     camera = rig.camera
@@ -131,7 +132,7 @@ def _right_columns(rig: StereoRig) -> FloatArray:
 
 
 def _in_ideal(scan: Scan, rig: StereoRig) -> Scan:
-    """The side at which lines of the left camera begin, in the ideal image."""
+    """The side of the ideal image that corresponds to the side at which the left camera begins to read."""
     if rig.aligned:
         return scan
     eye, rate = rig.eye("left"), rig.shutter_of(Scanning(scan=scan), 1.0).rate("left")
@@ -143,9 +144,9 @@ def _in_ideal(scan: Scan, rig: StereoRig) -> Scan:
 
 
 def without_lag(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspondences:
-    """The ideal matches as the right camera would have had them at the left one's times, to first order.
+    """The matches, ideal px, with the right camera's points moved to the left one's times, to first order.
 
-    In ideal pixels, for a lens shows no ray at some of the pixels that a lag may lead to.
+    They are ideal pixels because a moved point may lie where the lens's image has no ray.
     """
     ideal = without_lens(matches, rig)
     tracks, right = ideal.tracks.copy(), ideal.right.copy()
@@ -159,10 +160,10 @@ def without_lag(matches: Correspondences, lag: Lag, rig: StereoRig) -> Correspon
 
 
 def without_leaps(matches: Correspondences, rig: StereoRig) -> Correspondences:
-    """The matches but for pairs that leap over most of the image, which are wrong.
+    """The matches without pairs whose displacement exceeds ``_LONGEST_LEAP`` of the image, which are wrong.
 
-    Ends of a pair that lie a share 1 / ratio of the image apart are read at one time: between them is no
-    motion, and no error, whatever was matched. One such pair kept the estimate of a ratio of 0.8 at 1.17.
+    Two points that lie 1 / ratio of the image apart in successive frames are read at the same time. No motion
+    lies between them, so a wrong match has no error there: one such pair kept a ratio of 0.8 at 1.17.
     """
     sizes = [np.array([rig.sensor(side).width, rig.sensor(side).height]) for side in SIDES]
     left, right = (
@@ -175,10 +176,10 @@ def without_leaps(matches: Correspondences, rig: StereoRig) -> Correspondences:
 def find_start(
     matches: Correspondences, rig: StereoRig, known: Known, options: RobustOptions, seed: int
 ) -> tuple[RobustEstimate | None, Lag]:
-    """The motion that explains most matches, of those under ``COARSE``; None when there is none.
+    """The motion that explains most matches under any shutter of ``COARSE`` (None if none does), and the lag.
 
-    Matches are undistorted beforehand: their times are then slightly wrong, as they are under any of these. Where
-    cameras that differ have a known shutter, it is that one's.
+    Matches are undistorted beforehand, which makes their times slightly wrong, as any of these shutters does. If
+    the shutter is known and differs between the cameras or the rig is not aligned, it alone is used.
     """
     lag, found, camera = find_lag(matches.tracks, rig), list[RobustEstimate](), rig.ideal.camera
     given = known.shutter(rig)
@@ -202,7 +203,7 @@ def find_start(
 
 
 def _coarse(known: Known) -> list[tuple[Scan, float]]:
-    """Possible ones of ``COARSE``; all of them where the cameras may read differently."""
+    """The shutters of ``COARSE`` that are possible; all of them if the cameras may read differently."""
     starts = {scans.left for scans in known.scans}
     possible = [(scan, ratio) for scan, ratio in COARSE if ("global" if ratio == 0.0 else scan) in starts]
     if not all(scans.together for scans in known.scans) or not possible:
@@ -211,8 +212,8 @@ def _coarse(known: Known) -> list[tuple[Scan, float]]:
 
 
 def first_shutter(scans: Scans, lag: Lag) -> FloatArray:
-    """Ratio and delay (2,) of scans that fit a lag best; a ratio of 0.5 where the cameras read alike."""
-    bend = _columns_of_lag(scans, lag)
+    """Readout ratio and delay (2,) with which the scans fit a lag best; a ratio of 0.5 if both read alike."""
+    bend = _lag_of_unit_ratio(scans, lag)
     if scans.together:
         ratio = 0.5 if scans.rolls else 0.0
         return np.array([ratio, ratio * bend[0] - lag.line[0]])
@@ -222,67 +223,68 @@ def first_shutter(scans: Scans, lag: Lag) -> FloatArray:
 
 
 def largest_ratio(scans: Scans, lag: Lag) -> float:
-    """The largest readout ratio at which scans agree with a lag; 0: none does; 1: the cameras read alike.
+    """The largest readout ratio at which the scans agree with a lag; 0: there is none; 1: both read alike.
 
-    A lag is of first order: flow that changes while it is read bends it by some hundredths.
+    The lag is a first-order model: optical flow that changes during the readout shifts it by some hundredths.
     """
     if scans.together:
         return 1.0
-    bend = _columns_of_lag(scans, lag)
+    bend = _lag_of_unit_ratio(scans, lag)
     H = np.linalg.inv(np.linalg.inv(lag.H) + _BEND**2 * np.eye(3))
     constant = np.array([1.0, 0.0, 0.0])
     for ratio in np.arange(1.1, 0.0, -0.05):
         off = lag.line - ratio * bend
-        off = off - constant * (constant @ H @ off) / H[0, 0]  # the delay that fits best
+        off = off - constant * (constant @ H @ off) / H[0, 0]  # with the best delay
         if float(off @ H @ off) <= _FAR:
             return float(min(ratio, 1.0))
     return 0.0
 
 
-def _columns_of_lag(scans: Scans, lag: Lag) -> FloatArray:
-    """(3,) lag per readout ratio."""
+def _lag_of_unit_ratio(scans: Scans, lag: Lag) -> FloatArray:
+    """(3,) ``Lag.line`` of the scans for a readout ratio of 1 and no delay."""
     return np.asarray(line_of(scans, "left") - line_of(scans, "right") @ lag.right)
 
 
 _SCREENED = 160
-"""Measurements by which most scans are excluded."""
+"""Number of measurements by which most scans are excluded."""
 _CLOSE = 30.0
-"""Differences of the log-likelihood beyond which a hypothesis is excluded after that."""
+"""A hypothesis is excluded if its log-likelihood is lower than the best one's by more than this."""
 _LIKELY = 12.0
-"""The same at the end, for matches with independent errors."""
-_MOST_SCALE, _FIRST_NU = 10.0, 4.0
-"""Largest scale of the errors, px, and their tails, before their distribution is estimated."""
-_FALLS, _STEADY = 10, 0.9
-_UNSETTLED = 5.0
-"""Factor on that difference before a hypothesis is fitted at the scale of the best one."""
+"""The same threshold after the last fits, for matches with independent errors."""
+_LARGEST_SCALE, _FIRST_NU = 10.0, 4.0
+"""Largest error scale, px, and degrees of freedom before the distribution of the errors is estimated."""
+_SCALE_ROUNDS, _STEADY = 10, 0.9
+"""Most rounds in which the error scale is estimated anew, and the factor on it above which the rounds stop."""
+_ROUGH_FACTOR = 5.0
+"""Factor on ``_CLOSE`` before a hypothesis is fitted at the error scale of the best one."""
 _ROUGHLY = 1e-2
-"""Decrease of the cost, over the squared scale, at which the screening stops."""
-_REACH = 10.0
-"""As in ``packed.HeavyTailed``."""
+"""Decrease of the cost, divided by the squared scale, at which fits for the screening stop."""
+_OUTLIER_SCALES = 10.0
+"""Errors above this many scales mark a wrong match, as in ``packed.HeavyTailed``."""
 _TILES = (6, 4)
-"""Columns and rows of tiles in which matches may have common errors."""
+"""Columns and rows of image tiles; the errors of matches in one tile may be correlated."""
 _FIRST_REACH, _MOST_REACH, _LEAST_REACH = 0.02, 0.05, 0.001
-"""Differences of the ratio by which the sharpness of a maximum is measured: about two standard deviations."""
+"""Step of the ratio for second differences of the cost: its start, maximum and minimum; about two deviations."""
 _SLOPE_ROUNDS = 5
 _SMALL_RATIO, _FAR_BETTER = 0.3, 0.5
-"""Readout ratio that is nearly none, and errors over those of another fit that are far smaller."""
+"""A readout ratio close to a global shutter's; quotient of error scales below which one fit is far better."""
 _WIDE = 1.0
 """Prior standard deviation of a ratio."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Peak:
-    """Log-likelihood of a ratio, all else fitted: value - information (ratio - at)^2 / 2."""
+    """Profile log-likelihood of the ratio near its maximum: value - information (ratio - at)^2 / 2."""
 
     value: float
     at: float
-    """Where the parabola has its top, which may be an impossible ratio."""
+    """The ratio at the maximum of the parabola; it may lie outside 0 to 1."""
     information: float
-    """0 for a known ratio, as of global shutters."""
+    """Inverse variance of the ratio; 0 if the ratio is known, as for global shutters."""
     fit: CaptureFit
-    """At the best ratio; its deviations are those at that ratio."""
+    """The fit at the best ratio; its standard deviations are conditional on that ratio."""
     trade: FloatArray
-    """(23,) derivative of motion and unknowns by the ratio, all else fitted; zeros where the ratio is known."""
+    """(23,) derivative of the fitted motion and unknowns by the ratio; zeros if the ratio is known."""
 
     @property
     def sigma(self) -> float:
@@ -295,7 +297,7 @@ class Peak:
         if self.information == 0.0:
             return self.value
         ends = (np.array([LEAST_RATIO, 1.0]) - self.at) / self.sigma
-        if ends[0] > 0.0:  # so that neither logarithm is that of nearly 1
+        if ends[0] > 0.0:  # use the lower tail, where the difference of the two loses no digits
             ends = -ends[::-1]
         low, high = scipy.special.log_ndtr(ends)
         mass = high + np.log1p(-np.exp(min(low - high, -1e-12)))
@@ -305,24 +307,24 @@ class Peak:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WindowEvidence:
-    """Evidence of the hypotheses in the matches of two times; excluded hypotheses are left out."""
+    """The likelihood of each hypothesis given the matches of two frame times, without excluded hypotheses."""
 
     peaks: Mapping[Hypothesis, Peak]
     lost: float
-    """Log-likelihood of the excluded ones below the best one's, at least."""
+    """The log-likelihood of excluded hypotheses is lower than the best one's by at least this."""
     used: int
-    """Measurements that count: not so far off that they must be wrong."""
-    of: int
+    """Number of measurements that are not outliers."""
+    total: int
+    """Number of measurements."""
     noise_px: float
     dispersion: float
-    """Factor on all variances, for matches of one part of the image that have common errors, and for rows that
-    disagree."""
+    """Factor on all variances for correlated errors of neighbouring matches, and for rows that disagree."""
     contradicted: bool
-    """Whether no motion model holds for all rows: then any ratio may fit best."""
+    """Whether no motion model fits all rows, so that any ratio may fit best."""
 
     @property
     def of_any_ratio(self) -> WindowEvidence:
-        """The evidence without what it says of the ratio."""
+        """The evidence without its information about the ratio."""
         peaks = {key: replace(p, information=min(p.information, _WIDE**-2.0)) for key, p in self.peaks.items()}
         return replace(self, peaks=peaks)
 
@@ -330,35 +332,35 @@ class WindowEvidence:
 def window_evidence(
     matches: Correspondences, rig: StereoRig, known: Known, motion: tuple[FloatArray, FloatArray], lag: Lag
 ) -> WindowEvidence | None:
-    """All hypotheses, on matches with outliers, from a motion near the right one.
+    """Fit all hypotheses to matches with outliers, starting at a motion near the true one.
 
-    Most scans are excluded by some of the matches, under the first motion model. None for too few matches.
+    A subset of the matches excludes most scans, under the first motion model. None if there are too few matches.
     """
     first = TimedMatches(matches, rig, known.models[0], known.right_share)
     comparison = _Comparison({model: first.under(model) for model in known.models}, known)
     fits = comparison.of_known_shutter(motion) if known.shutter_known else comparison.screened(motion, lag)
-    screened = comparison.of_each_model(fits)
-    sharpened = None if screened is None else comparison.sharpened(*screened)
+    screened = comparison.fits_of_each_model(fits)
+    sharpened = None if screened is None else comparison.refitted_to_all(*screened)
     if sharpened is None:
         return None
     full, near = sharpened
-    sharp = _Slope(comparison.cost(full, near[0].hypothesis), near[0])
-    tailed = comparison.tailed(full, sharp.best)
-    if sharp.varies:
-        rows = tailed.by_rows(sharp.best.theta)
-        dispersion = _dispersion(sharp, first.pixels[full.chosen])
+    top = _Profile(comparison.cost(full, near[0].hypothesis), near[0])
+    tailed = comparison.tailed(full, top.best)
+    if top.varies:
+        rows = tailed.by_rows(top.best.theta)
+        dispersion = _dispersion(top, first.pixels[full.chosen])
         dispersion *= 1.0 if rows is None else rows.dispersion(dispersion)
     else:
-        rows, stated = None, tailed.stated(sharp.best.theta)
+        rows, stated = None, tailed.stated(top.best.theta)
         dispersion = 1.0 if stated is None else stated.shared
-    near = _near(near, full.scale, _LIKELY * dispersion)
-    slopes = [sharp, *(_Slope(comparison.cost(full, fit.hypothesis), fit) for fit in near[1:])]
-    reference, unit = min(slope.best.cost for slope in slopes), full.scale**2 * dispersion
+    near = _close_to_best(near, full.scale, _LIKELY * dispersion)
+    profiles = [top, *(_Profile(comparison.cost(full, fit.hypothesis), fit) for fit in near[1:])]
+    reference, unit = min(profile.best.cost for profile in profiles), full.scale**2 * dispersion
     return WindowEvidence(
-        peaks={slope.best.hypothesis: slope.peak(reference, unit) for slope in slopes},
+        peaks={profile.best.hypothesis: profile.peak(reference, unit) for profile in profiles},
         lost=_LIKELY,
         used=int(np.count_nonzero(full.chosen)),
-        of=first.count,
+        total=first.count,
         noise_px=full.scale,
         dispersion=dispersion,
         contradicted=rows is not None and rows.contradict,
@@ -367,19 +369,19 @@ def window_evidence(
 
 @dataclass(frozen=True)
 class _Comparison:
-    """The matches of a window under each motion model, and what is known of their capture."""
+    """The matches of a window for each motion model, and what is known about the capture."""
 
     timed: Mapping[str, TimedMatches]
     known: Known
 
     @property
     def first(self) -> TimedMatches:
-        """Under the first motion model."""
+        """The matches for the first motion model."""
         return self.timed[self.known.models[0]]
 
     @property
-    def some(self) -> BoolArray:
-        """About ``_SCREENED`` of the measurements, evenly chosen."""
+    def subset(self) -> BoolArray:
+        """Mask (count,) of about ``_SCREENED`` evenly spaced measurements."""
         count = self.first.count
         return np.asarray(np.arange(count) % max(count // _SCREENED, 1) == 0)
 
@@ -389,11 +391,11 @@ class _Comparison:
         )
 
     def rough_cost(self, hypothesis: Hypothesis, scale: float) -> CaptureCost:
-        """Of some measurements, before the distribution of their errors is estimated."""
-        return self.cost(Likelihood(nu=_FIRST_NU, scale=scale, chosen=self.some), hypothesis)
+        """The cost over ``subset``, before the distribution of the errors is estimated."""
+        return self.cost(Likelihood(nu=_FIRST_NU, scale=scale, chosen=self.subset), hypothesis)
 
     def screened(self, motion: tuple[FloatArray, FloatArray], lag: Lag) -> list[CaptureFit]:
-        """Fits of the scans that some of the matches allow, under the first motion model."""
+        """Fits of the scans that the measurements in ``subset`` do not exclude, under the first motion model."""
         known, model = self.known, self.known.models[0]
         start = known.start(Hypothesis(scans=GLOBAL, motion_model=""), 0.0, 0.0)
         theta, found = self.first.packed(GLOBAL, start).theta(*motion), dict[Scans, tuple[CaptureFit, float]]()
@@ -402,47 +404,47 @@ class _Comparison:
                 continue
             hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=known.delays[-1])
             starts = [(theta, known.start(hypothesis, *first_shutter(scans, lag)))]
-            if GLOBAL in found:  # which any scans with a small ratio nearly are
+            if GLOBAL in found:  # any scans with a small ratio are nearly a global shutter
                 still = found[GLOBAL][0]
                 starts.append((still.theta, known.start(hypothesis, LEAST_RATIO, float(still.unknowns[DELAY]))))
-            fits = (self.settled(hypothesis, start) for start in starts)
+            fits = (self.fit_at_own_scale(hypothesis, start) for start in starts)
             found[scans] = min(fits, key=lambda each: each[1])
         return self.judged(list(found.values()))[0]
 
     def of_known_shutter(self, motion: tuple[FloatArray, FloatArray]) -> list[CaptureFit]:
-        """The one fit in place of ``screened`` where the shutter is known and motion models alone compete."""
+        """The single fit in place of ``screened`` when the shutter is known and only motion models compete."""
         scans = self.known.scans[0]
         hypothesis = Hypothesis(scans=scans, motion_model=self.known.models[0])
         start = self.known.start(hypothesis, 0.0, 0.0)
         theta = self.first.packed(scans, start).theta(*motion)
-        return [fit_capture(self.rough_cost(hypothesis, _MOST_SCALE), theta, start, iterations=1)]
+        return [fit_capture(self.rough_cost(hypothesis, _LARGEST_SCALE), theta, start, iterations=1)]
 
-    def of_each_model(self, fits: Sequence[CaptureFit]) -> tuple[list[CaptureFit], Likelihood] | None:
-        """Fits of every motion model, on the scans of fits of the first one; and the errors of the best.
+    def fits_of_each_model(self, fits: Sequence[CaptureFit]) -> tuple[list[CaptureFit], Likelihood] | None:
+        """Fits of every motion model with the scans of the given fits, and the best fit's error distribution.
 
-        Each is fitted at the scale of its own errors: at another model's far smaller scale it would not move.
+        Each is fitted at its own error scale: at the far smaller scale of another model it would not move.
         """
         found = list[tuple[CaptureFit, float]]()
         for fit, model in product(fits, self.known.models):
             hypothesis = replace(fit.hypothesis, motion_model=model)
             starts = (self.start_from(fit, hypothesis, k) for k in hypothesis.accelerations)
-            settled = (self.settled(hypothesis, start) for start in starts)
-            found.append(min(settled, key=lambda each: (each[1], each[0].cost)))
+            refitted = (self.fit_at_own_scale(hypothesis, start) for start in starts)
+            found.append(min(refitted, key=lambda each: (each[1], each[0].cost)))
         fits, likelihood = self.judged(found)
         return None if likelihood is None else (fits, likelihood)
 
     def judged(self, found: Sequence[tuple[CaptureFit, float]]) -> tuple[list[CaptureFit], Likelihood | None]:
-        """Fits with their scales, px: those near the best one under the distribution of its errors; and this."""
+        """The fits (with error scales, px) close to the best under its error distribution; that distribution."""
         best, scale = min(found, key=lambda each: (each[1], each[0].cost), default=(None, 0.0))
-        likelihood = None if best is None else self.distribution(self.some, best, scale)
+        likelihood = None if best is None else self.distribution(self.subset, best, scale)
         if likelihood is None:
             return [], None
         costs = [self.cost(likelihood, fit.hypothesis)(fit.theta, fit.unknowns) for fit, _ in found]
         fits = [replace(fit, cost=cost) for (fit, _), cost in zip(found, costs, strict=True)]
-        return _near(fits, likelihood.scale, _UNSETTLED * _CLOSE), likelihood
+        return _close_to_best(fits, likelihood.scale, _ROUGH_FACTOR * _CLOSE), likelihood
 
     def start_from(self, fit: CaptureFit, hypothesis: Hypothesis, k: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """Start of a hypothesis at the fit of another one of the same scans; ``k`` where models differ."""
+        """Start values of a hypothesis from a fit with the same scans; acceleration ``k`` if the models differ."""
         model, own = hypothesis.motion_model, fit.hypothesis.motion_model
         unknowns = self.known.start(hypothesis, *fit.unknowns[[RATIO, DELAY]])
         unknowns[CALIBRATION] = fit.unknowns[CALIBRATION]
@@ -450,13 +452,15 @@ class _Comparison:
         motion = self.timed[own].kernel(fit.unknowns).motion(fit.theta)
         return self.timed[model].kernel(unknowns).theta(*motion), unknowns
 
-    def settled(self, hypothesis: Hypothesis, start: tuple[FloatArray, FloatArray]) -> tuple[CaptureFit, float]:
-        """A hypothesis at the scale of its own errors, which falls as the fit improves; and that scale, px.
+    def fit_at_own_scale(
+        self, hypothesis: Hypothesis, start: tuple[FloatArray, FloatArray]
+    ) -> tuple[CaptureFit, float]:
+        """Fit a hypothesis at the scale of its own errors, which falls as the fit improves; and that scale, px.
 
-        At a scale far below the errors that a wrong ratio leaves, informative matches would count least.
+        A scale far below the errors of a wrong ratio would give the most informative matches the least weight.
         """
-        scale, fit = min(self.rough_cost(hypothesis, _MOST_SCALE).typical_error(*start), _MOST_SCALE), None
-        for _ in range(_FALLS):
+        scale, fit = min(self.rough_cost(hypothesis, _LARGEST_SCALE).typical_error(*start), _LARGEST_SCALE), None
+        for _ in range(_SCALE_ROUNDS):
             cost = self.rough_cost(hypothesis, scale)
             fit = fit_capture(cost, *start, iterations=6, still=_ROUGHLY)
             start = (fit.theta, fit.unknowns)
@@ -467,30 +471,30 @@ class _Comparison:
         return fit, scale
 
     def fitted(self, likelihood: Likelihood, fits: Sequence[CaptureFit]) -> list[CaptureFit]:
-        """The fits again, with and without a late right camera, from the nearest fit; the best of them first.
+        """Refit each hypothesis, with and without a delay of the right camera, from the best of the given fits.
 
-        The fit of a hypothesis that cannot come near the best one ends early.
+        A fit stops early if it cannot come near the best one.
         """
         out, fits = list[CaptureFit](), sorted(fits, key=lambda fit: fit.cost)
         pairs = dict.fromkeys((fit.hypothesis.scans, fit.hypothesis.motion_model) for fit in fits)
         for (scans, model), delayed in product(pairs, self.known.delays):
             hypothesis = Hypothesis(scans=scans, motion_model=model, delayed=delayed)
-            of_pair = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
-            start = self.start_from(of_pair[0], hypothesis)
+            candidates = [f for f in fits if (f.hypothesis.scans, f.hypothesis.motion_model) == (scans, model)]
+            start = self.start_from(candidates[0], hypothesis)
             far = min((fit.cost for fit in out), default=np.inf) + _CLOSE * likelihood.scale**2
             cost = self.cost(likelihood, hypothesis)
             out.append(fit_capture(cost, *start, iterations=8, still=_ROUGHLY, hopeless=far))
         return out
 
-    def sharpened(
+    def refitted_to_all(
         self, fits: list[CaptureFit], likelihood: Likelihood
     ) -> tuple[Likelihood, list[CaptureFit]] | None:
-        """The fits on all matches, the best first, under the distribution of the best one's errors.
+        """Refit to all matches under the error distribution of the best fit; that distribution, and sorted fits.
 
-        Its scale falls as the best one is fitted better, or another one becomes the best; none is excluded before.
+        The error scale falls while the best fit improves or is replaced; fits are excluded only after that.
         """
         scale, everything = likelihood.scale, np.ones(self.first.count, dtype=np.bool_)
-        for _ in range(_FALLS):
+        for _ in range(_SCALE_ROUNDS):
             full = self.distribution(everything, min(fits, key=lambda fit: fit.cost), scale)
             if full is None:
                 return None
@@ -498,17 +502,17 @@ class _Comparison:
             if full.scale > _STEADY * scale:
                 break
             scale = full.scale
-        return full, _near(fits, full.scale)
+        return full, _close_to_best(fits, full.scale)
 
     def tailed(self, likelihood: Likelihood, fit: CaptureFit) -> HeavyTailed:
-        """The measurements as a fit reads them, with the distribution of their errors."""
+        """The measurements as read for a fit, with the distribution of their errors."""
         read = self.timed[fit.hypothesis.motion_model].read(fit.hypothesis.scans, likelihood.chosen)
         trust = np.ones(read.count) if likelihood.trust is None else likelihood.trust
         packed = vars(read.packed(fit.unknowns))
         return HeavyTailed(**packed, nu=likelihood.nu, scale=likelihood.scale, trust=trust)
 
     def distribution(self, among: BoolArray, fit: CaptureFit, scale: float) -> Likelihood | None:
-        """Of the errors under one fit, of the chosen matches that are not wrong."""
+        """The error distribution of the matches in ``among`` under one fit, without outliers; None: too few."""
         read = self.timed[fit.hypothesis.motion_model].read(fit.hypothesis.scans, among)
         packed = read.packed(fit.unknowns)
         found = heavy_tailed(packed, fit.theta, scale)
@@ -516,14 +520,14 @@ class _Comparison:
             return None
         freedom = np.repeat([1.0, 5.0], [len(packed.pairs), len(packed.tracks)])
         chosen = among.copy()
-        chosen[among] = each_term(packed, fit.theta).squares / freedom <= (_REACH * found.scale) ** 2
+        chosen[among] = each_term(packed, fit.theta).squares / freedom <= (_OUTLIER_SCALES * found.scale) ** 2
         return Likelihood(nu=found.nu, scale=max(found.scale, LEAST_SCALE_PX), chosen=chosen, trust=found.trust)
 
 
 def _is_excluded(scans: Scans, lag: Lag, found: Mapping[Scans, tuple[CaptureFit, float]]) -> bool:
-    """Whether the rows of left-right matches exclude scans, at all or except for ratios that are nearly none.
+    """Whether the lag excludes the scans, at all ratios or at all but small ones.
 
-    The latter are excluded with the global shutter, where cameras that read alike fit far better.
+    In the second case they resemble the global shutter and are excluded if other scans fit far better than it.
     """
     most = largest_ratio(scans, lag)
     if most <= 0.0 or most > _SMALL_RATIO or GLOBAL not in found:
@@ -531,20 +535,20 @@ def _is_excluded(scans: Scans, lag: Lag, found: Mapping[Scans, tuple[CaptureFit,
     return min(each for _, each in found.values()) < _FAR_BETTER * found[GLOBAL][1]
 
 
-def _near(fits: Sequence[CaptureFit], scale: float, far: float = _CLOSE) -> list[CaptureFit]:
-    """Those whose log-likelihood is not far below the best one's, the best first."""
+def _close_to_best(fits: Sequence[CaptureFit], scale: float, far: float = _CLOSE) -> list[CaptureFit]:
+    """The fits whose log-likelihood is at most ``far`` below the best one's, sorted from the best."""
     fits = sorted(fits, key=lambda fit: fit.cost)
     return [fit for fit in fits if fit.cost - fits[0].cost <= far * scale**2]
 
 
-class _Slope:
-    """The cost of a hypothesis about its minimum, as a function of the ratio, all else fitted to each."""
+class _Profile:
+    """The cost of a hypothesis near its minimum as a function of the ratio, with all else fitted (its profile)."""
 
     def __init__(self, cost: CaptureCost, start: CaptureFit) -> None:
         self._cost, self.scale = cost, cost.likelihood.scale
         self.varies = RATIO in cost.free
         free = fit_capture(cost, start.theta, start.unknowns)
-        # Once more as those beside it are found, or a start that is less settled than they looks like a valley.
+        # Fit once more, as the neighbouring ratios are: a less converged centre would bias the curvature.
         self.best = fit_capture(cost, free.theta, free.unknowns, fix_ratio=True)
         self.least, self.at, self.curvature = self.best.cost, float(self.best.unknowns[RATIO]), 0.0
         self._beside: tuple[CaptureFit, CaptureFit] = (self.best, self.best)
@@ -561,7 +565,7 @@ class _Slope:
             reach = float(np.clip(2.0 * sigma, _LEAST_REACH, _MOST_REACH))
 
     def _measure(self, reach: float) -> None:
-        """Top and curvature of the parabola through three ratios, the best one and one on either side of it."""
+        """Fit a parabola to the costs at the best ratio and at one ratio on either side of it."""
         ratio = float(self.best.unknowns[RATIO])
         below, above = self._beside = (self._at_ratio(ratio - reach), self._at_ratio(ratio + reach))
         slope = (above.cost - below.cost) / (2.0 * reach)
@@ -577,7 +581,7 @@ class _Slope:
         return fit_capture(self._cost, self.best.theta, unknowns, fix_ratio=True)
 
     def peak(self, reference: float, unit: float) -> Peak:
-        """In units of the errors' variance, px^2."""
+        """The peak relative to a reference cost, with ``unit`` px^2 as the variance of the errors."""
         spread = float(np.sqrt(unit)) / self.scale
         others = sum(k != RATIO for k in self._cost.free)
         low, high = (np.concatenate([fit.theta, fit.unknowns]) for fit in self._beside)
@@ -597,10 +601,10 @@ class _Slope:
         return (costs[1] - costs[0]) / float(high.unknowns[RATIO] - low.unknowns[RATIO])
 
 
-def _dispersion(slope: _Slope, pixels: FloatArray) -> float:
-    """Variance of the ratio over the one that independent errors would give, at least 1.
+def _dispersion(slope: _Profile, pixels: FloatArray) -> float:
+    """Quotient of the ratio's variance and its variance under independent errors, at least 1.
 
-    By tiles of the image with about as many points (n, 2) in every column.
+    Errors are summed over image tiles whose columns and rows have about equally many of the points (n, 2).
     """
     tiles = np.zeros(len(pixels), dtype=np.int64)
     for axis, count in enumerate(_TILES):

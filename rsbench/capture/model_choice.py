@@ -18,9 +18,9 @@ from rsbench.core.uncertainty import spread_about
 
 AUTO = "auto"
 _EQUAL = 0.9
-"""Share of the largest probability from which on models are equal, and the first one is used, the paper's."""
+"""Models with at least this share of the largest probability count as equal; the first in ``MODELS`` is used."""
 _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
-"""Differences between motions that count as the same, as of all models under a global shutter."""
+"""Motions that differ by less are the same, as those of all models are under a global shutter."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,23 +29,23 @@ class ModelChoice:
 
     used: str
     parameters: Mapping[str, float]
-    """Of the model used, beside w and d."""
+    """Parameters of the used model besides w and d."""
     probability: Mapping[str, float]
-    """Of each model that was compared, the most probable first."""
+    """Probability of each model that was compared, in descending order."""
     decided: bool
-    """Whether the one that is used has a probability of 0.95 and more."""
+    """Whether the used model has a probability of 0.95 or more."""
     rival: str
-    """The most probable other one; empty where none was compared."""
+    """The most probable of the other models; empty if none was compared."""
     d_angle_deg: float
-    """Between the d of the model used and that of the rival."""
+    """Angle between the d of the used model and that of the rival."""
     d_length_percent: float
-    """By how much the rival's d is longer."""
+    """How much longer the rival's d is."""
     spread: FloatArray
-    """(6, 6) what the uncertain ratio, offset and parameters of the model add to the covariance, and what the
-    other models do by how far their motions are from this one's, where the matches chose it."""
+    """(6, 6) covariance of w and d due to the uncertain ratio, disparity offset and model parameters; if the
+    matches chose the model, plus that due to the distance of the other models' motions."""
 
     def record(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """The fields that are written to JSON."""
         return {
             "text": str(self),
             "used": self.used,
@@ -69,12 +69,12 @@ class ModelChoice:
 
 
 def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
-    """The most probable model; the distance of the others' motions is in ``spread``, by their probabilities.
+    """Choose the most probable model, or a requested one; None if no hypothesis was compared.
 
-    None where no hypothesis was compared.
+    ``spread`` of a chosen model includes the distances of the other models' motions, by their probabilities.
 
     Args:
-        requested: a model that is used whatever the matches prefer.
+        requested: ``AUTO``, or a model that is used whatever the matches prefer.
     """
     if requested not in (AUTO, *capture.peaks) or not capture.peaks:
         return None
@@ -84,7 +84,7 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
     used = best if requested == AUTO else requested
     rival = next((name for name in probability if name != used), "")
     motions = {name: motion_at(capture.peaks[name]) for name in probability}
-    angle, percent = _apart(motions[used].d, motions[rival or used].d)
+    angle, percent = _translation_difference(motions[used].d, motions[rival or used].d)
     spread = spread_by_unknowns(capture.peaks[used])
     if requested == AUTO:
         values = {name: np.concatenate([each.w, each.d]) for name, each in motions.items()}
@@ -104,13 +104,13 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
 def spline_choice(
     choice: ModelChoice | None, spline: Motion, law: Motion, probability: float, unique: bool
 ) -> ModelChoice:
-    """The choice of a spline with this probability in place of the motion model ``law``.
+    """The record of a spline with the given probability that is used instead of the motion model ``law``.
 
     Args:
         unique: whether no other spline explains the matches as well.
     """
     laws = {law.name: 1.0} if choice is None else choice.probability
-    angle, percent = _apart(spline.d, law.d)
+    angle, percent = _translation_difference(spline.d, law.d)
     return ModelChoice(
         used=spline.name,
         parameters={},
@@ -123,8 +123,8 @@ def spline_choice(
     )
 
 
-def _apart(d: FloatArray, other: FloatArray) -> tuple[float, float]:
-    """Angle between two translations, degrees, and by how many per cent the other one is longer."""
+def _translation_difference(d: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Angle between two translations, degrees, and the relative excess length of the second, per cent."""
     angle = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(d, other)), d @ other))
     length = max(float(np.linalg.norm(d)), 1e-12)
     return float(angle), 100.0 * (float(np.linalg.norm(other)) / length - 1.0)
@@ -136,14 +136,14 @@ def _parameters(peak: Peak) -> dict[str, float]:
 
 
 def motion_at(peak: Peak) -> Motion:
-    """The motion of the body, metres, under the best fit of a hypothesis."""
+    """The motion of the body, metres, at the best fit of a hypothesis."""
     model = peak.fit.hypothesis.motion_model
     w, d = load_kernel(model, _parameters(peak)).motion(peak.fit.theta)
     return make_motion(model, w, d, _parameters(peak))
 
 
 def spread_by_unknowns(peak: Peak) -> FloatArray:
-    """(6, 6) what the uncertain ratio and other unknowns add to the covariance of w and d."""
+    """(6, 6) covariance of w and d that is due to the uncertain ratio and other unknowns."""
     J = load_kernel(peak.fit.hypothesis.motion_model, _parameters(peak)).motion_jacobian(peak.fit.theta)
     slope = J @ peak.trade[:6]
     return np.asarray(J @ peak.fit.spread @ J.T + peak.sigma**2 * np.outer(slope, slope))

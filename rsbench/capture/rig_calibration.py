@@ -1,16 +1,15 @@
-"""What frames show of a rig's calibration: the right camera's rotation, the baseline's direction, focal lengths.
+"""Correct a rig's calibration by its frames: rotation of the right camera, baseline direction, focal lengths.
 
-A calibration that is a little wrong moves the left-right matches off the epipolar lines. In ideal pixels of the
-rig these lines are rows, and to first order a rotation (x, y, z) of the right camera and a ratio of focal lengths
-move the rows of its rays (u, v, 1) by
+A slightly wrong calibration moves left-right matches off the epipolar lines. In ideal pixels these lines are rows,
+and a small rotation (x, y, z) of the right camera and a ratio of focal lengths move rows of rays (u, v, 1) by
 
     -(1 + v^2) x + u v y + u z + v log(f_right / f_left).
 
-``rotation_of_rows`` fits that to matches with outliers, without a motion or a shutter: enough to look for matches
-along the lines. ``refine_rig`` then estimates all of it with the motion: tracks of four images also show, by the
-depth that the motion gives them, how far the cameras converge and how long their focal lengths are. Its errors
-are whitened reprojection errors with heavy tails, as everywhere (``residuals.add_tracks``); what the tracks do not
-show stays at the prior, and its deviation says so.
+``rotation_of_rows`` fits this to matches with outliers, without a motion or a shutter, which suffices to search
+for matches along the epipolar lines. ``refine_rig`` then estimates all ``ERRORS`` jointly with the motion: as the
+motion determines depth, tracks through four images also show the convergence of the cameras and their focal
+lengths. It minimises whitened reprojection errors with heavy tails (``residuals.add_tracks``). A parameter that
+the tracks do not determine stays at its prior mean, with the prior's standard deviation.
 """
 
 from __future__ import annotations
@@ -44,52 +43,52 @@ ERRORS = (
     "focal_right",
     "right_delay",
 )
-"""Rotation of the right camera about the body's axes, rad; of both cameras against the baseline, rad; logarithms
-of the focal lengths; frame periods by which the right camera is later: added to what the calibration says."""
+"""Errors that are added to the calibration: rotation of the right camera about the body's axes, rad; rotation of
+both cameras against the baseline, rad; logarithms of the focal lengths; the right camera's delay, periods."""
 _CONVERGENCE, _DELAY = 1, len(ERRORS) - 1
 _STEP = 1e-6
 _SAMPLES, _ROUNDS, _REFITS = 2000, 8, 3
 _ROW_PX = 1.0
-"""Row difference of a match that counts for a rotation in the search, px."""
+"""Largest row difference of an inlier in the search, px."""
 _FEWEST, _LEAST_SHARE = 30, 0.15
-"""Matches that must agree on a rotation, and their share: matches of other scenes agree by chance on less."""
+"""Fewest inliers of a rotation, and their least share: a random rotation has fewer."""
 _WIDE = np.array([np.deg2rad(6.0), np.deg2rad(1.0), np.deg2rad(6.0), 0.08])
-"""Prior standard deviations of x, y, z and log(f_right / f_left) in the search by rows, which hardly show y."""
+"""Prior standard deviations of x, y, z and log(f_right / f_left) in the search by rows (hardly depends on y)."""
 _LEAST = np.array([np.deg2rad(0.2)] * 5 + [0.005, 0.005])
-"""Prior standard deviations of ``ERRORS``, at least: what an ordinary calibration has wrong."""
-_TIMES_FOUND = 1.5
-"""Prior standard deviations of what rows do not show, over what they do: both come from one calibration."""
+"""Smallest prior standard deviations of ``ERRORS``: the errors of an ordinary calibration."""
+_PRIOR_FACTOR = 1.5
+"""Prior standard deviations of all errors, divided by those found from rows, as they have the same cause."""
 _ITERATIONS, _STILL = 15, 1e-4
 _DAMPING = Damping(least=1e-8, first=1e-7, largest=1e6)
-_MOST = 400
-"""Tracks of a window: more would not be what limits the estimate."""
+_MOST_TRACKS = 400
+"""Most tracks per window: further ones would not improve the estimate."""
 _LEAST_NOISE_PX = 0.3
 _SHARED_PX = 0.03
-"""Error, px, that matches of one pair of images have in common."""
+"""Error, px, that all matches of an image pair have in common."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundRig:
-    """A rig whose calibration was corrected by its own frames."""
+    """A rig whose calibration was corrected by its frames."""
 
     rig: StereoRig
     shutter: RollingShutter
     errors: FloatArray
-    """(8,) of ``ERRORS`` that were added to the calibration."""
+    """(8,) values of ``ERRORS`` that were added to the calibration."""
     sigma: FloatArray
     """(8,) their standard deviations; 0: not estimated."""
     tracks: int
-    """That they are estimated from."""
+    """Number of tracks that were used."""
 
     @property
     def record(self) -> dict[str, Any]:
-        """Values and deviations by name, ready for JSON; angles in rad."""
+        """Values and standard deviations by name, for JSON; angles in rad."""
         pairs = zip(ERRORS, self.errors.tolist(), self.sigma.tolist(), strict=True)
         return {name: {"value": value, "sigma": sigma} for name, value, sigma in pairs if sigma > 0.0}
 
     @property
     def words(self) -> str:
-        """Such as "right camera turned by 0.21, -0.10, 0.35 deg (+- 0.01, 0.05, 0.01); focal lengths ..."."""
+        """Such as "right camera turned by 0.21, -0.10, 0.35 +- 0.01, 0.05, 0.01 deg; focal lengths ..."."""
         turn, turn_sigma = np.rad2deg(self.errors[:3]), np.rad2deg(self.sigma[:3])
         text = "right camera turned by {:.3f}, {:.3f}, {:.3f}".format(*turn)
         text += " +- {:.3f}, {:.3f}, {:.3f} deg".format(*turn_sigma)
@@ -113,16 +112,16 @@ def with_errors(rig: StereoRig, errors: FloatArray) -> StereoRig:
 
 
 def _row_columns(rays: FloatArray) -> FloatArray:
-    """(n, 4) by which rows (v) of right rays (n, 2) move with x, y, z and log(f_right / f_left)."""
+    """(n, 4) derivatives of the rows v of right rays (n, 2) by x, y, z and log(f_right / f_left)."""
     u, v = rays[:, 0], rays[:, 1]
     return np.stack([-(1.0 + v * v), u * v, u, v], axis=-1)
 
 
 def rotation_of_rows(stereo: FloatArray, rig: StereoRig, seed: int = 0) -> tuple[FloatArray, BoolArray] | None:
-    """Errors (8,) of a calibration from left-right matches (n, 4), ideal px, of whole images, with many outliers.
+    """Estimate ``ERRORS`` from the rows of left-right matches (n, 4), ideal px, with many outliers.
 
     Returns:
-        The errors that put the matches on one row, and the mask (n,) of those; None where too few agree.
+        The errors (8,) that put the matches on the same rows, and the mask (n,) of inliers; None: too few inliers.
     """
     focal, camera = rig.camera.fx, rig.camera
     centre = np.array([camera.cx, camera.cy])
@@ -131,7 +130,7 @@ def rotation_of_rows(stereo: FloatArray, rig: StereoRig, seed: int = 0) -> tuple
         return None
     rng, found, inside = np.random.default_rng(seed), np.zeros(4), np.zeros(len(stereo), dtype=np.bool_)
     for refit in range(_REFITS):
-        turned = _turned(right, found)
+        turned = _rotated(right, found)
         A, off = _row_columns(turned), left[:, 1] - turned[:, 1]
         prior = np.diag((_ROW_PX / focal / _WIDE) ** 2)
         if refit == 0:
@@ -149,28 +148,28 @@ def rotation_of_rows(stereo: FloatArray, rig: StereoRig, seed: int = 0) -> tuple
     if np.count_nonzero(inside) < max(_FEWEST, _LEAST_SHARE * len(stereo)):
         return None
     errors = np.zeros(len(ERRORS))
-    # Rays that have to turn by +x are those of a camera that is turned by -x.
+    # If the rays must be rotated by +x, the camera is rotated by -x.
     errors[:3], errors[5:7] = -found[:3], [0.5 * found[3], -0.5 * found[3]]
     return errors, inside
 
 
-def _turned(rays: FloatArray, found: FloatArray) -> FloatArray:
-    """Rays (n, 2) of the right camera turned by x, y, z, and longer by the fourth's exponential."""
+def _rotated(rays: FloatArray, found: FloatArray) -> FloatArray:
+    """Rays (n, 2) of the right camera, scaled by exp of the fourth value and then rotated by x, y, z."""
     xyz = np.concatenate([rays * np.exp(found[3]), np.ones((len(rays), 1))], axis=1) @ so3.exp(found[:3]).T
     return xyz[:, :2] / xyz[:, 2:]
 
 
 def prior_of(errors: FloatArray, delay_sigma: float = 0.0) -> FloatArray:
-    """(8,) standard deviations of the errors of a calibration whose rows show ``errors`` (8,)."""
-    turn = _TIMES_FOUND * float(np.max(np.abs(errors[[0, 2]])))
-    focal = _TIMES_FOUND * float(np.max(np.abs(errors[5:7])))
+    """(8,) prior standard deviations of ``ERRORS`` if ``rotation_of_rows`` found ``errors`` (8,)."""
+    turn = _PRIOR_FACTOR * float(np.max(np.abs(errors[[0, 2]])))
+    focal = _PRIOR_FACTOR * float(np.max(np.abs(errors[5:7])))
     sizes = np.array([turn] * 3 + [0.5 * turn] * 2 + [focal] * 2)
     return np.append(np.maximum(_LEAST, sizes), delay_sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Tracks of one pair of times, and their motion."""
+    """Tracks of one pair of frame times, and the distribution of their errors."""
 
     tracks: FloatArray
     trust: FloatArray
@@ -188,39 +187,43 @@ def refine_rig(
     seed: int = 0,
     motion_model: str = "linear",
 ) -> FoundRig | None:
-    """The rig with the errors of its calibration that tracks show, jointly with a motion of each window.
+    """Estimate the calibration errors of a rig from tracks, jointly with a motion for each window.
+
+    With several windows, standard deviations include the scatter between windows: motion that no model describes,
+    and moving objects, change the convergence by several standard deviations of the noise.
 
     Args:
-        windows: matches of pairs of times, with tracks, in pixels of the images.
-        rig: as calibrated.
-        shutter: known.
-        start: (8,) errors near the right ones, such as ``rotation_of_rows`` gives.
-        prior: (8,) standard deviations of the errors about 0; 0 is exact.
-
-    Of several windows, errors count as they scatter from window to window: motion that no law describes, and
-    things that move by themselves, pull the convergence by several deviations of the noise.
+        windows: matches of pairs of frame times, with tracks, in pixels of the images.
+        rig: the rig as calibrated.
+        shutter: the known shutter.
+        start: (8,) errors near the true ones, such as those of ``rotation_of_rows``.
+        prior: (8,) standard deviations of the errors about 0; 0: exact.
 
     Returns:
-        None where no motion explains the tracks.
+        The corrected rig; None if no motion explains the tracks.
     """
     starts = [start]
     if start[_CONVERGENCE] != 0.0:
         starts.append(np.where(np.arange(len(ERRORS)) == _CONVERGENCE, 0.0, start))
     search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
-    tried = [search.moving(each) for each in starts]
-    # Rows hardly show the convergence: under a wrong one, what moves in the scene may agree on a motion.
+    tried = [search.find_motions(each) for each in starts]
+    # Rows hardly determine the convergence; if it is wrong, moving objects may give the motion of most inliers.
     best = int(np.argmax([agreeing for *_, agreeing in tried]))
     start, (found, thetas, _) = starts[best], tried[best]
     if not found:
         return None
     problem = _Problem(found, search, prior)
     end = descend(problem, problem.place(start, thetas), _ITERATIONS, _DAMPING)
-    errors, sigma = end.errors, problem.sigma(end.H, problem.pulls(end.errors, end.thetas))
+    errors, sigma = end.errors, problem.sigma(end.H, problem.window_gradients(end.errors, end.thetas))
     if sigma is None:
         return None
     count = sum(len(each.tracks) for each in found)
     return FoundRig(
-        rig=with_errors(rig, errors), shutter=_read(shutter, errors), errors=errors, sigma=sigma, tracks=count
+        rig=with_errors(rig, errors),
+        shutter=_delayed(shutter, errors),
+        errors=errors,
+        sigma=sigma,
+        tracks=count,
     )
 
 
@@ -234,13 +237,13 @@ def agrees(
     seed: int = 0,
     motion_model: str = "linear",
 ) -> bool:
-    """Whether the first step of ``refine_rig`` from a calibration without errors finds none beyond the deviations.
+    """Whether one step of ``refine_rig`` from errors of 0 stays within ``deviations`` standard deviations.
 
-    It is a fifth of the work. One step is enough of errors that move rows by a fraction of a pixel: what it leaves
-    out is their square.
+    This takes a fifth of the time. One step suffices for errors that move rows by a fraction of a pixel: the
+    neglected terms are quadratic in them.
     """
     search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
-    found, thetas, _ = search.moving(np.zeros(len(ERRORS)))
+    found, thetas, _ = search.find_motions(np.zeros(len(ERRORS)))
     if not found:
         return False
     problem = _Problem(found, search, prior)
@@ -252,7 +255,7 @@ def agrees(
 
 
 def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
-    """Root mean square, px, over the image by which ``ERRORS`` (8,) move the rows of the right camera's rays."""
+    """Root mean square over the image, px, of the row differences that ``ERRORS`` (8,) cause."""
     camera = rig.camera
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, 5), np.linspace(0, camera.height - 1, 5))
     rays = camera.ideal.unproject(np.stack([x, y], axis=-1).reshape(-1, 2))[:, :2]
@@ -261,7 +264,7 @@ def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
 
 
 class _Search(NamedTuple):
-    """Windows of cameras whose calibration is in question, and how their motions are searched for."""
+    """The windows of a rig whose calibration is estimated, and the settings of the search for their motions."""
 
     windows: Sequence[Correspondences]
     rig: StereoRig
@@ -270,11 +273,11 @@ class _Search(NamedTuple):
     seed: int
     motion_model: str
 
-    def moving(self, start: FloatArray) -> tuple[list[_Window], list[FloatArray], int]:
-        """Windows that have a motion under errors (8,), their motions, and how many tracks agree with them."""
+    def find_motions(self, start: FloatArray) -> tuple[list[_Window], list[FloatArray], int]:
+        """The windows for which a motion is found with given errors (8,), motions, and inlier count."""
         solver, agreeing = RefinedSolver(motion_model=self.motion_model, use_pairs=False), 0
         found, thetas = list[_Window](), list[FloatArray]()
-        first, read = with_errors(self.rig, start), _read(self.shutter, start)
+        first, read = with_errors(self.rig, start), _delayed(self.shutter, start)
         for matches in self.windows:
             tracks, rng = Correspondences(tracks=matches.tracks), np.random.default_rng(self.seed)
             result = estimate_motion(tracks, first, read, solver, self.robust, rng)
@@ -283,7 +286,7 @@ class _Search(NamedTuple):
             packed = pack(tracks, first, read, self.motion_model)
             theta = packed.theta(result.estimate.w, result.estimate.d)
             chosen = matches.tracks[result.inliers["tracks"]]
-            some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST, 1)])
+            some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST_TRACKS, 1)])
             noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
             tailed = heavy_tailed(pack(some, first, read, self.motion_model), theta, noise)
             if tailed is None:
@@ -294,33 +297,33 @@ class _Search(NamedTuple):
         return found, thetas, agreeing
 
 
-def _read(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
+def _delayed(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
     late = shutter.right_delay + float(errors[_DELAY])
     return shutter if errors[_DELAY] == 0.0 else replace(shutter, right_delay=float(np.clip(late, -1.0, 1.0)))
 
 
 class _Place(NamedTuple):
-    """Where the descent is: errors (8,), motions of the windows, and the cost with its derivatives."""
+    """A point of the descent: errors (8,), motions of the windows, and the cost with its derivatives."""
 
     errors: FloatArray
     thetas: list[FloatArray]
     cost: float
     g: FloatArray
-    """(k,) gradient by the free errors, the motions left out; H (k, k) likewise."""
+    """(k,) gradient by the free errors after elimination of the motions; H (k, k) likewise."""
     H: FloatArray
     backs: list[tuple[FloatArray, FloatArray]]
-    """What gives the motions' steps."""
+    """For each window a (6,) and B (6, k): the step of its motion is -a - B step of the errors."""
 
 
 class _Problem:
-    """Tracks of all windows as a function of the errors and of the windows' motions; the motions are left out."""
+    """The cost of all windows by errors and motions, for ``descend``; the motions are eliminated in each step."""
 
     def __init__(self, windows: Sequence[_Window], search: _Search, prior: FloatArray) -> None:
         self.windows, self.rig, self.shutter, self.model = windows, search.rig, search.shutter, search.motion_model
         self.prior, self.free = prior, np.flatnonzero(prior > 0.0)
 
-    def pulls(self, errors: FloatArray, thetas: Sequence[FloatArray]) -> FloatArray:
-        """(windows, k) gradient of each window's cost by the free errors, its motion fitted."""
+    def window_gradients(self, errors: FloatArray, thetas: Sequence[FloatArray]) -> FloatArray:
+        """(windows, k) gradient of each window's cost by the free errors, with its motion fitted."""
         out, weight = list[FloatArray](), self.prior[self.free] ** -2.0
         for window, theta in zip(self.windows, thetas, strict=True):
             alone = copy.copy(self)
@@ -328,15 +331,15 @@ class _Problem:
             out.append(alone.place(errors, [theta]).g - weight * errors[self.free])
         return np.array(out)
 
-    def sigma(self, H: FloatArray, pulls: FloatArray | None = None) -> FloatArray | None:
-        """(8,) standard deviations of the errors by the Hessian of the free ones; None where it is singular."""
+    def sigma(self, H: FloatArray, window_gradients: FloatArray | None = None) -> FloatArray | None:
+        """(8,) standard deviations of the errors from the Hessian of the free ones; None if it is singular."""
         inverse, sigma = inverse_definite(H), np.zeros(len(ERRORS))
         if inverse is None:
             return None
-        if pulls is not None and len(pulls) > 1:
-            scatter = clustered(pulls @ inverse, np.arange(len(pulls)))
-            inverse = larger(scatter * variance_factor(len(pulls) - 1.0, 1), inverse)
-        # Errors that matches share move all of them alike: no number of matches averages them away.
+        if window_gradients is not None and len(window_gradients) > 1:
+            scatter = clustered(window_gradients @ inverse, np.arange(len(window_gradients)))
+            inverse = larger(scatter * variance_factor(len(window_gradients) - 1.0, 1), inverse)
+        # Errors that all matches have in common do not average out, however many matches there are.
         shared = _SHARED_PX / self.rig.camera.fx
         each = np.hypot(np.sqrt(np.diagonal(inverse)), shared)
         sigma[self.free] = np.minimum(each, self.prior[self.free])
@@ -344,13 +347,13 @@ class _Problem:
 
     def _packed(self, window: _Window, errors: FloatArray) -> Packed:
         matches = Correspondences(tracks=window.tracks)
-        return pack(matches, with_errors(self.rig, errors), _read(self.shutter, errors), self.model)
+        return pack(matches, with_errors(self.rig, errors), _delayed(self.shutter, errors), self.model)
 
     def place(self, errors: FloatArray, thetas: list[FloatArray]) -> _Place:
         """Negative log-likelihood at errors (8,) and motions, its gradient and Hessian.
 
-        The Hessian has the derivatives of rays and times; the gradient is the cost's own central difference: noisy
-        rays in the derivatives would pull the focal lengths to smaller values, five deviations of 1200 tracks.
+        The Hessian uses derivatives of rays and times. The gradient is a central difference of the cost, because
+        noisy rays in those derivatives would bias the focal lengths, by five standard deviations for 1200 tracks.
         """
         k = len(self.free)
         cost, g, H, backs = 0.0, np.zeros(k), np.zeros((k, k)), list[tuple[FloatArray, FloatArray]]()

@@ -1,11 +1,11 @@
-"""The focal length of a rig or of one camera, and k1 of a rig, from matches while the camera turns.
+"""Self-calibration: the focal length of a rig or of one camera, and k1 of a rig, from matches during a rotation.
 
-Cards of real rigs are a little wrong. A wrong focal length or lens bends what a rotation does to the image, so
-matches of a rig that turns show it, beside motion and shutter; matches of a rig that moves straight on do not.
+Calibrations of real rigs are slightly wrong. A wrong focal length or lens distorts the image motion that a
+rotation causes, so it can be estimated with motion and shutter while the rig rotates, not while it translates.
 
-Pairs of frames of one camera are less certain than the noise of their matches says: a hand shakes between two
-frames, and motion that no model describes is taken for a focal length. Only the scatter from pair to pair shows by
-how much, so this scatter, with a prior on it, counts as an error of each pair.
+For one camera, the focal length of a pair of frames is less certain than the noise of its matches suggests: a
+hand-held camera shakes between two frames, and motion that no model describes changes the estimated focal length.
+The error of each pair therefore includes the scatter between pairs, which has a prior.
 """
 
 from __future__ import annotations
@@ -28,43 +28,41 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
-_TELLING = 0.5
-"""Largest standard deviation of a determined value over the prior's."""
+_DETERMINED_SHARE = 0.5
+"""A value is determined if its standard deviation is at most this share of the prior's."""
 _LEAST_TURN = np.deg2rad(0.25)
-"""Per frame period: where a rig turns less, the focal length follows errors of the calibration more than the
-motion, and is not estimated. A straight drive (KITTI) gave one 6 % too long, at a stated standard deviation of 2
-%."""
+"""Least rotation per frame period for an estimate: below it, calibration errors affect the focal length more than
+the motion does. A straight drive (KITTI) gave one 6 % too long, at a stated standard deviation of 2 %."""
 _FEWEST_TURNS = 3
-"""Windows of a rig whose rows show that its calibration errs: only their scatter shows how much of that error the
-focal length takes up (KITTI: single windows are off by up to eleven standard deviations)."""
-_LEFT_OVER = 0.03
-"""Relative error of a focal length where the calibration errs by more than its terms describe: a KITTI excerpt
-that turns gave 4 % too little, at a standard deviation of 1 % by the scatter of its windows."""
-_TOGETHER = np.array([2e-4, 2e-4])
-"""Relative error of a focal length, and error of k1, by errors that matches of pictures share: without it the
+"""Fewest rotating windows of a rig whose rows show calibration errors: only the scatter of the windows shows how
+these affect the focal length (KITTI: single windows are off by up to eleven standard deviations)."""
+_EXTRA_SIGMA = 0.03
+"""Relative error of a focal length due to calibration errors that ``TERMS`` do not describe: a rotating KITTI
+excerpt gave 4 % too little, at a standard deviation of 1 % by the scatter of its windows."""
+_COMMON_SIGMA = np.array([2e-4, 2e-4])
+"""Relative error of a focal length, and error of k1, due to correlated errors of image matches: without it the
 deviations of 21 pairs of traced frames were too small by a half (``benchmarks/wrong_cards.py``)."""
-_MOST_ROUNDS, _SETTLED = 4, 0.1
-"""Behind a lens the error is linear only nearby: estimated again until it moves by this share of its deviation."""
+_MOST_ROUNDS, _CONVERGED = 4, 0.1
+"""With a lens, errors are only locally linear; they are estimated again until below this share of sigma."""
 _TERMS = [FOCAL, RADIAL]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundCamera:
-    """A rig as its card has it, except for what was estimated of its cameras."""
+    """A rig with the values of its card, except for those that were estimated."""
 
     rig: StereoRig
     sigma: CardSigma
-    """Of estimated values; the card's for others."""
+    """Standard deviations of the estimated values; the card's for others."""
     determined: tuple[bool, bool]
-    """Whether the focal length and k1 were estimated; where not, the rig has the card's."""
+    """Whether the focal length and k1 were estimated; otherwise the rig has the card's."""
     k1_later: bool = False
-    """Whether rows show that the calibration errs: k1 is then estimated with its other errors, and is no lens
-    here."""
+    """Whether rows show calibration errors: k1 is then estimated with these, and the rig's lens stays as given."""
 
     def words(self, given: StereoRig, sigma: CardSigma) -> str:
-        """Such as "focal length 545.9 +- 0.4 px (card: 520.0 +- 20.0)"."""
-        parts, later = list[str](), "is found with the errors of the calibration that rows show"
-        undetermined = "as the card has it: the matches cannot tell; turn the rig, or give more frames"
+        """A report such as "focal length 545.9 +- 0.4 px (card: 520.0 +- 20.0)"."""
+        parts, later = list[str](), "is estimated with the calibration errors that the rows show"
+        undetermined = "as on the card: the matches do not determine it; rotate the rig, or give more frames"
         if sigma.focal:
             card = f"(card: {given.camera.fx:.1f} +- {sigma.focal:.1f})"
             found = f"{self.rig.camera.fx:.1f} +- {self.sigma.focal:.1f} px"
@@ -85,16 +83,17 @@ def find_camera(
     robust: RobustOptions | None = None,
     seed: int = 0,
 ) -> FoundCamera:
-    """Focal length and k1 of a rig from the matches of one or more pairs of times, with all else that is unknown.
+    """Estimate the focal length and k1 of a rig from one or more windows, together with all other unknowns.
 
-    Where rows show that the calibration errs, k1 is one of these errors and stays the card's here.
+    If rows show calibration errors, k1 is estimated with these later, and keeps the card's value here.
 
     Args:
-        sigma: of the card; values with 0 are not estimated.
-        given: as ``known_of`` takes it; with a readout ratio alone, rows are read from the top.
+        windows: matches of two frame times each.
+        sigma: standard deviations of the card's values; values with 0 are not estimated.
+        given: as for ``known_of``; with a readout ratio and no scanning, rows are read from the top.
 
     Raises:
-        RsbenchError: a deviation of k1 for a lens that has none.
+        RsbenchError: ``sigma.k1`` is given for a lens model without k1.
     """
     given, lens = given or KnownInputs(), rig.camera.lens
     if sigma.k1 and lens is not None and lens.model == "double-sphere":
@@ -109,13 +108,13 @@ def find_camera(
         sigmas[_TERMS] = np.where(prior > 0.0, prior, sigmas[_TERMS])
         expecting = replace(known, calibration_sigma=tuple(sigmas.tolist()))
         errors = _errors_of(windows, found, expecting, robust, seed)
-        mended = None if errors is None else _mended(found, np.where(errors.determined, errors.values, 0.0))
+        better = None if errors is None else _corrected(found, np.where(errors.determined, errors.values, 0.0))
         lost = errors is None or not np.any(errors.determined) or np.any(determined & ~errors.determined)
-        if errors is None or mended is None or lost:
+        if errors is None or better is None or lost:
             return FoundCamera(rig=rig, sigma=sigma, determined=(False, False), k1_later=later)
-        found, determined, last = mended, errors.determined, errors.sigma * (mended.camera.fx, 1.0)
+        found, determined, last = better, errors.determined, errors.sigma * (better.camera.fx, 1.0)
         known = replace(known, scans=errors.scans)
-        if found.camera.lens is None or np.all(np.abs(errors.values) < _SETTLED * errors.sigma):
+        if found.camera.lens is None or np.all(np.abs(errors.values) < _CONVERGED * errors.sigma):
             break
     focal, k1 = np.where(determined, last, (sigma.focal, sigma.k1)).tolist()
     both = (bool(determined[0]), bool(determined[1]))
@@ -124,19 +123,19 @@ def find_camera(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Errors:
-    """Relative error by which a focal length is too short, and error by which k1 is too small, (2,) each."""
+    """(2,) relative error by which the focal length is too short, and error by which k1 is too small."""
 
     values: FloatArray
     sigma: FloatArray
     determined: BoolArray
     scans: tuple[Scans, ...]
-    """Under which, beyond doubt."""
+    """The scans under which these errors were estimated, which are certain."""
 
 
 def _errors_of(
     windows: Sequence[Correspondences], rig: StereoRig, known: Known, robust: RobustOptions | None, seed: int
 ) -> _Errors | None:
-    """From the windows in which the rig turns; None where they show nothing."""
+    """Estimate the errors from the windows in which the rig rotates; None if these do not suffice."""
     examined = [(each, examine(each, rig, known, robust, seed)) for each in windows]
     turning = [(each, window) for each, window in examined if _turn(window) >= _LEAST_TURN]
     if not turning:
@@ -147,18 +146,18 @@ def _errors_of(
     best = capture.likeliest
     if best is None or best.probability < CERTAIN:
         return None
-    errs = known.calibration_sigma[OFFSET] > 0.0 and best.scans.together  # rows of other scans differ anyway
-    if errs and len(turning) < _FEWEST_TURNS:
+    wrong_rows = known.calibration_sigma[OFFSET] > 0.0 and best.scans.together  # else rows differ by the scans
+    if wrong_rows and len(turning) < _FEWEST_TURNS:
         return None
-    prior, left_over = np.array(known.calibration_sigma)[_TERMS], np.array([_LEFT_OVER if errs else 0.0, 0.0])
-    sigma = np.hypot(np.hypot(np.array(best.calibration_sigma)[_TERMS], _TOGETHER), left_over)
-    determined = (prior > 0.0) & (sigma <= _TELLING * prior) & [True, not errs]
+    prior, extra = np.array(known.calibration_sigma)[_TERMS], np.array([_EXTRA_SIGMA if wrong_rows else 0.0, 0.0])
+    sigma = np.hypot(np.hypot(np.array(best.calibration_sigma)[_TERMS], _COMMON_SIGMA), extra)
+    determined = (prior > 0.0) & (sigma <= _DETERMINED_SHARE * prior) & [True, not wrong_rows]
     values = np.array(best.calibration)[_TERMS]
     return _Errors(values=values, sigma=sigma, determined=determined, scans=(best.scans,))
 
 
-def _mended(rig: StereoRig, errors: FloatArray) -> StereoRig | None:
-    """A rig without errors (2,) of its focal length and k1; None where its lens would fold within the image."""
+def _corrected(rig: StereoRig, errors: FloatArray) -> StereoRig | None:
+    """The rig corrected for errors (2,) of focal length and k1; None if its lens would fold within the image."""
     focal, k1 = map(float, errors)
     camera, lens = rig.camera, rig.camera.lens or Lens(model="brown-conrady")
     lens = replace(lens, k1=lens.k1 + k1) if k1 else camera.lens
@@ -174,7 +173,7 @@ def _k1(rig: StereoRig) -> float:
 
 
 def _turn(window: Window) -> float:
-    """Angle, rad, per frame period, under the best fit; 0 where there is none."""
+    """Rotation of the best fit, rad per frame period; 0 if there is no fit."""
     if window.evidence is None:
         return 0.0
     best = max(window.evidence.peaks.values(), key=lambda peak: peak.value)
@@ -184,43 +183,43 @@ def _turn(window: Window) -> float:
 # One camera
 
 PRIOR = 0.35
-"""Standard deviation of the logarithm of a focal length over the width of the image, about 0: lenses from a half
-to two widths, of 90 to 28 degrees, are within two of them."""
+"""Prior standard deviation of log(focal length / image width) about 0: two of them cover lenses from half a width
+to two widths, 90 to 28 degrees."""
 _MATCHES, _SAMPLES = 400, 100
-"""Of a pair, and of samples of them: neighbours in dense flow have common errors."""
+"""Number of matches of a pair that are used, as neighbours in dense flow are correlated; RANSAC iterations."""
 _MODELS = ("inertial", "accelerated")
 _NEARBY, _PAIR_ROUNDS = 0.3, 4
-"""Relative error of a focal length that is found at once; beyond it, the search starts again from there."""
+"""Relative error of a focal length up to which one fit suffices; otherwise the search restarts from its result."""
 _LEAST_PAIR_TURN, _LEAST_PAIR_MOVED = np.deg2rad(1.0), 0.01
-"""Per frame period, and the widths by which that moves the image: a smaller turn shows the errors of the flow more
-than the focal length, and a focal length that is far too short makes turns look large."""
+"""Least rotation of a pair, rad per frame period, and least image shift by it, in widths: errors of the flow
+affect smaller rotations more, and a focal length that is far too short makes the rotation look large."""
 _EXPECTED, _EXPECTED_WEIGHT = 0.25, 4.0
-"""Scatter of the logarithm from pair to pair, before any is seen, and the number of pairs that this counts for."""
+"""Prior of the scatter of the logarithm between pairs, and the number of pairs that this prior is worth."""
 _SHARED = 0.05
-"""Error that the pairs of a video have in common."""
+"""Relative error that all pairs of a video have in common."""
 _SHARED_BY_TRACKS = 0.02
-"""Error that the frames of a video have in common where one trajectory explains them."""
+"""The same if one trajectory explains all frames of the video."""
 _LEAST_TURNING = 0.5
-"""Share of the pairs: where few seem to turn, they do so by their errors."""
+"""Least share of rotating pairs: if only a few appear to rotate, this is due to their errors."""
 _BROKEN, _LEAST_GOOD = 3.0, 0.75
-"""Prior deviations beyond which a pair shows only its shake, and the share of pairs that must be within."""
-_TELLING_PAIRS = 0.65
-"""Largest standard deviation of a determined value over the prior's."""
+"""Prior deviations beyond which a pair is an outlier because of shake, and the least share of inliers."""
+_DETERMINED_SHARE_PAIRS = 0.65
+"""A focal length is determined if the standard deviation of its logarithm is at most this share of the prior's."""
 
 
 class PairFocal(NamedTuple):
     """The focal length from one pair of frames."""
 
     log: float
-    """Logarithm of the focal length over the width of the image."""
+    """Logarithm of focal length divided by image width."""
     sigma: float
-    """From the noise of the matches alone."""
+    """Standard deviation of ``log`` due to the noise of the matches alone."""
     turn: float
-    """Radians per frame period."""
+    """Rotation, radians per frame period."""
 
     @property
     def turns(self) -> bool:
-        """Whether the camera turned enough to show it."""
+        """Whether the camera rotated enough to determine the focal length."""
         return self.turn >= _LEAST_PAIR_TURN and self.turn * np.exp(self.log) >= _LEAST_PAIR_MOVED
 
 
@@ -229,21 +228,21 @@ class FoundFocal:
     """Focal length of a camera, px."""
 
     focal: float
-    """The most probable one; where the pairs do not determine it, the width of the image."""
+    """The most probable focal length; the image width if the pairs do not determine it."""
     sigma: float
     determined: bool
     pairs: int
-    """That it is estimated from."""
+    """Number of pairs that were used."""
 
 
 def focal_of_pair(
     matches: FloatArray, size: tuple[int, int], shutter: RollingShutter, options: RobustOptions, seed: int = 0
 ) -> PairFocal | None:
-    """From matches (n, 4) x0, y0, x1, y1, px, in random order; None where no motion explains them.
+    """The focal length from matches (n, 4) x0, y0, x1, y1, px, in random order; None if no motion explains them.
 
     Args:
-        size: width and height, px.
-        shutter: of the camera.
+        size: width and height of the image, px.
+        shutter: shutter of the camera.
     """
     width, height = size
     quick = replace(options, max_iterations=min(options.max_iterations, _SAMPLES))
@@ -272,18 +271,18 @@ def focal_of_pair(
 
 
 def focal_of_capture(capture: Capture, width: int) -> FoundFocal | None:
-    """The focal length found with the ratio, of images of this width; None: it is not determined."""
+    """The focal length, px, estimated with the readout ratio, for an image width; None: undetermined."""
     best = capture.likeliest
     error, sigma = (0.0, 0.0) if best is None else (best.calibration[FOCAL], best.calibration_sigma[FOCAL])
     log_sigma = float(np.hypot(sigma / (1.0 - error), _SHARED_BY_TRACKS))
-    if not sigma or log_sigma > _TELLING_PAIRS * PRIOR:
+    if not sigma or log_sigma > _DETERMINED_SHARE_PAIRS * PRIOR:
         return None
     focal = width / (1.0 - error)
     return FoundFocal(focal=focal, sigma=focal * log_sigma, determined=True, pairs=capture.windows)
 
 
 def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
-    """From all pairs of a video of this width together."""
+    """Combine the pairs of a video of this image width to one focal length."""
     solved = [each for each in pairs if each is not None]
     turning = [each for each in solved if each.turns]
     good = [each for each in turning if abs(each.log) <= _BROKEN * PRIOR]
@@ -299,7 +298,7 @@ def conclude_focal(pairs: Sequence[PairFocal | None], width: int) -> FoundFocal:
         scatter = float(np.sqrt(squares / (_EXPECTED_WEIGHT + len(good) - 1)))
     variance = 1.0 / float(np.sum(weights)) + _SHARED**2
     sigma = (1.0 / variance + 1.0 / PRIOR**2) ** -0.5
-    if sigma > _TELLING_PAIRS * PRIOR:
+    if sigma > _DETERMINED_SHARE_PAIRS * PRIOR:
         return undetermined
     focal = width * float(np.exp(mean * sigma**2 / variance))
     return FoundFocal(focal=focal, sigma=sigma * focal, determined=True, pairs=len(good))

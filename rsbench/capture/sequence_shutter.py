@@ -1,11 +1,10 @@
-"""The readout ratio and scan of a rig or camera that shakes, from successive frames.
+"""Estimate the readout ratio and scan of a shaking rig or camera from successive frames.
 
 Such frames follow none of the motion models, and a ratio estimated under these is wrong (``shakes``). Two frames
-do not show the ratio either: an arbitrary motion within the readout looks the same at any ratio. A sequence does:
-the rig moves between readouts as it does within them, and at a wrong ratio it would have to change its speed with
-every frame, at the frame rate. The ratio has a uniform prior, and its posterior is the evidence of the tracks:
-their probability under a trajectory whose accelerations are as strong as the tracks show
-(``trajectory_fit.log_evidence``).
+do not determine the ratio, since an arbitrary motion within the readout fits equally well at any ratio. A sequence
+does: the rig moves alike between and during readouts, and at a wrong ratio it would have to change its speed with
+every frame. The ratio has a uniform prior, so its posterior is proportional to the evidence of the tracks
+(``trajectory_fit.log_evidence``): their probability under a trajectory whose acceleration variance is estimated.
 """
 
 from __future__ import annotations
@@ -41,44 +40,43 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import shared_error_factor, tiles, variance_factor
 
 LONGEST = 12
-"""Successive windows that are used, at most: more would reduce the error by less than noise leaves."""
+"""Most successive windows that are used; further ones would hardly reduce the error."""
 SUCCESSIVE = 6
-"""Windows by which ``shakes`` decides."""
+"""Number of windows that ``shakes`` needs."""
 _CHECKED_TRACKS = 200
-"""Of each of them, at most."""
+"""Number of tracks per window that ``shakes`` uses, at most."""
 _FAR_BETTER = 0.8
-"""Scale of the errors about a trajectory over that about motion models, below which these are wrong."""
+"""If a trajectory's error scale divided by the motion models' is below this, the motion models are wrong."""
 _TOGETHER = tuple(Scanning(scan=scan) for scan in ("top", "bottom", "left", "right"))
 _FIRST, _OTHERS, _COARSE, _LEAST = 0.6, (0.3, 0.85), 0.15, 0.02
-"""Where the search starts, of one camera also there, its stride, and the least ratio of a rolling shutter."""
+"""Start ratio of the search, more start ratios for one camera, step, and least ratio of a rolling shutter."""
 _KNOTS = 0.25
-"""Frame periods between control poses to begin with: fine ones, because at a wrong ratio the trajectory is
-rough."""
+"""Frame periods between control poses at the start; small, as the trajectory is rough at a wrong ratio."""
 _WIDE = Tails(3.0, 0.3)
-"""Errors, px, of the search for the right stride: with the errors of refined matches, a ratio that is far off fits
-something else."""
+"""Error distribution, px, of the first fits: with the small errors of refined matches, a fit at a ratio that is
+far off would treat correct tracks as outliers."""
 _FEWEST, _SOME, _TRACKS = 15, 60, 150
-"""Tracks of a window, about: fewest for an estimate, to estimate the scanning, and the ratio."""
+"""Approximate tracks per window: fewest for an estimate, number for the scanning, and number for the ratio."""
 _SHARE = 0.5
-"""Weight of one camera's track beside the prior; common errors count in ``dispersion``."""
+"""Weight of one camera's track relative to the prior; ``dispersion`` accounts for correlated errors."""
 _COARSE_FOCAL, _FARTHEST = 0.3, 0.9
-"""Stride of the search in the logarithm of the focal length, and how far it goes."""
+"""Step of the search in the logarithm of the focal length, and its largest absolute value."""
 _LEAST_SHARE = 0.2
-"""Of the tracks must be right."""
+"""Least share of inliers among the tracks."""
 _PRECISION = 1e12
-_BEYOND, _SHARED = 2.5, 0.02
-"""Variance over what common errors within tiles of the image explain, and error of a ratio that all flow of a
-video has in common. Chosen on twelve warped hand-held videos of 320 x 240 px (seed 7)."""
+_EXTRA_VARIANCE, _SHARED = 2.5, 0.02
+"""Factor on the variance for errors beyond those correlated within image tiles, and error of the ratio common to
+all flow of a video. Chosen on twelve warped hand-held videos of 320 x 240 px (seed 7)."""
 _STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS, _ROUNDS = 0.05, 0.1, 5, 2, 4
-"""First differences of ratio and focal length, steps of Newton's method, and how often tails are learned."""
-_NOTHING = -1e12
-"""Logarithm of evidence where there is no fit."""
+"""First difference steps of ratio and log focal length; Newton steps, fine and rough; rounds of the tails."""
+_NO_FIT = -1e12
+"""Logarithm of the evidence if there is no fit."""
 
 
 def shakes(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> bool:
-    """Whether a trajectory through successive windows leaves far smaller errors than the motion models did.
+    """Whether a trajectory through successive windows fits them with far smaller errors than the motion models.
 
-    A spline follows any motion that is slow against its knots, whatever the ratio.
+    At any ratio, a spline follows all motion that is slow compared with its knots.
     """
     best = capture.likeliest
     if best is None or not best.scans.rolls or "global" in (best.scans.left, best.scans.right):
@@ -103,11 +101,13 @@ def capture_of_sequence(
     seed: int = 0,
     focal_sigma: float = 0.0,
 ) -> Capture:
-    """The shutter from one trajectory through successive windows, without motion models.
+    """Estimate the shutter from one trajectory through successive windows, without motion models.
 
-    Args: capture: the one under motion models, which is returned where no trajectory explains the tracks. windows:
-    of the frames 0 and 1, 1 and 2, ... scannings: how the cameras may read; None: both alike, at once, from one of
-    four sides, or as in ``capture``. focal_sigma: as of ``ratio_of_sequence``.
+    Args:
+        capture: the estimate by motion models, which is returned if no trajectory explains the tracks.
+        windows: matches of the frames 0 and 1, 1 and 2, ...
+        scannings: candidates; None: both cameras synchronous and from one of four sides, or as in ``capture``.
+        focal_sigma: see ``ratio_of_sequence``.
     """
     if scannings is None:
         best, scannings = capture.likeliest, _TOGETHER
@@ -124,15 +124,15 @@ def capture_of_sequence(
         sigma=found.sigma,
         delay=found.scanning.right_delay,
         delay_sigma=0.0,
-        calibration=_shorter(1.0 - float(np.exp(-found.log_focal))),
-        calibration_sigma=_shorter(found.log_focal_sigma * float(np.exp(-found.log_focal))),
+        calibration=_focal_errors(1.0 - float(np.exp(-found.log_focal))),
+        calibration_sigma=_focal_errors(found.log_focal_sigma * float(np.exp(-found.log_focal))),
     )
-    # Nearly without a readout it is all the same where it begins.
+    # With nearly no readout, the scan does not matter.
     near = nearly_global(replace(capture, candidates=(replace(candidate, probability=1.0),)))
     candidate, doubt = candidate if near is None else near[0], ""
     if candidate.probability < CERTAIN or candidate.sigma > MAX_SIGMA:
         text = f"{candidate.ratio:.2f} +- {candidate.sigma:.2f}"
-        doubt = f"{len(windows) + 1} frames in a row do not determine how fast: {text}"
+        doubt = f"{len(windows) + 1} successive frames do not determine the readout ratio: {text}"
     alone = is_of_one_camera(windows)
     return Capture(
         candidates=(candidate,),
@@ -146,18 +146,18 @@ def capture_of_sequence(
     )
 
 
-def _shorter(share: float) -> tuple[float, ...]:
-    """Errors of a calibration with focal lengths that are too short by this share."""
+def _focal_errors(share: float) -> tuple[float, ...]:
+    """The calibration errors of focal lengths that are too short by this share."""
     return (*NO_ERRORS[:FOCAL], share, *NO_ERRORS[FOCAL + 1 :])
 
 
 def shutter_of_sequence(windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> RollingShutter:
-    """The shutter of cameras that read alike, from the first successive windows of any motion.
+    """Estimate the shutter of cameras that read alike from the first ``LONGEST`` windows, under any motion.
 
     Raises:
         NoMotionError: the matches do not determine it.
     """
-    return shutter_found(capture_of_sequence(_nothing_of(windows), windows[:LONGEST], rig, None, seed), rig)
+    return shutter_found(capture_of_sequence(_without_estimate(windows), windows[:LONGEST], rig, None, seed), rig)
 
 
 def capture_of_video(
@@ -167,22 +167,22 @@ def capture_of_video(
     seed: int = 0,
     focal_sigma: float = 0.0,
 ) -> Capture | None:
-    """The shutter of one camera from a trajectory through successive frames; None where none explains the matches.
+    """The shutter of one camera from a trajectory through successive frames; None if none explains the matches.
 
     Args:
         windows: matches (n, 4) x0, y0, x1, y1, px, of the frames 0 and 1, 1 and 2, ...; with outliers.
-        scan: as in ``known_alone``.
-        focal_sigma: as of ``ratio_of_sequence``; the focal length is then among the errors of the calibration.
+        scan: see ``known_alone``.
+        focal_sigma: see ``ratio_of_sequence``; the focal length is returned as one of the calibration errors.
     """
     matches, scan = [Correspondences(left=each) for each in windows], scan or "top"
     scannings = Scanning(scan=scan), Scanning(scan=OPPOSITE[scan])
     rig = StereoRig.of_one(camera)
-    found = capture_of_sequence(_nothing_of(matches), matches, rig, scannings, seed, focal_sigma)
+    found = capture_of_sequence(_without_estimate(matches), matches, rig, scannings, seed, focal_sigma)
     return found if found.candidates else None
 
 
-def _nothing_of(windows: Sequence[Correspondences]) -> Capture:
-    """A capture before anything is estimated."""
+def _without_estimate(windows: Sequence[Correspondences]) -> Capture:
+    """The capture before anything is estimated."""
     pairs = [each.left if len(each.left) else each.tracks[:, [0, 1, 4, 5]] for each in windows]
     every = np.concatenate([*pairs, np.zeros((0, 4))])
     moved = float(np.median(np.linalg.norm(every[:, 2:] - every[:, :2], axis=1))) if len(every) else 0.0
@@ -191,22 +191,23 @@ def _nothing_of(windows: Sequence[Correspondences]) -> Capture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SequenceRatio:
-    """A readout ratio from successive frames."""
+    """A readout ratio estimated from successive frames."""
 
     scanning: Scanning
-    """The one of most evidence."""
+    """The scanning with the largest evidence."""
     probability: float
-    """Of the scanning, with equal prior probabilities."""
+    """Posterior probability of the scanning, with equal prior probabilities."""
     ratio: float
     sigma: float
     noise_px: float
     used: int
-    """Matches of tracks that are right."""
-    of: int
+    """Number of matches in inlier tracks."""
+    total: int
+    """Number of matches."""
     log_focal: float = 0.0
-    """Logarithm of the focal length over the rig's."""
+    """Logarithm of the focal length divided by the rig's."""
     log_focal_sigma: float = 0.0
-    """0: it is known."""
+    """Standard deviation of ``log_focal``; 0: the focal length is given."""
 
 
 def ratio_of_sequence(
@@ -216,11 +217,11 @@ def ratio_of_sequence(
     seed: int = 0,
     focal_sigma: float = 0.0,
 ) -> SequenceRatio | None:
-    """How cameras read, by one of several scannings; None where no trajectory explains the tracks.
+    """Estimate the ratio and choose among the scannings; None if no trajectory explains the tracks.
 
     Args:
-        windows: of the frames 0 and 1, 1 and 2, ...; with outliers.
-        seed: of the search for motions of single windows.
+        windows: matches, with outliers, of the frames 0 and 1, 1 and 2, ...
+        seed: seed of the search for motions of single windows.
         focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given.
     """
     alone = is_of_one_camera(windows)
@@ -228,14 +229,14 @@ def ratio_of_sequence(
         return None
     fewer = thinned_chains if alone else thinned
     few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place]]()
-    # A spline that begins with motions under a wrong camera may stay where these lead it under any other.
+    # Start at several places: a spline may not leave the motions that were found with a wrong camera.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
     first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
         try:
             starts = [_Profile(few, rig, scanning, (each, seed), focal_sigma) for each in first]
             profile = max(starts, key=lambda each: each.at(each.start))
-            place = profile.ascended(profile.climb(profile.start))
+            place = profile.maximum(profile.climb(profile.start))
         except NotDefiniteError:
             continue
         found[number] = profile.comparable(place), place
@@ -244,27 +245,27 @@ def ratio_of_sequence(
     best = max(found, key=lambda each: found[each][0])
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], (found[best][1], seed), focal_sigma)
-        top, covariance = profile.summit(profile.ascended(found[best][1]))
+        top, covariance = profile.newton(profile.maximum(found[best][1]))
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
     odds = sum(np.exp((each - found[best][0]) / dispersion) for each, _ in found.values())
-    estimate = profile.stated(top, covariance * dispersion, 1.0 / float(odds))
-    # A trajectory explains two or three wrong matches exactly, or all of them by a scale that is no noise.
-    right = estimate.used >= _LEAST_SHARE * estimate.of and estimate.noise_px <= MOST_NOISE_PX
+    estimate = profile.result(top, covariance * dispersion, 1.0 / float(odds))
+    # Refuse fits to two or three wrong matches, and fits to all of them with an error scale too large for noise.
+    right = estimate.used >= _LEAST_SHARE * estimate.total and estimate.noise_px <= MOST_NOISE_PX
     return estimate if right else None
 
 
 class _Place(NamedTuple):
-    """Where evidence is evaluated."""
+    """A readout ratio and a focal length at which the evidence is evaluated."""
 
     ratio: float
     log_focal: float
-    """As in ``SequenceRatio``."""
+    """See ``SequenceRatio``."""
 
 
 class _Profile:
-    """Evidence of ratios and focal lengths, for the same tracks under the same tails."""
+    """The evidence as a function of ratio and focal length, for fixed tracks and a fixed error distribution."""
 
     def __init__(
         self,
@@ -274,18 +275,18 @@ class _Profile:
         start: tuple[_Place, int],
         focal_sigma: float,
     ) -> None:
-        """With a first fit at a place, from motions of the windows; ``start`` is this place and a seed."""
+        """Fit a first trajectory at the place in ``start`` (place, seed), from the motions of single windows."""
         self._windows, self._rig, self._scanning, self._focal_sigma = windows, rig, scanning, focal_sigma
         self._linked = [np.ones(len(each.left)) for each in windows] if is_of_one_camera(windows) else None
-        # Dense flow errs together; features do not.
+        # Errors of dense flow are correlated, those of features are not.
         flow = self._linked is not None
-        self._share, self._beyond, self._shared = (_SHARE, _BEYOND, _SHARED) if flow else (1.0, 1.0, 0.0)
+        self._share, self._extra, self._shared = (_SHARE, _EXTRA_VARIANCE, _SHARED) if flow else (1.0, 1.0, 0.0)
         self._fits = dict[_Place, Fit]()
         self._values = dict[_Place, float]()
         self.start = place = start[0]
         tracks, options = self._tracks(place), TrajectoryOptions()
         motions = window_motions(windows, self._rig_at(place), self._shutter(place.ratio), start[1])
-        # The same knots whatever the ratio: what no track depends on adds the same to all.
+        # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
         curve = first_curve(motions, tracks, span_of(len(windows), self._shutter(1.0)), _KNOTS)
         self._near = place, fit(curve, tracks, options.prior, True, _WIDE, np.ones(len(tracks)))
 
@@ -308,10 +309,10 @@ class _Profile:
         near = min(self._fits, key=lambda other: float(np.hypot(*np.subtract(other, place))))
         return near, self._fits[near]
 
-    def settle(self, place: _Place) -> None:
-        """Take tails, right tracks and kind of prior from the fit at a place.
+    def adopt_fit(self, place: _Place) -> None:
+        """Adopt error distribution, inliers and kind of prior from the fit at a place.
 
-        Knots stay fine: smoothness is for the prior to decide, and coarse knots would enforce it.
+        The knots stay fine, since coarse ones would enforce a smoothness that the prior must decide on.
         """
         self.at(place)
         tracks, (_, last) = self._tracks(place), self._fit_near(place)
@@ -320,26 +321,26 @@ class _Profile:
         self._values.clear()
 
     def at(self, place: _Place) -> float:
-        """Logarithm of evidence, and of the prior of the focal length."""
+        """Logarithm of evidence times the prior of the focal length."""
         if place not in self._values:
             near, start = self._fit_near(place)
-            curve = _turning_less(start.curve, float(np.exp(place.log_focal - near.log_focal)))
+            curve = _with_smaller_rotations(start.curve, float(np.exp(place.log_focal - near.log_focal)))
             try:
                 found = fit(curve, self._tracks(place), start.prior, True, start.tails, start.trust)
                 prior = -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
                 self._fits[place], self._values[place] = found, log_evidence(found, _PRECISION) + prior
             except NotDefiniteError:
-                self._values[place] = _NOTHING
+                self._values[place] = _NO_FIT
         return self._values[place]
 
     def climb(self, start: _Place) -> _Place:
-        """From a place, by strides, to one with less evidence on all sides.
+        """Move in steps of ``_COARSE`` to a place whose neighbours all have less evidence.
 
         Raises:
-            NotDefiniteError: there is no fit at the first.
+            NotDefiniteError: there is no fit at the start.
         """
         best = start
-        if self.at(best) == _NOTHING:
+        if self.at(best) == _NO_FIT:
             raise NotDefiniteError("no trajectory explains the tracks")
         strides = [(-_COARSE, 0.0), (_COARSE, 0.0)]
         strides += [(0.0, -_COARSE_FOCAL), (0.0, _COARSE_FOCAL)] if self._focal_sigma else []
@@ -354,10 +355,10 @@ class _Profile:
                     best, moved = other, bool(self._focal_sigma)
         return best
 
-    def summit(self, start: _Place, steps: int = _STEPS) -> tuple[_Place, FloatArray]:
-        """Where the evidence is largest, and its covariance (2, 2) there: Newton's method on differences.
+    def newton(self, start: _Place, steps: int = _STEPS) -> tuple[_Place, FloatArray]:
+        """The place of largest evidence and its covariance (2, 2), by Newton's method on finite differences.
 
-        The second row and column are 0 where the focal length is known.
+        The second row and column are 0 if the focal length is given.
         """
         best, axes = start, 2 if self._focal_sigma else 1
         reach, H = np.array([_STEP, _STEP_FOCAL]), np.eye(2)
@@ -390,29 +391,29 @@ class _Profile:
         out[:axes, :axes] = np.linalg.inv(H)
         return best, out
 
-    def ascended(self, place: _Place) -> _Place:
-        """From a place to a summit, near which tails and right tracks are taken from the fit at it.
+    def maximum(self, place: _Place) -> _Place:
+        """Maximise the evidence, adopting error distribution and inliers at each new maximum until it stays.
 
-        Those of a fit that is far off, whose errors are large, have a flat evidence with other summits.
+        Those of a fit that is far off have large errors, and the evidence under them is flat with other maxima.
         """
         for _ in range(_ROUNDS):
-            self.settle(place)
-            last, place = place, self.summit(self.climb(place), _ROUGH_STEPS)[0]
+            self.adopt_fit(place)
+            last, place = place, self.newton(self.climb(place), _ROUGH_STEPS)[0]
             if abs(place.ratio - last.ratio) < _STEP and abs(place.log_focal - last.log_focal) < _STEP_FOCAL:
                 break
         return place
 
     def comparable(self, place: _Place) -> float:
-        """Logarithm of evidence with the normalisation of the tails, for profiles of the same tracks."""
+        """Normalised logarithm of evidence, which can be compared with that of other profiles of these tracks."""
         value, (_, found) = self.at(place), self._fit_near(place)
         tails, freedom = found.tails, self._tracks(place).freedom
         each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
         each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
-        wrong = -freedom * np.log(MOST_NOISE_PX)  # evenly spread, whatever the tails of the right ones
+        wrong = -freedom * np.log(MOST_NOISE_PX)  # outliers have a uniform distribution in all profiles
         return value + self._share * float(np.sum(np.where(found.trust > 0.0, each, wrong)))
 
     def dispersion(self, top: _Place, covariance: FloatArray) -> float:
-        """Variance over that of the evidence: tracks of one part of the image have common errors."""
+        """Factor on the covariance that accounts for correlated errors of tracks in one part of the image."""
         axes, tracks = 2 if self._focal_sigma else 1, self._tracks(top)
         scores = np.zeros((len(tracks), axes))
         for axis in range(axes):
@@ -430,16 +431,16 @@ class _Profile:
             scores[:, axis] = (costs[1] - costs[0]) / (ends[1] - ends[0])
         inverse, groups = covariance[:axes, :axes], tiles(tracks.ends[tracks.starts[:-1], :2])
         shared = shared_error_factor(scores @ inverse, groups, inverse, axes)
-        return self._beyond * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
+        return self._extra * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
 
     def _spans(self, place: _Place) -> FloatArray:
-        """Windows that each track is seen through."""
+        """Number of windows that each track extends over."""
         tracks = self._tracks(place)
         return np.maximum(np.round(np.diff(tracks.starts) / (1 if self._linked else 2)) - 1.0, 1.0)
 
-    def stated(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:
-        """At a summit, with a covariance (2, 2) about it; the ratio is at most 1."""
-        ratio, deviation = _within(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), self._shared)))
+    def result(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:
+        """The result at the maximum ``top`` with its covariance (2, 2); the ratio is limited to at most 1."""
+        ratio, deviation = _truncated(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), self._shared)))
         self.at(top)
         found = self._fit_near(top)[1]
         return SequenceRatio(
@@ -449,22 +450,22 @@ class _Profile:
             sigma=deviation,
             noise_px=noise_px(found.tails),
             used=int(np.sum(self._spans(top)[found.trust > 0.0])),
-            of=int(np.sum(self._spans(top))),
+            total=int(np.sum(self._spans(top))),
             log_focal=top.log_focal,
             log_focal_sigma=float(np.sqrt(covariance[1, 1])),
         )
 
 
-def _within(ratio: float, sigma: float) -> tuple[float, float]:
-    """Mean and standard deviation of a normal ratio that is known to be possible."""
+def _truncated(ratio: float, sigma: float) -> tuple[float, float]:
+    """Mean and standard deviation of a normal distribution truncated to possible ratios."""
     fine = np.linspace(_LEAST, 1.0, 981)
     density = np.exp(-0.5 * ((fine - ratio) / max(sigma, 1e-3)) ** 2)
     mean = float(density @ fine / np.sum(density))
     return mean, float(np.sqrt(density @ (fine - mean) ** 2 / np.sum(density)))
 
 
-def _turning_less(curve: Curve, factor: float) -> Curve:
-    """A spline with all turns divided by a factor, by which the focal length is longer."""
+def _with_smaller_rotations(curve: Curve, factor: float) -> Curve:
+    """The spline with rotations divided by a factor, which compensates a focal length longer by this factor."""
     if factor == 1.0:
         return curve
     return make_curve(curve.first, curve.interval, so3.exp(so3.log(curve.R) / factor), curve.p)

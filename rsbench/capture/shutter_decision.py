@@ -1,9 +1,9 @@
-"""The shutter that a correction uses: from the matches of a rig or of one camera, or an error that says why not.
+"""Decide on the shutter that a correction uses, from the matches of a rig or of one camera.
 
-``known_of`` collects what is given; it is not estimated. An estimate is used where it is certain, or where its
-error does not matter. Otherwise the message names what the matches leave undetermined, what that trades against,
-and the remedy. One camera that turns or passes things shows its readout by how far lines that are read later have
-moved; a motion along its lines shows nothing. Lengths are in any unit there: the estimate does not depend on it.
+``known_of`` collects the given values, which are not estimated. An estimated shutter is used if it is certain or
+if its error does not matter. Otherwise the error message names what the matches leave undetermined, which
+parameter compensates for it, and the remedy. The readout of one camera can be estimated while it rotates or passes
+objects, since later lines have moved further; a motion along its lines shows nothing. Its lengths have any unit.
 """
 
 from __future__ import annotations
@@ -49,46 +49,46 @@ from rsbench.solvers.refined import RefinedSolver
 
 OPPOSITE: dict[Scan, Scan] = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 _MAX_SIGMA, _HARMLESS_PX = 0.1, 1.0
-"""Largest standard deviation of a ratio that is used; a larger one is used where it moves no pixel by this."""
+"""Largest standard deviation of a ratio that is used, unless it moves pixels by no more than ``_HARMLESS_PX``."""
 _MAX_SHARE = 0.25
-"""The same as a share of one camera's ratio: a correction by twice the true ratio is no better than none."""
+"""The same relative to one camera's ratio: a correction by twice the true ratio is no better than none."""
 _PRIOR_FACTOR, _LEAST_PRIOR_PX, _MOST_PRIOR_PX, _FEWEST = 2.0, 0.1, 2.0, 200
-"""Prior standard deviation of each error of a calibration over the size of the row differences, its limits, px,
-and the left-right matches that it needs: the other errors come from the same calibration as these differences.
-Below 0.1 px there are none to find: rendered pairs show at most 0.02 px, two excerpts of KITTI odometry 1.1 px."""
+"""Prior standard deviation of the calibration errors divided by the size of the row differences, which have the
+same cause; its limits, px; fewest left-right matches for it. Below 0.1 px no errors are estimated: rendered pairs
+show at most 0.02 px, two excerpts of KITTI odometry 1.1 px."""
 _LEAST_SIZE = 1e-3
-"""px by which 1 of a term moves a pixel, at least: an image of a narrow field shows little of some terms."""
-_FROM_GLOBAL = 3.0
-"""Standard deviations from 0 that a ratio of rolling lines needs: a pair of KITTI, whose calibration errs, gave
+"""Lower limit of the shift by 1 of a term, px: in a narrow field of view some terms have little effect."""
+_ROLLING_SIGMAS = 3.0
+"""Least ratio of a rolling shutter, in standard deviations: a pair of KITTI, whose calibration is wrong, gave
 0.25 +- 0.09 from the left, at a probability of 0.98."""
 _CLEARLY, LEAST_BACKWARDS, _NEAR = 0.999, 0.25, 0.2
-"""Probability of the opposite scan at which frames are refused, and the ratio from which their order shows."""
+"""Probability of the opposite scan above which frames are refused; least ratio for that; tolerance of a ratio."""
 _FEW = 600
-"""Tracks, or matches of one camera, that show for most frames that time runs forward."""
-_LOOK, _CLEARLY_LESS = 500, 0.97
-"""Matches of a quick look at the order of frames, and the share of the noise that is less than by chance."""
+"""Tracks, or matches of one camera, that suffice for most frames to show that they are in temporal order."""
+_QUICK_TEST, _CLEARLY_LESS = 500, 0.97
+"""Number of matches of a quick test of the order of frames; quotient of noise below which one order is better."""
 _AXES = ("tilt", "pan", "roll", "sideways motion", "vertical motion", "forward motion")
 
 
 class NoMotionError(RsbenchError):
-    """The frames are in order, but no motion explains their matches; the message says why."""
+    """Raised if the frames are in order but no motion explains their matches; the message says why."""
 
 
 def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Known:
-    """What is known of a capture before its matches are fitted: the one step from given values.
+    """Convert given values to what is known about a capture before its matches are fitted.
 
-    Errors of the calibration that are not given are estimated where the row differences of the left-right matches
-    show some; these set their prior, because they come from the same calibration.
+    If no calibration errors are given, they are estimated where the row differences of left-right matches show
+    some; the size of these differences sets their prior.
 
     Raises:
-        RsbenchError: a readout ratio of the right camera, but none of the left one.
+        RsbenchError: a readout ratio of the right camera is given, but none of the left one.
     """
     ratio, scanning, scans = given.readout_ratio, given.scanning, ALL_SCANS
     if scanning is not None:
         if ratio is None and scanning.right_readout_ratio is not None:
             raise RsbenchError(
-                f"right_readout_ratio = {scanning.right_readout_ratio}: give readout_ratio too; it is estimated "
-                "for cameras alone that share one"
+                f"right_readout_ratio = {scanning.right_readout_ratio}: give readout_ratio too; a ratio is only "
+                "estimated if both cameras have the same"
             )
         rolling = scans_of(rig.shutter_of(scanning, 1.0))
         scans = (GLOBAL, rolling, reversed_scans(rolling))
@@ -97,16 +97,16 @@ def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Kn
         scans=scans,
         delay=None if scanning is None else scanning.right_delay,
         calibration=given.calibration or NO_ERRORS,
-        calibration_sigma=_errors_expected(matches, rig) if given.calibration is None else NO_ERRORS,
+        calibration_sigma=_calibration_prior(matches, rig) if given.calibration is None else NO_ERRORS,
         models=given.models,
     )
     return known if ratio is None or scanning is None else known.with_shutter(rig.shutter_of(scanning, ratio))
 
 
-def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, ...]:
-    """Prior standard deviation of each error of a calibration, from the left-right matches of both times.
+def _calibration_prior(matches: Correspondences, rig: StereoRig) -> tuple[float, ...]:
+    """(14,) prior standard deviation of each calibration error, from the left-right matches of both times.
 
-    Those of the tracks where there are no others.
+    If there are no such matches, those of the tracks are used.
     """
     tracks, stereo = matches.tracks, np.concatenate([matches.stereo_0, matches.stereo_1])
     stereo = stereo if len(stereo) else np.concatenate([tracks[:, :4], tracks[:, 4:]])
@@ -120,7 +120,7 @@ def _errors_expected(matches: Correspondences, rig: StereoRig) -> tuple[float, .
     camera = rig.camera
     rays = (0.5 * (stereo[:, :2] + stereo[:, 2:]) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     out = sigma / np.maximum(term_sizes(rays, camera.fx), _LEAST_SIZE)
-    out[FOCAL] = 0.0  # which the rows do not show
+    out[FOCAL] = 0.0  # the rows do not depend on it
     return tuple(out.tolist())
 
 
@@ -131,13 +131,13 @@ def as_global(
     known: Known,
     under_global: Callable[[], Capture | None] = lambda: None,
 ) -> Capture:
-    """A global shutter, where the matches allow nothing but one or nearly one (``nearly_global``).
+    """Replace a capture whose shutter is global or nearly so (``nearly_global``) by one with a global shutter.
 
-    All other unknowns are estimated again under a global shutter.
+    All other unknowns are estimated again under a global shutter. Other captures are returned unchanged.
 
     Args:
         windows: the matches of the capture.
-        under_global: a capture under a global shutter, or None; called where the shutter is global.
+        under_global: returns the capture under a global shutter if the caller has it, else None.
     """
     candidates = nearly_global(capture)
     if candidates is None:
@@ -157,14 +157,14 @@ def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
     """The shutter of the most probable candidate.
 
     Raises:
-        NoMotionError: there is none, or what the matches leave undetermined would matter.
+        NoMotionError: there is none, or it is too uncertain and its error would matter.
     """
     best = capture.likeliest
     if best is None:
         raise NoMotionError(f"cannot tell how the cameras read: {capture.reason}")
     harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
     named = best.probability >= CERTAIN or capture.moved_px <= _HARMLESS_PX
-    rolls = not best.scans.rolls or best.ratio >= _FROM_GLOBAL * best.sigma or harmless
+    rolls = not best.scans.rolls or best.ratio >= _ROLLING_SIGMAS * best.sigma or harmless
     if not named or not rolls or not (best.sigma <= _MAX_SIGMA or harmless):
         raise NoMotionError(cannot_tell(capture))
     return shutter_of(best, rig)
@@ -174,18 +174,18 @@ def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
     """The shutter of a candidate.
 
     Raises:
-        NoMotionError: one camera alone rolls: so it seems of two with ratios of their own, too.
+        NoMotionError: only one camera has a rolling shutter; two cameras with different ratios may look like that.
     """
     if candidate.scans.rolls and "global" in (candidate.scans.left, candidate.scans.right):
         raise NoMotionError(
-            f"{candidate.scans}, or with another ratio: give readout_ratio and right_readout_ratio"
+            f"{candidate.scans}, or both rolling with different ratios: give readout_ratio and right_readout_ratio"
         )
     delay = candidate.delay if abs(candidate.delay) > 2.0 * candidate.delay_sigma else 0.0
     return shutter_under(candidate.scans, candidate.ratio, rig, delay)
 
 
 def cannot_tell(capture: Capture) -> str:
-    """Which unknowns the matches leave undetermined, what the ratio trades against, and the remedy."""
+    """Message on what the matches leave undetermined, what compensates for the ratio, and the remedy."""
     text = f"cannot tell the readout ratio: {capture.reason}"
     peak = capture.peaks.get(capture.motion_model)
     best = capture.likeliest
@@ -195,8 +195,7 @@ def cannot_tell(capture: Capture) -> str:
 
 
 def _trade(peak: Peak) -> str:
-    """The parameter of the motion, or the offset, that compensates most of a change of the ratio, and by how
-    much."""
+    """Text on the motion parameter, and the disparity offset, that compensate most of a change of the ratio."""
     w, d, offset = peak.trade[:3], peak.trade[3:6], float(peak.trade[6 + CALIBRATION.start + OFFSET])
     depth = 10.0 * max(float(np.linalg.norm(peak.fit.theta[3:])), 1e-6)
     k = int(np.argmax(np.abs(np.concatenate([w, d / depth]))))
@@ -208,13 +207,13 @@ def _trade(peak: Peak) -> str:
 
 
 def reversed_scans(scans: Scans) -> Scans:
-    """Lines read from the opposite side: what frames in the wrong order look like."""
+    """The scans with lines read from the opposite side, which frames in the wrong order appear to have."""
     opposite = {**OPPOSITE, "global": "global"}
     return Scans(opposite[scans.left], opposite[scans.right])  # pyrefly: ignore[bad-argument-type]
 
 
 def runs_backwards(capture: Capture, scans: Scans) -> bool:
-    """Whether lines are read from the side opposite to given scans, or the frames are in the wrong order."""
+    """Whether lines are clearly read from the side opposite to ``scans``, as of frames in the wrong order."""
     best = capture.likeliest
     if best is None or best.scans != reversed_scans(scans) or best.scans == scans:
         return False
@@ -230,12 +229,11 @@ def scans_by_laws(
     seed: int,
     start: Motion | None = None,
 ) -> Scans | None:
-    """The scans of a given shutter, or the opposite ones, whichever motion models show beyond doubt; None:
-    neither.
+    """The scans of a given shutter or the opposite ones, whichever are certain by motion models; None: neither is.
 
-    Only near the given ratio: where no model holds, any ratio may come out. For most frames a part of the matches
-    shows the given scans under the model of ``start``; otherwise all models and then all matches are used.
-    ``start`` is as in ``examine``.
+    The estimated ratio must be near the given one: if no model holds, it may be arbitrary. For most frames some of
+    the matches suffice to confirm the given scans under the model of ``start``; otherwise all models and then all
+    matches are used. ``start`` is as in ``examine``.
     """
     few, found = thinned([matches], _FEW)[0], None
     alone = (start.name,) if start is not None and start.name in models else models
@@ -253,7 +251,7 @@ def scans_by_laws(
 
 
 def record_of(capture: Capture) -> dict[str, Any]:
-    """What was estimated of the shutter and how certain it is, as JSON holds it."""
+    """The estimated shutter and its uncertainty, as written to JSON."""
     best = candidates_of(capture)[0] if capture.candidates else dict.fromkeys(_OF_A_CANDIDATE)
     likeliest = capture.likeliest
     return {
@@ -278,7 +276,7 @@ _OF_A_CANDIDATE = ("left", "right", "probability", "readout_ratio", "readout_rat
 
 
 def candidates_of(capture: Capture) -> list[dict[str, Any]]:
-    """All scans that are not excluded, the most probable first."""
+    """Records of all scans that are not excluded, in descending probability."""
     values = ((c.scans.left, c.scans.right, c.probability, c.ratio, c.sigma) for c in capture.candidates)
     return [dict(zip(_OF_A_CANDIDATE, each, strict=True)) for each in values]
 
@@ -287,11 +285,11 @@ def candidates_of(capture: Capture) -> list[dict[str, Any]]:
 
 
 def known_alone(scan: Scan | None = None, focal_sigma: float = 0.0) -> Known:
-    """What is known of a camera whose readout ratio is not given, with its ``scan`` if that is.
+    """What is known about one camera without a given readout ratio.
 
-    The opposite scan stays possible, because frames in the wrong order show it. Columns are possible only where
-    ``scan`` gives them: errors of the flow of one camera resemble them. ``focal_sigma`` is the relative prior
-    standard deviation of the focal length; 0: it is given.
+    The opposite scan stays possible, because it reveals frames in the wrong order. Scans by columns are possible
+    only if ``scan`` is one of them: errors of one camera's optical flow resemble them. ``focal_sigma`` is the
+    relative prior standard deviation of the focal length; 0: the focal length is given.
     """
     given, sigma = Scans(scan or "top", scan or "top"), np.array(NO_ERRORS)
     sigma[FOCAL] = focal_sigma
@@ -302,7 +300,7 @@ def known_alone(scan: Scan | None = None, focal_sigma: float = 0.0) -> Known:
 def examine_alone(
     matches: FloatArray, camera: PinholeCamera, known: Known, options: RobustOptions, seed: int = 0
 ) -> Window:
-    """Matches (n, 4) x0, y0, x1, y1, px, of two frames of a camera under each hypothesis; with outliers."""
+    """Fit each hypothesis to matches (n, 4) x0, y0, x1, y1, px, with outliers, of two frames of one camera."""
     given, rig = Correspondences(left=matches), StereoRig.of_one(camera)
     # The search starts from the motion under a shutter between those that are possible.
     starts = {scans.left for scans in known.scans}
@@ -317,8 +315,8 @@ def examine_alone(
 def fits_backwards(
     matches: FloatArray, camera: PinholeCamera, shutter: RollingShutter, options: RobustOptions, seed: int = 0
 ) -> bool:
-    """Whether matches (n, 4) fit better where lines are read from the other side: a quick look, no decision."""
-    noise, given = list[float](), Correspondences(left=matches[:: max(len(matches) // _LOOK, 1)])
+    """Quick test whether matches (n, 4) fit better if lines are read from the opposite side."""
+    noise, given = list[float](), Correspondences(left=matches[:: max(len(matches) // _QUICK_TEST, 1)])
     for scan in (shutter.scan_of("left"), OPPOSITE[shutter.scan_of("left")]):
         solver, rng = RefinedSolver(motion_model="inertial", one_camera=True), np.random.default_rng(seed)
         found = estimate_motion(
@@ -329,7 +327,7 @@ def fits_backwards(
 
 
 def conclude_alone(windows: Sequence[Window]) -> Capture:
-    """What all windows of a camera show together; a global shutter where they allow only one or nearly one."""
+    """Combine all windows of one camera; the result is a global shutter if the shutter is global or nearly so."""
     capture = conclude(windows)
     candidates = nearly_global(capture)
     return capture if candidates is None else replace(capture, candidates=candidates, named=True)
@@ -339,10 +337,10 @@ def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
     """The shutter of the most probable candidate.
 
     Raises:
-        NoMotionError: there is none, or what the frames leave undetermined would matter.
+        NoMotionError: there is none, or it is too uncertain and its error would matter.
     """
 
-    def words(candidate: Candidate) -> str:
+    def reading_of(candidate: Candidate) -> str:
         start = candidate.scans.left
         return "all lines read at once" if start == "global" else f"lines read from the {start}"
 
@@ -355,8 +353,8 @@ def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
     if certain and (best.sigma <= min(_MAX_SIGMA, _MAX_SHARE * best.ratio) or harmless):
         return shutter_of(best, StereoRig.of_one(camera))
     if certain:
-        how = f"{words(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
+        how = f"{reading_of(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
     else:
         likely = [each for each in capture.candidates if each.probability > 0.1]
-        how = ", or ".join(f"{words(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
+        how = ", or ".join(f"{reading_of(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
     raise NoMotionError(f"cannot tell the readout ratio: the frames show {how}. {remedy}")

@@ -1,13 +1,13 @@
-"""The trajectory of a rig through a sequence, from the matches of neighbouring frames: at once, or as a stream.
+"""Estimate the trajectory of a rig from the matches of successive frames, of a whole sequence or of a stream.
 
-Two frames do not show a shake that is the same in both; a sequence does, for its windows overlap. The trajectory
-is a spline of largest posterior probability (``trajectory_fit``) under tracks with heavy-tailed errors and a prior
-on accelerations, whose strength is estimated from the matches.
+Two frames cannot reveal a shake that is the same in both; a sequence can, because its windows overlap. The
+trajectory is the spline of largest posterior probability (``trajectory_fit``) given tracks with heavy-tailed
+errors and a prior on accelerations, whose variance is estimated from the matches.
 
-``stream_trajectory`` takes a sequence without end, some frames at a time, in constant memory. Matches that leave
-the memory are kept as a quadratic cost of the control poses that stay (marginalisation: G. Sibley, L. Matthies, G.
-Sukhatme, Sliding window filter with application to planetary landing, J. Field Robotics 2010). Knots and the
-memory of the prior are those of the first frames; its variances are updated.
+``stream_trajectory`` processes a sequence of any length, some frames at a time, in constant memory. Matches of
+frames that are dropped are replaced by a quadratic cost of the remaining control poses (marginalisation: G.
+Sibley, L. Matthies, G. Sukhatme, Sliding window filter with application to planetary landing, J. Field Robotics
+2010). Knot interval and time constant of the prior come from the first frames; its variances are updated.
 """
 
 from __future__ import annotations
@@ -54,60 +54,60 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 _ONE_SIGMA = 0.8413447460685429
-_JUDGED = 8
-"""First windows, from which knots and prior are chosen."""
+_FIRST_WINDOWS = 8
+"""Number of first windows from which the knot interval and the prior are chosen."""
 _FEWEST, _LEAST_SHARE = 15, 0.2
-"""Right tracks, and their share, from which on a window is supported by its own matches."""
+"""A window is supported by its own matches if it has at least this many inlier tracks, and this share of them."""
 MOST_NOISE_PX = 10.0
-"""Larger errors are no noise: random tracks leave some 20 px, and at that scale most of them count as right."""
+"""Largest plausible noise: random tracks give some 20 px, and at that scale most of them would be inliers."""
 _ADVANCE, _LAG = 6, 5
-"""Windows that leave a stream together, and later windows that they wait for."""
+"""Number of windows that a stream returns at once, and number of later windows that it needs for them."""
 _FAR = 1_000_000
-_JUDGED_BY = 250
-"""Tracks of a window, about, by which knots and prior of a stream are chosen."""
+_FIRST_TRACKS = 250
+"""Approximate number of tracks per window from which knots and prior of a stream are chosen."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryOptions:
-    """How a trajectory is estimated."""
+    """Options for the estimation of a trajectory."""
 
     intervals: tuple[float, ...] = (1 / 2, 1 / 3, 1 / 4)
-    """Frame periods between two control poses: the first one to begin with, then those of most evidence."""
+    """Candidate knot intervals, frame periods: fits start with the first and choose the one of most evidence."""
     prior: Prior = Prior(memory=0.5, smooth=2, rotation=1e-4, position=1e-4)  # noqa: RUF009
-    """To begin with."""
+    """Prior at the start."""
     learn: bool = True
-    """Whether the prior and the knots are estimated."""
+    """Whether the prior and the knot interval are estimated."""
     link: bool = True
-    """Whether tracks that meet in a frame are one; without it their common ends count as two."""
+    """Whether tracks that share a pixel in a frame are joined; otherwise this pixel counts twice."""
     share: float = 0.5
-    """Weight of a track beside the prior. Patches of neighbouring tracks overlap and have common errors: with a
-    weight of 1, the common errors of a still hand are estimated as accelerations."""
+    """Weight of a track relative to the prior. Patches of neighbouring tracks overlap, so their errors are
+    correlated: with a weight of 1, those of a steady hand would be estimated as accelerations."""
     seed: int = 0
-    """Of the search for motions of single windows."""
+    """Seed of the search for motions of single windows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """What the rig did, seen from the body at time 0."""
+    """The estimated trajectory; the world is the body at time 0."""
 
     motion: ContinuousMotion
     """body_from_world at any time of the sequence, frame periods."""
     shutter: RollingShutter
-    """Given or estimated."""
+    """The given or estimated shutter."""
     noise_px: float
-    """Of a coordinate, as of a normal error: two in three are below it."""
+    """Standard deviation of a coordinate: 68 % of the errors are below it."""
     nu: float
-    """Degrees of freedom of the tails; 30 is as good as normal."""
+    """Degrees of freedom of the t distribution of the errors; with 30 it is nearly normal."""
     prior: Prior
     inliers: tuple[BoolArray, ...]
-    """For each window, which of its tracks are right."""
+    """For each window, which of its tracks are inliers."""
     supported: BoolArray
-    """(windows,) whether a window's own tracks support it; elsewhere the spline bridges it."""
+    """(windows,) whether a window's own tracks support it; the others are interpolated by the spline."""
     fit: Fit
     covariance_band: FloatArray
-    """Of the control poses, see ``trajectory_spline``."""
+    """Covariance of the control poses, see ``trajectory_spline``."""
     gyro: GyroFound | None = None
-    """What was estimated of a gyroscope; None: none was given."""
+    """Bias, noise and clock of a gyroscope; None: none was given."""
 
     @property
     def curve(self) -> Curve:
@@ -120,21 +120,21 @@ class Trajectory:
         return self.motion.interval
 
     def window(self, number: int) -> Motion:
-        """The motion seen from the body at the start of a frame, which is time 0."""
+        """The motion relative to the body at the start of frame ``number``, which is its time 0."""
         return self.motion.from_time(float(number))
 
     def covariance(self, tau: ArrayLike) -> FloatArray:
-        """Covariance (n, 6, 6) of the poses at times (n,), given that of time 0.
+        """Covariance (n, 6, 6) of the poses at times (n,), given the pose at time 0.
 
-        Of small turns of the body about its own axes, radians, and of its position in the world, metres.
+        It is that of small rotations about the body's axes, radians, and of the position in the world, metres.
         """
         return pose_covariance(self.curve, self.covariance_band, np.atleast_1d(tau))
 
     def covariance_between(self, start: float, tau: ArrayLike) -> FloatArray:
         """Covariance (n, 6, 6) of the poses at times (n,) within a period of ``start``, given the pose there.
 
-        Of small turns of the body about its own axes, radians, and of its position in the axes of the body at
-        ``start``, metres.
+        It is that of small rotations about the body's axes, radians, and of the position in the axes at ``start``,
+        metres.
         """
         return covariance_between(self.curve, self.covariance_band, start, np.atleast_1d(tau))
 
@@ -148,16 +148,16 @@ def estimate_trajectory(
     seed: int = 0,
     gyro: FloatArray | None = None,
 ) -> Trajectory:
-    """The trajectory of a rig, from matches with outliers.
+    """Estimate the trajectory of a rig from matches with outliers.
 
     Args:
-        windows: of the frames 0 and 1, 1 and 2, ...
-        motions: of each window, to begin with; None: a search finds them.
-        seed: of that search, where there are no options.
-        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence; bias and noise are estimated.
+        windows: matches of the frames 0 and 1, 1 and 2, ...
+        motions: start motion of each window; None: a robust search finds them.
+        seed: seed of that search if ``options`` is None.
+        gyro: (n, 4) samples as in ``Correspondences.gyro``, tau of the sequence; bias and noise are estimated.
 
     Raises:
-        ValueError: no windows, or no tracks in any.
+        ValueError: there are no windows, or none has tracks.
     """
     options, windows = options or TrajectoryOptions(seed=seed), [informative(each) for each in windows]
     if not any(len(window.tracks) for window in windows):
@@ -188,7 +188,7 @@ def estimate_trajectory(
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What a trajectory is estimated from."""
+    """The inputs from which a trajectory is estimated."""
 
     windows: Sequence[Correspondences]
     rig: StereoRig
@@ -198,12 +198,12 @@ class _Inputs:
     gyro: GyroSteps | None
 
     def fitted(self) -> tuple[Fit, TimedTracks]:
-        """The spline, and the tracks that it was fitted to."""
+        """The fitted spline, and the tracks that it was fitted to."""
         options = self.options
-        found, tracks = self._first(_JUDGED, options.intervals[0], options.prior)
+        found, tracks = self._first(_FIRST_WINDOWS, options.intervals[0], options.prior)
         if options.learn:
             found = choose(found, tracks, options.intervals)
-        if len(self.windows) > _JUDGED:
+        if len(self.windows) > _FIRST_WINDOWS:
             found, tracks = self._first(len(self.windows), found.curve.interval, found.prior, found.drift)
         if options.link:
             right = [found.trust[each] for each in tracks.members]
@@ -214,7 +214,7 @@ class _Inputs:
     def _first(
         self, count: int, interval: float, prior: Prior, drift: Drift | None = None
     ) -> tuple[Fit, TimedTracks]:
-        """The spline of the first windows, and their tracks."""
+        """A spline fitted to the first ``count`` windows, and their tracks."""
         tracks, motions = self._packed(count, drift), self.motions[:count]
         curve = first_curve(motions, tracks, span_of(len(motions), self.shutter), interval)
         return fit(curve, tracks, prior, self.options.learn, drift=drift), tracks
@@ -230,12 +230,12 @@ class _Inputs:
 
 
 def noise_px(tails: Tails) -> float:
-    """Of a coordinate, as of a normal error: two in three are below it."""
+    """Standard deviation of a coordinate, px, by the share of normal errors below it (68 %)."""
     return tails.scale * float(scipy.special.stdtrit(tails.nu, _ONE_SIGMA))
 
 
 def is_supported(inliers: BoolArray, tails: Tails) -> bool:
-    """Whether tracks (n,), some of them right, support their window."""
+    """Whether the inliers among tracks (n,) suffice to support their window."""
     enough = np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers))
     return bool(enough and noise_px(tails) <= MOST_NOISE_PX)
 
@@ -245,26 +245,26 @@ def is_supported(inliers: BoolArray, tails: Tails) -> bool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreamedWindow:
-    """Two successive frames of a sequence; every value is final."""
+    """The result for two successive frames of a stream, which later frames do not change."""
 
     number: int
     motion: ContinuousMotion
-    """Seen from the body at the start of the first frame, which is time 0; right for both frames."""
+    """The motion relative to the body at the start of the first frame (time 0), valid for both frames."""
     body_from_world: Pose
-    """Of that time; the world is the body at time 0 of the sequence."""
+    """The pose at that time; the world is the body at time 0 of the sequence."""
     inliers: BoolArray
-    """(n,) which tracks are right."""
+    """(n,) which tracks are inliers."""
     covariance: FloatArray | None
-    """(6, 6) of w and d of ``motion``; None where no track spans a period."""
+    """(6, 6) covariance of w and d of ``motion``; None if no track spans a period."""
     apart: int
-    """Windows to the nearest supported one of those seen so far; 0: this one is supported."""
+    """Distance, in windows, to the nearest supported window so far; 0: this window is supported."""
     noise_px: float
     gyro: GyroFound | None
-    """What is known of a gyroscope by then; None: there is none."""
+    """The current estimates for a gyroscope; None: there is none."""
 
     @property
     def supported(self) -> bool:
-        """Whether its own tracks support it; else the spline bridges it."""
+        """Whether the window's own tracks support it; otherwise the spline interpolates it."""
         return self.apart == 0
 
 
@@ -276,11 +276,11 @@ def stream_trajectory(
     options: TrajectoryOptions | None = None,
     gyro: FloatArray | None = None,
 ) -> Iterator[StreamedWindow]:
-    """As ``estimate_trajectory``, for windows that come one after the other.
+    """``estimate_trajectory`` for windows that arrive one after the other.
 
     Args:
-        seed: of the search for motions of single windows, where there are no options.
-        gyro: (n, 4) samples as of ``Correspondences.gyro``, tau of the sequence.
+        seed: seed of the search for motions of single windows if ``options`` is None.
+        gyro: (n, 4) samples as in ``Correspondences.gyro``, with tau of the sequence.
     """
     options = options or TrajectoryOptions(seed=seed)
     state = _State(rig, shutter, options, None if gyro is None else gyro_steps(gyro))
@@ -289,29 +289,29 @@ def stream_trajectory(
         if len(state.windows) == _ADVANCE + _LAG:
             found, tracks = state.solve()
             yield from state.final(found, tracks, _ADVANCE)
-            state.leave(found, tracks, _ADVANCE)
+            state.marginalise(found, tracks, _ADVANCE)
     if state.windows:
         yield from state.final(*state.solve(), len(state.windows))
 
 
 class _State:
-    """The memory of a stream: the windows since the last that left, and a summary of those that have left."""
+    """The state of a stream: the current windows, and a quadratic cost in place of the dropped ones."""
 
     def __init__(
         self, rig: StereoRig, shutter: RollingShutter, options: TrajectoryOptions, gyro: GyroSteps | None
     ) -> None:
         self.rig, self.shutter, self.options = rig, shutter, options
         self.gyro = gyro
-        """Of the windows in memory and of later ones."""
-        self.unlike: GyroFound | None = None
-        """One that contradicted the matches."""
+        """Samples of the current and of later windows."""
+        self.rejected_gyro: GyroFound | None = None
+        """A gyroscope that contradicted the matches."""
         self.windows, self.motions = list[Correspondences](), list[Motion | None]()
         self.first = self.fresh = 0
         self.curve: Curve | None = None
         self.past: Past | None = None
         self.fit: Fit | None = None
         self._supported = -_FAR
-        """Number of the last supported window of those that have left."""
+        """Number of the last supported window among the dropped ones."""
 
     def add(self, window: Correspondences, motion: Motion | None) -> None:
         self.windows.append(informative(window))
@@ -328,26 +328,26 @@ class _State:
         tracks = pack_windows(windows, self.rig, self.shutter, right, self.first, self.past, share)
         if self.gyro is None:
             return tracks
-        # Samples that have left with earlier windows are not used again, wherever a clock puts them by now.
+        # Samples that were dropped are not used again, even if the clock estimate has moved since.
         shift = 0.0 if drift is None else drift.shift
         first = span_of(0, self.shutter)[0] - shift if self.curve is None else -np.inf
         last = span_of(self.first + len(windows), self.shutter)[1] - shift
         return replace(tracks, gyro=self.gyro.between(first, last))
 
     def solve(self) -> tuple[Fit, TimedTracks]:
-        """The spline of all windows in memory; a gyroscope that contradicts the matches is dropped."""
+        """Fit the spline to all current windows; a gyroscope that contradicts the matches is dropped."""
         found, tracks = self._solved()
         if tracks.gyro is None or found.drift is None or not contradicts(tracks.gyro, found.drift):
             return found, tracks
-        self.gyro, self.unlike = None, GyroFound.of(found.drift, used=False)
+        self.gyro, self.rejected_gyro = None, GyroFound.of(found.drift, used=False)
         self.past = None if self.past is None else self.past.without_gyro()
         self.fit = None if self.fit is None else replace(self.fit, drift=None)
         return self._solved()
 
     def _solved(self) -> tuple[Fit, TimedTracks]:
-        """A first fit to some of the tracks shows which are right."""
+        """Fit the spline, after a first fit to some of the tracks that selects the inliers."""
         count, options = len(self.windows), self.options
-        few = thinned(self.windows, _JUDGED_BY)
+        few = thinned(self.windows, _FIRST_TRACKS)
         if self.curve is None or self.fit is None:
             tracks = self._pack(few)
             curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
@@ -367,7 +367,7 @@ class _State:
         return fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift), tracks
 
     def final(self, found: Fit, tracks: TimedTracks, count: int) -> Iterator[StreamedWindow]:
-        """The first ``count`` windows."""
+        """The results for the first ``count`` windows."""
         start, end = span_of(1, self.shutter)
         inverse = covariance_band(found, tracks)
         pairs = zip(tracks.members, self.windows, strict=True)
@@ -383,16 +383,16 @@ class _State:
                 inliers=right[number - self.first],
                 apart=min(abs(number - each) for each in supported),
                 noise_px=noise_px(found.tails),
-                gyro=self.unlike if found.drift is None else GyroFound.of(found.drift),
+                gyro=self.rejected_gyro if found.drift is None else GyroFound.of(found.drift),
             )
         self._supported = max(each for each in supported if each < self.first + count)
 
-    def leave(self, found: Fit, tracks: TimedTracks, count: int) -> None:
-        """Drop the first ``count`` windows, except for what they determine of those that stay."""
+    def marginalise(self, found: Fit, tracks: TimedTracks, count: int) -> None:
+        """Drop the first ``count`` windows and marginalise their matches."""
         right = [found.trust[each] for each in tracks.members[:count]]
-        gone = self._pack(self.windows[:count], right if self.options.link else None)
-        trust = np.zeros(len(gone))
-        for members, each in zip(gone.members, right, strict=True):
+        dropped = self._pack(self.windows[:count], right if self.options.link else None)
+        trust = np.zeros(len(dropped))
+        for members, each in zip(dropped.members, right, strict=True):
             trust[members] = each
         curve = found.curve
         stays = self.first + count + span_of(0, self.shutter)[0]
@@ -400,25 +400,25 @@ class _State:
         first = curve.first + drop * curve.interval
         if self.gyro is not None and tracks.gyro is not None and found.drift is not None:
             begun = first - found.drift.shift
-            gone = replace(gone, gyro=tracks.gyro.begun_before(begun))
+            dropped = replace(dropped, gyro=tracks.gyro.begun_before(begun))
             self.gyro = self.gyro.between(begun, np.inf)
-        self.past = _marginal(found, gone, trust, drop)
+        self.past = _marginal(found, dropped, trust, drop)
         self.curve = make_curve(first, curve.interval, curve.R[drop:], curve.p[drop:])
         self.fit = found
         self.windows, self.motions = self.windows[count:], self.motions[count:]
         self.first, self.fresh = self.first + count, 0
 
 
-def _marginal(found: Fit, gone: TimedTracks, trust: FloatArray, drop: int) -> Past:
-    """What tracks determine of the control poses from number ``drop`` on, whatever those before are."""
+def _marginal(found: Fit, dropped: TimedTracks, trust: FloatArray, drop: int) -> Past:
+    """The quadratic cost of the control poses from number ``drop`` on, with the earlier ones eliminated."""
     curve, smooth, drift = found.curve, found.prior.smooth, found.drift
-    equations = normal_equations(curve, gone, found.tails, found.prior, trust, until=drop, drift=drift)
-    band, border = anchored(equations, curve, gone, ANCHORED), equations.border
-    ends = gone.span[1]
-    if gone.gyro is not None and drift is not None:
-        ends = np.concatenate([ends, gone.gyro.end + drift.shift])
+    equations = normal_equations(curve, dropped, found.tails, found.prior, trust, until=drop, drift=drift)
+    band, border = anchored(equations, curve, dropped, ANCHORED), equations.border
+    ends = dropped.span[1]
+    if dropped.gyro is not None and drift is not None:
+        ends = np.concatenate([ends, dropped.gyro.end + drift.shift])
     latest = np.floor((ends - curve.first) / curve.interval)
-    known = 0 if gone.past is None else len(gone.past.p)
+    known = 0 if dropped.past is None else len(dropped.past.p)
     count = min(max(int(np.max(latest, initial=0)) + 4, drop + smooth + 2, known), len(curve.p))
     m, size = 6 * drop, 6 * count
     H, gradient = np.zeros((size, size)), equations.gradient[:size]

@@ -1,9 +1,8 @@
-"""The spline of largest posterior probability: robust Levenberg-Marquardt steps on banded normal equations.
+"""Fit the spline of largest posterior probability by robust Levenberg-Marquardt steps on banded normal equations.
 
-The descent starts from the motions of neighbouring frames, one after the other (``first_curve``). Noise, its tails
-and the strength of the prior are estimated with it: the first two by maximum likelihood, the last by maximum
-evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992), as are the knots and the kind of prior
-(``choose``).
+The fit starts from the motions of the windows, chained (``first_curve``). Scale and tails of the errors are
+estimated with the spline by maximum likelihood; the prior's variances, the knot interval and the kind of prior
+(``choose``) by maximum evidence (D. MacKay, Bayesian interpolation, Neural Computation 1992).
 """
 
 from __future__ import annotations
@@ -71,77 +70,77 @@ from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 
 NORMAL = 1e9
-"""Degrees of freedom of normal errors."""
+"""Degrees of freedom at which a t distribution is practically normal."""
 _ROUNDS, _STEPS_A_ROUND, _LAST_STEPS = 15, 2, 10
-_FLAT, _FLAT_STRENGTH, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
+_FLAT, _FLAT_VARIANCE, _FLAT_EVIDENCE = 0.01, 0.05, 0.1
 _FLAT_COST, _NEAR = 1e-3, 1.0
 _MANY = 300
-"""Tracks from which on two threads are faster."""
+"""With this many tracks, two threads are faster than one."""
 _LEAST_WIDTH = 5
-"""Control poses that one term of the prior, or a sample of a gyroscope, depends on."""
+"""Number of control poses that one term of the prior, or one gyroscope sample, depends on."""
 ANCHORED = 1e4
-"""Precision of the pose at time 0 over that of the most certain control pose."""
-_TELLING = 2.0
-"""Accelerations that tracks must determine before their strength is estimated."""
-_STRENGTHS = (1e-10, 1e2)
-"""Least and largest, of both kinds: far beyond those of hand-carried cameras."""
+"""Precision of the pose at time 0 divided by that of the most certain control pose."""
+_FEWEST = 2.0
+"""Number of accelerations that the tracks must determine before the prior's variance is estimated."""
+_LIMITS = (1e-10, 1e2)
+"""Smallest and largest variance of accelerations, far beyond those of hand-carried cameras."""
 _DAMPING = Damping(least=0.0, first=1e-6, largest=3e8, dropped=1e-6)
 _SOME = 250
-"""Tracks of a window, about: enough to begin with."""
+"""Approximate number of tracks per window from which the first motions are estimated."""
 _SHORT = 0.03
-"""Length to begin with of translations that matches determine but for their length: that of metres of a hand. The
-prior begins with metres too; translations of length 1 had accelerations that it kept as they were, and errors of
-0.28 px in place of 0.05."""
+"""Length at the start of one camera's translations, whose scale is unknown: a hand's, in metres, as the prior's
+start variance is in metres too. With a length of 1, that variance was never adapted to the large accelerations,
+and errors were 0.28 px instead of 0.05."""
 _WEAKEST = 100.0
-"""Least precision of poses in the evidence: nothing else bounds the length of one camera's even translation, and
-0.1 beside ``_SHORT`` hardly does."""
+"""Least precision of poses in the evidence: nothing else bounds the scale of one camera's uniform translation, and
+a precision of 0.1 would hardly do so at the length ``_SHORT``."""
 _SUSPECT = 4.0
-"""A window's own motion is wrong where its error is so many times that of one interpolated from its neighbours."""
+"""A window's own motion is wrong if its error is this many times that of the motion of its neighbours."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Frame periods."""
+"""Candidates for ``Prior.memory``, frame periods."""
 _PRECISION = 1e12
-_WORTH = 1.0
-"""Gain in the logarithm of evidence from which another choice is taken."""
+_LEAST_GAIN = 1.0
+"""Least gain in the logarithm of evidence for which another prior or knot interval is chosen."""
 
 
 class Equations(NamedTuple):
-    """Normal equations at a spline."""
+    """Normal equations of the fit, linearised at a spline."""
 
     cost: float
-    """Negative logarithm of likelihood and prior, except for constants."""
+    """Negative logarithm of likelihood times prior, up to constants."""
     gradient: FloatArray
     band: FloatArray
-    """Without anchors."""
+    """Normal matrix without ``anchors``."""
     squares: FloatArray
-    """(n,) of the tracks, px^2."""
+    """(n,) squared errors of the tracks, px^2."""
     rough: Roughness
     sensed: Sensed | None = None
-    """Of a gyroscope."""
+    """The part of a gyroscope's samples."""
     border: Border | None = None
-    """Of its errors."""
+    """The part of a gyroscope's errors."""
 
     @property
     def slope(self) -> FloatArray:
-        """Gradient by all unknowns."""
+        """Gradient by all unknowns, including the gyroscope's errors."""
         return self.gradient if self.border is None else np.concatenate([self.gradient, self.border.slope])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fit:
-    """A spline, and the distributions under which it was fitted."""
+    """A fitted spline with its error distribution and prior."""
 
     curve: Curve
     tails: Tails
     prior: Prior
     trust: FloatArray
-    """(n,) 1 of tracks that count, else 0."""
+    """(n,) 1 for inlier tracks, 0 for outliers."""
     equations: Equations
     drift: Drift | None = None
-    """Of a gyroscope."""
+    """Errors of a gyroscope."""
 
 
 def width_of(tracks: TimedTracks, curve: Curve) -> int:
-    """Width of the band: unknowns that one track depends on."""
+    """Width of the band: number of unknowns that one track, term of the prior or ``Past`` couples."""
     last = len(curve.p) - 4
     places = [np.clip(np.floor((tau - curve.first) / curve.interval), 0, last) for tau in tracks.span]
     known = 0 if tracks.past is None else len(tracks.past.p)
@@ -158,16 +157,16 @@ def normal_equations(
     until: int | None = None,
     drift: Drift | None = None,
 ) -> Equations:
-    """At a spline, under given distributions.
+    """The normal equations at a spline, for given error distribution and prior.
 
     Args:
-        until: number of a control pose; only that part of the prior which begins before it.
-        drift: of the gyroscope, where the tracks have one.
+        until: only terms of the prior that begin before the control pose of this number are added.
+        drift: errors of the gyroscope, if the tracks have one.
     """
     n, past = len(curve.p), tracks.past
     width = width_of(tracks, curve)
     band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
-    cost = _add_halves(curve, tracks, tails, tracks.share * trust, (squares, band, gradient), want)
+    cost = _add_in_threads(curve, tracks, tails, tracks.share * trust, (squares, band, gradient), want)
     rough = roughness(curve, prior.memory, prior.smooth, width, past is None, until)
     for kind, strength in enumerate((prior.rotation, prior.position)):
         cost += 0.5 * rough.squares[kind] / strength
@@ -185,7 +184,7 @@ def normal_equations(
     return Equations(cost, gradient, band, squares, rough, found, border)
 
 
-def _add_halves(
+def _add_in_threads(
     curve: Curve,
     tracks: TimedTracks,
     tails: Tails,
@@ -193,7 +192,7 @@ def _add_halves(
     out: tuple[FloatArray, FloatArray, FloatArray],
     want: bool,
 ) -> float:
-    """``add_tracks``, many of them in two halves side by side, on any machine, so that sums are the same."""
+    """``add_tracks``; many tracks run as two halves in threads, on all machines, so that sums are identical."""
     starts, middle, same = tracks.starts, len(trust) // 2, (tracks.focal, tails)
     if len(trust) < _MANY:
         return add_tracks(curve, tracks.ends, starts, *same, trust, *out, want)
@@ -212,7 +211,7 @@ def _add_halves(
 def _add_past(
     past: Past, curve: Curve, gradient: FloatArray, band: FloatArray, border: Border | None, drift: Drift | None
 ) -> float:
-    """Cost of control poses, and errors of a gyroscope, that differ from earlier ones; adds its equations."""
+    """Add the quadratic cost of marginalised windows to the equations; returns the cost."""
     k = len(past.p)
     turned = so3.log(curve.R[:k] @ np.swapaxes(past.R, 1, 2))
     away = np.concatenate([turned, curve.p[:k] - past.p], axis=1).ravel()
@@ -229,10 +228,10 @@ def _add_past(
 
 
 def anchored(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float) -> FloatArray:
-    """The normal matrix, a band, with the pose at time 0 fixed where nothing else fixes the spline.
+    """The normal matrix, a band; without marginalised windows, the pose at time 0 is fixed as the origin.
 
     Args:
-        certain: precision of that pose over that of the most certain control pose.
+        certain: precision of that pose divided by that of the most certain control pose.
     """
     band = equations.band
     if tracks.past is not None:
@@ -241,15 +240,15 @@ def anchored(equations: Equations, curve: Curve, tracks: TimedTracks, certain: f
 
 
 def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> FloatArray:
-    """Covariance of the control poses of a fit, in its band, by their expected information; time 0 is fixed.
+    """Covariance of the control poses, in its band, from the expected information; the pose at time 0 is fixed.
 
     Args:
-        share: weight of a track beside the prior, in place of its weight in the fit.
+        share: weight of a track relative to the prior, in place of its weight in the fit.
 
     Raises:
         NotDefiniteError: the tracks do not determine the spline.
     """
-    # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
+    # Expected information of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
     tails, curve = found.tails, found.curve
     expected = found.trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     normal, each = Tails(NORMAL, tails.scale), replace(tracks, share=share)
@@ -258,12 +257,12 @@ def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> Floa
 
 
 def log_evidence(found: Fit, precision: float) -> float:
-    """Logarithm of the probability of the tracks under the prior (Laplace's approximation), except for constants.
+    """Logarithm of the marginal likelihood of the tracks (Laplace's approximation), up to constants.
 
-    To compare fits with other knots and orders, under the same tails and of the same tracks.
+    It compares fits to the same tracks under the same error distribution, with different knots or priors.
 
     Args:
-        precision: of the pose at time 0, the same for all.
+        precision: precision of the pose at time 0, which must be the same for all compared fits.
     """
     curve, equations = found.curve, found.equations
     anchor = anchors(curve, equations.band.shape[1], precision)
@@ -277,7 +276,7 @@ def log_evidence(found: Fit, precision: float) -> float:
 
 
 def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
-    """(n,) of the best points of tracks, px^2."""
+    """(n,) squared errors of the tracks at their best points, px^2."""
     squares, trust, nothing = *np.zeros((2, len(tracks))), np.zeros((1, width_of(tracks, curve)))
     of_tracks = tracks.ends, tracks.starts, tracks.focal, Tails(3.0, 1.0)
     add_tracks(curve, *of_tracks, trust, squares, nothing, np.zeros(1), False)
@@ -285,27 +284,27 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
 
 
 def right_tracks(found: Fit, tracks: TimedTracks) -> FloatArray:
-    """(n,) which tracks are right by a fit to others, 1 or 0."""
+    """(n,) 1 for tracks that are inliers of a fit, which may be to other tracks, else 0."""
     reach = tracks.freedom * (REACH * found.tails.scale) ** 2
     return (squared_errors(found.curve, tracks) <= reach).astype(np.float64)
 
 
 class _Place(NamedTuple):
-    """Where the descent is."""
+    """A point of the descent."""
 
     curve: Curve
     drift: Drift | None
     equations: Equations
-    promise: float = 0.0
+    predicted: float = 0.0
     """Decrease of the cost that was predicted for the last step."""
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """The cost of a spline under given distributions, for ``descend``.
+    """The cost of a spline for a given error distribution and prior, in the form that ``descend`` takes.
 
-    Steps that promise little are taken as they are: the equations take the weights of pixels as given, and their
-    root is not quite the least cost.
+    Steps with a small predicted decrease are always accepted: the equations treat the weights of pixels as
+    constants, so their root is not exactly the minimum of the cost.
     """
 
     tracks: TimedTracks
@@ -313,9 +312,9 @@ class _Problem:
     prior: Prior
     trust: FloatArray
 
-    def place(self, curve: Curve, drift: Drift | None, promise: float = 0.0) -> _Place:
+    def place(self, curve: Curve, drift: Drift | None, predicted: float = 0.0) -> _Place:
         here = normal_equations(curve, self.tracks, self.tails, self.prior, self.trust, drift=drift)
-        return _Place(curve, drift, here, promise)
+        return _Place(curve, drift, here, predicted)
 
     def stepped(self, here: _Place, damping: float) -> _Place | None:
         equations, drift = here.equations, here.drift
@@ -329,18 +328,18 @@ class _Problem:
                 step = np.concatenate(bordered_step(lower, equations.gradient, equations.border))
         except NotDefiniteError:
             return None
-        curve, promise = moved(here.curve, step[: len(damped)]), -0.5 * float(step @ equations.slope)
+        curve, predicted = moved(here.curve, step[: len(damped)]), -0.5 * float(step @ equations.slope)
         if self.tracks.past is None:
             curve = from_pose_at(curve, 0.0)
-        there = self.place(curve, None if drift is None else drift.moved(step[len(damped) :]), promise)
-        near = damping == 0.0 and abs(promise) < _NEAR
+        there = self.place(curve, None if drift is None else drift.moved(step[len(damped) :]), predicted)
+        near = damping == 0.0 and abs(predicted) < _NEAR
         return there if there.equations.cost <= equations.cost + (_NEAR if near else 0.0) else None
 
     def settled(self, before: _Place, after: _Place) -> bool:
-        return after.promise < _FLAT_COST
+        return after.predicted < _FLAT_COST
 
     def descended(self, curve: Curve, drift: Drift | None, steps: int) -> tuple[Curve, Equations, Drift | None]:
-        """Steps until one promises to lower the cost by less than a thousandth of a unit."""
+        """Descend until the predicted decrease of the cost is below a thousandth of a unit."""
         found = descend(self, self.place(curve, drift), steps, _DAMPING)
         return found.curve, found.equations, found.drift
 
@@ -354,11 +353,11 @@ def fit(
     trust: FloatArray | None = None,
     drift: Drift | None = None,
 ) -> Fit:
-    """The spline, from one that is near, with the noises, tails and, if ``learn``, the prior's strength.
+    """Fit the spline and the error distribution from a start nearby, and with ``learn`` the prior's variances.
 
     Args:
-        trust: with it, ``tails`` and ``trust`` are fixed.
-        drift: of the gyroscope that the tracks have, to begin with.
+        trust: if given, ``tails`` and ``trust`` stay fixed.
+        drift: start values of the gyroscope's errors, if the tracks have one.
     """
     fixed = trust is not None
     trust = np.ones(len(tracks)) if trust is None else trust
@@ -369,34 +368,34 @@ def fit(
         drift = first_drift(curve, tracks.gyro)
     for _ in range(_ROUNDS):
         curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _STEPS_A_ROUND)
-        last = _strengths_of(prior, drift)
+        last = _variances(prior, drift)
         old, lower = tails.scale, band_factor(anchored(here, curve, tracks, ANCHORED))
-        used, determined, better, drift = _strengths(here, lower, prior, drift)
+        used, determined, better, drift = _estimate_variances(here, lower, prior, drift)
         if not fixed:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
         prior = better if learn else prior
-        change = np.abs(np.log(_strengths_of(prior, drift) / last))
-        settling = (change > _FLAT_STRENGTH) & (change * determined > _FLAT_EVIDENCE)
+        change = np.abs(np.log(_variances(prior, drift) / last))
+        settling = (change > _FLAT_VARIANCE) & (change * determined > _FLAT_EVIDENCE)
         if abs(np.log(tails.scale / old)) < _FLAT and not np.any(settling):
             break
     curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _LAST_STEPS)
     return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, drift=drift)
 
 
-def _strengths_of(prior: Prior, drift: Drift | None) -> FloatArray:
-    """Variances that are estimated with the spline."""
+def _variances(prior: Prior, drift: Drift | None) -> FloatArray:
+    """(2 or 3,) variances that are estimated with the spline."""
     return np.array([prior.rotation, prior.position, *([] if drift is None else [drift.variance])])
 
 
-def _strengths(
+def _estimate_variances(
     here: Equations, lower: FloatArray, prior: Prior, drift: Drift | None
 ) -> tuple[float, FloatArray, Prior, Drift | None]:
-    """Number of parameters that tracks determine; numbers (2 or 3,) of accelerations and errors of a gyroscope
-    beside them; the prior and the gyroscope's noise of more evidence."""
+    """Re-estimate the variances by evidence: returns the number of parameters that tracks determine, the numbers
+    (2 or 3,) of accelerations and gyroscope errors that determine variances, the prior and the drift."""
     inverse, old = bordered_inverse(lower, here.border), np.array([prior.rotation, prior.position])
     tied = np.array([band_inner(inverse, band) for band in here.rough.bands]) / old
     determined = np.maximum(here.rough.count - tied, 1e-3)
-    new = np.where(determined > _TELLING, np.clip(here.rough.squares / determined, *_STRENGTHS), old)
+    new = np.where(determined > _FEWEST, np.clip(here.rough.squares / determined, *_LIMITS), old)
     used = len(lower) - 6.0 - float(np.sum(tied))
     if here.sensed is not None and here.border is not None and drift is not None:
         own, left, drift = learned(here.sensed, drift, lower, inverse, here.border)
@@ -404,15 +403,15 @@ def _strengths(
     return used, determined, prior._replace(rotation=float(new[0]), position=float(new[1])), drift
 
 
-# Where the descent begins
+# Start of the fit
 
 
 def window_motions(
     windows: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter, seed: int
 ) -> list[Motion | None]:
-    """The paper's motion in each window, of some of its tracks; None where they show none.
+    """The paper's linear motion of each window, from some of its tracks; None if none is found.
 
-    Translations of one camera have the length ``_SHORT``.
+    The unknown length of one camera's translation is set to ``_SHORT``.
     """
     alone = is_of_one_camera(windows)
     out, solver, unit = list[Motion | None](), RefinedSolver(one_camera=alone), _SHORT if alone else 1.0
@@ -427,32 +426,32 @@ def window_motions(
 def first_curve(
     motions: Sequence[Motion | None], tracks: TimedTracks, span: tuple[float, float], interval: float
 ) -> Curve:
-    """A spline along the motions of the windows; missing and wrong ones are interpolated from their neighbours'.
+    """The spline through the motions of the windows; missing and wrong ones are interpolated from neighbours.
 
     Args:
         span: times of the first and the last line.
     """
     rates, known = _rates(motions)
     places = np.arange(len(rates))
-    others = np.stack([_bridged(rates, known & (places != k))[k] for k in places])
-    own, bridged = (_chained(each, span, interval) for each in (_bridged(rates, known), others))
+    others = np.stack([_interpolated(rates, known & (places != k))[k] for k in places])
+    own, bridged = (_spline_through(each, span, interval) for each in (_interpolated(rates, known), others))
     errors = []
     for curve in (own, bridged):
         chosen = [squared_errors(curve, tracks)[members] for members in tracks.members]
         errors.append(np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen]))
     known &= ~(errors[0] > _SUSPECT * errors[1])
-    return _chained(_bridged(rates, known), span, interval)
+    return _spline_through(_interpolated(rates, known), span, interval)
 
 
 def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:
-    """A longer spline: along the motions of the windows from ``start`` on, to a time."""
+    """The spline extended to time ``last`` along the motions of the windows from number ``start`` on."""
     rates, known = _rates(motions)
     if not np.any(known):
         rates, known = _rates([ContinuousMotion.of(curve).from_time(start - 1.0)])
-    rates = _bridged(rates, known)
+    rates = _interpolated(rates, known)
     count = control_count(curve.first, last, curve.interval)
     taus = curve.first + curve.interval * (np.arange(count) - 1.0)
-    ahead = from_pose_at(_chained(rates, (0.0, max(last - start, 1.0)), curve.interval), 0.0)
+    ahead = from_pose_at(_spline_through(rates, (0.0, max(last - start, 1.0)), curve.interval), 0.0)
     own, later = evaluate(curve, taus)[0], evaluate(ahead, taus - start)[0]
     here = evaluate(curve, float(start))[0]
     R, p = curve.R, curve.p
@@ -464,21 +463,21 @@ def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: 
 
 
 def _rates(motions: Sequence[Motion | None]) -> tuple[FloatArray, BoolArray]:
-    """Rates (n, 6) of rotation and translation, and which are known."""
+    """(n, 6) rates of rotation and translation, and a mask (n,) of known ones."""
     rates = np.array([[0.0] * 6 if motion is None else [*motion.w, *motion.d] for motion in motions])
     return rates, np.array([motion is not None for motion in motions])
 
 
-def _bridged(rates: FloatArray, known: BoolArray) -> FloatArray:
-    """Rates (n, 6), the unknown ones interpolated; 0 where none is known."""
+def _interpolated(rates: FloatArray, known: BoolArray) -> FloatArray:
+    """Rates (n, 6) with unknown ones interpolated; all 0 if none is known."""
     if not np.any(known):
         return np.zeros_like(rates)
     places = np.arange(len(rates))
     return np.stack([np.interp(places, places[known], column[known]) for column in rates.T], axis=1)
 
 
-def _chained(rates: FloatArray, span: tuple[float, float], interval: float) -> Curve:
-    """Through the poses that rates of rotation and translation (n, 6) lead to."""
+def _spline_through(rates: FloatArray, span: tuple[float, float], interval: float) -> Curve:
+    """The spline through the poses that result from rates (n, 6) of rotation and translation, one per period."""
     motions, poses = [LinearMotion(rate[:3], rate[3:]) for rate in rates], [Pose(np.eye(3), np.zeros(3))]
     for motion in motions:
         poses.append(compose(Pose(*motion.body_from_world(1.0)), poses[-1]))
@@ -494,11 +493,11 @@ def _chained(rates: FloatArray, span: tuple[float, float], interval: float) -> C
 
 
 def choose(found: Fit, tracks: TimedTracks, intervals: Sequence[float]) -> Fit:
-    """The fit of most evidence, by climbing from one: its memory, then its smoothness, then its knots."""
+    """Improve the evidence of a fit by changing the prior's memory, its smoothness, and the knot interval."""
     best, most = found, log_evidence(found, _PRECISION)
 
     def better(curve: Curve, memory: float, smooth: int) -> bool:
-        """Whether another prior or other knots are, with the same tails and tracks; they are then the best."""
+        """Whether another prior or knot interval has more evidence, with the same tails; it then becomes best."""
         nonlocal best, most
         prior = best.prior._replace(memory=memory, smooth=smooth)
         try:
@@ -506,7 +505,7 @@ def choose(found: Fit, tracks: TimedTracks, intervals: Sequence[float]) -> Fit:
             evidence = log_evidence(other, _PRECISION)
         except NotDefiniteError:
             return False
-        gained = evidence > most + _WORTH
+        gained = evidence > most + _LEAST_GAIN
         if gained:
             best, most = other, evidence
         return gained

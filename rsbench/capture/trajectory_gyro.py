@@ -1,9 +1,8 @@
-"""A gyroscope beside the matches of a sequence: the rates that it measures, and its errors.
+"""Gyroscope samples in the fit of a trajectory, and the estimation of the gyroscope's errors.
 
-A sample is a measurement of the spline's rate at its time, with white noise, so that nothing is integrated: gaps
-and slow sampling do no harm. Its errors are estimated with the spline: a constant bias, the offset of its clock,
-and errors of its axes and scales are unknowns beside the control poses, a border of 13 columns beside the band;
-then the variance of the noise.
+A sample measures the angular rate of the spline at its time, with white noise. Nothing is integrated, so gaps and
+slow sampling do no harm. A constant bias, the offset of its clock, and errors of its axes and scales are unknowns
+in addition to the control poses: 13 columns that border the band matrix. Then the noise variance is estimated.
 """
 
 from __future__ import annotations
@@ -27,46 +26,46 @@ from rsbench.core import so3
 from rsbench.core.so3 import FloatArray
 
 _APART = 1 / 16
-"""Frame periods: closer samples are averaged. A filter in the sensor correlates their noise, and a mean over an
-eighth of a period would blunt the shake of a hand."""
+"""Samples are averaged over this time, frame periods: a filter in the sensor correlates the noise of closer ones,
+and a mean over an eighth of a period would attenuate the shake of a hand."""
 _MOMENT = 1e-3
-"""Half of the time over which the spline's turn is measured as its rate: far above rounding, far below a knot."""
+"""Half of the time step, frame periods, of the difference that gives the spline's rate."""
 _BIAS = 1e-2
 """Prior standard deviation of the bias, rad per frame period: 0.3 rad/s at 30 Hz."""
 _SHIFT, FARTHEST = 0.2, 0.5
 """Prior standard deviation of the shift of its clock, frame periods, and the largest shift: a quarter of the
 period of the fastest shakes of a hand."""
-_CROOKED, _MOST_CROOKED = 0.02, 0.3
-"""Prior standard deviation of errors of axes and scales, rad and relative, and their largest credible ones."""
+_MISALIGNMENT, _MOST_MISALIGNMENT = 0.02, 0.3
+"""Prior standard deviation of errors of axes and scales, rad and relative, and their largest plausible value."""
 ERRORS = 13
-_EXPECTED = np.array([_BIAS] * 3 + [_SHIFT] + [_CROOKED] * 9)
+_EXPECTED = np.array([_BIAS] * 3 + [_SHIFT] + [_MISALIGNMENT] * 9)
 _LEAST_VARIANCE = 1e-12
-"""rad^2 per frame period: far below that of any gyroscope, and above rounding."""
-_TELLING = 2.0
-"""Errors, in number, beside those that the spline follows, from which on their variance is estimated."""
+"""Smallest noise variance, rad^2 per frame period: far below that of any gyroscope, and above rounding."""
+_LEAST_RESIDUALS = 2.0
+"""Effective number of residuals, after those that the spline follows, above which their variance is estimated."""
 _UNLIKE, _NOISY = 0.3, 3.0
-"""Root mean square of a gyroscope's errors, over the variation of its rates and over its own noise: above both, it
-contradicts the matches."""
+"""A gyroscope contradicts the matches if the root mean square of its errors exceeds this share of the variation of
+its rates and this multiple of its noise."""
 
 
 class GyroSteps(NamedTuple):
-    """Turns that a gyroscope measured, n of them in the order of time."""
+    """n rotations that a gyroscope measured, in the order of time."""
 
     start: FloatArray
     """(n,) frame periods."""
     end: FloatArray
     turn: FloatArray
-    """(n, 3) rotation vectors of the body at the end, seen from the body at the start; with the bias."""
+    """(n, 3) rotation vectors of the body at the end, relative to the body at the start; including the bias."""
     worth: FloatArray
-    """(n,) frame periods that each stands for: its rates have the noise of a turn over that time."""
+    """(n,) frame periods that each sample represents: its rate has the noise of a rotation over that time."""
 
     def between(self, first: float, last: float) -> GyroSteps:
-        """Those that start at a time or later, and end at another or earlier."""
+        """The rotations within the times ``first`` to ``last``."""
         begun, ended = np.searchsorted(self.start, first), np.searchsorted(self.end, last, side="right")
         return GyroSteps(*(each[begun:ended] for each in self))
 
     def begun_before(self, time: float) -> GyroSteps:
-        """Those that start before a time."""
+        """The rotations that start before a time."""
         return GyroSteps(*(each[: np.searchsorted(self.start, time)] for each in self))
 
 
@@ -74,10 +73,10 @@ class Drift(NamedTuple):
     """Errors of a gyroscope."""
 
     errors: FloatArray
-    """(13,) bias of its rates in the convention of ``Correspondences.gyro``, rad per frame period; the shift:
-    frame periods that its times are early by; what the matrix (3, 3) that multiplies its rates has beside 1."""
+    """(13,) bias of the rates in the convention of ``Correspondences.gyro``, rad per frame period (3); shift of
+    the clock, i.e. frame periods by which its times are early (1); matrix of axes and scales, minus 1 (9)."""
     variance: float
-    """Of the white noise of its turn over a frame period, about each axis, rad^2."""
+    """Variance of the white noise of its rotation over a frame period about each axis, rad^2."""
 
     @property
     def bias(self) -> FloatArray:
@@ -86,16 +85,16 @@ class Drift(NamedTuple):
 
     @property
     def shift(self) -> float:
-        """Frame periods."""
+        """Frame periods by which its times are early."""
         return float(self.errors[3])
 
     @property
-    def crooked(self) -> FloatArray:
-        """(3, 3)."""
+    def misalignment(self) -> FloatArray:
+        """(3, 3) deviation of the matrix of axes and scales from the identity."""
         return self.errors[4:].reshape(3, 3)
 
     def moved(self, step: FloatArray) -> Drift:
-        """After a step of the errors (13,), the shift within its limits."""
+        """The errors after a step (13,), with the shift clipped to its limits."""
         errors = self.errors + step
         errors[3] = np.clip(errors[3], -FARTHEST, FARTHEST)
         return self._replace(errors=errors)
@@ -106,25 +105,25 @@ class GyroFound:
     """Errors of a gyroscope, as estimated from a sequence."""
 
     bias: FloatArray
-    """(3,) of its samples, rad per frame period."""
+    """(3,) bias of its samples, rad per frame period."""
     shift: float
-    """Frame periods that its times are early by."""
+    """Frame periods by which its times are early."""
     matrix: FloatArray
-    """(3, 3) which multiplies its rates, with the bias: near the identity, where axes and scales are off."""
+    """(3, 3) matrix that multiplies its rates: the identity plus errors of axes and scales."""
     noise: float
-    """Standard deviation of its turn over a frame period about each axis, rad; with motion that no spline
-    follows."""
+    """Standard deviation of its rotation over a period about each axis, rad, including unmodelled motion."""
     used: bool
-    """False: its samples contradict the matches, being of another time, sign or other axes, and were left out."""
+    """False: its samples contradict the matches (other times, signs or axes) and were not used."""
 
     @classmethod
     def of(cls, drift: Drift, *, used: bool = True) -> GyroFound:
         noise = float(np.sqrt(drift.variance))
-        return cls(bias=drift.bias, shift=drift.shift, matrix=np.eye(3) + drift.crooked, noise=noise, used=used)
+        matrix = np.eye(3) + drift.misalignment
+        return cls(bias=drift.bias, shift=drift.shift, matrix=matrix, noise=noise, used=used)
 
 
 class Border(NamedTuple):
-    """Normal equations of a gyroscope's errors beside those of the control poses."""
+    """The parts of the normal equations that involve a gyroscope's errors."""
 
     mixed: FloatArray
     """(6 controls, 13)."""
@@ -135,7 +134,7 @@ class Border(NamedTuple):
 
 
 class Sensed(NamedTuple):
-    """Sum of squared errors of steps, whitened except for the variance, and half its derivatives."""
+    """Sum of squared residuals of the samples for a variance of 1, and half its derivatives."""
 
     squares: float
     gradient: FloatArray
@@ -144,11 +143,11 @@ class Sensed(NamedTuple):
     """(6 controls, width)."""
     border: Border
     count: int
-    """Scalar errors."""
+    """Number of scalar residuals."""
 
 
 def gyro_steps(samples: FloatArray) -> GyroSteps:
-    """Turns within a moment around samples (n, 4) tau, w, in any order; close ones are averaged."""
+    """Convert samples (n, 4) tau, w, in any order, to short rotations; close samples are averaged."""
     samples = samples[np.argsort(samples[:, 0], kind="stable")]
     first = np.flatnonzero(np.diff(np.floor(samples[:, 0] / _APART), prepend=-np.inf))
     if len(first) < 2:
@@ -160,21 +159,21 @@ def gyro_steps(samples: FloatArray) -> GyroSteps:
 
 
 def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
-    """Errors of steps within a spline, and their derivatives in a band of a width, five control poses at least."""
+    """Residuals of steps for a spline, with derivatives in a band of a width (at least 30: five control poses)."""
     count, controls, length = len(steps.start), len(curve.p), steps.end - steps.start
     views = blank_views(2 * count)
     fill_views(curve, np.concatenate([steps.start, steps.end]) + drift.shift, views)
     R, turn, index = views.R.reshape(2, count, 3, 3), views.turn.reshape(2, count, 4, 3, 3), views.index
     turned = R[1] @ np.swapaxes(R[0], 1, 2)
-    wanted = steps.turn + steps.turn @ drift.crooked.T - length[:, None] * drift.bias
+    wanted = steps.turn + steps.turn @ drift.misalignment.T - length[:, None] * drift.bias
     off = turned @ np.swapaxes(so3.exp(wanted), 1, 2)
     errors, root = so3.log(off), (steps.worth**0.5 / length)[:, None]
-    # By a turn of the body at the end, and whitened.
+    # Derivative by a rotation of the body at the end, whitened.
     by_end = np.linalg.inv(so3.left_jacobian(errors)) * root[..., None]
     faster = views.spin[count:] - (turned @ views.spin[:count, :, None])[..., 0]
     against = by_end @ off @ so3.left_jacobian(wanted)
-    by_crooked = -(against[..., None] * steps.turn[:, None, None, :]).reshape(count, 3, 9)
-    by_drift = np.concatenate([against * length[:, None, None], by_end @ faster[..., None], by_crooked], axis=2)
+    by_matrix = -(against[..., None] * steps.turn[:, None, None, :]).reshape(count, 3, 9)
+    by_drift = np.concatenate([against * length[:, None, None], by_end @ faster[..., None], by_matrix], axis=2)
     errors = root * errors
     size = 4 + int(np.max(index[count:] - index[:count], initial=0))
     first = np.minimum(index[:count], controls - size)
@@ -191,13 +190,13 @@ def sensed(curve: Curve, steps: GyroSteps, drift: Drift, width: int) -> Sensed:
 
 
 def first_drift(curve: Curve, steps: GyroSteps) -> Drift:
-    """No errors, except for the noise of steps about a spline."""
+    """Start values: errors of 0, and the variance of the residuals for a spline."""
     found = sensed(curve, steps, Drift(np.zeros(ERRORS), 1.0), 6 * max(len(curve.p), 5))
     return Drift(np.zeros(ERRORS), max(found.squares / max(found.count, 1), _LEAST_VARIANCE))
 
 
 def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]:
-    """Cost of steps, and the border; ``begins``: with the prior on the gyroscope's errors."""
+    """Cost of the samples, and the border; with ``begins``, the prior of the gyroscope's errors is added."""
     border = Border(*(each / drift.variance for each in found.border))
     cost = 0.5 * found.squares / drift.variance
     if begins:
@@ -209,18 +208,18 @@ def border_of(found: Sensed, drift: Drift, begins: bool) -> tuple[float, Border]
 
 
 class Eliminated(NamedTuple):
-    """A gyroscope's errors, eliminated from normal equations whose factor is known."""
+    """The result of eliminating the control poses from the normal equations of a gyroscope's errors."""
 
     follows: FloatArray
-    """(6 controls, 13) how the control poses move against them."""
+    """(6 controls, 13) minus the derivative of the fitted control poses by the gyroscope's errors."""
     covariance: FloatArray
-    """(13, 13) of them."""
+    """(13, 13) covariance of the gyroscope's errors."""
     log_determinant: float
-    """What it adds to that of the control poses alone."""
+    """Log-determinant of all normal equations minus that of the control poses alone."""
 
 
 def eliminated(lower: FloatArray, border: Border) -> Eliminated:
-    """Raises NotDefiniteError."""
+    """Eliminate the control poses, whose normal matrix has the factor ``lower``. Raises NotDefiniteError."""
     follows = band_solve(lower, border.mixed)
     left = border.corner - border.mixed.T @ follows
     try:
@@ -239,7 +238,7 @@ def bordered_step(lower: FloatArray, gradient: FloatArray, border: Border) -> tu
 
 
 def bordered_inverse(lower: FloatArray, border: Border | None) -> FloatArray:
-    """Covariance of control poses, in its band, beside a gyroscope's unknown errors."""
+    """Covariance of control poses, in its band, including the uncertainty of a gyroscope's errors."""
     inverse = band_inverse(lower)
     if border is None:
         return inverse
@@ -253,7 +252,10 @@ def bordered_inverse(lower: FloatArray, border: Border | None) -> FloatArray:
 def learned(
     found: Sensed, drift: Drift, lower: FloatArray, inverse: FloatArray, border: Border
 ) -> tuple[float, float, Drift]:
-    """Parameters that steps determine, errors that are left beside them, and the variance of more evidence.
+    """Re-estimate the noise variance by evidence.
+
+    Returns the number of parameters that the samples determine, the number of residuals beyond these, and the
+    errors with the new variance.
 
     Args:
         lower: factor of the normal matrix of control poses alone.
@@ -264,22 +266,21 @@ def learned(
     tied -= 2.0 * np.sum((rest.follows @ rest.covariance) * found.border.mixed)
     used = float(tied) / drift.variance
     left = found.count - used
-    if left <= _TELLING:
+    if left <= _LEAST_RESIDUALS:
         return used, 1e-3, drift
     return used, left, drift._replace(variance=max(found.squares / left, _LEAST_VARIANCE))
 
 
 def contradicts(steps: GyroSteps, drift: Drift) -> bool:
-    """Whether the samples of a gyroscope are of another clock or other axes than the matches.
+    """Whether a gyroscope contradicts the matches, as with another clock or other axes.
 
-    Its errors are a large part of its rates and exceed its noise, or its clock, axes or scales are off by more
-    than is credible.
+    Its residuals are a large part of its rates and exceed its noise, or clock, axes or scales are implausible.
     """
     if len(steps.start) < 3 or drift.variance <= _LEAST_VARIANCE:
         return False
     rates = steps.turn / (steps.end - steps.start)[:, None]
     errors = drift.variance * float(np.mean(1.0 / steps.worth))
     varied = float(np.mean(np.var(rates, axis=0)))
-    noise = float(np.mean(np.diff(rates, n=2, axis=0) ** 2)) / 6.0  # slow turns hardly show in second differences
-    far = abs(drift.shift) >= FARTHEST or float(np.max(np.abs(drift.crooked))) > _MOST_CROOKED
+    noise = float(np.mean(np.diff(rates, n=2, axis=0) ** 2)) / 6.0  # second differences remove slow rotations
+    far = abs(drift.shift) >= FARTHEST or float(np.max(np.abs(drift.misalignment))) > _MOST_MISALIGNMENT
     return far or errors > max(_UNLIKE**2 * varied, _NOISY**2 * noise)

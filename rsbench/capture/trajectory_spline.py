@@ -1,21 +1,21 @@
 """The spline of a trajectory: its poses and their derivatives, its prior, and banded matrices.
 
-A cubic B-spline through control poses: rotations cumulative on SO(3), positions of the body in the world.
+The trajectory is a cubic B-spline of control poses: cumulative on SO(3) for rotations, in the world for positions.
 
     R(u) = exp(b3 O[i+2]) exp(b2 O[i+1]) exp(b1 O[i]) C[i],   O[k] = log(C[k+1] C[k]^T)
     p(u) = p[i] + b1 (p[i+1] - p[i]) + b2 (p[i+2] - p[i+1]) + b3 (p[i+3] - p[i+2])
 
-with C body_from_world and the b of ``core.spline_motion``. Rotations and positions do not mix, as they would on
-SE(3), so that a body without forces moves straight in the world while it turns. C. Sommer, V. Usenko, D. Schubert,
-N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for the
-derivatives.
+with C body_from_world and the b of ``core.spline_motion``. Unlike on SE(3), rotations do not affect positions, so
+a body without forces moves straight in the world while it rotates. The derivatives follow C. Sommer, V. Usenko, D.
+Schubert, N. Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR
+2020.
 
-The prior says how hands, heads and vehicles shake. Accelerations, about each axis and along it, are stationary
-noise that forgets within a time (R. Singer, Estimating optimal tracking filter performance for manned maneuvering
-targets, IEEE Trans. AES 1970): as second differences d of the control poses, (1 - rho L)^m d is white, L the step
-back by a knot and rho = exp(-interval / memory). White accelerations, whose memory is 0, would allow a tremor at
-any rate; white jerk lets the rig run away. T. Barfoot, C. Tong, S. Sarkka, Batch continuous-time trajectory
-estimation as exactly sparse Gaussian process regression, RSS 2014, for such priors of trajectories.
+The prior models the shake of hands, heads and vehicles: accelerations about and along each axis are stationary
+noise with a correlation time, ``memory`` (R. Singer, Estimating optimal tracking filter performance for manned
+maneuvering targets, IEEE Trans. AES 1970). With d the second differences of the control poses, (1 - rho L)^m d is
+white, where L shifts back by one knot and rho = exp(-interval / memory). White accelerations (memory 0) would
+allow tremor at any frequency; white jerk would let the rig drift away. For such priors see T. Barfoot, C. Tong, S.
+Sarkka, Batch continuous-time trajectory estimation as exactly sparse Gaussian process regression, RSS 2014.
 
 Banded symmetric matrices are stored by columns: entry (j, i) of a band (n, width) is element (j + i, j) of the
 matrix.
@@ -44,11 +44,11 @@ from rsbench.core.so3 import FloatArray
 
 
 class NotDefiniteError(ValueError):
-    """A matrix without a Cholesky factor."""
+    """Raised for a matrix without a Cholesky factor."""
 
 
 def band_factor(band: FloatArray) -> FloatArray:
-    """Lower Cholesky factor, a band.
+    """Lower Cholesky factor of a band matrix, as a band.
 
     Raises:
         NotDefiniteError: there is none.
@@ -61,12 +61,12 @@ def band_factor(band: FloatArray) -> FloatArray:
 
 
 def band_solve(lower: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution (n, ...) for a right-hand side (n, ...)."""
+    """Solution (n, ...) for a right-hand side (n, ...), with the factor ``lower`` of the matrix."""
     return np.asarray(scipy.linalg.cho_solve_banded((lower.T, True), right, check_finite=False))
 
 
 def band_log_determinant(lower: FloatArray) -> float:
-    """Of the matrix with this factor."""
+    """Log-determinant of the matrix with the factor ``lower``."""
     return 2.0 * float(np.sum(np.log(lower[:, 0])))
 
 
@@ -79,8 +79,8 @@ def band_inner(a: FloatArray, b: FloatArray) -> float:
 def band_inverse(lower: FloatArray) -> FloatArray:
     """The elements of the inverse that lie in the band of the factor.
 
-    K. Takahashi, J. Fagan, M. Chen, Formation of a sparse bus impedance matrix, PICA 1973: from the last column to
-    the first, each from those below it.
+    K. Takahashi, J. Fagan, M. Chen, Formation of a sparse bus impedance matrix, PICA 1973: columns are computed
+    from the last to the first, each from the later ones.
     """
     n, width = lower.shape
     out, square, column = np.zeros((n, width)), np.zeros((width, width)), np.zeros(width)
@@ -105,12 +105,12 @@ def band_inverse(lower: FloatArray) -> FloatArray:
 
 
 _ORDER = 4
-"""Control poses that a pose depends on."""
+"""Number of control poses that a pose depends on."""
 _SAME = 1e-9
 
 
 class Curve(NamedTuple):
-    """The spline as compiled functions take it; the first interval begins at ``first``."""
+    """The spline in the form that compiled functions take; the first interval begins at time ``first``."""
 
     first: float
     interval: float
@@ -120,7 +120,7 @@ class Curve(NamedTuple):
     p: FloatArray
     """(n, 3) positions of the body in the world, metres."""
     steps: FloatArray
-    """(n - 1, 3) O, radians."""
+    """(n - 1, 3) rotation vectors O between control poses, radians."""
     inverse_left: FloatArray
     """(n - 1, 3, 3) inverse left Jacobians of the steps; their transposes are the right ones."""
 
@@ -131,8 +131,8 @@ class Curve(NamedTuple):
 
 
 def make_curve(first: float, interval: float, R: FloatArray, p: FloatArray) -> Curve:
-    """The spline of control poses (n, 3, 3), (n, 3)."""
-    # Products of products drift off the rotations, twice as far each time: one step back to the nearest.
+    """The spline of control poses with rotations R (n, 3, 3) and positions p (n, 3)."""
+    # Repeated products drift off SO(3), so take one Newton step to the nearest rotation.
     R = 1.5 * R - 0.5 * R @ np.swapaxes(R, 1, 2) @ R
     steps = so3.log(R[1:] @ np.swapaxes(R[:-1], 1, 2))
     inverse_left = np.linalg.inv(so3.left_jacobian(steps))
@@ -141,20 +141,20 @@ def make_curve(first: float, interval: float, R: FloatArray, p: FloatArray) -> C
 
 
 def moved(curve: Curve, step: FloatArray) -> Curve:
-    """Each control pose turned by exp of the first three numbers of its row (n, 6), and shifted by the others."""
+    """The spline after a step (n, 6): control poses are rotated by exp of the first three values and shifted."""
     step = step.reshape(-1, 6)
     return make_curve(curve.first, curve.interval, so3.exp(step[:, :3]) @ curve.R, curve.p + step[:, 3:])
 
 
 def from_pose_at(curve: Curve, tau: float) -> Curve:
-    """The same trajectory, with the body at a time as the world."""
+    """The same trajectory relative to the body at time ``tau``."""
     (R, t), _, _ = evaluate(curve, tau)
     p = -R.T @ t
     return make_curve(curve.first, curve.interval, curve.R @ R.T, (curve.p - p) @ R.T)
 
 
 def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
-    """The intervals that contain times from ``first`` to ``last``; ``zero`` becomes time 0."""
+    """The intervals that contain times ``first`` to ``last``, with times counted from ``zero``."""
     low = int(np.clip(np.floor((first - curve.first) / curve.interval + 1e-9), 0, len(curve.p) - _ORDER))
     high = int(np.clip(np.ceil((last - curve.first) / curve.interval - 1e-9), low + 1, len(curve.p) - _ORDER + 1))
     chosen = slice(low, high + _ORDER - 1)
@@ -162,20 +162,20 @@ def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
 
 
 def span_of(windows: int, shutter: RollingShutter) -> tuple[float, float]:
-    """Times of the first and the last line of a number of windows, with time 0 between."""
+    """Times of the first and the last line of a number of windows; the first is at most 0."""
     ends = [shutter.start(frame, side) for frame in (0, windows) for side in SIDES]
     return min(0.0, float(np.min(ends))), float(np.max(ends)) + shutter.readout_ratio
 
 
 def control_count(first: float, last: float, interval: float) -> int:
-    """Control poses of a spline that reaches from one time to another."""
+    """Number of control poses of a spline from one time to another."""
     return max(int(np.ceil((last - first) / interval - 1e-9)), 1) + _ORDER - 1
 
 
 def evaluate(curve: Curve, tau: ArrayLike) -> tuple[Pose, FloatArray, FloatArray]:
-    """body_from_world at times (...), w' with dR/dtau = [w']x R, and the velocity (..., 3) of p.
+    """body_from_world at times (...), w' (..., 3) with dR/dtau = [w']x R, and the velocity (..., 3) of p.
 
-    Before the first interval and after the last, rates stay what they are there.
+    The motion is extrapolated with constant rates before the first interval and after the last.
     """
     tau = np.asarray(tau, dtype=np.float64)
     inside = np.clip(tau, curve.first, curve.last)
@@ -198,21 +198,21 @@ def evaluate(curve: Curve, tau: ArrayLike) -> tuple[Pose, FloatArray, FloatArray
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class ContinuousMotion(Motion):
-    """The trajectory of a rig over many frames, seen from the body at time 0."""
+    """The trajectory of a rig over many frames, relative to the body at time 0."""
 
     name: ClassVar[str] = "continuous"
     first: float
-    """Where the first interval begins, frame periods."""
+    """Start of the first interval, frame periods."""
     interval: float
     """Frame periods between two control poses."""
     controls: FloatArray
     """(n, 6) rotation vectors of body_from_world, radians, and positions of the body in the world, metres."""
 
     def __init__(self, w: ArrayLike, d: ArrayLike, first: float, interval: float, controls: ArrayLike) -> None:
-        """From control poses whose ``endpoint`` is w and d.
+        """Create the motion from control poses; w and d must equal their ``endpoint``.
 
         Raises:
-            ValueError: no such rows, or another w or d.
+            ValueError: the controls are not rows of 6 finite numbers, or have another w or d.
         """
         super().__init__(w, d)
         rows = np.array(controls, dtype=np.float64)
@@ -229,7 +229,7 @@ class ContinuousMotion(Motion):
 
     @classmethod
     def of(cls, curve: Curve) -> ContinuousMotion:
-        """The motion of a spline, seen from its body at time 0."""
+        """The motion of a spline relative to its body at time 0."""
         curve = from_pose_at(curve, 0.0)
         own = {
             "first": curve.first,
@@ -251,8 +251,7 @@ class ContinuousMotion(Motion):
         return spin, so3.cross(spin, t) - (R @ speed[..., None])[..., 0]
 
     def seen(self, axes: FloatArray, scale: float = 1.0) -> ContinuousMotion:
-        """In other axes (3, 3), also mirrored ones, and another unit of length, of which the old one is
-        ``scale``."""
+        """The motion in other axes (3, 3), which may be mirrored, with lengths multiplied by ``scale``."""
         turns, places = self.controls[:, :3], self.controls[:, 3:]
         rows = np.concatenate([np.linalg.det(axes) * turns @ axes.T, scale * places @ axes.T], axis=1)
         own = {"first": self.first, "interval": self.interval, "controls": rows}
@@ -275,22 +274,22 @@ class ContinuousMotion(Motion):
 
 
 class Views(NamedTuple):
-    """Poses at n times."""
+    """Poses at n times, with derivatives."""
 
     index: NDArray[np.int64]
     """(n,) the first of the four control poses that a pose depends on."""
     R: FloatArray
     """(n, 3, 3) body_from_world."""
     p: FloatArray
-    """(n, 3) in the world, metres."""
+    """(n, 3) position in the world, metres."""
     spin: FloatArray
     """(n, 3) dR/dtau = [spin]x R."""
     speed: FloatArray
     """(n, 3) dp/dtau."""
     turn: FloatArray
-    """(n, 4, 3, 3) how the body turns when a control pose does, each about its own axes."""
+    """(n, 4, 3, 3) derivative of the body's rotation by that of each control pose, about the axes of each."""
     share: FloatArray
-    """(n, 4) how p moves when a control pose does."""
+    """(n, 4) derivative of p by the position of each control pose."""
 
 
 @compiled(error_model="numpy")
@@ -309,7 +308,7 @@ def blank_views(count: int) -> Views:
 
 @compiled(error_model="numpy")
 def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
-    """The poses at times (n,)."""
+    """Compute the poses at times (n,)."""
     work = np.zeros((5, 3, 3))
     for k in range(len(taus)):
         fill_view(curve, taus[k], views, k, work)
@@ -317,7 +316,7 @@ def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
 
 @compiled(error_model="numpy")
 def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) -> None:
-    """The pose at one time, as number ``k``; work (5, 3, 3)."""
+    """Compute the pose at one time and store it at index ``k``; ``work`` is a buffer (5, 3, 3)."""
     count = len(curve.p)
     place = (tau - curve.first) / curve.interval
     i = min(max(math.floor(place), 0), count - 4)
@@ -338,7 +337,7 @@ def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) 
 
 @compiled(error_model="numpy")
 def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: int, work: FloatArray) -> None:
-    """Rotation, its rate and its derivatives: from the last factor to the first."""
+    """Compute rotation, angular rate and derivatives, from the last factor of R to the first."""
     before, factor, jacobian, product, by_step = work[0], work[1], work[2], work[3], work[4]
     turn, spin = views.turn[k], (0.0, 0.0, 0.0)
     for m in range(3):
@@ -361,7 +360,7 @@ def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: 
             for n in range(3):
                 turn[j, m, n] = -b[j] * by_step[m, n]
         _multiply(before, factor, product)
-        before, product = product, before  # to copy one takes seconds to compile, for the error of unlike shapes
+        before, product = product, before  # a copy would add seconds of compilation, for its check of shapes
     for m in range(3):
         for n in range(3):
             turn[0, m, n] += before[m, n]
@@ -402,9 +401,9 @@ class Prior(NamedTuple):
     """Prior on accelerations."""
 
     memory: float
-    """Frame periods of their correlation."""
+    """Correlation time, frame periods."""
     smooth: int
-    """m: 1 or 2; the power of fast shakes falls with their rate to the power of -4 - 2 m."""
+    """m, 1 or 2: the power of fast shakes falls with their frequency to the power of -4 - 2 m."""
     rotation: float
     """Variance of angular accelerations about each axis, rad^2 per frame period^4."""
     position: float
@@ -415,24 +414,24 @@ NO_PRIOR = Prior(1.0, 1, np.inf, np.inf)
 
 
 class Roughness(NamedTuple):
-    """Sums of squared accelerations, whitened; over the variances of a prior, twice its cost."""
+    """Sums of squared whitened accelerations; divided by the prior's variances, they are twice its cost."""
 
     squares: FloatArray
-    """(2,) of rotations and of positions."""
+    """(2,) sums for rotations and for positions."""
     gradients: FloatArray
-    """(2, 6 controls) of half the squares."""
+    """(2, 6 controls) gradients of half the squares."""
     bands: FloatArray
     """(2, 6 controls, width) Gauss-Newton matrices of half the squares, see ``trajectory_tracks.add_tracks``."""
     count: int
-    """Accelerations of either kind, scalar."""
+    """Number of scalar accelerations of each kind."""
     log_density: float
-    """Logarithm of the density of control poses of one axis, at unit variances, except for constants."""
+    """Logarithm of the prior density of one axis at its mode, for a variance of 1, up to constants."""
 
 
 def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
-    """Weights of successive second differences, for accelerations of unit variance.
+    """Weights of successive second differences that whiten accelerations of unit variance.
 
-    One row for each of the first ``smooth`` differences, which have fewer before them, and one for all later ones.
+    The first ``smooth`` differences have fewer before them and own rows; all later ones share one.
     """
     rho = float(np.exp(-interval / memory)) if memory > 0.0 else 0.0
     unit = interval**-2
@@ -448,11 +447,11 @@ def whitening(interval: float, memory: float, smooth: int) -> list[FloatArray]:
 def roughness(
     curve: Curve, memory: float, smooth: int, width: int, begins: bool = True, until: int | None = None
 ) -> Roughness:
-    """Of a spline, in bands of a width (at least 6 (smooth + 3)).
+    """The roughness of a spline, in bands of a width (at least 6 (smooth + 3)).
 
     Args:
-        begins: whether the spline begins here; otherwise differences that need earlier control poses are left out.
-        until: number of a control pose; only differences that begin before it.
+        begins: whether the spline begins here; otherwise the first ``smooth`` differences are left out.
+        until: only differences that begin before the control pose of this number are used.
     """
     n, steps = len(curve.p), (curve.steps, np.diff(curve.p, axis=0))
     gradients, bands = np.zeros((2, 6 * n)), np.zeros((2, 6 * n, width))
@@ -480,9 +479,9 @@ def roughness(
 
 
 def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
-    """Logarithm of the density of a prior at its mode, except for constants that are the same for any knots.
+    """Logarithm of the density of a prior at its mode, up to constants that do not depend on the knots.
 
-    All second differences, one rate and one pose determine the control poses by a matrix of determinant 1.
+    Second differences, one rate and one pose are related to the control poses by a matrix of determinant 1.
     """
     sizes = 0.5 * rough.count * float(np.log(prior.rotation) + np.log(prior.position))
     return 6.0 * rough.log_density - sizes
@@ -491,11 +490,11 @@ def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
 def add_blocks(
     gradient: FloatArray, band: FloatArray, by: FloatArray, errors: FloatArray, first: NDArray[np.int64], part: int
 ) -> None:
-    """Add normal equations of errors (n, m) whose derivatives (n, k, m, 3) are by k successive control poses.
+    """Add normal equations of errors (n, m) with derivatives (n, k, m, 3) by k successive control poses.
 
     Args:
-        first: (n,) number of the first of these poses.
-        part: 0 or 3: rotations or positions.
+        first: (n,) index of the first of these poses.
+        part: 0 for rotations, 3 for positions.
     """
     _add_blocks(gradient, band, np.ascontiguousarray(by), np.ascontiguousarray(errors), first, part)
 
@@ -518,10 +517,9 @@ def _add_blocks(
 
 
 def anchors(curve: Curve, width: int, precision: float) -> FloatArray:
-    """Band (6 controls, width) of what a roughness leaves free, the same for any knots: the pose at time 0, a
-    rate.
+    """Band (6 controls, width) that fixes what ``roughness`` does not: the pose at time 0, and one rate.
 
-    ``precision`` is that of the pose at time 0.
+    It is the same for all knots. ``precision`` is that of the pose at time 0.
     """
     n = len(curve.p)
     band, views = np.zeros((6 * n, width)), blank_views(1)
@@ -543,7 +541,7 @@ _SAMPLES, _STEPS = 4, 4
 def approximated(
     body_from_world: Callable[[FloatArray], Pose], span: tuple[float, float], interval: float
 ) -> Curve:
-    """The spline closest to poses at times (n,), of a motion that lasts for a span."""
+    """The least-squares spline approximation of a motion during a span of time."""
     count = control_count(*span, interval)
     R, t = body_from_world(np.asarray(span[0] + interval * (np.arange(count) - 1.0), dtype=np.float64))
     curve = make_curve(span[0], interval, R, _positions(R, t))
@@ -566,31 +564,31 @@ def approximated(
 
 
 def _positions(R: FloatArray, t: FloatArray) -> FloatArray:
-    """Of bodies in the world (n, 3)."""
+    """(n, 3) positions of the body in the world."""
     return -(np.swapaxes(R, 1, 2) @ t[..., None])[..., 0]
 
 
 def pose_covariance(curve: Curve, inverse: FloatArray, taus: FloatArray) -> FloatArray:
-    """Covariance (n, 6, 6) of poses at times (n,): turns of the body, radians, and its positions, metres.
+    """Covariance (n, 6, 6) of poses at times (n,): rotations of the body, radians, and its positions, metres.
 
     Args:
-        inverse: of the normal matrix, in its band.
+        inverse: inverse of the normal matrix, within its band.
     """
     views, by = _derivatives(curve, taus)
     return np.asarray(by @ _block(inverse, views, views) @ np.swapaxes(by, 1, 2))
 
 
 def covariance_between(curve: Curve, inverse: FloatArray, start: float, taus: FloatArray) -> FloatArray:
-    """Covariance (n, 6, 6) of poses at times (n,), seen from the pose at another one.
+    """Covariance (n, 6, 6) of poses at times (n,) relative to the pose at time ``start``.
 
     Raises:
-        ValueError: a time so far away that the band does not contain their covariance.
+        ValueError: a time is so far from ``start`` that the band does not contain their covariance.
     """
     one, by_one = _derivatives(curve, np.full(len(taus), start))
     other, by = _derivatives(curve, taus)
     if 6 * (np.max(np.abs(other.index - one.index), initial=0) + 4) > inverse.shape[1]:
         raise ValueError(f"times that far from {start:g} have no covariance with it in the band")
-    # R' = R R_s^T turns by dR - R' dR_s; q = R_s (p - p_s) moves by R_s (dp - dp_s) + dR_s x q.
+    # R' = R R_s^T rotates by dR - R' dR_s; q = R_s (p - p_s) moves by R_s (dp - dp_s) + dR_s x q.
     R, R_s = other.R, one.R
     relative = R @ np.swapaxes(R_s, 1, 2)
     q = (R_s @ (other.p - one.p)[..., None])[..., 0]
@@ -616,7 +614,7 @@ def _derivatives(curve: Curve, taus: FloatArray) -> tuple[Views, FloatArray]:
 
 
 def _block(inverse: FloatArray, a: Views, b: Views) -> FloatArray:
-    """Covariances (n, 24, 24) of the control poses that poses depend on."""
+    """(n, 24, 24) covariances between the control poses of two sets of poses."""
     rows, columns = (6 * views.index[:, None] + np.arange(24) for views in (a, b))
     low = np.minimum(rows[:, :, None], columns[:, None])
     high = np.maximum(rows[:, :, None], columns[:, None])
@@ -624,11 +622,11 @@ def _block(inverse: FloatArray, a: Views, b: Views) -> FloatArray:
 
 
 def motion_covariance(curve: Curve, inverse: FloatArray, start: float) -> FloatArray | None:
-    """Covariance (6, 6) of w and d, of the motion over a period, seen from the body at its start."""
+    """Covariance (6, 6) of w and d of the motion during one frame period, relative to the body at its start."""
     (here, there), _, _ = evaluate(curve, np.array([start, start + 1.0]))
     R = here[1] @ here[0].T
     t = there[1] - R @ there[0]
-    # w moves by J^-1 of a turn of the body about its own axes, and t = -R p by that turn and by p.
+    # A rotation of the body about its own axes changes w by J^-1 of it; t = -R p depends on it and on p.
     by = np.zeros((6, 6))
     by[:3, :3] = np.linalg.inv(so3.left_jacobian(so3.log(R)))
     by[3:, :3], by[3:, 3:] = -so3.hat(t), -R

@@ -1,10 +1,10 @@
-"""The matches of a sequence as tracks, their reprojection errors, and the distribution of these.
+"""The matches of a sequence as tracks, their reprojection errors, and the distribution of these errors.
 
-A track is any number of ends: pixels of one point, each with its camera and time. Its point, (x, y, 1) / rho in
-the camera of the first end, is found by few Gauss-Newton steps and eliminated from the normal equations (Schur
-complement; B. Triggs et al., Bundle Adjustment, 2000), in compiled functions. A pixel that is shifted is also read
-at another time, which counts in the noise of an end. Nothing is linear in the motion but for those steps. A track
-weighs as under a multivariate t distribution (``solvers.engine.packed.HeavyTailed``).
+A track is a set of observations ("ends") of one point: pixels, each with its camera and readout time. The point,
+(x, y, 1) / rho in the camera of the first observation, is estimated by a few Gauss-Newton steps and eliminated
+from the normal equations (Schur complement; B. Triggs et al., Bundle Adjustment, 2000), in compiled functions. An
+error of a pixel also changes its readout time; the weight W of an observation accounts for that. Tracks are
+weighted as under a multivariate t distribution (``solvers.engine.packed.HeavyTailed``).
 """
 
 from __future__ import annotations
@@ -29,65 +29,66 @@ from rsbench.solvers.engine.packed import t_distribution
 
 IntArray = NDArray[np.int64]
 ENOUGH = 400
-"""Tracks of a window from which on its pairs add little, and take longer than all else."""
+"""With this many tracks in a window, its pairs are ignored: they add little and take most of the time."""
 LONGEST = 5
-"""Frames of a track: more would couple more control poses for little."""
+"""Most frames of a track: longer ones would couple more control poses for little gain."""
 REACH = 10.0
-"""Errors, in scales, beyond which a track is wrong."""
+"""A track with an error of more scales than this is an outlier."""
 LEAST_SCALE_PX = 1e-3
 BEHIND = 1e12
 """Squared error, px^2, of a track whose point lies behind a camera."""
 _NEAREST = 1e-3
-"""Least ratio of depths at two ends."""
+"""Least depth of the point at an observation, relative to that at the first one."""
 _POINT_STEPS = 2
-"""Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
+"""Gauss-Newton steps for the point: an error of 1 px becomes 1e-3 px after one and 1e-9 px after two."""
 _ROUGH_RHO = 3.0
-"""1/m: prior standard deviation of inverse depths, for tracks that do not show their own."""
+"""Prior standard deviation of inverse depths, 1/m, for tracks that do not determine theirs."""
 _UNCERTAIN = 0.3
-"""px: the error that one such deviation counts as."""
+"""Error, px, that an inverse depth of one such deviation contributes to the cost."""
 END = 10
-"""Values of an end."""
+"""Number of values per observation."""
 
 
 class Tails(NamedTuple):
-    """Distribution of errors."""
+    """Student t distribution of errors."""
 
     nu: float
+    """Degrees of freedom."""
     scale: float
     """px."""
 
 
 class Scratch(NamedTuple):
-    """Work arrays for one track of n ends."""
+    """Work arrays for one track of n observations."""
 
     views: Views
     G: FloatArray
-    """(n, 3, 3) rotation from the camera of the first end."""
+    """(n, 3, 3) rotation from the camera of the first observation."""
     b: FloatArray
-    """(n, 3) how the point moves with rho."""
+    """(n, 3) derivative of the point by rho."""
     W: FloatArray
-    """(n, 2, 2) takes errors in ideal pixels to pixels of unit noise."""
+    """(n, 2, 2) maps errors in ideal pixels to errors in measured pixels."""
     e: FloatArray
     """(n, 2) errors, px."""
     D: FloatArray
-    """(n, 2, 3) their derivatives by x, y, rho."""
+    """(n, 2, 3) derivatives of the errors by x, y, rho."""
     point: FloatArray
     """(3,) x, y, rho."""
     left: FloatArray
-    """(3,) gradient by them: 0 but for rounding at the best point."""
+    """(3,) gradient by x, y, rho; 0 up to rounding at the best point."""
     P: FloatArray
-    """(n, 3) the point, in units of its depth at the first end."""
+    """(n, 3) the point, in units of its depth at the first observation."""
     N: FloatArray
     """(3, 3) normal matrix of the point."""
     L: FloatArray
-    """(3, 3) its Cholesky factor."""
+    """(3, 3) Cholesky factor of N."""
     work: FloatArray
     block: FloatArray
-    """(2, 24) derivatives of one end by four control poses."""
+    """(2, 24) derivatives of one observation by four control poses."""
     Q: FloatArray
     """(3, m) mixed part of the normal matrix."""
     H: FloatArray
-    """(m, m) upper half of the normal matrix of the control poses that the track feels."""
+    """(m, m) upper half of the normal matrix of the control poses that the track depends on."""
     g: FloatArray
     """(m,) gradient."""
 
@@ -127,16 +128,16 @@ def add_tracks(
     gradient: FloatArray,
     want: bool,
 ) -> float:
-    """Negative logarithm of the likelihood of tracks, and the normal equations of their weighted squares.
+    """Negative log-likelihood of tracks, and their weighted normal equations.
 
     Args:
-        ends: (e, 10) ray (x, y), tau, derivative of the ideal pixel by the pixel (2 x 2, rows first), derivative
-            of tau by the pixel (2), x of the camera's offset from the body.
-        starts: (n + 1,) first end of each track, and e.
-        trust: (n,) factors on the tracks' parts; those of 0 have squares, and no part.
-        squares: (n,) filled, px^2: chi-squared with 2 ends - 3 degrees of freedom at a noise of 1 px.
-        band: (6 controls, width) lower half of the normal matrix, by columns from the diagonal on; added to when
-            ``want``, as is gradient (6 controls,).
+        ends: (e, 10) observations: ray (x, y), tau, derivative of the ideal pixel by the pixel (2 x 2, rows
+            first), derivative of tau by the pixel (2), x of the camera's offset from the body.
+        starts: (n + 1,) index of each track's first observation, and e.
+        trust: (n,) weights of the tracks; for a weight of 0, only ``squares`` is computed.
+        squares: (n,) output, px^2: chi-squared with 2 observations - 3 degrees of freedom at a noise of 1 px.
+        band: (6 controls, width) lower half of the normal matrix, by columns from the diagonal on; equations are
+            added to it and to gradient (6 controls,) if ``want``.
     """
     most = 0
     for k in range(len(starts) - 1):
@@ -159,7 +160,7 @@ def add_tracks(
 
 @compiled(error_model="numpy")
 def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> float:
-    """The best point of a track; its squared error, px^2."""
+    """Estimate the point of a track; returns the squared error, px^2."""
     count = len(track)
     for n in range(count):
         fill_view(curve, track[n, 2], s.views, n, s.work)
@@ -183,7 +184,7 @@ def _ridge() -> float:
 
 @compiled(error_model="numpy")
 def _first_point(track: FloatArray, s: Scratch) -> Vector:
-    """The point of the first end's ray and of the inverse depth that all others show; fills G and b."""
+    """The point on the first observation's ray at the inverse depth that fits all others; fills G and b."""
     v, x = s.views, (track[0, 0], track[0, 1], 1.0)
     R, p = v.R[0], (v.p[0, 0], v.p[0, 1], v.p[0, 2])
     centre = plus(p, -1.0, apply_transposed(R, (track[0, 9], 0.0, 0.0)))
@@ -206,9 +207,9 @@ def _first_point(track: FloatArray, s: Scratch) -> Vector:
 
 @compiled(error_model="numpy")
 def _linearise(track: FloatArray, focal: FloatArray, point: Vector, s: Scratch, weigh: bool) -> bool:
-    """Fill errors, their derivatives by the point and the factor of its normal matrix; False behind a camera.
+    """Fill errors, their derivatives by the point and the factor of its normal matrix; False: behind a camera.
 
-    ``weigh`` fills W too.
+    With ``weigh``, W is filled too.
     """
     rho, v = point[2], s.views
     s.N[:, :] = 0.0
@@ -241,7 +242,7 @@ def _linearise(track: FloatArray, focal: FloatArray, point: Vector, s: Scratch, 
 
 @compiled(error_model="numpy")
 def _flow(P: Vector, rate: Vector, focal: FloatArray) -> tuple[float, float]:
-    """How the ideal pixel of P moves when P moves by ``rate``."""
+    """Velocity of the ideal pixel of a point P that moves by ``rate``."""
     return (
         focal[0] * (rate[0] - P[0] / P[2] * rate[2]) / P[2],
         focal[1] * (rate[1] - P[1] / P[2] * rate[2]) / P[2],
@@ -250,18 +251,18 @@ def _flow(P: Vector, rate: Vector, focal: FloatArray) -> tuple[float, float]:
 
 @compiled(error_model="numpy")
 def _fill_weight(end: FloatArray, flow: tuple[float, float], W: FloatArray) -> None:
-    """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s."""
+    """W = (L - v s^T)^-1, where L = d ideal pixel / d pixel, v the predicted velocity and s = d tau / d pixel."""
     a, b = end[3] - flow[0] * end[7], end[4] - flow[0] * end[8]
     c, d = end[5] - flow[1] * end[7], end[6] - flow[1] * end[8]
     det = a * d - b * c
-    if not abs(det) > 1e-3:  # the image overtakes its own readout
+    if not abs(det) > 1e-3:  # the image moves as fast as the readout
         a, b, c, d, det = 1.0, 0.0, 0.0, 1.0, 1.0
     W[0, 0], W[0, 1], W[1, 0], W[1, 1] = d / det, -b / det, -c / det, a / det
 
 
 @compiled(error_model="numpy")
 def _factor(N: FloatArray, L: FloatArray) -> bool:
-    """Lower Cholesky factor (3, 3) of N; False when the ends do not determine the point."""
+    """Fill the lower Cholesky factor (3, 3) of N; False: the observations do not determine the point."""
     for i in range(3):
         for j in range(i + 1):
             total = N[i, j]
@@ -297,7 +298,7 @@ def _forward(L: FloatArray, g: Vector) -> Vector:
 def _add_track(
     track: FloatArray, focal: FloatArray, s: Scratch, weight: float, band: FloatArray, gradient: FloatArray
 ) -> None:
-    """Normal equations without the point: H = Dc^T Dc - Q N^-1 Q^T with Q = Dc^T Dp."""
+    """Add the normal equations with the point eliminated: H = Dc^T Dc - Q N^-1 Q^T with Q = Dc^T Dp."""
     low, high = s.views.index[0], s.views.index[0]
     for n in range(len(track)):
         low, high = min(low, s.views.index[n]), max(high, s.views.index[n])
@@ -322,7 +323,7 @@ def _add_track(
 
 @compiled(error_model="numpy")
 def _fill_block(end: FloatArray, n: int, focal: FloatArray, s: Scratch) -> None:
-    """Derivatives of the errors of an end by its four control poses."""
+    """Fill the derivatives of an observation's errors by its four control poses."""
     v, W, P, rho = s.views, s.W[n], (s.P[n, 0], s.P[n, 1], s.P[n, 2]), s.point[2]
     body = plus(P, -rho * end[9], (1.0, 0.0, 0.0))
     by_pose = s.work[0], s.work[1]
@@ -344,7 +345,7 @@ def _fill_block(end: FloatArray, n: int, focal: FloatArray, s: Scratch) -> None:
 
 @compiled(error_model="numpy")
 def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, gradient: FloatArray) -> None:
-    """Add the weighted equations (size) to the band from unknown ``first`` on, without the point."""
+    """Eliminate the point and add the weighted equations (size) to the band from unknown ``first`` on."""
     Q = s.Q
     for i in range(size):
         q = _forward(s.L, (Q[0, i], Q[1, i], Q[2, i]))
@@ -361,10 +362,10 @@ def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, 
 
 
 def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float) -> tuple[Tails, FloatArray]:
-    """Distribution of errors of largest likelihood, and which tracks (n,) are right, 1 or 0.
+    """Maximum-likelihood distribution of the errors, and 1 for inlier tracks, 0 for outliers (n,).
 
     Args:
-        used: degrees of freedom that the trajectory has taken.
+        used: number of degrees of freedom that the fit of the trajectory takes away.
     """
     near = squares <= freedom * (REACH * tails.scale) ** 2
     if not np.any(near):
@@ -377,21 +378,21 @@ def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Past:
-    """The summary of matches that have left, for the first control poses of a spline: a quadratic cost."""
+    """Marginalised matches of earlier windows: a quadratic cost of the first control poses of a spline."""
 
     R: FloatArray
-    """(k, 3, 3) the control poses at which the cost was expanded."""
+    """(k, 3, 3) rotations of the control poses at which the cost was expanded."""
     p: FloatArray
-    """(k, 3)."""
+    """(k, 3) positions of these control poses."""
     gradient: FloatArray
-    """(6 k,), followed by those of the errors of a gyroscope, where there is one."""
+    """(6 k,), followed by the gyroscope's errors if there is one."""
     H: FloatArray
-    """(6 k, 6 k), likewise."""
+    """(6 k, 6 k), extended likewise."""
     errors: FloatArray | None = None
-    """(m,) of the gyroscope, at which the cost was expanded."""
+    """(m,) errors of the gyroscope at which the cost was expanded."""
 
     def without_gyro(self) -> Past:
-        """The cost of the control poses alone, with the errors of a gyroscope eliminated."""
+        """The cost of the control poses alone, with the gyroscope's errors eliminated."""
         if self.errors is None:
             return self
         k = 6 * len(self.p)
@@ -403,22 +404,22 @@ class Past:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TimedTracks:
-    """Tracks, as ``add_tracks`` takes them."""
+    """Tracks in the form that ``add_tracks`` takes."""
 
     ends: FloatArray
-    """(e, 10)."""
+    """(e, 10) observations."""
     starts: IntArray
-    """(n + 1,) first end of each track, and e."""
+    """(n + 1,) index of each track's first observation, and e."""
     members: tuple[IntArray, ...]
-    """For each window, the track (m,) of each of its tracks, left pairs and right pairs that no track repeats."""
+    """For each window, the track index (m,) of its tracks, then of its left and right pairs outside tracks."""
     focal: FloatArray
     """(2,) fx, fy, px."""
     past: Past | None = None
-    """Summary of earlier windows; None: the spline begins here, and the pose at time 0 is the world's."""
+    """Marginalised earlier windows; None: the spline begins here, and the world is the body at time 0."""
     share: float = 1.0
-    """Weight of a track beside the prior: less than 1 where neighbouring tracks have common errors."""
+    """Weight of a track relative to the prior: less than 1 if errors of neighbouring tracks are correlated."""
     gyro: GyroSteps | None = None
-    """Turns by a gyroscope while the spline lasts; None: there is none."""
+    """Rotations measured by a gyroscope during the spline; None: there is none."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -430,13 +431,13 @@ class TimedTracks:
 
     @property
     def span(self) -> tuple[FloatArray, FloatArray]:
-        """Times (n,) of the earliest and the latest end of each track."""
+        """Times (n,) of the earliest and the latest observation of each track."""
         taus = self.ends[:, 2]
         return np.minimum.reduceat(taus, self.starts[:-1]), np.maximum.reduceat(taus, self.starts[:-1])
 
 
 def thinned(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
-    """About ``count`` tracks of each window, and pairs only where there are fewer tracks; of one camera, pairs."""
+    """About ``count`` tracks per window, all matches if there are fewer; or pairs for one camera."""
     if is_of_one_camera(windows):
         return [Correspondences(left=each.left[:: max(len(each.left) // count, 1)]) for each in windows]
     few = [Correspondences(tracks=each.tracks[:: max(len(each.tracks) // count, 1)]) for each in windows]
@@ -444,21 +445,21 @@ def thinned(windows: Sequence[Correspondences], count: int) -> list[Corresponden
 
 
 def thinned_chains(windows: Sequence[Correspondences], count: int) -> list[Correspondences]:
-    """About ``count`` pairs of one camera for each window, with those that go on from them in the next windows."""
+    """About ``count`` pairs of one camera per window, chosen as whole chains through successive windows."""
     pairs = [each.left for each in windows]
-    numbers, chains = _numbered(pairs, [np.ones(len(each), dtype=np.bool_) for each in pairs], 0)
+    numbers, chains = _track_numbers(pairs, [np.ones(len(each), dtype=np.bool_) for each in pairs], 0)
     every = max(sum(map(len, pairs)) // max(count * len(pairs), 1), 1)
     kept = np.random.default_rng(0).permutation(chains) % every == 0
     return [Correspondences(left=each[kept[own]]) for each, own in zip(pairs, numbers, strict=True)]
 
 
 def is_of_one_camera(windows: Sequence[Correspondences]) -> bool:
-    """Whether there are matches of the left camera alone."""
+    """Whether the windows have matches of the left camera only."""
     return not any(len(each.tracks) or len(each.right) for each in windows)
 
 
 def informative(window: Correspondences) -> Correspondences:
-    """The part of a window that is used: its tracks alone, where there are enough."""
+    """The matches of a window that are used: only its tracks if there are ``ENOUGH``, otherwise all."""
     return Correspondences(tracks=window.tracks) if len(window.tracks) >= ENOUGH else window
 
 
@@ -471,13 +472,13 @@ def pack_windows(
     past: Past | None = None,
     share: float = 1.0,
 ) -> TimedTracks:
-    """The tracks of windows, and their pairs that no track repeats; window k is of the frames k and k + 1.
+    """Pack the tracks of windows, and their pairs outside tracks; window k has the frames k and k + 1.
 
     Args:
-        right: for each window, which of its members (m,) are right (not 0): right ones that meet in a frame are
-            one track; None: none is linked to another.
+        right: for each window, which of its members (m,) are inliers (not 0): inliers that share a pixel in a
+            frame are joined to one track; None: none are joined.
         first: number of the first window.
-        past, share: as in ``TimedTracks``.
+        past, share: see ``TimedTracks``.
     """
     members = [np.zeros(0, dtype=np.int64) for _ in windows]
     ends, owners = list[FloatArray](), list[IntArray]()
@@ -485,12 +486,12 @@ def pack_windows(
     for sides in (SIDES, SIDES[:1], SIDES[1:]):
         if len(sides) == 2:
             pixels = [window.tracks for window in windows]
-        else:  # pairs that no track repeats
+        else:  # pairs that are not part of a track
             pixels = [getattr(window, sides[0])[unlinked_pairs(window, sides[0])] for window in windows]
         known = [np.zeros(len(rows), dtype=np.bool_) for rows in pixels]
         if right is not None:
             known = [right[k][len(members[k]) :][: len(rows)] != 0.0 for k, rows in enumerate(pixels)]
-        numbers, count = _numbered(pixels, known, offset)
+        numbers, count = _track_numbers(pixels, known, offset)
         for k, own in enumerate(numbers):
             new = own >= 0 if k == 0 else ~np.isin(own, numbers[k - 1])
             for frame, chosen in ((0, new), (1, np.ones(len(own), dtype=np.bool_))):
@@ -514,11 +515,13 @@ def pack_windows(
     )
 
 
-def _numbered(pixels: Sequence[FloatArray], right: Sequence[BoolArray], first: int) -> tuple[list[IntArray], int]:
-    """Numbers (n,) of the tracks that the rows of each window belong to, from ``first`` on, and the next number.
+def _track_numbers(
+    pixels: Sequence[FloatArray], right: Sequence[BoolArray], first: int
+) -> tuple[list[IntArray], int]:
+    """For each window the track numbers (n,) of its rows, counted from ``first``, and the next free number.
 
-    A right row continues a right track of the window before that ends where it begins, if that has fewer than
-    ``LONGEST`` frames.
+    An inlier row continues an inlier track of the previous window that ends where the row begins, if that track
+    has fewer than ``LONGEST`` frames.
     """
     out, count = list[IntArray](), first
     numbers = lengths = np.zeros(0, dtype=np.int64)
@@ -526,21 +529,21 @@ def _numbered(pixels: Sequence[FloatArray], right: Sequence[BoolArray], first: i
     for rows, known in zip(pixels, right, strict=True):
         half = rows.shape[1] // 2
         open_ = np.flatnonzero(lengths < LONGEST)
-        met = _met(rows[:, :half], ends[open_], known)
-        goes_on = met >= 0
+        matched = _nearest_ends(rows[:, :half], ends[open_], known)
+        continues = matched >= 0
         own, length = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), 2, dtype=np.int64)
-        before = open_[met[goes_on]]
-        own[goes_on], length[goes_on] = numbers[before], lengths[before] + 1
+        before = open_[matched[continues]]
+        own[continues], length[continues] = numbers[before], lengths[before] + 1
         fresh = len(rows) - len(before)
-        own[~goes_on] = count + np.arange(fresh)
+        own[~continues] = count + np.arange(fresh)
         count += fresh
         out.append(own)
         numbers, lengths, ends = own[known], length[known], rows[known, half:]
     return out, count
 
 
-def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
-    """For each place (n, c) the nearest of others (m, c) within the tolerance, each once; -1 for none."""
+def _nearest_ends(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
+    """For each of ``begins`` (n, c) the index of the nearest of ``ends`` (m, c), used once; -1: none is near."""
     out = -np.ones(len(begins), dtype=np.int64)
     distance, nearest = (part[:, 0] for part in nearest_within(begins, ends))
     order = np.argsort(distance, kind="stable")
@@ -551,7 +554,7 @@ def _met(begins: FloatArray, ends: FloatArray, known: BoolArray) -> IntArray:
 
 
 def pack_ends(pixels: FloatArray, frame: int, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """Ends (n, 10) of pixels (n, 2) of one image."""
+    """Observations (n, 10) for pixels (n, 2) of one image."""
     out = np.zeros((len(pixels), END))
     eye = rig.eye(side)
     out[:, :2], out[:, 2] = eye.unproject(pixels)[:, :2], shutter.pixel_time(pixels, frame, side)

@@ -1,10 +1,10 @@
-"""What the cameras of a rig did, from matches alone: motion, readout ratio, scans, delay, disparity offset.
+"""Estimate motion, readout ratio, scans, delay and disparity offset of a rig from matches alone.
 
-The hypotheses are data: how each of the two cameras reads (all lines at once, or from one of the four sides: 25
-scans), how the rig moves (``hypotheses.MODELS``), and whether the right camera is late. Each is fitted by maximum
-likelihood with heavy tails, and they are compared by their evidence: the likelihood integrated over the unknowns
-(Laplace's approximation) times the prior probability. Ratio, scans and motion model are estimated together,
-because a ratio under the wrong motion model is wrong by many of its own standard deviations.
+A hypothesis says how each of the two cameras reads (all lines at once, or from one of the four sides: 25 scans),
+how the rig moves (``hypotheses.MODELS``), and whether the right camera is delayed. ``examine`` fits each by
+maximum likelihood with heavy tails; ``conclude`` compares them by their evidence: the likelihood integrated over
+the unknowns (Laplace's approximation) times the prior probability. Ratio, scans and motion model are estimated
+jointly, because a ratio under the wrong motion model is wrong by many of its standard deviations.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CERTAIN = 0.95
-"""Probability from which a candidate is determined."""
+"""Least probability of a candidate that counts as determined."""
 MAX_SIGMA = 0.015
-"""Largest standard deviation of a determined readout ratio: 0.03 is then two of them."""
+"""Largest standard deviation of a determined readout ratio, so that two of them are 0.03."""
 FEWEST = 30
-"""Matches between two times."""
+"""Fewest matches between two frame times."""
 _LEAST_SHARE = 0.3
-"""Of the matches, that must agree with a determined shutter."""
+"""Least share of inliers among the matches for a determined shutter."""
 _NEARLY, _SMALL = 0.06, 0.15
-"""Readout ratio of nearly a global shutter, within two deviations; and the largest root mean square of the ratios
-that the matches then allow."""
+"""Largest ratio, minus two standard deviations, of a shutter that may be global; and the largest root mean square
+of the ratios that the matches allow if it is."""
 _STILL_PX = 1.0
 _UNLIKELY = 0.01
 _EXPECTED = {"top": 0.5, "global": 0.25, "bottom": 0.1, "left": 0.04, "right": 0.04}
-"""Prior probability of cameras that read alike, by where they begin."""
+"""Prior probability of two cameras with the same scan, by the side at which they begin to read."""
 _APART, _ONE_GLOBAL = 0.06, 0.01
-"""Prior probability of cameras that roll differently, and of one camera that rolls beside one that does not."""
+"""Prior probability of two rolling cameras with different scans, and of a rolling and a global one."""
 _LATE = 0.2
-"""Prior probability that the right camera is late."""
+"""Prior probability that the right camera is delayed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """How the cameras may read, with its probability and what follows from it."""
+    """A possible pair of scans, with its probability and the values of the unknowns under it."""
 
     scans: Scans
     probability: float
@@ -64,35 +64,36 @@ class Candidate:
     delay: float
     delay_sigma: float
     calibration: tuple[float, ...] = NO_ERRORS
-    """Errors of the calibration, see ``calibration.TERMS``."""
+    """Calibration errors, see ``calibration.TERMS``."""
     calibration_sigma: tuple[float, ...] = NO_ERRORS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Capture:
-    """What matches show of the shutters and the motion of a rig; by default nothing."""
+    """The estimated shutter and motion of a rig, from the matches of one or more windows."""
 
     candidates: tuple[Candidate, ...] = ()
-    """The most probable first; those below one in a hundred are left out."""
+    """Scans in descending probability, without those below 0.01."""
     models: Mapping[str, float] = field(default_factory=dict)
-    """Probability of each motion model, the most probable first."""
+    """Probability of each motion model, in descending order."""
     peaks: Mapping[str, Peak] = field(default_factory=dict)
-    """For each motion model under the most probable scans; of the last window, where there are several."""
+    """The peak of each motion model under the most probable scans, in the last window."""
     reason: str
-    """Why the shutter is not determined; empty where it is."""
+    """Why the shutter is not determined; empty if it is."""
     named: bool = False
-    """Whether it is known which camera rolls and from where, though perhaps not how fast."""
+    """Whether the scans are determined, even if the readout ratio is not."""
     windows: int = 0
-    """Pairs of times that the estimate uses."""
+    """Number of windows that were used."""
     matches: int
     used: int = 0
+    """Number of inliers among ``matches``."""
     noise_px: float = float("nan")
     moved_px: float
-    """Median distance that a match moves between the times."""
+    """Median displacement of the matches between the frame times, px."""
 
     @property
     def determined(self) -> bool:
-        """Whether the scans and their ratio are known."""
+        """Whether the scans and their ratio are determined."""
         return not self.reason
 
     @property
@@ -102,7 +103,7 @@ class Capture:
 
     @property
     def offset(self) -> float:
-        """px by which disparities are too large, under the most probable candidate."""
+        """Excess of the disparities, px, under the most probable candidate."""
         return self.calibration[OFFSET]
 
     @property
@@ -112,22 +113,22 @@ class Capture:
 
     @property
     def calibration(self) -> tuple[float, ...]:
-        """Errors of the calibration under the most probable candidate."""
+        """Calibration errors under the most probable candidate."""
         return NO_ERRORS if self.likeliest is None else self.likeliest.calibration
 
     @property
     def motion_model(self) -> str:
-        """The most probable one; empty where there is none."""
+        """The most probable motion model; empty if none was estimated."""
         return next(iter(self.models), "")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Window:
-    """The matches of two successive times, compared under each hypothesis."""
+    """The result for the matches of two successive frame times."""
 
     evidence: WindowEvidence | None = None
     reason: str
-    """Why there is none."""
+    """Why ``evidence`` is None."""
     matches: int
     moved_px: float
 
@@ -140,10 +141,12 @@ def examine(
     seed: int = 0,
     start: Motion | None = None,
 ) -> Window:
-    """The matches of two times, with outliers; left-right matches are joined where there are no tracks.
+    """Fit all hypotheses to the matches of two frame times, with outliers.
+
+    Left-right matches are joined to tracks if there are no tracks.
 
     Args:
-        start: a motion near theirs, of any model; None: a robust search finds one.
+        start: a motion near the true one, of any model; None: a robust search finds one.
     """
     known, options = known or Known(), options or RobustOptions()
     if len(matches.tracks) == 0 and len(matches.stereo_0) + len(matches.stereo_1) > 0:
@@ -167,7 +170,7 @@ def examine(
 
 
 def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA, *, under_laws: bool = False) -> Capture:
-    """What all windows of one rig show together, at least one.
+    """Combine the windows of one rig, at least one, to an estimate.
 
     Args:
         max_sigma: largest standard deviation of a determined readout ratio.
@@ -186,7 +189,7 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA, *, under_l
     scans = dict.fromkeys(key.scans for key in sums)
     candidates = sorted((_candidate(each, sums, shares) for each in scans), key=lambda each: -each.probability)
     kept = sum(window.used for window in used)
-    share = kept / sum(window.of for window in used)
+    share = kept / sum(window.total for window in used)
     likely = sorted((key for key in sums if key.scans == candidates[0].scans), key=lambda key: shares[key])
     names = dict.fromkeys(key.motion_model for key in shares)
     models = {name: sum(p for key, p in shares.items() if key.motion_model == name) for name in names}
@@ -205,10 +208,10 @@ def conclude(windows: Sequence[Window], max_sigma: float = MAX_SIGMA, *, under_l
 
 
 def nearly_global(capture: Capture) -> tuple[Candidate, ...] | None:
-    """The candidates with a global shutter first, where the matches allow only such a shutter or nearly one.
+    """If the matches allow only (nearly) global shutters, the candidates with these merged to one global shutter.
 
-    Whatever side it begins at: errors of a calibration resemble small differences of times, and no camera has
-    a readout that short. None where the matches allow more, or a global shutter alone.
+    Scans with small ratios from any side are merged: calibration errors resemble small time differences, and no
+    camera reads that fast. None if the matches allow larger ratios, or already allow only a global shutter.
     """
     near = [each for each in capture.candidates if each.ratio - 2.0 * each.sigma <= _NEARLY]
     probability = sum(each.probability for each in near)
@@ -221,19 +224,19 @@ def nearly_global(capture: Capture) -> tuple[Candidate, ...] | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Sum:
-    """One hypothesis in all windows of a rig."""
+    """One hypothesis, combined over all windows of a rig."""
 
     log_evidence: float
     at: float
     sigma: float
     mean: FloatArray
-    """(17,) of the unknowns; of delay and calibration, which the windows share."""
+    """(17,) weighted mean of the unknowns; it is used for delay and calibration, which the windows share."""
     sigmas: FloatArray
     last: Peak
 
 
 def _combined(windows: Sequence[WindowEvidence]) -> dict[Hypothesis, _Sum]:
-    """The peaks of several windows of one rig, multiplied."""
+    """Multiply the likelihoods of several windows of one rig, for each hypothesis."""
     out = {}
     for key in dict.fromkeys(key for window in windows for key in window.peaks):
         peaks = [window.peaks[key] for window in windows if key in window.peaks]
@@ -242,7 +245,7 @@ def _combined(windows: Sequence[WindowEvidence]) -> dict[Hypothesis, _Sum]:
 
 
 def _product(peaks: Sequence[Peak], lost: float) -> _Sum:
-    """Peaks of several windows, multiplied; their scatter counts where it exceeds their standard deviations."""
+    """Multiply the peaks of several windows; scatter beyond their standard deviations widens the result."""
     at, information = peaks[0].at, peaks[0].information
     if len(peaks) > 1 and information > 0.0:
         weights, places = np.array([peak.information for peak in peaks]), np.array([peak.at for peak in peaks])
@@ -263,7 +266,7 @@ def _product(peaks: Sequence[Peak], lost: float) -> _Sum:
 
 
 def _log_prior(key: Hypothesis) -> float:
-    """Of how the cameras read; motion models are equally likely."""
+    """Log prior probability of a hypothesis's scans and delay; all motion models are equally probable."""
     late, scans = _LATE if key.delayed else 1.0 - _LATE, key.scans
     if scans.together:
         return float(np.log(_EXPECTED[scans.left] * late))
@@ -272,7 +275,7 @@ def _log_prior(key: Hypothesis) -> float:
 
 
 def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hypothesis, float]) -> Candidate:
-    """The scans under all motion models: mean and standard deviation of the mixture."""
+    """The candidate for given scans, with mean and standard deviation of the mixture over motion models."""
     keys = [key for key in sums if key.scans == scans]
     parts, weights = [sums[key] for key in keys], np.array([shares[key] for key in keys])
     probability = float(np.sum(weights))
@@ -295,7 +298,7 @@ def _candidate(scans: Scans, sums: Mapping[Hypothesis, _Sum], shares: Mapping[Hy
 
 
 def _mixture(weights: FloatArray, parts: Sequence[tuple[Any, Any]]) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation (...) of a mixture of parts with these."""
+    """Mean and standard deviation (...) of a mixture of parts with given means and standard deviations."""
     means, sigmas = np.moveaxis(np.array(parts), 1, 0)
     mean = np.asarray(weights @ means)
     return mean, np.sqrt(weights @ (sigmas**2 + (means - mean) ** 2))
@@ -304,7 +307,7 @@ def _mixture(weights: FloatArray, parts: Sequence[tuple[Any, Any]]) -> tuple[Flo
 def _doubt(
     candidates: Sequence[Candidate], share: float, moved_px: float, max_sigma: float, contradicted: bool
 ) -> str:
-    """Why the best candidate is not determined; empty where it is."""
+    """Text on why the best candidate is not determined; empty if it is."""
     best = candidates[0]
     if share < _LEAST_SHARE:
         return f"only {share:.0%} of the matches agree with any motion and shutter"
@@ -315,6 +318,6 @@ def _doubt(
         if contradicted:
             return f"{best.scans}, but no motion model holds for all rows, so that any ratio is as likely{still}"
         ratio = f"{best.ratio:.2f} +- {best.sigma:.2f}"
-        return f"{best.scans}, but the matches do not determine how fast: {ratio}{still}"
+        return f"{best.scans}, but the matches do not determine the readout ratio: {ratio}{still}"
     allowed = [f"{each.scans} ({each.probability:.0%})" for each in candidates if each.probability > 0.1]
     return f"the matches allow {', or '.join(allowed) or 'many scans'}{still}"

@@ -1,10 +1,10 @@
 """A spline in place of a motion model: for two frames of a rig, and for two or more frames of one camera.
 
-A hand that shakes follows no model of six or seven parameters. For a rig, the spline through two frames is
-preferred where it raises the likelihood by more than its parameters are worth (G. Schwarz, Estimating the
-dimension of a model, Annals of Statistics 1978); only parameters that the matches determine count. One camera
-shows no length: that of its translation stays near where the search begins, and the prior, whose strength is
-estimated, does not depend on it.
+A hand-held camera that shakes follows no model of six or seven parameters. For two frames of a rig, a spline is
+preferred if it increases the likelihood by more than the penalty for its parameters (G. Schwarz, Estimating the
+dimension of a model, Annals of Statistics 1978), of which only those that the matches determine count. For one
+camera, the scale is unknown: the length of its translation stays near that at the start of the fit, and the prior,
+whose variance is estimated, adapts to it.
 """
 
 from __future__ import annotations
@@ -41,34 +41,33 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import small_sample_factor, spread_about, tempered
 from rsbench.solvers.engine.packed import HeavyTailed, each_term, heavy_tailed, pack
 
-_OF_A_MODEL = 6.0
-"""Parameters of a motion model, at least."""
+_MODEL_PARAMETERS = 6.0
+"""Fewest parameters of a motion model."""
 _FEWEST = 30
-"""Tracks, or matches of one camera, from which on a spline is fitted to two frames."""
+"""Fewest tracks, or matches of one camera, for a spline through two frames."""
 _KNOTS = 0.25
 """Frame periods between control poses."""
 _DEPTHS = 3.0
-"""Deviations of a disparity by which depth is observed: half of the disparities must be larger."""
+"""Depth is observed if the median disparity exceeds this many of its standard deviations."""
 _APART = 6.0
-"""Squared deviations, in sum over the six, within which two splines are one."""
+"""Two splines are the same if the sum of squared normalised differences of the six parameters is below this."""
 _MEDIAN = 4.35
-"""Of chi-squared of five degrees of freedom."""
+"""Median of chi-squared with five degrees of freedom."""
 _SHARE, _SHARE_OF_VIDEO = 0.15, 0.5
-"""Weight of a track beside the prior, and in the covariance, for two frames and for more. Two frames hardly show
-rotations of rows that are alike in both: with a larger weight, common errors of tracks of a tenth of a pixel
-turned it by degrees."""
+"""Weight of a track relative to the prior, and in the covariance, for two frames and for more. Two frames hardly
+determine rotations that are the same during both readouts: with a larger weight, correlated errors of a tenth of a
+pixel rotated the spline by degrees."""
 _PRIOR = Prior(memory=0.25, smooth=1, rotation=1e-4, position=1e-2)
-"""Of one camera, to begin with; its strength is estimated."""
-_GAINED = 0.3
-"""Mean gain in log-likelihood per match from which a spline of one camera replaces a motion model. Neighbours in
-dense flow have common errors, so that many of them count for one; rendered motions of constant speed gave 0.1 at
-most."""
-_OPEN_PX = 0.15
-"""Largest standard deviation, root mean square over the rows of a frame, of the image of a distant point: above
-it, two frames leave undetermined how the camera shook."""
+"""Start value of the prior for one camera, whose variances are estimated."""
+_LEAST_GAIN = 0.3
+"""Least mean gain in log-likelihood per match for which a spline of one camera replaces a motion model. As errors
+of dense flow are correlated, many matches count as one; rendered motions of constant speed gave at most 0.1."""
+_MOST_UNDETERMINED_PX = 0.15
+"""Largest standard deviation, px, of the image of a distant point, root mean square over the rows: above it, two
+frames do not determine the shake of the camera."""
 _ROWS = 24
-_JUDGED_BY = 150
-"""Matches of a window, about, by which the prior is estimated, and which of the others are right."""
+_FIRST_MATCHES = 150
+"""Approximate number of matches per window from which the prior is estimated and the inliers are chosen."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,32 +75,32 @@ class TwoFrameSpline:
     """The spline of two frames of a rig."""
 
     motion: ContinuousMotion
-    """Of the body, metres."""
+    """Motion of the body, metres."""
     covariance: FloatArray | None
-    """(6, 6) of its w and d; None where the matches do not determine it."""
+    """(6, 6) covariance of its w and d; None if the matches do not determine it."""
     noise_px: float
     inliers: BoolArray
-    """Of the tracks."""
+    """(n,) which tracks are inliers."""
     probability: float
-    """Of the spline, against the motion model."""
+    """Probability of the spline compared with the motion model."""
     unique: bool
-    """Whether no other spline, from another start, explains the matches as well."""
+    """Whether fits from other starts give the same spline or explain the matches less well."""
 
 
 def two_frame_spline(
     matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion, seed: int = 0
 ) -> TwoFrameSpline | None:
-    """The spline beside a motion of the body by a model, where the matches ask for one.
+    """Fit a spline to two frames if the residuals of a motion model require one.
 
-    None where there are few tracks, no fit, no depth, or no trace of time in what the model leaves. Where the law
-    is far off, a search from it alone ends beside the best spline: one from rest is made too. On a plane several
-    splines explain the matches; their distance is in the covariance.
+    None if there are few tracks, no fit, no observed depth, or no dependence of the residuals on the readout time.
+    The fit starts at the motion model and, since that may be far off, at rest. If the scene is a plane, several
+    splines explain the matches, and their distance is included in the covariance.
 
     Args:
-        law: the motion of largest likelihood under a model, where the search begins.
+        law: the motion of the body of largest likelihood under a model.
     """
     window = informative(matches)
-    if shutter.still or len(window.tracks) < _FEWEST or not _asks_for_one(window, rig, shutter, law):
+    if shutter.still or len(window.tracks) < _FEWEST or not _needs_spline(window, rig, shutter, law):
         return None
     starts = [law, make_motion("linear", np.zeros(3), np.zeros(3))]
     splines = [_Spline.through(window, rig, shutter, start, seed) for start in starts]
@@ -110,19 +109,19 @@ def two_frame_spline(
         return None
     tails = min((each.found.fit.tails for each in fitted), key=lambda each: each.scale)
     everything = np.ones(len(fitted[0].tracks))
-    worths = np.array([each.worth(each.found.curve, each.determined, tails, everything) for each in fitted])
-    spline = fitted[int(np.argmax(worths))]
-    odds = tempered(np.exp(worths - worths.max()), 1.0 / _SHARE)
+    scores = np.array([each.score(each.found.curve, each.determined, tails, everything) for each in fitted])
+    spline = fitted[int(np.argmax(scores))]
+    odds = tempered(np.exp(scores - scores.max()), 1.0 / _SHARE)
     motions = np.stack([np.concatenate([each.found.motion.w, each.found.motion.d]) for each in fitted])
     found, errors = spline.found, (spline.found.fit.tails, spline.found.fit.trust)
     theirs = approximated(law.body_from_world, span_of(1, shutter), _KNOTS)
-    gain = spline.worth(found.curve, spline.determined, *errors) - spline.worth(theirs, _OF_A_MODEL, *errors)
-    # The prior's strength is estimated from as many accelerations as the matches determine.
-    factor = small_sample_factor(max(spline.determined - _OF_A_MODEL, 0.0), int(_OF_A_MODEL))
+    gain = spline.score(found.curve, spline.determined, *errors) - spline.score(theirs, _MODEL_PARAMETERS, *errors)
+    # Small samples: the prior's variance is estimated from the accelerations that the matches determine.
+    factor = small_sample_factor(max(spline.determined - _MODEL_PARAMETERS, 0.0), int(_MODEL_PARAMETERS))
     covariance = motion_covariance(found.curve, covariance_band(found.fit, spline.tracks, _SHARE), 0.0)
     if covariance is not None:
-        covariance = factor * covariance + _of_common_shifts(window, rig, shutter, law)
-    apart = spread_about(motions[int(np.argmax(worths))], odds, motions)
+        covariance = factor * covariance + _shared_error_covariance(window, rig, shutter, law)
+    apart = spread_about(motions[int(np.argmax(scores))], odds, motions)
     unique = covariance is not None and float(np.trace(np.linalg.solve(covariance, apart))) < _APART
     return TwoFrameSpline(
         motion=found.motion,
@@ -135,10 +134,10 @@ def two_frame_spline(
 
 
 def dispersion_of_rows(matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> float:
-    """Factor on a motion's covariance for what rows show against its law, see ``Rows.dispersion``.
+    """Factor on a motion's covariance for rows that do not fit its motion model, see ``Rows.dispersion``.
 
     Args:
-        law: as of ``two_frame_spline``.
+        law: see ``two_frame_spline``.
     """
     tailed = None if shutter.still else _under_law(informative(matches), rig, shutter, law)
     theta = None if tailed is None else tailed.theta(law.w, law.d)
@@ -149,8 +148,8 @@ def dispersion_of_rows(matches: Correspondences, rig: StereoRig, shutter: Rollin
     return rows.dispersion(1.0 if stated is None else stated.shared)
 
 
-def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:
-    """Whether depth is observed, and rows contradict the law."""
+def _needs_spline(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:
+    """Whether depth is observed, and the rows contradict the motion model."""
     tailed = _under_law(window, rig, shutter, law)
     rows = None if tailed is None else tailed.by_rows(tailed.theta(law.w, law.d))
     if tailed is None or rows is None or not rows.contradict:
@@ -163,7 +162,7 @@ def _asks_for_one(window: Correspondences, rig: StereoRig, shutter: RollingShutt
 def _under_law(
     window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion
 ) -> HeavyTailed | None:
-    """Tracks with the distribution of their errors; None for few tracks, or a law without equations."""
+    """The tracks with the distribution of their errors; None if there are few or the model has no kernel."""
     if len(window.tracks) < _FEWEST or not has_kernel(law.name):
         return None
     packed = pack(Correspondences(tracks=window.tracks), rig, shutter, law.name, motion_parameters=law.parameters)
@@ -172,8 +171,10 @@ def _under_law(
     return heavy_tailed(packed, theta, max(float(np.sqrt(np.median(squares) / _MEDIAN)), LEAST_SCALE_PX))
 
 
-def _of_common_shifts(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> FloatArray:
-    """(6, 6) what errors that all matches of a region share do to w and d, by the equations of a law nearby."""
+def _shared_error_covariance(
+    window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion
+) -> FloatArray:
+    """(6, 6) covariance of w and d due to errors common to all matches of a region, by a motion model nearby."""
     tailed = _under_law(window, rig, shutter, law)
     theta = None if tailed is None else tailed.theta(law.w, law.d)
     stated = None if tailed is None or theta is None else tailed.stated(theta)
@@ -191,14 +192,13 @@ def log_odds_of_opposite(
     motion: Motion,
     seed: int = 0,
 ) -> float:
-    """Log-odds that lines are read from the opposite side, or frames are in the wrong order, for a rig that may
-    shake.
+    """Log-odds that lines are read from the opposite side, or frames are in the wrong order, if the rig may shake.
 
-    Minus infinity where either spline has no fit.
+    Minus infinity if either spline has no fit.
 
     Args:
         opposite: the shutter with the opposite scan.
-        motion: where the search begins.
+        motion: start of both fits.
     """
     window = informative(matches)
     given, other = (_Spline.through(window, rig, each, motion, seed) for each in (shutter, opposite))
@@ -206,13 +206,13 @@ def log_odds_of_opposite(
         return -np.inf
     tails = min((each.found.fit.tails for each in (given, other)), key=lambda each: each.scale)
     everything = np.ones(len(given.tracks))
-    here, there = (each.worth(each.found.curve, each.determined, tails, everything) for each in (given, other))
+    here, there = (each.score(each.found.curve, each.determined, tails, everything) for each in (given, other))
     return there - here
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Spline:
-    """A spline, and the tracks that it was fitted to."""
+    """A fitted spline and its tracks."""
 
     found: Trajectory
     tracks: TimedTracks
@@ -228,14 +228,14 @@ class _Spline:
             return None
         return cls(found=found, tracks=pack_windows([window], rig, shutter, share=TrajectoryOptions.share))
 
-    def worth(self, curve: Curve, parameters: float, tails: Tails, trust: FloatArray) -> float:
-        """Log-likelihood of a spline, less half of log n for each parameter; except for a constant."""
+    def score(self, curve: Curve, parameters: float, tails: Tails, trust: FloatArray) -> float:
+        """Log-likelihood of a spline minus half of log n per parameter, up to a constant (Schwarz's criterion)."""
         found = normal_equations(curve, self.tracks, tails, NO_PRIOR, trust, want=False)
         return -found.cost - 0.5 * parameters * float(np.log(len(self.tracks)))
 
     @property
     def determined(self) -> float:
-        """Number of its parameters that the matches determine, not the prior (D. MacKay, see ``fit``)."""
+        """Number of parameters that the matches determine, not the prior (see ``trajectory_fit``)."""
         bands, prior = self.found.fit.equations.rough.bands, self.found.prior
         pairs = zip(bands, (prior.rotation, prior.position), strict=True)
         tied = [band_inner(self.found.covariance_band, band) / strength for band, strength in pairs]
@@ -248,14 +248,14 @@ class _Spline:
 def camera_trajectory(
     windows: Sequence[FloatArray], motions: Sequence[Motion], rig: StereoRig, shutter: RollingShutter
 ) -> list[ContinuousMotion] | None:
-    """The motion in each window, seen from the camera at its start, d of length 1; None without a fit.
+    """Estimate the motion in each window relative to the camera at its start, with d of length 1; None: no fit.
 
     Args:
-        windows: matches (n, 4) x0, y0, x1, y1, px, with outliers, of the frames 0 and 1, 1 and 2, ...; those that
-            end where others begin are one track.
-        motions: of each window, to begin with; d of any length.
-        rig: its body is where the camera is, the left one.
-        shutter: of the camera.
+        windows: matches (n, 4) x0, y0, x1, y1, px, with outliers, of the frames 0 and 1, 1 and 2, ...; matches
+            that share a pixel in a frame are joined to one track.
+        motions: start motion of each window, with d of any length.
+        rig: a rig whose left camera is the camera and whose body is at this camera.
+        shutter: shutter of the camera.
     """
     try:
         curve = _fitted(windows, motions, rig, shutter, _SHARE_OF_VIDEO)[0].curve
@@ -269,12 +269,12 @@ def camera_trajectory(
 def camera_two_frame_spline(
     matches: FloatArray, law: Motion, rig: StereoRig, shutter: RollingShutter
 ) -> ContinuousMotion | None:
-    """As ``camera_trajectory``, for two frames; None where a model is as good, or the shake is undetermined.
+    """``camera_trajectory`` for two frames; None if a motion model fits as well, or the shake is undetermined.
 
     Args:
         matches: (n, 4) x0, y0, x1, y1, px, with outliers.
-        law: the motion under the model that fits best.
-        rig, shutter: as there.
+        law: the motion under the best motion model.
+        rig, shutter: see ``camera_trajectory``.
     """
     if shutter.still or len(matches) < _FEWEST:
         return None
@@ -289,14 +289,13 @@ def camera_two_frame_spline(
         for curve in (found.curve, theirs)
     )
     gained = (other - own) / max(float(np.sum(found.trust)), 1.0)
-    if gained < _GAINED or _open_px(found.curve, inverse, rig, shutter) > _OPEN_PX:
+    if gained < _LEAST_GAIN or _undetermined_px(found.curve, inverse, rig, shutter) > _MOST_UNDETERMINED_PX:
         return None
     return _window(found.curve, 0, shutter)
 
 
-def _open_px(curve: Curve, inverse: FloatArray, rig: StereoRig, shutter: RollingShutter) -> float:
-    """Standard deviation, px, root mean square over rows of frame 1, of a distant point moved to the middle
-    row."""
+def _undetermined_px(curve: Curve, inverse: FloatArray, rig: StereoRig, shutter: RollingShutter) -> float:
+    """Standard deviation, px, of a distant point corrected to frame 1's middle row, rms over rows."""
     lines = np.linspace(0.0, shutter.height - 1.0, _ROWS)
     middle = float(shutter.time_after((shutter.height - 1) / 2, 1, "left"))
     taus = shutter.pixel_time(np.stack([np.zeros(_ROWS), lines], axis=-1), 1, "left")
@@ -311,12 +310,12 @@ def _fitted(
     shutter: RollingShutter,
     share: float,
 ) -> tuple[Fit, TimedTracks]:
-    """A first fit to some of the matches shows which are right."""
+    """Fit the spline to the inliers, after a first fit to some of the matches that selects them."""
 
     def packed(each: Sequence[FloatArray], right: Sequence[FloatArray] | None = None) -> TimedTracks:
         return pack_windows([Correspondences(left=one) for one in each], rig, shutter, right, share=share)
 
-    few = packed([each[:: max(len(each) // _JUDGED_BY, 1)] for each in windows])
+    few = packed([each[:: max(len(each) // _FIRST_MATCHES, 1)] for each in windows])
     first = fit(first_curve(motions, few, span_of(len(windows), shutter), _KNOTS), few, _PRIOR)
     tracks = packed(windows)
     trust = right_tracks(first, tracks)
@@ -325,7 +324,7 @@ def _fitted(
 
 
 def _window(curve: Curve, number: int, shutter: RollingShutter) -> ContinuousMotion | None:
-    """None where it does not move."""
+    """The motion in one window with d of length 1; None if d is 0."""
     start, end = span_of(1, shutter)
     motion = ContinuousMotion.of(part(curve, number + start, number + end, float(number)))
     length = float(np.linalg.norm(motion.d))

@@ -35,53 +35,55 @@ if TYPE_CHECKING:
 
     Finish: TypeAlias = Callable[[Fused], Fused]
 
-_OUT = "Folder or .mp4, .mov, .mkv, .avi. Default: NAME-corrected, of one camera's video .mp4."
-_SIDES = "Both cameras of the rig are in each frame, the left one left."
-_FOV = "Horizontal field of view of one camera's frames as they are stored, degrees."
+_OUT = "Folder or .mp4, .mov, .mkv, .avi. Default: NAME-corrected, for one camera's video .mp4."
+_SIDES = "Each frame shows both cameras of the rig side by side, the left one on the left."
+_FOV = "Horizontal field of view of one camera's frames as stored, degrees."
 _TARGET = (
-    "Time of a corrected frame: first, middle, last or a row. Default: first; middle where one camera is guessed"
+    "Row whose time a corrected frame has: first, middle, last or a number. Default: first; middle for one camera "
+    "without --camera and --frames"
 )
-_INPAINT = "Invent all pixels that no frame shows, or none. Default: specks and slits alone"
-_FAST = "Of a rig: features and depth at half the size, which takes less time and loses little."
-_ROW_POSES = "Of a sequence, write the pose at every row too: row_poses.csv, in TUM's format."
-_RECTIFY = "Write rectified pairs too, with P1, P2, Q: rectified/."
+_INPAINT = "Fill all pixels that no frame shows, or none. Default: only specks and slits"
+_FAST = "For a rig: features and depth at half the size, which is faster and nearly as accurate."
+_ROW_POSES = "For a sequence, also write the pose at every row: row_poses.csv, in TUM's format."
+_RECTIFY = "Also write rectified pairs with P1, P2, Q: rectified/."
 _SOLVER = "rs-stereo-refined"
 _RIG_ONLY = (
     *("rig", "left", "right", "sky", "fill", "solver", "motion_model", "matcher", "features", "corrector", "fast"),
     *("row_poses", "rectify", "side_by_side"),
 )
-"""Parameters that the correction of one camera's frames does not have."""
-_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
+"""Parameters that have no effect on frames of one camera."""
+_MODEL = "Motion model: a name, or auto for the most probable one. Default: auto if the solver supports it"
 
 
 CameraFile = Annotated[
     Path | None,
-    typer.Option(metavar="CAMERA", help="Of one camera, in place of --rig: camera.toml or a calibration."),
+    typer.Option(metavar="CAMERA", help="For one camera, in place of --rig: camera.toml or a calibration."),
 ]
 Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
 GyroFile = Annotated[
     Path | None,
     typer.Option(
         metavar="LOG.gcsv|LOG.csv",
-        help="What a gyroscope measured; of a rig, over four frames and more. Needs --fps or a video.",
+        help="Samples of a gyroscope; with a rig for four frames or more. Needs --fps or a video.",
     ),
 ]
 Fps = Annotated[
     float | None,
-    typer.Option(help="Frames a second, for --gyro, --shutter and a line delay. Default: what the video says."),
+    typer.Option(help="Frames per second, for --gyro, --shutter and a line delay. Default: that of the video."),
 ]
 ReadoutRatio = Annotated[
-    float | None, typer.Option(help="Readout time over frame period, in place of what the calibration says.")
+    float | None, typer.Option(help="Readout time divided by frame period, in place of that in the calibration.")
 ]
 ShutterName = Annotated[
-    str | None, typer.Option("--shutter", metavar="NAME", help="The same from a mode: rsbench list shutters.")
+    str | None,
+    typer.Option("--shutter", metavar="NAME", help="Readout time of a camera mode, see rsbench list shutters."),
 ]
 GyroOffset = Annotated[
     float | None,
     typer.Option(
         metavar="SECONDS",
-        help="What --gyro's clock shows at the first row of the first frame. Default: 0; of one camera what the "
-        "frames show, within half a second.",
+        help="Time of --gyro's clock at the first row of the first frame. Default: 0; for one camera, estimated "
+        "within half a second.",
     ),
 ]
 
@@ -92,8 +94,8 @@ def correct(
         list[Path] | None,
         typer.Argument(
             metavar="VIDEO|DIR|IMAGES",
-            help="Of one camera; with --rig two videos or folders, or LEFT_0 RIGHT_0 LEFT_1 RIGHT_1; or a folder "
-            "of a rendered sequence.",
+            help="Frames of one camera; with --rig two videos or folders, or LEFT_0 RIGHT_0 LEFT_1 RIGHT_1; or a "
+            "folder of a rendered sequence.",
         ),
     ] = None,
     rig: Annotated[
@@ -126,7 +128,7 @@ def correct(
     readout_ratio: ReadoutRatio = None,
     shutter: ShutterName = None,
 ) -> None:
-    """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two times or a whole sequence."""
+    """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two frames or a sequence."""
     log = GyroscopeOptions(file=gyro, fps=fps, offset_s=gyro_offset)
     readout = ReadoutOptions(readout_ratio=readout_ratio, shutter=shutter, fps=fps)
     given = arranged(frames, rig, camera, footage, left, right, side_by_side)
@@ -137,7 +139,7 @@ def correct(
     check_out(out)
     if given.one_camera:
         _refuse_rig_options(ctx)
-        # Of what was an error before positional inputs were guessed, the time from which rows are moved least.
+        # With inputs that only recent versions accept, the middle row, to whose time rows move least.
         row = target or ("middle" if given.words else "first")
         from rsbench.pipeline.mono_sequence import options_of_camera
 
@@ -155,7 +157,7 @@ def correct(
 
 
 def _refuse_rig_options(ctx: typer.Context) -> None:
-    """Raises RsbenchError if the command line has an option without effect on the frames of one camera."""
+    """Raise RsbenchError if the command line has an option without effect on frames of one camera."""
     for parameter in ctx.command.params:
         source = ctx.get_parameter_source(parameter.name or "")
         if parameter.name in _RIG_ONLY and source is not None and source.name == "COMMANDLINE":
@@ -164,7 +166,7 @@ def _refuse_rig_options(ctx: typer.Context) -> None:
 
 
 def _correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
-    """Exit 1 where no motion or no correction is found; ``close``: narrow holes of corrected frames."""
+    """Correct four frames or a sequence; exit 1 if it fails. ``close``: close narrow holes of corrected frames."""
     from rsbench.capture.shutter_decision import NoMotionError
     from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.pipeline.isolated_components import Isolation
@@ -194,14 +196,12 @@ def _options(
 
 
 def _without_filling(entry: CorrectorEntry) -> CorrectorEntry:
-    """The corrector with the filling of ours turned off."""
+    """The built-in corrector without filling from other views; RsbenchError for other correctors."""
     from rsbench.components.imports import component_key
     from rsbench.vision.correctors import FusionCorrector
 
     if not isinstance(entry.component, FusionCorrector):
-        raise RsbenchError(
-            f"--no-fill: corrector {entry.name!r} fills nothing that could be turned off; leave it out"
-        )
+        raise RsbenchError(f"--no-fill: has no effect on corrector {entry.name!r}; leave it out")
     component = replace(entry.component, use_other_views=False)
     return replace(entry, component=component, key=component_key(component, {}))
 

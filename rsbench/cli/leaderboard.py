@@ -588,11 +588,11 @@ def _show(
 
 
 def _cells(line: Standing) -> dict[str, str]:
-    from rsbench.benchmark.statistics import in_words
+    from rsbench.benchmark.statistics import format_interval
 
     primary = line.track.primary
     cells = {"method": line.scored.header.method, "rank": line.rank_words}
-    cells[primary.title] = in_words(*line.means[primary.key])
+    cells[primary.title] = format_interval(*line.means[primary.key])
     for score in line.track.scores:
         if score.key in ("flip", *line.track.beside):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"

@@ -225,13 +225,13 @@ def blaming(where: str, what: str) -> Iterator[None]:
     except RecursionError:  # the caller reports the circle
         raise
     except (Exception, SystemExit) as error:
-        text = str(error).partition("\n")[0] if isinstance(error, RsbenchError) else in_words(error)
+        text = str(error).partition("\n")[0] if isinstance(error, RsbenchError) else exception_text(error)
         raise RsbenchError(f"{where}: {what}: {text}") from error
     finally:
         _threads.extend(each for each in threading.enumerate() if each not in before and not each.daemon)
 
 
-def in_words(error: BaseException) -> str:
+def exception_text(error: BaseException) -> str:
     """Type and text of an error, in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -36,8 +36,8 @@ from rsbench.components.imports import (
     blaming,
     component_key,
     entry_points_by_name,
+    exception_text,
     import_target,
-    in_words,
     package_of,
     try_import,
 )
@@ -361,4 +361,4 @@ def _blamed_parse(cls: type[Component], parameters: Mapping[str, Any], where: st
             f"(numbers, texts, tuples, dataclasses): {str(error).partition(chr(10))[0]}"
         ) from error
     except (Exception, SystemExit) as error:  # raised by the constructor
-        raise RsbenchError(f"{where}: parameters: {in_words(error)}") from error
+        raise RsbenchError(f"{where}: parameters: {exception_text(error)}") from error

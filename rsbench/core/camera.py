@@ -1,12 +1,12 @@
-"""The camera and its lens; the only place that knows the pixel convention.
+"""The camera and its lens; the pixel convention is defined here alone.
 
-Pixel coordinates are (x, y) and the centre of the top-left pixel is (0, 0), so a centred principal point of a
-900 x 900 image is (449.5, 449.5). Camera frame: x right, y down, z forward. Pixels are those of the image as
-the sensor has it, distorted by the lens; "ideal" pixels are those of the same camera without it.
+Pixel coordinates are (x, y) and the centre of the top-left pixel is (0, 0), so a centred principal point of a 900
+x 900 image is (449.5, 449.5). Camera frame: x right, y down, z forward. Pixels are those of the sensor's image,
+which the lens distorts; "ideal" pixels are those of the same camera without a lens.
 
-A lens maps ideal coordinates, x / z and y / z of a point in the camera frame, to distorted ones; these times
-the focal length, plus the principal point, are pixels. The lens models are OpenCV's, coefficient for
-coefficient, but for the double sphere, which is that of its paper.
+A lens maps ideal coordinates, x / z and y / z of a point in the camera frame, to distorted ones, which are
+multiplied by the focal length and shifted by the principal point to give pixels. The lens models and their
+coefficients are OpenCV's, except for the double sphere, which follows its paper.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
 }
 """The coefficients of each model in the order of OpenCV's vectors, or of the paper."""
 _ALWAYS_IN_FILES = ("k1", "k2", "p1", "p2", "k3", "k4")
-"""Files list all of these for the first two models, whichever they have."""
+"""Coefficients that files list for the first two models, even those that a model does not have."""
 WIDEST = 1.5
-"""Angle from the optical axis, rad, beyond which a fisheye shows nothing here: rays have z = 1."""
+"""Largest angle from the optical axis, rad, that a fisheye lens shows, as rays have z = 1."""
 _CONVERGED = 1e-14
-"""Newton steps end when they are as short as this, relative to 1 + the radius: rounding."""
+"""Length of a Newton step, relative to 1 + the radius, at which the iteration ends (rounding)."""
 _MOST_STEPS = 40
 _FEW = 16384
-"""Numbers of places whose ideal ones are remembered."""
+"""Results of ``undistort`` for at most this many coordinates are cached."""
 _ENTRIES = 4097
-"""Radii of the table in which Newton's method for a rational lens starts."""
+"""Number of radii in the table of start values of Newton's method for a rational lens."""
 
 
 class Distorted(NamedTuple):
     """Distorted coordinates with their derivative."""
 
     xy: FloatArray
-    """(..., 2); NaN where the lens does not see the point."""
+    """(..., 2); NaN for points that the lens does not show."""
     jacobian: FloatArray
-    """(..., 2, 2) by the ideal coordinates."""
+    """(..., 2, 2) derivative by the ideal coordinates."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,28 +70,28 @@ class Lens:
     """
 
     model: LensModel
-    """``brown-conrady``: radial and tangential distortion of ordinary lenses; ``rational``: the same of wider
-    ones; ``kannala-brandt`` and ``double-sphere``: fisheye lenses."""
+    """``brown-conrady``: radial and tangential distortion of ordinary lenses; ``rational``: the same for wider
+    lenses; ``kannala-brandt`` and ``double-sphere``: fisheye lenses."""
     k1: float = 0.0
-    """First radial coefficient, as OpenCV has it."""
+    """First radial coefficient, as in OpenCV."""
     k2: float = 0.0
     """Second radial coefficient."""
     p1: float = 0.0
-    """First tangential coefficient; of ``brown-conrady`` and ``rational``."""
+    """First tangential coefficient of ``brown-conrady`` and ``rational``."""
     p2: float = 0.0
-    """Second tangential coefficient; of ``brown-conrady`` and ``rational``."""
+    """Second tangential coefficient of ``brown-conrady`` and ``rational``."""
     k3: float = 0.0
     """Third radial coefficient."""
     k4: float = 0.0
-    """Fourth radial coefficient of ``kannala-brandt``; of ``rational`` the first of the denominator."""
+    """Fourth radial coefficient of ``kannala-brandt``; first coefficient of the denominator of ``rational``."""
     k5: float = 0.0
-    """Second coefficient of the denominator; of ``rational`` alone."""
+    """Second coefficient of the denominator of ``rational``."""
     k6: float = 0.0
-    """Third coefficient of the denominator; of ``rational`` alone."""
+    """Third coefficient of the denominator of ``rational``."""
     xi: float = 0.0
-    """Distance between the two spheres over their radius; of ``double-sphere`` alone."""
+    """Distance between the two spheres divided by their radius, for ``double-sphere``."""
     alpha: float = 0.0
-    """Place of the pinhole behind the second sphere, 0 to 1; of ``double-sphere`` alone."""
+    """Position of the pinhole behind the second sphere, 0 to 1, for ``double-sphere``."""
 
     def __post_init__(self) -> None:
         arguments.check_one_of("lens model", self.model, get_args(LensModel))
@@ -108,7 +108,7 @@ class Lens:
 
     @property
     def number(self) -> int:
-        """Number of the model in tables of compiled code: its place in ``COEFFICIENTS``."""
+        """Number of the model in compiled code: its index in ``COEFFICIENTS``."""
         return list(COEFFICIENTS).index(self.model)
 
     @property
@@ -117,7 +117,7 @@ class Lens:
         return tuple(getattr(self, name) for name in COEFFICIENTS[self.model])
 
     def record(self) -> dict[str, Any]:
-        """The lens as tables of cards and files have it: its model and its coefficients."""
+        """The lens as a table of cards and files: its model and its coefficients."""
         first = self.model in ("brown-conrady", "kannala-brandt")
         names = _ALWAYS_IN_FILES if first else COEFFICIENTS[self.model]
         return {"model": self.model, **{name: getattr(self, name) for name in names}}
@@ -148,10 +148,10 @@ class Lens:
         return models[self.model](known)
 
     def undistort(self, xy: ArrayLike) -> FloatArray:
-        """Ideal coordinates (..., 2) of distorted ones (..., 2); NaN where there are none.
+        """Ideal coordinates (..., 2) of distorted ones (..., 2); NaN if there are none.
 
-        What comes back is within ``reach``, does not fold, and distorts to ``xy`` but for rounding. The double
-        sphere has a closed form; the others are solved by Newton's method.
+        Results are within ``reach``, where the lens does not fold, and ``distort`` maps them to ``xy`` up to
+        rounding. The double sphere has a closed form; the others are solved by Newton's method.
         """
         wanted = np.asarray(xy, dtype=np.float64)
         if self.model == "double-sphere":
@@ -179,9 +179,9 @@ class Lens:
         return np.where(good[:, None], ideal, np.nan).reshape(wanted.shape)
 
     def _start(self, distorted: FloatArray) -> FloatArray:
-        """Where Newton's method starts: at the same radius, within half of the reach; by table if rational."""
+        """Start of Newton's method: the same radius, at most half of the reach; a table for a rational lens."""
         radius = np.hypot(distorted[:, 0], distorted[:, 1])
-        if self.model == "rational":  # whose radii may bend either way
+        if self.model == "rational":  # its radii may grow or shrink
             ideal, bent = self._radii
             return distorted * (np.interp(radius, bent, ideal) / np.where(radius > 0.0, radius, 1.0))[:, None]
         most = 0.5 * self.reach
@@ -201,7 +201,7 @@ class Lens:
         return self._tangential(x, y, s, gain, bend)
 
     def denominator(self, s: FloatArray) -> FloatArray:
-        """Denominator (...) of the radial factor at squared ideal radii (...); of ``rational``."""
+        """Denominator (...) of the radial factor of ``rational`` at squared ideal radii (...)."""
         return 1.0 + s * (self.k4 + s * (self.k5 + s * self.k6))
 
     def _quotient(self, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -216,7 +216,7 @@ class Lens:
     def _tangential(
         self, x: FloatArray, y: FloatArray, s: FloatArray, gain: FloatArray, bend: FloatArray
     ) -> Distorted:
-        """With a radial factor and twice its derivative by s = x^2 + y^2."""
+        """Distort by a radial factor, given with twice its derivative by s = x^2 + y^2, and tangential terms."""
         p1, p2 = self.p1, self.p2
         xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
         yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
@@ -234,14 +234,14 @@ class Lens:
         k1, k2, k3, k4 = self.k1, self.k2, self.k3, self.k4
         bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
         slope = 1.0 + a * (3.0 * k1 + a * (5.0 * k2 + a * (7.0 * k3 + a * 9.0 * k4)))
-        central = s < 1e-12  # atan r = r - r^3 / 3: what is left out is below rounding
+        central = s < 1e-12  # atan r = r - r^3 / 3 up to rounding
         gain = np.where(central, 1.0 + s * (k1 - 1.0 / 3.0), bent / np.where(central, 1.0, r))
         bend = np.where(central, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + s) - gain) / np.where(central, 1.0, s))
         J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
         return Distorted(ideal * gain[..., None], J)
 
     def _rational_reach(self) -> float:
-        """Where the distorted radius ceases to grow, or is infinite: in a table that narrows to one entry."""
+        """Ideal radius at which the distorted one stops growing or is infinite, by successively finer tables."""
         low, high = 0.0, math.tan(WIDEST)
         for _ in range(5):
             radius = np.linspace(low, high, _ENTRIES)
@@ -256,7 +256,7 @@ class Lens:
 
     @cached_property
     def _radii(self) -> tuple[FloatArray, FloatArray]:
-        """Ideal radii of a rational lens, and the distorted ones without tangential terms; both grow."""
+        """Increasing ideal radii of a rational lens, and the distorted radii without tangential terms."""
         ideal = np.linspace(0.0, self.reach, _ENTRIES)[:-1]
         return ideal, ideal * self._quotient(ideal * ideal)[0]
 
@@ -274,7 +274,7 @@ class Lens:
     def _sphere_reach(self) -> float:
         """Tangent of the angle at which the second projection folds (alpha > 1/2) or goes to infinity.
 
-        Both are at a cosine of -w from the centre of the second sphere, which stands at -xi on the axis.
+        Both occur at a cosine of -w, seen from the centre of the second sphere, at -xi on the axis.
         """
         low = self.alpha <= 0.5
         w = self.alpha / (1.0 - self.alpha) if low else (1.0 - self.alpha) / self.alpha
@@ -283,7 +283,7 @@ class Lens:
         return math.tan(min(math.acos(max(cosine, -1.0)), WIDEST))
 
     def _from_spheres(self, distorted: FloatArray) -> FloatArray:
-        """Usenko et al., eq. 46: closed form of ``undistort``."""
+        """Closed form of ``undistort``: Usenko et al., eq. 46."""
         xi, alpha = self.xi, self.alpha
         s = np.sum(distorted * distorted, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -301,7 +301,7 @@ def _matrix(by_x: FloatArray, across: FloatArray, by_y: FloatArray) -> FloatArra
 
 
 def inverse_2x2(J: FloatArray) -> FloatArray:
-    """Inverses of matrices (..., 2, 2); not finite where there is none."""
+    """Inverses of matrices (..., 2, 2); not finite for singular ones."""
     a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(_stack_2x2(d, -b, -c, a) / (a * d - b * c)[..., None, None])
@@ -316,8 +316,8 @@ def _solve(J: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _first_root(coefficients: list[float]) -> float:
-    """Smallest positive root of a polynomial, lowest power first; infinite when it has none."""
-    # What is nothing beside the others puts a root beyond all images, and would overflow as a divisor.
+    """Smallest positive root of a polynomial, lowest power first; infinite if it has none."""
+    # Negligible coefficients only give roots beyond all images, and would overflow as divisors.
     small = 1e-100 * max(map(abs, coefficients))
     roots = np.polynomial.polynomial.polyroots([c if abs(c) > small else 0.0 for c in coefficients])
     real = roots.real[(np.abs(roots.imag) <= 1e-6 * np.abs(roots)) & (roots.real > 0.0)]
@@ -325,12 +325,12 @@ def _first_root(coefficients: list[float]) -> float:
 
 
 _TRIED = 33
-"""Columns and rows of the points, spread over the whole image, at which a lens must be invertible."""
+"""Number of columns and rows of a grid over the image, at whose points a lens must be invertible."""
 
 
 @lru_cache(maxsize=64)
 def _of_few(lens: Lens, values: bytes, shape: tuple[int, ...]) -> FloatArray:
-    """``Lens.undistort`` of a few places: estimates of poses ask for the same ones again and again."""
+    """``Lens.undistort`` of few coordinates, cached since estimates use the same ones repeatedly."""
     return lens.solved(np.frombuffer(values).reshape(shape))
 
 
@@ -339,7 +339,7 @@ class PinholeCamera:
     """Intrinsics; sizes and focal lengths in pixels.
 
     Raises:
-        ValueError: a value that is not possible, or a lens that folds or cannot be inverted inside the image.
+        ValueError: a value is impossible, or the lens folds or cannot be inverted inside the image.
     """
 
     width: int
@@ -349,7 +349,7 @@ class PinholeCamera:
     cx: float
     cy: float
     lens: Lens | None = None
-    """None: an ideal one, without distortion."""
+    """None: an ideal camera, without distortion."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -379,14 +379,14 @@ class PinholeCamera:
 
     @classmethod
     def centred(cls, width: int, height: int, focal: float) -> PinholeCamera:
-        """Square pixels and the principal point in the middle of the image; ValueError as of the class."""
+        """A camera with square pixels and the principal point in the middle of the image; raises as the class."""
         for name, size in (("width", width), ("height", height)):
             arguments.check_whole(f"camera {name}", size, 1, arguments.LARGEST_SIZE)
         return cls(width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
 
     @property
     def K(self) -> FloatArray:
-        """Calibration matrix (3, 3); ValueError where there is none, with a lens: see ``ideal``."""
+        """Calibration matrix (3, 3); ValueError for a camera with a lens, see ``ideal``."""
         if self.lens is not None:
             raise ValueError(f"a camera with a lens ({self.lens.model}) has no calibration matrix; its ideal has")
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
@@ -402,7 +402,7 @@ class PinholeCamera:
         return self if self.lens is None else replace(self, lens=None)
 
     def project(self, x_in_cam: ArrayLike) -> FloatArray:
-        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN where z <= 0 or the lens does not reach."""
+        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN where z <= 0 or beyond ``reach``."""
         x = np.asarray(x_in_cam, dtype=np.float64)
         z = np.where(x[..., 2] > 0.0, x[..., 2], np.nan)
         if self.lens is not None:
@@ -422,9 +422,9 @@ class PinholeCamera:
         return (self.lens.distort(xy).jacobian @ rate[..., None])[..., 0] * self._focal
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """Rays (..., 3) in the camera frame with z = 1, so ``depth * ray`` is the point; from pixels (..., 2).
+        """Rays (..., 3) of pixels (..., 2) in the camera frame with z = 1, so that ``depth * ray`` is the point.
 
-        NaN where the lens shows no ray, which is never inside the image.
+        NaN where the lens shows no ray, which never occurs inside the image.
         """
         p = np.asarray(pixels, dtype=np.float64)
         x, y = (p[..., 0] - self.cx) / self.fx, (p[..., 1] - self.cy) / self.fy
@@ -434,12 +434,12 @@ class PinholeCamera:
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def ideal_pixels(self, pixels: ArrayLike) -> FloatArray:
-        """Where the camera without its lens sees (..., 2) what this one sees at pixels (..., 2)."""
+        """Pixels (..., 2) in the camera without its lens that correspond to pixels (..., 2) of this one."""
         p = np.asarray(pixels, dtype=np.float64)
         return p if self.lens is None else self.ideal.project(self.unproject(p))
 
     def lens_pixels(self, ideal_pixels: ArrayLike) -> FloatArray:
-        """Pixels (..., 2) at which this camera sees what the one without a lens sees at (..., 2); NaN for none."""
+        """Pixels (..., 2) that correspond to pixels (..., 2) of the camera without its lens; NaN: none."""
         p = np.asarray(ideal_pixels, dtype=np.float64)
         return p if self.lens is None else self.project(self.ideal.unproject(p))
 
@@ -472,7 +472,7 @@ class PinholeCamera:
         return inside_x & (p[..., 1] >= -0.5) & (p[..., 1] <= self.height - 0.5)
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """The camera of the same images at another size."""
+        """The camera for the same images resized to another size."""
         x, y = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=cx, cy=cy)

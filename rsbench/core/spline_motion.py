@@ -1,10 +1,10 @@
-"""Motions along splines: a shaken rig (``SplineMotion``), and a path through poses (``TrajectoryMotion``).
+"""Motions along splines: a shaking rig (``SplineMotion``), and a path through poses (``TrajectoryMotion``).
 
-``SplineMotion`` is a cumulative cubic B-spline on SE(3) through given or drawn control poses. S. Lovegrove, A.
-Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial fusion with
-application to rolling shutter cameras, BMVC 2013, for the spline; C. Sommer, V. Usenko, D. Schubert, N. Demmel,
-D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020, for its
-velocity. They write world_from_body; here the poses are its inverse, so the factors are in the opposite order:
+``SplineMotion`` is a cumulative cubic B-spline on SE(3) with given or random control poses. The spline follows S.
+Lovegrove, A. Patron-Perez, G. Sibley, Spline Fusion: a continuous-time representation for visual-inertial fusion
+with application to rolling shutter cameras, BMVC 2013; its velocity follows C. Sommer, V. Usenko, D. Schubert, N.
+Demmel, D. Cremers, Efficient derivative computation for cumulative B-splines on Lie groups, CVPR 2020. They write
+world_from_body; here the poses are its inverse, so the factors are in the opposite order:
 
     P(u) = exp(b3 O[i+3]) exp(b2 O[i+2]) exp(b1 O[i+1]) C[i],   O[k] = log(C[k] C[k-1]^-1)
 
@@ -12,17 +12,16 @@ velocity. They write world_from_body; here the poses are its inverse, so the fac
 
 in the interval i, u in [0, 1]. It is twice continuously differentiable.
 
-A shake may also be given by its power spectrum (``ShakeSpectrum``): in each band every rotation and translation
-is a sum of sines, one in each of as many equal parts of the band, with random frequencies and phases; a
-Gaussian process of that flat spectrum as their number grows (S. Rice, Mathematical Analysis of Random Noise,
-1944). A longer shake begins as a shorter one does.
+A shake may also be given by its power spectrum (``ShakeSpectrum``): in each band, every rotation and translation
+is a sum of sines with random frequencies and phases, one in each of equal parts of the band. As their number
+grows, this approaches a Gaussian process with a flat spectrum (S. Rice, Mathematical Analysis of Random Noise,
+1944). A longer shake begins like a shorter one with the same seed.
 
-``TrajectoryMotion`` interpolates positions and unit quaternions (of one sign along the path) together,
-component by component, by the cubic spline that is twice continuously differentiable (C. de Boor, A Practical
-Guide to Splines, 1978; not-a-knot condition at both ends); the quaternion is then normalised. Poses are met to
-rounding; between them the spline of a path f with step h errs by about 5/384 h^4 max |f''''| (C. Hall, W.
-Meyer, J. Approx. Theory 1976). Turning or moving the frame of all poses turns or moves the path, and nothing
-else.
+``TrajectoryMotion`` interpolates positions and unit quaternions (with consistent signs) component by component by
+the cubic spline that is twice continuously differentiable (C. de Boor, A Practical Guide to Splines, 1978;
+not-a-knot condition at both ends), and normalises the quaternion. Poses are interpolated up to rounding; between
+them, the error for a path f and step h is about 5/384 h^4 max |f''''| (C. Hall, W. Meyer, J. Approx. Theory 1976).
+A rotation or translation of the frame of all poses only rotates or translates the path.
 """
 
 from __future__ import annotations
@@ -44,31 +43,31 @@ from rsbench.core.so3 import FloatArray
 _SINES = 8
 """Number of sines in a band, for each axis."""
 _FASTEST = 0.25
-"""Cycles of a band for each interval of the control poses, at most: a cubic spline through four points of a sine
-differs from it by less than 3 % of its size."""
+"""Largest frequency of a band, cycles per interval of the control poses: a cubic spline with four points per cycle
+differs from a sine by less than 3 % of its amplitude."""
 _MOST_BANDS = 32
 _LARGEST_DEG, _LARGEST_M = 45.0, 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class ShakeSpectrum:
-    """A steady path and the bands of the shake around it."""
+    """A uniform path, and the frequency bands of the shake around it."""
 
     path: FloatArray
-    """(6,) of one frame period: rotation vector, radians, and translation, metres."""
+    """(6,) motion in one frame period: rotation vector, radians, and translation, metres."""
     bands: FloatArray
-    """(n, 4) from and to, cycles per frame period, and standard deviations about and along each axis, radians and
-    metres."""
+    """(n, 4) lowest and highest frequency, cycles per frame period, and standard deviations about and along each
+    axis, radians and metres."""
 
     @classmethod
     def of(cls, record: Any, interval: float) -> ShakeSpectrum:
-        """From ``path``, degrees and metres, and ``bands`` with degrees and metres, as a card has them.
+        """Read ``path``, in degrees and metres, and ``bands``, with degrees and metres, of a card.
 
         Args:
-            interval: frame periods between the control poses that are to carry it.
+            interval: frame periods between the control poses of the spline.
 
         Raises:
-            ValueError: another key, no such numbers, or a band too fast for the interval.
+            ValueError: there is another key, values are not such numbers, or a band is too fast for the interval.
         """
         if not isinstance(record, Mapping) or set(record) != {"path", "bands"}:
             raise ValueError("spectrum must be a table with path and bands, and no other key")
@@ -92,7 +91,7 @@ class ShakeSpectrum:
     def control(self, times: FloatArray, interval: float, rng: np.random.Generator) -> FloatArray:
         """Control poses (n, 6), rotation vectors and translations, at times (n,) one interval apart.
 
-        The spline of them passes where the sines are at those times.
+        The spline has the values of the sines at these times.
         """
         low, high, turn, shift = self.bands.T[..., None, None]
         part, phase = np.moveaxis(rng.random((len(self.bands), 6, _SINES, 2)), -1, 0)
@@ -100,7 +99,7 @@ class ShakeSpectrum:
         sigma = np.concatenate(
             [np.broadcast_to(turn, (len(turn), 3, 1)), np.broadcast_to(shift, (len(turn), 3, 1))], 1
         )
-        # A cubic B-spline of a sine's samples is smaller by this factor where its pieces meet.
+        # A cubic B-spline whose control points are samples of a sine is smaller by this factor at its knots.
         kept = (2.0 + np.cos(2.0 * np.pi * frequency * interval)) / 3.0
         size = sigma * np.sqrt(2.0 / _SINES) / kept
         waves = np.sin(2.0 * np.pi * (frequency * times[:, None, None, None] + phase))
@@ -111,23 +110,23 @@ class ShakeSpectrum:
 
 
 LAST = 2.0
-"""Rows of frame 1 are read until then, at the latest: how long a shake is that does not say."""
+"""Latest time at which a row of frame 1 is read: the default length of a shake."""
 _TOLERANCE = 1e-12
 _SAME = 1e-9
-"""Largest difference of w and d that are still those of given poses."""
+"""Largest difference of w and d from those of the given poses."""
 _MAX_ITERATIONS = 100
 _LONGEST, _MOST_DRAWN = 1e4, 20_000
 
 
 class Shake(NamedTuple):
-    """How control poses leave the smooth path: independent normal draws, of these standard deviations."""
+    """Standard deviations of the independent normal deviations of control poses from the smooth path."""
 
     interval: float
-    """Frame periods between two control poses: shakes of up to 1 / (2 interval) cycles per period."""
+    """Frame periods between two control poses: the shake has up to 1 / (2 interval) cycles per period."""
     rotation_deg: tuple[float, float, float]
-    """About x (pitch), y (yaw), z (roll)."""
+    """Rotation about x (pitch), y (yaw), z (roll), degrees."""
     translation: tuple[float, float, float]
-    """Along x, y (heave), z, metres."""
+    """Translation along x, y (heave), z, metres."""
 
 
 PRESETS = {
@@ -136,8 +135,8 @@ PRESETS = {
     "drone": Shake(0.1, (0.06, 0.04, 0.06), (0.0005, 0.001, 0.0005)),
     "driving": Shake(0.5, (0.3, 0.05, 0.15), (0.005, 0.015, 0.005)),
 }
-"""Chosen, not measured: a steady hand sways below a third of the frame rate, one that trembles shakes at about
-that rate, rotors shake a frame faster and by less, a road slower and by more, in pitch and heave above all."""
+"""Chosen, not measured: a steady hand sways below a third of the frame rate, a trembling one at about that rate;
+rotors cause faster and smaller shakes, and roads slower and larger ones, mostly in pitch and heave."""
 
 
 @final
@@ -145,17 +144,17 @@ that rate, rotors shake a frame faster and by less, a road slower and by more, i
 class SplineMotion(Motion):
     """Constant twist with a shake: control pose k is exp(shake[k]) exp(tau_k xi), tau_k = (k - 1) interval.
 
-    The twist xi is such that the spline, seen from its own pose at time 0, is (exp([w]x), d) at time 1. Without a
-    shake it is ``TwistMotion``. Before time 0 and after the last interval it goes on at the velocity it has there.
+    The twist xi is such that the spline, relative to its pose at time 0, is (exp([w]x), d) at time 1. Without a
+    shake it is ``TwistMotion``. Before time 0 and after the last interval, the velocity is constant.
 
-    The shake comes from a preset and a seed, or is given; or the control poses are, which fix w and d.
+    The shake comes from a preset and a seed, or is given; or the control poses are given, which determine w and d.
     """
 
     name: ClassVar[str] = "spline"
     interval: float
     """Frame periods between two control poses."""
     shake: FloatArray
-    """(n, 6) twists (w, v), radians and metres, by which each control pose leaves the path."""
+    """(n, 6) twists (w, v), radians and metres, by which control poses deviate from the path."""
 
     def __init__(
         self,
@@ -169,34 +168,34 @@ class SplineMotion(Motion):
         periods: float | None = None,
         spectrum: Mapping[str, Any] | None = None,
     ) -> None:
-        """From ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and ``shake``, ``poses`` or ``spectrum``.
+        """Give ``preset`` ("handheld") and ``seed`` (0), or ``interval`` and ``shake``, ``poses`` or ``spectrum``.
 
         Args:
-            periods: until when a shake that is drawn lasts, frame periods; a longer one begins as a shorter one.
+            periods: length of a random shake, frame periods; a longer one begins like a shorter one.
             poses: (n, 6) rotation vectors (radians) and translations (metres) of the body's control poses;
                 w and d must be their ``endpoint``.
-            spectrum: ``path`` and ``bands``, see ``ShakeSpectrum.of``; ``seed`` draws; w and d as of ``poses``.
+            spectrum: ``path`` and ``bands``, see ``ShakeSpectrum.of``, with ``seed``; w and d as for ``poses``.
 
         Raises:
-            ValueError: another combination, too few control poses, a half turn or more, or a shake so strong
-                that no path leads to (w, d).
+            ValueError: other combinations, too few control poses, a rotation of 180 degrees or more, or a shake so
+                strong that no path leads to (w, d).
         """
         super().__init__(w, d)
         if float(np.linalg.norm(self.w)) >= np.pi:
-            raise ValueError(f"w of a spline must be below a half turn, got {self.w.tolist()}")
+            raise ValueError(f"w of a spline must be shorter than pi (180 degrees), got {self.w.tolist()}")
         chosen = {"preset": preset, "seed": seed, "interval": interval, "shake": shake, "poses": poses}
         chosen |= {"periods": periods, "spectrum": spectrum}
         parameters = {key: value for key, value in chosen.items() if value is not None}
         fixed = self.endpoint(parameters)
         if fixed is not None and np.max(np.abs(np.concatenate(fixed) - [*self.w, *self.d])) > _SAME:
             raise ValueError(
-                "w and d of a spline with poses or a spectrum are those of its poses, and were given otherwise"
+                "w and d of a spline with poses or a spectrum must be those of its poses, but differ from them"
             )
         step, offsets = _shake(parameters)
         offsets.setflags(write=False)
         object.__setattr__(self, "interval", step)
         object.__setattr__(self, "shake", offsets)
-        _ = self._spline  # a shake that no path carries is refused here, not at the first use
+        _ = self._spline  # refuse a too strong shake here, not at the first use
 
     @cached_property
     def _spline(self) -> _Spline:
@@ -247,7 +246,7 @@ class SplineMotion(Motion):
 
 
 class _Spline:
-    """The spline of control poses (n); the first stands one interval before time 0."""
+    """The spline of control poses (n); the first is one interval before time 0."""
 
     def __init__(self, interval: float, control: Pose) -> None:
         self.interval, self.control = interval, control
@@ -255,7 +254,7 @@ class _Spline:
         self.steps = se3.log(compose(later, inverse(earlier)))
 
     def pose(self, tau: ArrayLike) -> Pose:
-        """The pose alone at times (...): a third of the work of ``at``, the same bits."""
+        """The pose at times (...), with the same bits as that of ``at``, in a third of the time."""
         tau = np.asarray(tau, dtype=np.float64)
         if not np.all((tau >= 0.0) & (tau <= (len(self.steps) - 2) * self.interval)):
             return self.at(tau)[0]
@@ -286,22 +285,22 @@ class _Spline:
         return going_on, twist, np.where(inside[..., None], change, 0.0)
 
     def from_start(self, tau: float) -> Pose:
-        """Pose at a time from that at time 0."""
+        """Pose at a time relative to that at time 0."""
         return compose(self.at(tau)[0], inverse(self.at(0.0)[0]))
 
     def fastest(self, first: float, last: float) -> tuple[float, float]:
-        """Bounds of |w'| and |t'|: the rates of the three factors are positive and add up to 1 / interval."""
+        """Upper bounds of |w'| and |t'|: the rates of the three factors are positive and sum to 1 / interval."""
         ends = np.clip(np.floor(np.array([first, last]) / self.interval), 0, len(self.steps) - 3).astype(np.int64)
         steps = np.stack([self.steps[ends[0] + j : ends[1] + j + 1] for j in range(3)], axis=1)
         turn, shift = np.linalg.norm(steps[..., :3], axis=-1), np.linalg.norm(steps[..., 3:], axis=-1)
-        # No partial product brings the origin farther out than the sum of all that its factors shift.
+        # No partial product moves the origin farther than the sum of the translations of its factors.
         reach = np.linalg.norm(self.control.t[ends[0] : ends[1] + 1], axis=-1) + np.sum(shift, axis=-1)
         speed = np.max(shift + turn * reach[:, None])
         return float(np.max(turn)) / self.interval, float(speed) / self.interval
 
 
 def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
-    """Interval and shake (n, 6) that the parameters of ``SplineMotion`` mean."""
+    """Interval and shake (n, 6) for parameters of ``SplineMotion``."""
     if "poses" in parameters or "spectrum" in parameters:
         spline = _given_spline(parameters)
         xi = se3.log(spline.from_start(1.0))
@@ -321,7 +320,7 @@ def _shake(parameters: Mapping[str, Any]) -> tuple[float, FloatArray]:
 
 
 def _generator(purpose: str, parameters: Mapping[str, Any]) -> np.random.Generator:
-    """The generator with the seed of the parameters; one for each purpose."""
+    """The random generator for a purpose, with the seed of the parameters."""
     seed = parameters.get("seed", 0)
     arguments.check_whole("seed", seed, 0, 1 << 256)
     digest = hashlib.sha256(f"{purpose}/{int(seed)}".encode()).digest()
@@ -372,7 +371,7 @@ def _interval(parameters: Mapping[str, Any]) -> float:
 
 
 def _place(tau: FloatArray, interval: float, count: int) -> tuple[NDArray[np.int64], FloatArray]:
-    """Interval (...) of times (...), and where in it they are, from 0 to 1."""
+    """Index (...) of the interval of times (...), and their position in it, 0 to 1."""
     i = np.clip(np.floor(tau / interval), 0, count - 4).astype(np.int64)
     return i, np.clip(tau / interval - i, 0.0, 1.0)
 
@@ -382,7 +381,7 @@ def _cumulative(u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def least_poses(interval: float, periods: float = LAST) -> int:
-    """Control poses that reach a time."""
+    """Number of control poses needed until time ``periods``."""
     return int(np.ceil(periods / interval - 1e-9)) + 3
 
 
@@ -401,7 +400,7 @@ def _times(interval: float, control: Pose) -> FloatArray:
 
 
 def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:
-    """The spline from the identity at 0 to ``end`` at 1: a fixed point of the path's twist."""
+    """The spline from the identity at time 0 to ``end`` at time 1, by fixed-point iteration of its twist."""
     offsets = se3.exp(shake)
     times, xi, before = _times(interval, offsets), se3.log(end), np.inf
     for _ in range(_MAX_ITERATIONS):
@@ -409,7 +408,7 @@ def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:
         spline = _Spline(interval, control)
         missing = compose(end, inverse(spline.from_start(1.0)))
         error = float(np.linalg.norm(se3.log(missing)))
-        # Until rounding: who takes differences of w and d wants more than the tolerance.
+        # Iterate until rounding, as finite differences by w and d need more than the tolerance.
         if error == 0.0 or (error <= _TOLERANCE and error >= 0.5 * before):
             return _Spline(interval, compose(control, inverse(spline.at(0.0)[0])))
         before = error
@@ -418,29 +417,26 @@ def _through(interval: float, shake: FloatArray, end: Pose) -> _Spline:
 
 
 LARGEST_TURN_DEG = 90.0
-"""Largest rotation between two poses: beyond it the path between them is ambiguous."""
-_SAME = 1e-9
-"""Largest difference of w and d that are still those of given poses."""
+"""Largest rotation between two poses, as the path between them would be ambiguous beyond it."""
 _UNIT = 1e-6
-"""Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
+"""Tolerance of the length of a quaternion, for rounding in a file."""
 
 
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class TrajectoryMotion(Motion):
-    """Through poses of the body, seen from the body at time 0. Beyond the first and the last the speed stays."""
+    """Motion through poses of the body, relative to the body at time 0; velocity is constant beyond both ends."""
 
     name: ClassVar[str] = "trajectory"
     poses: FloatArray
-    """(n, 8) time in frame periods, position x, y, z in metres and quaternion x, y, z, w of the body in a frame
-    that stands still: world_from_body."""
+    """(n, 8) time in frame periods, position x, y, z in metres and quaternion x, y, z, w: world_from_body."""
 
     def __init__(self, w: ArrayLike, d: ArrayLike, poses: ArrayLike) -> None:
-        """From poses whose ``endpoint`` is w and d.
+        """Create the motion from poses; w and d must be their ``endpoint``.
 
         Raises:
-            ValueError: not such rows, times that do not grow or do not reach from 0 to 1, a turn of more than
-                ``LARGEST_TURN_DEG`` from one pose to the next, or another w or d.
+            ValueError: rows are not such poses, times do not increase or do not reach from 0 to 1, the rotation
+                between successive poses exceeds ``LARGEST_TURN_DEG``, or w or d differ.
         """
         super().__init__(w, d)
         rows = _checked(poses)
@@ -448,7 +444,7 @@ class TrajectoryMotion(Motion):
         object.__setattr__(self, "poses", rows)
         R, t = self.body_from_world(1.0)
         if np.max(np.abs(np.concatenate([so3.log(R) - self.w, t - self.d]))) > _SAME:
-            raise ValueError("w and d of a trajectory are those of its poses, and were given otherwise")
+            raise ValueError("w and d of a trajectory must be those of its poses, but differ from them")
 
     @cached_property
     def _path(self) -> _Path:
@@ -496,9 +492,9 @@ class Moving(NamedTuple):
 
     world_from_body: Pose
     turn: FloatArray
-    """(..., 3) rotation rate in the body's own axes, rad per unit of time."""
+    """(..., 3) angular rate in the body's axes, rad per unit of time."""
     speed: FloatArray
-    """(..., 3) in the axes of the world, metres per unit of time."""
+    """(..., 3) velocity in the world's axes, metres per unit of time."""
     turn_change: FloatArray
     """(..., 3) derivative of ``turn``."""
     speed_change: FloatArray
@@ -506,7 +502,7 @@ class Moving(NamedTuple):
 
 
 class _Path(NamedTuple):
-    """The spline of positions and quaternions (7), from the first time to the last."""
+    """The spline of positions and quaternions (7 components), from the first time to the last."""
 
     spline: Any
     first: float
@@ -521,7 +517,7 @@ class _Path(NamedTuple):
         return cls(CubicSpline(poses[:, 0], values), float(poses[0, 0]), float(poses[-1, 0]))
 
     def at(self, tau: ArrayLike) -> Moving:
-        """At times (...); before the first pose and after the last at the velocity that it has there."""
+        """The motion at times (...); velocity is constant before the first pose and after the last."""
         tau = np.asarray(tau, dtype=np.float64)
         within = np.clip(tau, self.first, self.last)
         beyond = (tau - within)[..., None]
@@ -530,7 +526,7 @@ class _Path(NamedTuple):
         x, y, z, w = np.moveaxis(place[..., 3:], -1, 0)
         v, dv, dw = place[..., 3:6], rate[..., 3:6], rate[..., 6:]
         square = np.sum(place[..., 3:] ** 2, axis=-1, keepdims=True)
-        # 2 q* q' of a quaternion q, whose length has no part in it.
+        # 2 q* q' / |q|^2 for a quaternion q of any length.
         turn = 2.0 * (w[..., None] * dv - dw * v - so3.cross(v, dv)) / square
         ddv, ddw = change[..., 3:6], change[..., 6:]
         growth = 2.0 * np.sum(place[..., 3:] * rate[..., 3:], axis=-1, keepdims=True) / square
@@ -541,22 +537,22 @@ class _Path(NamedTuple):
 
 
 def world_from_body(poses: ArrayLike, tau: ArrayLike) -> Pose:
-    """Pose (..., 3, 3), (..., 3) at times (...) of the spline through poses (n, 8) as ``TrajectoryMotion`` has.
+    """Pose (..., 3, 3), (..., 3) at times (...) of the spline through poses (n, 8), see ``TrajectoryMotion``.
 
     Raises:
-        ValueError: rows that can be no path.
+        ValueError: the rows are no path.
     """
     return _Path.through(_checked(poses, spans=False)).at(tau).world_from_body
 
 
 def turns_deg(quaternions: FloatArray) -> FloatArray:
-    """Angles (n - 1,) from one of unit quaternions (n, 4) to the next, degrees."""
+    """Angles (n - 1,) between successive unit quaternions (n, 4), degrees."""
     cosine = np.abs(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
     return np.asarray(np.rad2deg(2.0 * np.arccos(np.minimum(cosine, 1.0))))
 
 
 def _one_sign(quaternions: FloatArray) -> FloatArray:
-    """The same rotations, each quaternion on the side of the one before."""
+    """The same rotations, with the sign of each quaternion chosen to be near the previous one."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
     signs = np.concatenate([[1.0], np.where(flips, -1.0, 1.0)])
     return np.asarray(quaternions * np.cumprod(signs)[:, None])
@@ -569,7 +565,7 @@ def _checked(value: ArrayLike, spans: bool = True) -> FloatArray:
     if np.any(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > _UNIT):
         raise ValueError("poses: a quaternion is not of length 1")
     if np.any(np.diff(rows[:, 0]) <= 0.0):
-        raise ValueError("poses: each time must be later than the one before")
+        raise ValueError("poses: each time must be later than the previous one")
     if spans and not rows[0, 0] <= 0.0 < 1.0 <= rows[-1, 0]:
         raise ValueError(f"poses must reach from time 0 to 1, they are from {rows[0, 0]:g} to {rows[-1, 0]:g}")
     if np.max(turns_deg(rows[:, 4:])) > LARGEST_TURN_DEG:

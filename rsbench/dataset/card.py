@@ -1,4 +1,4 @@
-"""Dataset cards: what to render, with the keys of the paper's experiment."""
+"""Dataset cards, which describe what is rendered, with the keys of the paper's experiment."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class CameraCard:
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceCard:
-    """One scene seen from one viewpoint under one motion."""
+    """One scene rendered from one viewpoint under one motion."""
 
     SHORTHANDS: ClassVar = SHUTTER_KEY | RIG_KEY
 
@@ -63,28 +63,28 @@ class SequenceCard:
     scene: str
     """Name of a scene card, or a path to one."""
     viewpoint: str = "default"
-    """Name of a viewpoint of the scene card: where the body, the middle of the baseline, stands at time 0 and
-    looks. A vertical rig stands so that its left camera is upright."""
+    """Name of a viewpoint of the scene card: the pose of the body, at the middle of the baseline, at time 0. A
+    vertical rig is placed so that its left camera is upright."""
     motion: MotionCard | None = None
     """Motion of this sequence, in place of the dataset's."""
     rig: RigTables | None = None
     """Rig of this sequence, in place of the dataset's."""
     baseline: float | None = None
-    """Full distance between the cameras, metres, in place of the dataset's."""
+    """Distance between the cameras, metres, in place of the dataset's."""
     readout_ratio: float | None = None
-    """Readout time over frame period, in place of the dataset's."""
+    """Readout time divided by frame period, in place of the dataset's."""
     frame_period_s: float | None = None
-    """Seconds from one frame to the next, in place of the dataset's."""
+    """Time between frames, seconds, in place of the dataset's."""
     sensor: Sensor | None = None
     """Exposure and noise, in place of the dataset's."""
     scale: float = 1.0
-    """Factor of baseline and translation: for scenes that are larger or nearer than others."""
+    """Factor on baseline and translation, for scenes that are larger or nearer than others."""
     seed: int | None = None
     """Seed of this sequence, in place of the dataset's."""
     moving: tuple[MovingCard, ...] = ()
-    """Objects that move by themselves."""
+    """Moving objects."""
     start: Start | None = None
-    """Pose of the body at time 0, where that is not at the viewpoint: made from a trajectory."""
+    """Pose of the body at time 0 if it is not at the viewpoint; computed from a trajectory."""
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -94,7 +94,7 @@ class SequenceCard:
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """What one value of an axis of a grid sets in every sequence; what is left out stays."""
+    """The values that one value of a grid's axis sets in every sequence; values that are absent stay unchanged."""
 
     SHORTHANDS: ClassVar = SHUTTER_KEY | RIG_KEY
 
@@ -105,18 +105,18 @@ class Variation:
     rig: RigTables | None = None
     """Rig, in place of the sequence's."""
     baseline: float | None = None
-    """Full distance between the cameras, metres, in place of the sequence's."""
+    """Distance between the cameras, metres, in place of the sequence's."""
     readout_ratio: float | None = None
-    """Readout time over frame period, in place of the sequence's."""
+    """Readout time divided by frame period, in place of the sequence's."""
     frame_period_s: float | None = None
-    """Seconds from one frame to the next, in place of the sequence's."""
+    """Time between frames, seconds, in place of the sequence's."""
     sensor: Sensor | None = None
     """Exposure and noise, in place of the sequence's."""
     moving: tuple[MovingCard, ...] | None = None
-    """Objects that move, in place of the sequence's."""
+    """Moving objects, in place of the sequence's."""
 
     def of(self, sequence: SequenceCard) -> SequenceCard:
-        """A sequence with it."""
+        """The sequence with the values of this variation."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return replace(sequence, **{name: value for name, value in values.items() if value is not None})
 
@@ -128,10 +128,10 @@ Twin = Literal["first", "middle", "last"]
 class DatasetCard(Scanning):
     """A dataset: its rig and shutter, and its sequences.
 
-    From a key to pixels: ``rig_of``, ``shutter_for``, ``motion_of`` and ``sensor_of`` of this class make the
-    objects of a sequence from its keys, and ``render_camera`` in rsbench/dataset/generation.py renders its frames
-    with them. There ``shutter.row_time`` gives the time of each image row, the motion the pose at that time, the
-    renderer the row seen from that pose, and the sensor turns it into digital numbers.
+    ``rig_of``, ``shutter_for``, ``motion_of`` and ``sensor_of`` create the objects of a sequence from its keys,
+    and ``render_camera`` in rsbench/dataset/generation.py renders its frames with them: ``shutter.row_time`` gives
+    the time of each image row, the motion the pose at that time, the renderer the row from that pose, and the
+    sensor converts it to digital numbers.
     """
 
     SHORTHANDS: ClassVar = SHUTTER_KEY | RIG_KEY
@@ -141,28 +141,27 @@ class DatasetCard(Scanning):
     description: str = ""
     """One line for ``rsbench list datasets``."""
     license: str = "CC-BY-4.0"
-    """SPDX name of the licence of the data: another one where meshes or textures of yours ask for it."""
+    """SPDX name of the licence of the data; choose another one if your meshes or textures require it."""
     camera: CameraCard = None  # pyrefly: ignore[bad-assignment]
     """Image size, focal length and lens of both cameras. Required, unless there is a ``rig``."""
     baseline: float = None  # pyrefly: ignore[bad-assignment]
-    """Full distance between the cameras, metres. Required with ``camera``."""
+    """Distance between the cameras, metres. Required with ``camera``."""
     rig: RigTables | None = None
     """Name of a rig card (``rsbench list rigs``) or a path to one, or its tables: a calibrated rig, in place of
-    ``camera`` and ``baseline``. What it states of the readout goes before ``readout_ratio`` and ``scan`` here, but
-    not before those of a sequence."""
+    ``camera`` and ``baseline``. Its readout takes precedence over ``readout_ratio`` and ``scan`` here, but not
+    over those of a sequence."""
     readout_ratio: float = None  # pyrefly: ignore[bad-assignment]
-    """Readout time over frame period, 0 (global shutter) to 1: row y of frame k is exposed at the time k +
-    readout_ratio * y / height, in frame periods. Required, unless ``shutter`` is given or the rig states it."""
+    """Readout time divided by frame period, 0 (global shutter) to 1: row y of frame k is exposed at the time k +
+    readout_ratio * y / height, in frame periods. Required, unless ``shutter`` or a rig with a readout is given."""
     readout_range: tuple[float, float] | None = None
-    """Two readout ratios: each sequence's is drawn evenly between them, by its seed and name; all other ratios
-    of the card are ignored."""
+    """Two readout ratios, between which that of each sequence is drawn uniformly, by its seed and name; all other
+    ratios of the card are ignored."""
     frame_period_s: float = 0.1
-    """Seconds from one frame to the next."""
+    """Time between frames, seconds."""
     frames: int = len(FRAMES)
     """Number of frames of each camera."""
     motion: MotionCard | None = None
-    """Motion of the rig. Required, unless each sequence has its own, from the grid too, or there is a
-    trajectory."""
+    """Motion of the rig. Required, unless each sequence or a grid has motions, or there is a trajectory."""
     trajectory: TrajectoryCard | None = None
     """File of poses along which the rig moves, in place of a motion."""
     renderer: str = "default"
@@ -170,23 +169,22 @@ class DatasetCard(Scanning):
     sensor: Sensor | None = None
     """Exposure and noise of the rolling-shutter frames. Absent: an ideal sensor."""
     channels: tuple[Channel, ...] = ()
-    """Channels of ground truth beside images, depth and poses."""
+    """Channels of ground truth in addition to images, depth and poses."""
     twins: tuple[int | Twin, ...] = ()
-    """Rows, counted in the order of the readout, at whose poses global-shutter images are rendered too; that of
-    the first row always is."""
+    """Rows, in the order of the readout, besides the first, at whose poses global-shutter images are rendered."""
     exposed_twins: bool = False
-    """Whether global-shutter images are rendered as the sensor exposes them too: with its exposure time, fall-off
-    and brightness, and without noise, mosaic and JPEG. A corrected frame of that sensor is compared with them."""
+    """Whether global-shutter images are also rendered with the sensor's exposure time, fall-off and brightness,
+    but without noise, mosaic and JPEG, for comparison with corrected frames of that sensor."""
     imu: Imu | None = None
     """Rates and errors of the channel ``imu``. Absent: the defaults."""
     matches: Matching | None = None
     """Feature matcher of the channel ``matches``. Absent: the defaults."""
     seed: int = 0
-    """Seed of everything that is drawn at random."""
+    """Seed of all random values."""
     seeds: tuple[int, ...] = ()
-    """When given, every sequence is made once per seed under the name NAME-SEED; random axes change with it."""
+    """If given, each sequence is made once per seed, as NAME-SEED; random axes depend on the seed."""
     grid: dict[str, dict[str, Variation]] = field(default_factory=dict)
-    """Axes of named values: every sequence is made once per combination, under the name NAME-VALUE-VALUE."""
+    """Axes of named values: each sequence is generated once per combination with the name NAME-VALUE-VALUE."""
     sequence: tuple[SequenceCard, ...] = ()
     """The sequences, each a table ``[[sequence]]``; at least one."""
 
@@ -214,9 +212,7 @@ class DatasetCard(Scanning):
         names = [sequence.name for sequence in self.sequence]
         if not names:
             raise ValueError("a dataset needs at least one [[sequence]]")
-        for name, count in Counter(
-            name.lower() for name in names
-        ).items():  # folders that many systems take for one
+        for name, count in Counter(name.lower() for name in names).items():  # many file systems ignore case
             if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
 
@@ -245,7 +241,7 @@ class DatasetCard(Scanning):
             raise ValueError("'motion' is required")
 
     def rig_of(self, sequence: SequenceCard) -> StereoRig:
-        """The rig of a sequence; ValueError for one that is not stated, or cannot be."""
+        """The rig of a sequence; ValueError if it is missing or impossible."""
         tables = sequence.rig or self.rig
         if tables is not None:
             rig = tables.rig()
@@ -257,7 +253,7 @@ class DatasetCard(Scanning):
         return StereoRig(camera=replace(camera, lens=self.camera.lens), baseline=baseline)
 
     def shutter_for(self, sequence: SequenceCard) -> RollingShutter:
-        """The shutter of a sequence; ValueError for one that is not stated, or cannot be."""
+        """The shutter of a sequence; ValueError if it is missing or impossible."""
         tables = sequence.rig or self.rig
         stated = None if tables is None else tables.readout_ratio
         ratio = next(
@@ -269,7 +265,7 @@ class DatasetCard(Scanning):
         return self.rig_of(sequence).shutter_of(scanning, ratio)
 
     def period_of(self, sequence: SequenceCard) -> float:
-        """Seconds of a frame period."""
+        """Frame period of a sequence, seconds."""
         tables = sequence.rig or self.rig
         stated = self.frame_period_s if tables is None else tables.frame_period_s or self.frame_period_s
         return stated if sequence.frame_period_s is None else sequence.frame_period_s
@@ -278,7 +274,7 @@ class DatasetCard(Scanning):
         return self.sensor if sequence.sensor is None else sequence.sensor
 
     def twins_of(self, sequence: SequenceCard) -> tuple[int, ...]:
-        """Rows of the twins but the first; ValueError for one that the cameras do not have."""
+        """Rows of the twins except row 0; ValueError for a row that the cameras do not have."""
         shutter = self.shutter_for(sequence)
         lines = min(shutter.lines(side) for side in SIDES)
         if self.twins and lines < max(shutter.lines(side) for side in SIDES):
@@ -306,11 +302,11 @@ class DatasetCard(Scanning):
     def _motion_card(self, sequence: SequenceCard) -> MotionCard:
         card = sequence.motion or self.motion
         if card is None:
-            raise ValueError(f"{sequence.name}: the trajectory was not followed yet; load_dataset_card does it")
+            raise ValueError(f"{sequence.name}: has no motion from the trajectory yet; use load_dataset_card")
         return card if self.frames == len(FRAMES) else card.lasting(math.ceil(self._span(sequence)[1]))
 
     def _span(self, sequence: SequenceCard) -> tuple[float, float]:
-        """From when to when its rows are exposed, frame periods."""
+        """Start and end of the exposure of all rows of a sequence, frame periods."""
         period, sensor, shutter = self.period_of(sequence), self.sensor_of(sequence), self.shutter_for(sequence)
         half = 0.0 if sensor is None else 0.5 * sensor.longest_s / period
         starts = [float(shutter.start(0, side)) for side in SIDES]
@@ -323,7 +319,7 @@ class DatasetCard(Scanning):
         return self.seed if sequence.seed is None else sequence.seed
 
     def manifest_of(self, sequence: SequenceCard) -> dict[str, Any]:
-        """What the sequence.json of a sequence says whatever scene, renderer and seed are."""
+        """The part of a sequence's sequence.json that does not depend on scene, renderer and seed."""
         manifest = sequence_manifest(
             name=sequence.name,
             rig=self.rig_of(sequence),
@@ -344,7 +340,7 @@ class DatasetCard(Scanning):
         return {**manifest, **sensor, **channels, **imu, **matches, **twins, **moving}
 
     def only(self, names: list[str]) -> DatasetCard:
-        """The same card with some of its sequences; RsbenchError for a name that it does not have."""
+        """The card with some of its sequences; RsbenchError for an unknown name."""
         known = {sequence.name: sequence for sequence in self.sequence}
         for name in names:
             if name not in known:
@@ -352,15 +348,15 @@ class DatasetCard(Scanning):
         return replace(self, sequence=tuple(known[name] for name in names))
 
     def with_rig(self, rig: RigTables) -> DatasetCard:
-        """The same card with this rig instead of its own cameras."""
+        """The card with this rig instead of its cameras."""
         none: dict[str, Any] = {"camera": None, "baseline": None}
         return replace(self, rig=rig, **none)
 
     def with_channels(self, names: tuple[Channel, ...]) -> DatasetCard:
-        """The same card with these channels instead of its own.
+        """The card with these channels instead of its own.
 
         Raises:
-            RsbenchError: its cameras cannot have one of them.
+            RsbenchError: a channel is not available for its cameras.
         """
         try:
             return replace(self, channels=names)
@@ -368,10 +364,10 @@ class DatasetCard(Scanning):
             raise RsbenchError(f"dataset {self.name}: {error}") from error
 
     def shard(self, part: int, parts: int) -> DatasetCard:
-        """The same card with every ``parts``-th sequence, from the ``part``-th, counted from 1.
+        """The card with every ``parts``-th sequence, beginning with number ``part``, counted from 1.
 
         Raises:
-            RsbenchError: no such part, or none of the sequences is in it.
+            RsbenchError: there is no such part, or it has no sequences.
         """
         if not 1 <= part <= parts:
             raise RsbenchError(f"shard {part}/{parts}: the first number goes from 1 to the second")
@@ -382,16 +378,16 @@ class DatasetCard(Scanning):
         return replace(self, sequence=self.sequence[part - 1 :: parts])
 
     def along(self, file: Path) -> DatasetCard:
-        """The same card with a trajectory from this file in place of all motions; other keys of its own stay."""
+        """The card with a trajectory from this file in place of all motions; other keys of a trajectory stay."""
         own = self.trajectory or TrajectoryCard(file="")
         sequences = tuple(replace(sequence, motion=None) for sequence in self.sequence)
         return replace(self, motion=None, trajectory=replace(own, file=str(file.absolute())), sequence=sequences)
 
     def expanded(self, folder: Path = Path()) -> DatasetCard:
-        """A card with every sequence that it makes: one per seed and part of a trajectory, random axes drawn.
+        """The card with all sequences explicit: one per seed, grid value and part of a trajectory, axes drawn.
 
         Args:
-            folder: of the card, where the files of a trajectory and of moving meshes are looked for.
+            folder: folder of the card, to which the files of a trajectory and of moving meshes are relative.
 
         Raises:
             RsbenchError: the file of a trajectory is wrong.
@@ -400,12 +396,14 @@ class DatasetCard(Scanning):
         seeds: tuple[int | None, ...] = self.seeds or (None,)
         made = [each for sequence in self.sequence for seed in seeds for each in self._variants(sequence, seed)]
         if self.trajectory is not None:
-            made = [each for sequence in made for each in self._followed(sequence, self.trajectory, folder)]
+            made = [
+                each for sequence in made for each in self._along_trajectory(sequence, self.trajectory, folder)
+            ]
         made = [replace(each, moving=tuple(thing.found(folder) for thing in each.moving)) for each in made]
         return replace(self, sequence=tuple(made), grid={}, trajectory=None, seeds=(), readout_range=None)
 
     def _variants(self, sequence: SequenceCard, seed: int | None) -> list[SequenceCard]:
-        """One sequence for each combination of the grid. What is drawn is drawn once for each motion."""
+        """One sequence for each combination of the grid; random values are drawn once per motion."""
         own = sequence if seed is None else replace(sequence, seed=seed)
         ending = () if seed is None else (str(seed),)
         made = []
@@ -422,8 +420,8 @@ class DatasetCard(Scanning):
         return made
 
     def _upright(self, sequence: SequenceCard) -> SequenceCard:
-        """With the left camera upright, from whose axes those of the body of a vertical rig are a quarter turn
-        away."""
+        """The sequence with its start rotated so that the left camera is upright: the body's axes of a vertical
+        rig are rotated by 90 degrees against the camera's."""
         R = self.rig_of(sequence).own("left").R
         turn = 0.5 * math.pi * round(2.0 * math.atan2(R[1, 0], R[0, 0]) / math.pi)
         if turn == 0.0:
@@ -431,7 +429,7 @@ class DatasetCard(Scanning):
         return replace(sequence, start=Start(position=(0.0, 0.0, 0.0), quaternion=_about_z(turn)))
 
     def _with_ratio(self, sequence: SequenceCard) -> SequenceCard:
-        """With a readout ratio of its own, where they are drawn."""
+        """The sequence with a random readout ratio if there is a ``readout_range``."""
         if self.readout_range is None:
             return sequence
         share = generator(f"{self.seed_of(sequence)}/{sequence.name}/readout_ratio").random()
@@ -460,8 +458,8 @@ class DatasetCard(Scanning):
         moving = tuple(each.scaled(sequence.scale) for each in sequence.moving)
         return replace(sequence, motion=motion, baseline=baseline, moving=moving, scale=1.0)
 
-    def _followed(self, sequence: SequenceCard, card: TrajectoryCard, folder: Path) -> list[SequenceCard]:
-        """One sequence for each so many frames on a trajectory."""
+    def _along_trajectory(self, sequence: SequenceCard, card: TrajectoryCard, folder: Path) -> list[SequenceCard]:
+        """One sequence for each part of a trajectory."""
         parts = parts_along(card, folder, self.period_of(sequence), self._span(sequence), self.frames)
         return [
             replace(
@@ -481,14 +479,14 @@ def _about_z(angle: float) -> tuple[float, float, float, float]:
 def load_dataset_card(
     name_or_path: str | Path, trajectory: Path | None = None, seeds: tuple[int, ...] = ()
 ) -> DatasetCard:
-    """Dataset card by name or path, expanded.
+    """Load a dataset card and expand it.
 
     Args:
-        name_or_path: of the card.
+        name_or_path: name or path of the card.
         trajectory: file along which the rig moves, in place of the card's motions.
-        seeds: in place of the card's.
+        seeds: seeds in place of the card's.
 
-    Raises RsbenchError as ``rsbench.components.cards.load_card``, or where the file of a trajectory is wrong.
+    Raises RsbenchError as ``rsbench.components.cards.load_card`` does, or if the file of a trajectory is wrong.
     """
     path = card_path("datasets", name_or_path)
     card = read_dataset_card(path)
@@ -500,7 +498,7 @@ def load_dataset_card(
 
 
 def read_dataset_card(path: Path) -> DatasetCard:
-    """A dataset card as it stands in its file, nothing drawn; raises as ``load_dataset_card``."""
+    """Read a dataset card without expanding it; raises as ``load_dataset_card`` does."""
     search(path)
     card = in_all_tables(with_shutters(read_toml(path), str(path)), lambda table: with_rig(table, str(path)))
     return parse_card(DatasetCard, card, str(path))

@@ -216,7 +216,7 @@ class TruthChannel:
     """One channel of ground truth."""
 
     name: ClassVar[str] = ""
-    knows_movement: ClassVar[bool] = True
+    supports_moving: ClassVar[bool] = True
     """Whether it is correct where objects move."""
     of_pairs: ClassVar[bool] = False
     """Whether a pair of successive frames (``Sequence.pairs``) keeps it."""
@@ -365,7 +365,7 @@ class _Inertial(TruthChannel):
 
 
 class _Tracks(TruthChannel):
-    name, knows_movement = "tracks", False
+    name, supports_moving = "tracks", False
 
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
         return (TRACKS,)
@@ -375,7 +375,7 @@ class _Tracks(TruthChannel):
 
 
 class _Affine(TruthChannel):
-    name, knows_movement = "affine", False
+    name, supports_moving = "affine", False
 
     def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
         return "" if "tracks" in names else "channels: 'affine' belongs to the points of 'tracks': add 'tracks'"
@@ -405,7 +405,7 @@ class _Radiance(_Pictures):
 
 
 class _Matches(TruthChannel):
-    name, knows_movement, of_pairs = "matches", False, True
+    name, supports_moving, of_pairs = "matches", False, True
 
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
         return (MATCHER, *map(matches_file, range(frames - 1)))

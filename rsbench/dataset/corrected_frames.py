@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, TERMS, in_words
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, TERMS, describe_errors
 from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.shutter_decision import record_of
 from rsbench.capture.trajectory_gyro import GyroFound
@@ -295,7 +295,7 @@ def rig_record(
         "disparity_offset": calibration[OFFSET],
         "disparity_offset_sigma": None if capture is None else capture.offset_sigma,
         "calibration_errors": dict(zip(TERMS, calibration, strict=True)) if any(calibration) else None,
-        "calibration_note": in_words(calibration, rig) if rig_found is None else rig_found.words,
+        "calibration_note": describe_errors(calibration, rig) if rig_found is None else rig_found.words,
         **({} if rig_found is None else {"rig_errors": rig_found.record}),
         "capture": None if capture is None else record_of(capture),
         "target_row": options.target_row,

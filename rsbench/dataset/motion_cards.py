@@ -1,4 +1,4 @@
-"""Motions on dataset cards: of the rig, along a trajectory from a file, and of objects that move by themselves."""
+"""Motions on dataset cards: a motion model or a trajectory file for the rig, and motions of moving objects."""
 
 from __future__ import annotations
 
@@ -39,16 +39,15 @@ Axis = Vector | str
 
 @dataclass(frozen=True, kw_only=True)
 class MotionCard:
-    """Magnitudes and axes of one frame period's motion; the axes need not be unit vectors."""
+    """Motion in one frame period as magnitudes and axes, which need not be unit vectors."""
 
     model: str = "linear"
     """Name of a motion model, or ``package.module:Class``."""
     parameters: dict[str, Any] = field(default_factory=dict)
-    """Parameters of the motion model; absent ones have its defaults, or are drawn for each sequence (a shake's
-    seed)."""
+    """Parameters of the motion model; absent ones have defaults, or are drawn per sequence (a shake's seed)."""
     rotation_deg: float | None = None
-    """Angle of the rotation in one frame period, degrees. Required, as the axes and the translation are, unless
-    the parameters alone fix the motion."""
+    """Angle of the rotation in one frame period, degrees. Required, like the axes and the translation, unless
+    the parameters alone determine the motion."""
     rotation_axis: Axis | None = None
     """Axis of the rotation (x right, y down, z forward), of any length; or ``"random"``: drawn for each sequence
     from its seed and name when the card is loaded."""
@@ -62,7 +61,7 @@ class MotionCard:
         given = [name for name in names if getattr(self, name) is not None]
         if fixed_endpoint(self.model, self.parameters) is not None:
             if given:
-                raise ValueError(f"{given[0]}: the parameters of the model {self.model!r} fix the motion already")
+                raise ValueError(f"{given[0]}: leave it out, as parameters of model {self.model!r} fix the motion")
             self.motion()
             return
         for name in names:
@@ -81,7 +80,7 @@ class MotionCard:
     def motion(self) -> Motion:
         """The motion of the rig's body, radians and metres per frame period.
 
-        Raises ValueError when an axis was not drawn yet.
+        Raises ValueError if a random axis has not been drawn yet.
         """
         w, d = fixed_endpoint(self.model, self.parameters) or (
             _scaled(self.rotation_axis, np.deg2rad(self.rotation_deg or 0.0)),
@@ -90,11 +89,11 @@ class MotionCard:
         return make_motion(self.model, w, d, self.parameters)
 
     def lasting(self, periods: float) -> MotionCard:
-        """With what a model needs to go on as it is until a time, where the card does not say it."""
+        """The card with the model's default parameters for a motion that lasts for ``periods`` frame periods."""
         return replace(self, parameters=motion_model(self.model).lasting(self.parameters, periods))
 
     def drawn(self, seed: int, name: str) -> MotionCard:
-        """With axes drawn, uniform on the sphere, the same whatever the lengths are; and random parameters."""
+        """The card with random axes drawn uniformly on the sphere, independent of the lengths, and parameters."""
         axes = {
             field: _random_axis(f"{seed}/{name}/{field}")
             for field in ("rotation_axis", "translation_axis")
@@ -105,7 +104,7 @@ class MotionCard:
 
 
 def generator(text: str) -> np.random.Generator:
-    """What is drawn for a purpose that a text names."""
+    """The random generator for a purpose, which ``text`` names."""
     return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
 
 
@@ -124,29 +123,28 @@ def _scaled(axis: Axis | None, length: float) -> np.ndarray:
 
 FORMAT = "timestamp tx ty tz qx qy qz qw"
 _NEARLY_UNIT = 0.01
-"""Quaternions are written with four digits or more; beyond, another order of their parts is more likely."""
+"""Largest deviation of a quaternion's length from 1; a larger one suggests another order of its components."""
 _AROUND = 24
-"""Poses before and after that a sequence keeps: of farther ones the spline feels 0.27^24."""
+"""Number of poses that a sequence keeps before and after its time; the spline depends on others by 0.27^24."""
 _MOST_PARTS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryCard:
-    """The rig goes along the poses of a file: each two frames, or as many as the card says, are a sequence."""
+    """The rig follows the poses of a file; each two frames, or as many as the card says, are a sequence."""
 
     file: str
     """File of poses in TUM's format, relative to the card: lines ``timestamp tx ty tz qx qy qz qw``, seconds and
     metres."""
     absolute: bool = False
-    """Whether the poses are in the frame of the scene (z up); otherwise the first sequence starts at the
-    viewpoint."""
+    """Whether poses are in the frame of the scene (z up); else the first sequence starts at the viewpoint."""
     start_s: float = 0.0
-    """Seconds from the first pose of the file to the first frame."""
+    """Time from the first pose of the file to the first frame, seconds."""
     step: float | None = None
     """Frame periods from one sequence to the next. Absent: as many as a sequence has frames; with one less,
     successive sequences share a frame."""
     pairs: int | None = None
-    """Number of sequences, at most. Absent: all that the file holds."""
+    """Largest number of sequences. Absent: as many as the file allows."""
     longest_gap_s: float = 1.0
     """Longest time between two poses, seconds; files with longer gaps are refused."""
 
@@ -162,27 +160,27 @@ class TrajectoryCard:
 
 
 class Trajectory(NamedTuple):
-    """Poses of a body in a frame that stands still: world_from_body."""
+    """Poses of a body in a fixed frame: world_from_body."""
 
     seconds: FloatArray
-    """(n,) from the first one."""
+    """(n,) times since the first pose."""
     poses: FloatArray
     """(n, 7) position x, y, z, metres, and unit quaternion x, y, z, w."""
 
 
 class Part(NamedTuple):
-    """The frames of one sequence on the trajectory."""
+    """The part of a trajectory for one sequence."""
 
     poses: FloatArray
-    """(m, 8) as ``TrajectoryMotion`` takes them: time 0 is the start of frame 0."""
+    """(m, 8) poses as ``TrajectoryMotion`` takes them; time 0 is the start of frame 0."""
     start: Start
 
 
 def read_trajectory(path: Path, longest_gap_s: float) -> Trajectory:
-    """Poses of a file in TUM's format; blank lines and those that begin with # say nothing.
+    """Read poses from a file in TUM's format; blank lines and those that begin with # are skipped.
 
     Raises:
-        RsbenchError: it cannot be read, or a line is wrong: one line with its number and a remedy.
+        RsbenchError: the file cannot be read, or a line is wrong; the message has its number and a remedy.
     """
     stamps, poses, lines = list[Decimal](), list[FloatArray](), list[int]()
     for number, text in enumerate(read_text(path).splitlines(), start=1):
@@ -194,7 +192,7 @@ def read_trajectory(path: Path, longest_gap_s: float) -> Trajectory:
             lines.append(number)
     if len(poses) < 2:
         raise RsbenchError(f"{path}: has {len(poses)} poses, at least 2 are needed: lines of {FORMAT}")
-    # Exact where the stamps are: seconds since 1970 leave a float a quarter of a microsecond.
+    # Subtract as decimals: a float resolves seconds since 1970 to a quarter of a microsecond only.
     trajectory = Trajectory(np.array([float(stamp - stamps[0]) for stamp in stamps]), np.array(poses))
     _check_steps(trajectory, path, lines, longest_gap_s)
     return trajectory
@@ -225,16 +223,16 @@ def _check_steps(trajectory: Trajectory, path: Path, lines: list[int], longest_g
         where = f"{path}: line {number}"
         if step <= 0.0:
             raise RsbenchError(
-                f"{where}: its timestamp is not later than the one before; sort the lines, each once"
+                f"{where}: its timestamp is not later than the previous one; sort the lines and remove duplicates"
             )
         if step > longest_gap_s:
             raise RsbenchError(
-                f"{where}: is {step:g} s after the pose before (longest_gap_s = {longest_gap_s:g}); timestamps "
+                f"{where}: is {step:g} s after the previous pose (longest_gap_s = {longest_gap_s:g}); timestamps "
                 "are seconds; cut the file there, or give more poses or a larger longest_gap_s in [trajectory]"
             )
         if turn > LARGEST_TURN_DEG:
             raise RsbenchError(
-                f"{where}: turns by {turn:.0f} degrees from the pose before, more than {LARGEST_TURN_DEG:g}; "
+                f"{where}: turns by {turn:.0f} degrees from the previous pose, more than {LARGEST_TURN_DEG:g}; "
                 "cut the file there or give more poses"
             )
 
@@ -242,14 +240,14 @@ def _check_steps(trajectory: Trajectory, path: Path, lines: list[int], longest_g
 def parts_along(
     card: TrajectoryCard, folder: Path, period_s: float, span: tuple[float, float], frames: int
 ) -> list[Part]:
-    """The sequences that a card makes of its file.
+    """Split the trajectory file of a card into sequences.
 
     Args:
-        card: see there.
-        folder: of the dataset's card.
-        period_s: seconds of a frame period.
-        span: from when to when a sequence needs poses: frame periods from the start of its frame 0.
-        frames: of a sequence.
+        card: the card.
+        folder: folder of the dataset's card.
+        period_s: frame period, seconds.
+        span: start and end of the time for which a sequence needs poses, frame periods from its frame 0.
+        frames: number of frames of a sequence.
 
     Raises:
         RsbenchError: the file is wrong, or too short for one sequence.
@@ -287,19 +285,19 @@ def _start(place: Pose, first: Pose, absolute: bool) -> Start:
     return Start(position=(x, y, z), quaternion=(a, b, c, d), absolute=absolute)
 
 
-TAKEN: tuple[Channel, ...] = tuple(name for name, channel in OBJECTS.items() if channel.knows_movement)
-"""Channels that know of moving objects, or that these do not matter to."""
+TAKEN: tuple[Channel, ...] = tuple(name for name, channel in OBJECTS.items() if channel.supports_moving)
+"""Channels that support moving objects, or do not depend on them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MovingCard(Body):
-    """An object and how it moves: turned about its position and shifted, as the motion says of a body."""
+    """An object and its motion: a rotation about its position, and a translation."""
 
     motion: MotionCard
-    """The object's own motion: it turns about its position and is shifted."""
+    """The object's motion: a rotation about its position, and a translation."""
 
     def scaled(self, by: float) -> MovingCard:
-        """All lengths times a factor."""
+        """The object with all lengths multiplied by a factor."""
         motion, box = self.motion, self.box
         if motion.translation is not None:
             motion = replace(motion, translation=motion.translation * by)
@@ -314,7 +312,7 @@ class MovingCard(Body):
         return replace(mesh, size=mesh.size * by)
 
     def found(self, folder: Path) -> MovingCard:
-        """With the path of its mesh file, which a card names relative to its folder."""
+        """The object with the full path of its mesh file, which a card gives relative to its folder."""
         if self.mesh is None:
             return self
         path = folder / Path(self.mesh.file).expanduser()
@@ -326,7 +324,7 @@ class MovingCard(Body):
 
     @property
     def record(self) -> dict[str, Any]:
-        """As sequence.json holds it; of a mesh file, the name without folders."""
+        """The fields that are written to sequence.json; a mesh file is named without its folder."""
         values = {field.name: getattr(self, field.name) for field in fields(Body) if field.name != "mesh"}
         listed = {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
         mesh: dict[str, Any] = (
@@ -338,13 +336,13 @@ class MovingCard(Body):
 def drawn(
     moving: Sequence[MovingCard], seed: int, name: str, lasting: float | None = None
 ) -> tuple[MovingCard, ...]:
-    """With the axes of their motions drawn, see ``MotionCard.drawn``.
+    """The objects with the axes of their motions drawn, see ``MotionCard.drawn``.
 
     Args:
         moving: the objects.
-        seed: of the sequence.
-        name: of the sequence.
-        lasting: until when they move, frame periods; by default as long as those of two frames.
+        seed: seed of the sequence.
+        name: name of the sequence.
+        lasting: time until which they move, frame periods; by default that of two frames.
 
     Raises:
         ValueError: a motion is given for a shorter time.
@@ -364,13 +362,13 @@ def drawn(
 
 @dataclass(frozen=True, kw_only=True)
 class MovingManifest(Body):
-    """The same in a sequence.json."""
+    """A moving object in a sequence.json."""
 
     motion: dict[str, Any]
 
     @property
     def thing(self) -> MovingObject:
-        """Raises RsbenchError as ``motions.read_motion``."""
+        """The object's geometry; raises RsbenchError as ``read_motion`` does."""
         return MovingObject(np.array(self.position), read_motion(self.motion))
 
     def __post_init__(self) -> None:
@@ -380,7 +378,7 @@ class MovingManifest(Body):
 
 
 def check_moving(moving: Sequence[Body], channels: Sequence[str]) -> None:
-    """Raises ValueError for too many objects, two files of one name, or a channel that knows nothing of them."""
+    """Raise ValueError for too many objects, two files with one name, or a channel that does not support them."""
     if len(moving) > MOST_MOVING:
         raise ValueError(f"moving: {len(moving)} objects: at most {MOST_MOVING}")
     named = {(each.mesh.name, each.mesh.file) for each in moving if each.mesh is not None}
@@ -390,7 +388,7 @@ def check_moving(moving: Sequence[Body], channels: Sequence[str]) -> None:
     refused = [name for name in channels if name in CHANNELS and name not in TAKEN]
     if moving and refused:
         raise ValueError(
-            f"channels: {refused[0]!r} does not know of moving objects; these sequences have {', '.join(TAKEN)}"
+            f"channels: {refused[0]!r} does not support moving objects; these sequences have {', '.join(TAKEN)}"
         )
 
 

@@ -1,4 +1,4 @@
-"""One sequence on disk: what it is (sequence.json) and its images, depth maps and row poses, read on demand."""
+"""A sequence on disk: its description (sequence.json), and images, depth maps and row poses, read on demand."""
 
 from __future__ import annotations
 
@@ -54,28 +54,27 @@ FORMAT, OF_RIG = 1, 2
 FORMATS = (FORMAT, OF_RIG)
 """Formats of files: 1 for the ideal rig, 2 for cameras that differ or look in different directions."""
 CONVENTIONS, WITH_LENS, OF_FRAMES, WITH_MOVING = 1, 2, 3, 4
-"""Conventions of pixels and times. A lens, another scan or a late right camera has its own number, and so have
-more than two frames, and of objects that move, whatever the cameras: earlier versions of rsbench, that would take
-them for ideal, for two or for still, refuse to read them."""
+"""Numbers of conventions of pixels and times: an ideal rig; a lens, another scan or a delayed right camera; more
+than two frames; moving objects. Versions without a feature thus refuse such files."""
 UNITS = {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = no surface"}
-"""Units in dataset.json, for people who find the folder."""
+"""Units in dataset.json, for readers of the folder."""
 
 M = TypeVar("M")
 
 
 def check_sizes(rig: StereoRig) -> None:
-    """Raises ValueError for cameras of more pixels than files may have."""
+    """Raise ValueError for cameras with more pixels than files may have."""
     for side in SIDES:
         check_size("camera" if rig.aligned else side, (rig.sensor(side).width, rig.sensor(side).height))
 
 
 def format_of(rig: StereoRig, shutter: RollingShutter) -> int:
-    """The format of the files of such cameras."""
+    """The format of files for these cameras."""
     return FORMAT if rig.aligned and shutter.right_readout_ratio is None else OF_RIG
 
 
 def conventions_of(plain: bool, frames: int, moves: bool = False) -> int:
-    """``plain``: of a rectified pair that reads rows from the top at once; ``moves``: of objects that move."""
+    """Number of conventions; ``plain``: rectified, rows read top down at once; ``moves``: moving objects."""
     if moves:
         return WITH_MOVING
     if frames > len(FRAMES):
@@ -85,7 +84,7 @@ def conventions_of(plain: bool, frames: int, moves: bool = False) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionManifest:
-    """A motion as ``motions.motion_record`` writes it."""
+    """A motion as ``motion_record`` writes it."""
 
     model: str
     w: Vector
@@ -116,7 +115,7 @@ class CamerasManifest:
 
 @dataclass(frozen=True, kw_only=True)
 class RigManifest:
-    """What files say of a rig whose cameras differ."""
+    """The description of a rig whose cameras differ."""
 
     cameras: CamerasManifest
     right_from_left: RightFromLeft
@@ -124,7 +123,7 @@ class RigManifest:
 
     @property
     def rig(self) -> StereoRig:
-        """The rig; ValueError where the extrinsics contradict the cameras."""
+        """The rig; ValueError if the extrinsics contradict the cameras."""
         rig = StereoRig.of_body(self.cameras.left.own, self.cameras.right.own, self.baseline)
         R, t = rig.right_from_left
         stated = self.right_from_left.R, np.array(self.right_from_left.translation)
@@ -134,12 +133,12 @@ class RigManifest:
 
 
 _SAME = 1e-9
-"""Largest difference of two statements of one rotation, or of directions."""
+"""Largest difference of two records of one rotation, or of directions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceManifest(Scanning):
-    """What sequence.json must hold; it holds more."""
+    """The keys of sequence.json that are read; it has more."""
 
     format: int
     conventions: int
@@ -165,7 +164,7 @@ class SequenceManifest(Scanning):
     moving: tuple[MovingManifest, ...] = ()
     glossy: bool = False
     files: dict[str, str] = field(default_factory=dict)
-    """sha256 by the path below the sequence's folder."""
+    """SHA-256 of files by their path below the sequence's folder."""
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -188,7 +187,7 @@ class SequenceManifest(Scanning):
             list(self.twins) != sorted({row for row in self.twins if 0 < row < lines})
             or len(self.twins) > MOST_TWINS
         ):
-            raise ValueError(f"twins = {list(self.twins)}: must grow from 1 to {lines - 1}, {MOST_TWINS} at most")
+            raise ValueError(f"twins = {list(self.twins)}: must rise from 1 to {lines - 1}, {MOST_TWINS} at most")
         if self.sensor is not None:
             check_brightness(self.sensor, self.frames)
         if not self.frame_period_s > 0.0:
@@ -222,7 +221,7 @@ class FileManifest:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetManifest:
-    """What dataset.json must hold; it holds more."""
+    """The keys of dataset.json that are read; it has more."""
 
     format: int
     sequences: tuple[str, ...]
@@ -230,16 +229,16 @@ class DatasetManifest:
     """Files by their paths below the dataset's folder."""
     name: str = ""
     license: str = "CC-BY-4.0"
-    """SPDX name; data of rsbench 0.1 do not say it, and are under this one."""
+    """SPDX name; data of rsbench 0.1, which lack it, have this licence."""
     card: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.sequences:
-            raise ValueError("sequences = []: must name one at least")
+            raise ValueError("sequences = []: must name at least one")
         for name, count in Counter(self.sequences).items():
             check_name(name)
             if count > 1:
-                raise ValueError(f"sequences: {name!r} stands there twice")
+                raise ValueError(f"sequences: {name!r} is listed twice")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,35 +252,35 @@ class Sequence(ChannelReader):
     motion: Motion
     frame_period_s: float
     sensor: Sensor | None = None
-    """Sensor of the rolling-shutter frames; None: an ideal one."""
+    """Sensor of the rolling-shutter frames; None: an ideal sensor."""
     imu: Imu | None = None
     """Sensor of the channel ``imu``."""
     matching: Matching | None = None
     """Matcher of the channel ``matches``."""
     twins: tuple[int, ...] = ()
-    """Rows, counted as they are read, from whose poses there are global-shutter twins beside those of row 0."""
+    """Rows, in the order of the readout, at whose poses there are global-shutter twins in addition to row 0."""
     exposed_twins: bool = False
-    """Whether it has the global-shutter images as the sensor exposes them."""
+    """Whether it has global-shutter images with the sensor's exposure."""
     channels: tuple[str, ...] = ()
-    """Names of those that it has beside images, depth and poses; later versions know more."""
+    """Names of channels in addition to images, depth and poses; later versions may have more."""
     frames: int = len(FRAMES)
-    """How many each camera has."""
+    """Number of frames of each camera."""
     first: int = 0
-    """Number, in the folder, of the frame that is frame 0 here; above 0 only for a pair."""
+    """Number in the folder of the frame that is frame 0 here; above 0 only for a pair."""
     moving: tuple[MovingManifest, ...] = ()
-    """Objects that move by themselves, numbered from 1."""
+    """Moving objects, numbered from 1."""
     objects: tuple[MovingObject, ...] = ()
-    """How they do."""
+    """Motions of the moving objects."""
     glossy: bool = False
-    """Whether its scene has glossy surfaces, which look otherwise from each place."""
+    """Whether its scene has glossy surfaces, which look different from each viewpoint."""
     manifest: dict[str, Any]
     """Content of sequence.json."""
 
     def pairs(self) -> list[Sequence]:
-        """Each two successive frames as a sequence of their own, such as ``castle.3`` of frames 3 and 4.
+        """Pairs of successive frames as sequences of two frames, such as ``castle.3`` for frames 3 and 4.
 
-        Its world is the body at its own time 0, and its motion is the rest of it, seen from there. Of the
-        channels it has those of one frame or between two. A sequence of two frames is its only pair.
+        The world of a pair is the body at its time 0, its motion is relative to that, and its channels are those
+        of one frame or between two. A sequence of two frames is its only pair.
         """
         if self.frames == len(FRAMES):
             return [self]
@@ -319,16 +318,16 @@ class Sequence(ChannelReader):
         return sorted(path for name in folders for path in (self.folder / name).iterdir() if path.stem in ends)
 
     def image(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
-        """(H, W, 3) sRGB; ``gs`` is the global-shutter image at the pose of a row: 0, or one of ``twins``."""
+        """(H, W, 3) sRGB image; ``gs``: the global-shutter image at the pose of a row, 0 or one of ``twins``."""
         return read_png(
             inside(self.folder, picture_file(shutter, side, frame + self.first, row)), self._size(side)
         )
 
     def exposed_image(self, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
-        """(H, W, 3) sRGB: what the sensor expects under a global shutter at the pose of a row, without noise.
+        """(H, W, 3) sRGB global-shutter image of the sensor at the pose of a row, without noise.
 
         Raises:
-            RsbenchError: the dataset has a sensor, and was made without ``exposed_twins``.
+            RsbenchError: the dataset has a sensor but no ``exposed_twins``.
         """
         if self.sensor is None:
             return self.image("gs", side, frame, row)
@@ -340,40 +339,40 @@ class Sequence(ChannelReader):
         return read_png(inside(self.folder, exposed_file(side, frame + self.first, row)), self._size(side))
 
     def clean_image(self, side: Side, frame: int) -> NDArray[np.uint8]:
-        """(H, W, 3) sRGB: the rolling-shutter frame of an ideal sensor, sharp and without noise."""
+        """(H, W, 3) sRGB rolling-shutter frame of an ideal sensor, sharp and without noise."""
         if self.sensor is None:
             return self.image("rs", side, frame)
         return read_png(inside(self.folder, clean_file(side, frame + self.first)), self._size(side))
 
     def images(self, shutter: Shutter = "rs") -> list[NDArray[np.uint8]]:
-        """Left 0, right 0, left 1, right 1, and so on: the order of ``rsbench.match`` and ``rsbench.correct``."""
+        """Images left 0, right 0, left 1, right 1, ...: the order of ``rsbench.match`` and ``rsbench.correct``."""
         return [self.image(shutter, side, frame) for frame in range(self.frames) for side in SIDES]
 
     def depth(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.float32]:
-        """(H, W) z in the camera of the row that saw the pixel, m, 0 = no surface; ``row`` as of ``image``."""
+        """(H, W) z in the camera at the time of the pixel's row, m; 0: no surface. For ``row`` see ``image``."""
         file = picture_file(shutter, side, frame + self.first, row, depth=True)
         return read_depth(inside(self.folder, file), self._size(side))
 
     def labels(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.uint8]:
-        """(H, W) what moves at each pixel of a picture: the number of an object, 0 = none, and 128 more where an
-        object hides the sun from what is seen; all 0 where none moves. ``row`` as of ``image``."""
+        """(H, W) labels: number of the moving object at each pixel, 0: none, plus 128 in the shadow of a moving
+        object. For ``row`` see ``image``."""
         if not self.moving:
             return np.zeros(self._size(side)[::-1], dtype=np.uint8)
         path = inside(self.folder, moving_file(shutter, side, frame + self.first, row))
         labels = read_grey_png(path, self._size(side))
         if np.max(numbers_of(labels)) > len(self.moving):
-            raise RsbenchError(f"{path}: holds object {np.max(numbers_of(labels))}: there are {len(self.moving)}")
+            raise RsbenchError(f"{path}: has object {np.max(numbers_of(labels))}: there are {len(self.moving)}")
         return labels
 
     def gloss(self, shutter: Shutter, side: Side, frame: int, row: int = 0) -> NDArray[np.bool_]:
-        """(H, W) whether a pixel's surface is glossy; ``row`` as of ``image``."""
+        """(H, W) whether a pixel's surface is glossy. For ``row`` see ``image``."""
         if not self.glossy:
             return np.zeros(self._size(side)[::-1], dtype=np.bool_)
         path = inside(self.folder, gloss_file(shutter, side, frame + self.first, row))
         return read_mask(path, self._size(side))
 
     def poses(self, side: Side, frame: int) -> tuple[FloatArray, Pose]:
-        """Row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3) as stored; of columns, where those are read."""
+        """Stored row times (H,) and ``cam_from_world`` (H, 3, 3), (H, 3); for columns if columns are read."""
         path = inside(self.folder, f"poses/{side}_{frame + self.first}.csv")
         tau, poses = read_poses(path)
         if len(tau) != (lines := self.shutter.lines(side)):
@@ -394,7 +393,7 @@ def sequence_manifest(
     frames: int = len(FRAMES),
     moves: bool = False,
 ) -> dict[str, Any]:
-    """The geometric part of sequence.json, with units in the names where they are not metres and radians."""
+    """The geometric part of sequence.json; key names have a unit unless it is metres or radians."""
     readout_s = shutter.readout_ratio * frame_period_s
     kind = format_of(rig, shutter)
     count = {"frames": frames} if frames > len(FRAMES) else {}
@@ -425,14 +424,13 @@ def read_sequence(folder: Path) -> Sequence:
     """Open a sequence folder.
 
     Raises:
-        RsbenchError: no sequence.json, a format of another version, a field that is missing or wrong, or a name
-            that is not the folder's.
+        RsbenchError: sequence.json is missing, of another version or wrong, or its name is not the folder's.
     """
     return sequence_of(read_json(path := inside(folder, "sequence.json")), path)
 
 
 def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
-    """The sequence of which a sequence.json holds this; the rest as of ``read_sequence``. Opens no file."""
+    """``read_sequence`` from the content of a sequence.json, without opening a file."""
     folder = path.parent
     manifest = _parsed(SequenceManifest, content, path)
     if manifest.name != (is_named := os.path.basename(os.path.abspath(folder))):
@@ -462,19 +460,19 @@ def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
 
 
 def read_dataset(folder: Path) -> list[Sequence]:
-    """All sequences that dataset.json names, in its order.
+    """Read all sequences that dataset.json lists, in its order.
 
     Raises:
-        RsbenchError: not a finished dataset, or a sequence that cannot be read.
+        RsbenchError: the folder is not a finished dataset, or a sequence cannot be read.
     """
     return [read_sequence(inside(folder, name)) for name in read_dataset_manifest(folder).sequences]
 
 
 def read_pairs(folder: Path) -> list[Sequence]:
-    """All pairs of successive frames of a dataset, each a sequence of two: what is scored.
+    """All pairs of successive frames of a dataset as sequences of two frames, which are scored.
 
     Raises:
-        RsbenchError: as ``read_dataset``, or two of these have one name.
+        RsbenchError: as for ``read_dataset``, or two pairs have the same name.
     """
     pairs = [pair for sequence in read_dataset(folder) for pair in sequence.pairs()]
     for name, count in Counter(pair.name for pair in pairs).items():
@@ -484,10 +482,10 @@ def read_pairs(folder: Path) -> list[Sequence]:
 
 
 def read_dataset_manifest(folder: Path) -> DatasetManifest:
-    """The dataset.json of a folder.
+    """Read the dataset.json of a folder.
 
     Raises:
-        RsbenchError: not a finished dataset, a format of another version, or a field that is missing or wrong.
+        RsbenchError: the folder is not a finished dataset, or dataset.json is of another version or wrong.
     """
     path = inside(folder, "dataset.json")
     if not path.is_file():
@@ -506,7 +504,7 @@ def _parsed(cls: type[M], content: dict[str, Any], path: Path) -> M:
 
 
 def files_of(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Paths that a sequence must have, by its sequence.json."""
+    """Paths of the files that a sequence must have according to its sequence.json."""
     frames, rows = frames_of(manifest), twins_of(manifest)
     views = views_of(frames)
     clean = tuple(clean_file(*view) for view in views if manifest.get("sensor"))

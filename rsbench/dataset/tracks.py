@@ -105,7 +105,7 @@ def make_tracks(
     Args:
         geometry: of the sequence.
         depths: (H, W) of each rolling-shutter frame, metres, 0 = no surface.
-        blocked: as of ``channel_truth``.
+        blocked: see ``views.Blocked``.
         seed: of the draw.
     """
     views = track_views(geometry.frames)

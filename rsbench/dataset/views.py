@@ -1,4 +1,4 @@
-"""The pictures of a sequence, and where what one of them sees lies in another."""
+"""The images of a sequence, and the reprojection of the surfaces in one image to another."""
 
 from __future__ import annotations
 
@@ -28,72 +28,72 @@ if TYPE_CHECKING:
 
 _NEAREST = 32
 FAR = 1e7
-"""Where the sky is looked for, metres: no motion of a rig moves it by a hundredth of a pixel."""
+"""Distance at which the sky is placed, metres: no motion of a rig moves it by a hundredth of a pixel."""
 
 
 NUMBER, SHADED = 127, 128
-"""Bits of a label: those of the object's number, and the one that a moving object hides the sun."""
+"""Bits of a label: the object's number; the pixel lies in the shadow of a moving object."""
 
 
 class PixelClass(IntEnum):
-    """Whether another picture sees the surface of a pixel: the values of a mask."""
+    """Whether another image shows the surface of a pixel: the values of a mask."""
 
     UNSOLVED = 0
-    """No row that sees it was found; there is no value."""
+    """The search for its row failed; there is no value."""
     VISIBLE = 1
     OCCLUDED = 2
-    """In view, but something nearer hides it."""
+    """In view, but a nearer surface hides it."""
     OUT_OF_VIEW = 3
-    """Outside of the picture or behind the camera; of sky too."""
+    """Outside of the image or behind the camera; also for sky."""
     SKY = 4
-    """No surface here, and none there: the value is that of the direction."""
+    """Sky in both images; the value is that of the direction."""
     SKY_OCCLUDED = 5
-    """No surface here, but one there."""
+    """Sky that a surface hides in the other image."""
 
 
 def numbers_of(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Numbers (...) of the objects at labels (...); 0 = none."""
+    """Object numbers (...) of labels (...); 0: no moving object."""
     return np.asarray(labels & NUMBER, dtype=np.uint8)
 
 
 def seen_from(geometry: Geometry, number: int) -> FixedGeometry:
-    """The rig's motion in the frame of a moving object, in which the object's points are at rest; 0: in the
-    world."""
+    """The geometry relative to a moving object, in whose frame its points are at rest; number 0: the world."""
     motion = RelativeMotion(geometry.motion, geometry.objects[number - 1]) if number else geometry.motion
     return FixedGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
 
 
 class ImageView(NamedTuple):
-    """A picture: one camera at one time, with a rolling or a global shutter."""
+    """An image of one camera at one frame time, with a rolling or a global shutter."""
 
     shutter: Shutter
     side: Side
     frame: int
     row: int = 0
-    """The row whose pose a global shutter has, counted in the order of the readout."""
+    """The row whose pose a global-shutter image has, counted in the order of the readout."""
 
     @property
     def image(self) -> str:
-        """Path of the image below the folder of the sequence, like ``depth``, that of the depth map."""
+        """Path of the image below the folder of the sequence."""
         return picture_file(*self)
 
     @property
     def depth(self) -> str:
+        """Path of the depth map."""
         return picture_file(*self, depth=True)
 
     @property
     def labels(self) -> str:
-        """File of the labels of moving objects, where there are any."""
+        """Path of the labels of moving objects, if there are any."""
         return moving_file(*self)
 
     @property
     def gloss(self) -> str:
-        """File of the mask of glossy surfaces, where there are any."""
+        """Path of the mask of glossy surfaces, if there are any."""
         return gloss_file(*self)
 
     @property
     def exposed(self) -> str:
-        """File of the global-shutter image as the sensor exposes it, where the dataset has it."""
+        """Path of the global-shutter image with the sensor's exposure, if the dataset has it."""
         return exposed_file(*self[1:])
 
     @property
@@ -105,7 +105,7 @@ class ImageView(NamedTuple):
         return self._replace(side="right" if self.side == "left" else "left")
 
     def next_frame(self, frames: int) -> ImageView:
-        """The picture of the next of ``frames`` frames; of the previous one for the last frame."""
+        """The image of the next of ``frames`` frames; for the last frame, that of the previous one."""
         return self._replace(frame=self.frame + (1 if self.frame < frames - 1 else -1))
 
     @property
@@ -113,9 +113,9 @@ class ImageView(NamedTuple):
         return self._replace(frame=self.frame - 1)
 
     def partners(self) -> Iterator[ImageView]:
-        """Views that see most of the same surfaces: other shutter, other camera, next frame, previous frame.
+        """Views with most surfaces in common: other shutter, other camera, next frame, previous frame.
 
-        The last two need not be there.
+        The last two may not exist in the sequence.
         """
         after = self._replace(frame=self.frame + 1)
         yield from (self.other_shutter, self.other_side, after, self.frame_before)
@@ -126,28 +126,28 @@ Times = tuple[int, int]
 
 
 def image_views(times: Iterable[int]) -> tuple[ImageView, ...]:
-    """All pictures of these frames, without twins at other rows than the first."""
+    """All views of these frames; global-shutter views are those of row 0."""
     return tuple(ImageView(*each) for each in product(SHUTTERS, SIDES, times))
 
 
 def view_pairs(times: Times) -> tuple[tuple[ImageView, ImageView], ...]:
-    """Each view of two frames against its three partners."""
+    """All pairs of a view of two frames and one of its three partners."""
     both = image_views(times)
     return tuple((source, target) for source in both for target in source.partners() if target in both)
 
 
 def nearby_views(view: ImageView, frames: int) -> list[ImageView]:
-    """Other views of a sequence of so many frames, the nearest in time first; of long ones not all."""
+    """Other views of a sequence of ``frames`` frames, by distance in time, of at most ``_NEAREST`` frames."""
     times = sorted(range(frames), key=lambda frame: abs(frame - view.frame))[:_NEAREST]
     return [each for time in times for each in image_views((time,)) if each != view]
 
 
 IMAGE_VIEWS, VIEW_PAIRS = image_views(FRAMES), view_pairs(FRAMES)
-"""All pictures, and all pairs of them, of a sequence of two frames."""
+"""All views, and all pairs of partners, of a sequence of two frames."""
 
 
 def times_at(geometry: Geometry, view: ImageView, pixels: FloatArray) -> FloatArray:
-    """Times (...) at which a view sees pixels (..., 2), frame periods; the frame's own for NaN."""
+    """Times (...) of pixels (..., 2) of a view, frame periods; the frame number for NaN."""
     if view.shutter == "gs":
         return np.broadcast_to(_time(geometry, view), pixels.shape[:-1])
     tau = geometry.shutter.pixel_time(pixels, view.frame, view.side)
@@ -163,44 +163,44 @@ def _pose(geometry: Geometry, view: ImageView) -> Pose:
 
 
 def image_seed(seed: int, sequence: str, side: Side, frame: int) -> int:
-    """Independent noise per image; rolling- and global-shutter twins share it, so that row 0 is the same."""
+    """Noise seed of an image, the same for rolling- and global-shutter twins, so that their rows 0 are equal."""
     text = f"{seed}/{sequence}/{side}/{frame}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 
 _SAME = 1e-11
-"""Largest difference of entries of a pose: of rotations, and metres."""
+"""Largest interpolation error of a pose's entries: of rotations, and metres."""
 _FINEST, _AT_JUMPS = 64, 1e-8
-"""Entries of a table for each line, at most, and their largest difference then: accelerations jump, as at the end
-of a spline."""
+"""Most table entries per line, and the largest interpolation error allowed then, as the acceleration may be
+discontinuous, for instance at the end of a spline."""
 _TOLERANCE_PX = 1e-8
-"""Residual of the row equation that needs no further step; stored values are rounded to 1e-3 px."""
+"""Residual of the row equation at which the search stops; stored values are rounded to 1e-3 px."""
 _MOST_STEPS = 12
 _SEEN, _NOT_SEEN, _UNSURE = 0, 1, 2
 
 
 ByBands = Callable[[Callable[[int, int], None], int], object]
-"""Calls a function with the first row, and the last one excluded, of bands that cover so many rows."""
+"""Calls a function for bands of rows, with their first row and the row after their last, that cover a height."""
 
 
 class Reprojected(NamedTuple):
-    """Pixels at which a picture sees points (...)."""
+    """Pixels of points (...) in an image."""
 
     pixels: FloatArray
-    """(..., 2) px; NaN where it does not see them."""
+    """(..., 2) px; NaN for points that it does not show."""
     eyes: FloatArray
-    """(..., 3) the camera's centre at that time, world frame; arbitrary where it does not see them."""
+    """(..., 3) the camera's centre at that time, world frame; arbitrary for points that it does not show."""
     unsolved: NDArray[np.bool_]
-    """(...) whether the search failed, so that it is unknown whether the picture sees them."""
+    """(...) whether the search failed, so that it is unknown whether the image shows the point."""
 
 
 class _Table(NamedTuple):
-    """Poses of a picture as a function of the line, from line -1."""
+    """Poses of an image as a function of the line, from line -1."""
 
     entries: FloatArray
-    """(n, 24): rotation and translation of ``cam_from_world``, and their changes by an entry."""
+    """(n, 24): rotation and translation of ``cam_from_world``, and their derivatives per table entry."""
     per_line: float
-    """Number of entries per line; 0: one pose for all lines."""
+    """Number of entries per line; 0: all lines have one pose."""
 
 
 def find(
@@ -213,20 +213,20 @@ def find(
     any_motion: bool = False,
     by_bands: ByBands = lambda work, height: [work(0, height)],
 ) -> Reprojected:
-    """Search the lines of a picture that see points (rows, n, 3), world frame, from lines (rows, n) near them.
+    """Find the lines and pixels of an image at which it shows points.
 
     Args:
         geometry: rig, shutter and motion.
-        target: the picture.
-        points: see above.
-        start: see above.
-        in_camera: (rows, n, 3), filled with the points in the target's camera at the time it sees them, metres;
-            meaningless where the target does not see the point. Not computed by default.
-        any_motion: search every crossing of every point, slowly, if no table of poses follows the motion.
+        target: the image.
+        points: (rows, n, 3) points, world frame, metres.
+        start: (rows, n) lines at which the search starts.
+        in_camera: (rows, n, 3) output: the points in the target's camera at their times, metres; meaningless for
+            points that the target does not show. Not computed by default.
+        any_motion: use a slow search for all solutions if no table of poses represents the motion.
         by_bands: runs the search for bands of rows, for example in threads.
 
     Raises:
-        RsbenchError: a motion that no table of poses follows, unless ``any_motion``.
+        RsbenchError: no table of poses represents the motion, unless ``any_motion``.
     """
     camera, shutter = geometry.rig.sensor(target.side), geometry.shutter
     pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
@@ -291,7 +291,7 @@ def _pose_table(geometry: Geometry, view: ImageView) -> _Table:
 
 
 def _intrinsics(camera: PinholeCamera) -> FloatArray:
-    """(18,): width, height, fx, fy, cx, cy; which lens, its reach and its coefficients."""
+    """(18,) width, height, fx, fy, cx, cy; number of the lens model, largest radius and coefficients."""
     lens = camera.lens
     own = [0.0] * 12
     if lens is not None:
@@ -315,10 +315,10 @@ def reproject_rows(
     status: NDArray[np.uint8],
     in_camera: FloatArray,
 ) -> None:
-    """Fill what ``Reprojected`` has, and ``in_camera`` unless it is empty; NumPy: ``core.projection.rs_project``.
+    """Fill the fields of ``Reprojected``, and ``in_camera`` unless empty. NumPy: ``core.projection.rs_project``.
 
-    Each point starts where its two neighbours in the row lead, with the slope found there. No other row has an
-    effect: the bits of a row are the same whatever rows are requested with it.
+    The search for a point starts from the extrapolated result of its two neighbours in the row. Other rows have no
+    effect, so that the bits of a row do not depend on the rows that are requested with it.
     """
     pose = np.zeros(12)
     _pose_between(table, 0.0, pose)
@@ -376,7 +376,7 @@ def _line(
             return x, y, line, slope, _SEEN
         if -0.5 <= line <= lines - 0.5:
             return x, y, line, slope, _NOT_SEEN
-    # Another crossing, or one behind a pole, cannot be decided here: the solver that looks for all crossings does.
+    # Further solutions are possible, and solutions beyond a pole: the slow search for all of them decides.
     first = _off(table, per_line, camera, axis, X, -0.5, pose)
     last = _off(table, per_line, camera, axis, X, lines - 0.5, pose)
     if math.isnan(first) and math.isnan(last):
@@ -404,7 +404,7 @@ def _off(
 
 @compiled
 def _pose_between(table: FloatArray, place: float, pose: FloatArray) -> None:
-    """Fill rotation and translation (12,) at a place between entries (Hermite), that of the ends beyond them."""
+    """Interpolate rotation and translation (12,) between entries (cubic Hermite), constant beyond the ends."""
     below = min(max(math.floor(place), 0), table.shape[0] - 2)
     u = min(max(place - below, 0.0), 1.0)
     v = 1.0 - u
@@ -417,19 +417,19 @@ def _pose_between(table: FloatArray, place: float, pose: FloatArray) -> None:
 
 @compiled
 def _pixel(pose: FloatArray, camera: FloatArray, X: tuple[float, float, float]) -> tuple[float, float]:
-    """NaN behind the camera or beyond the lens. NumPy: ``PinholeCamera.project``."""
+    """Pixel of a point; NaN behind the camera or beyond the lens. NumPy: ``PinholeCamera.project``."""
     z = pose[6] * X[0] + pose[7] * X[1] + pose[8] * X[2] + pose[11]
     if not z > 0.0:
         return math.nan, math.nan
     x = (pose[0] * X[0] + pose[1] * X[1] + pose[2] * X[2] + pose[9]) / z
     y = (pose[3] * X[0] + pose[4] * X[1] + pose[5] * X[2] + pose[10]) / z
     if camera[6] > 0.0:
-        x, y = _bent(camera, x, y)
+        x, y = _distorted(camera, x, y)
     return camera[2] * x + camera[4], camera[3] * y + camera[5]
 
 
 @compiled
-def _bent(camera: FloatArray, x: float, y: float) -> tuple[float, float]:
+def _distorted(camera: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Distorted coordinates. NumPy: ``Lens.distort``."""
     k1, k2, p1, p2, k3, k4 = camera[8], camera[9], camera[10], camera[11], camera[12], camera[13]
     s = x * x + y * y
@@ -458,12 +458,12 @@ def _bent(camera: FloatArray, x: float, y: float) -> tuple[float, float]:
 
 
 Blocked = Callable[[FloatArray, FloatArray, FloatArray | None], NDArray[np.bool_]]
-"""Whether something stands before points (n, 3) seen from eyes (n, 3), world frame, metres; at times (n,), given
-where objects move."""
+"""Mask (n,) of points (n, 3) that are hidden from eyes (n, 3), world frame, metres, at times (n,), which are
+needed only if objects move."""
 
 
 class Rays(Protocol):
-    """Rays through the scene of a sequence: ``renderers.segments.SceneRays`` is one."""
+    """Ray casting in the scene of a sequence, as ``SceneRays`` implements it."""
 
     def blocked(
         self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None
@@ -472,24 +472,24 @@ class Rays(Protocol):
 
 
 class PairTruth(NamedTuple):
-    """Where the pixels of a source lie in another picture, and what became of them."""
+    """True displacement and visibility of the pixels of a source image in a target image."""
 
     offset: FloatArray
     """(H, W, 2) x_target - x_source, px; NaN where the class is UNSOLVED or OUT_OF_VIEW."""
     classes: NDArray[np.uint8]
-    """(H, W) of ``PixelClass``."""
+    """(H, W) values of ``PixelClass``."""
 
 
 class SeenSurfaces:
-    """The points that the pixels of a picture see, and the camera's places when it sees them.
+    """The surface points of the pixels of an image, and the camera's centres at their times.
 
     Args:
-        geometry: of the sequence.
-        source: the picture.
-        depth: (H, W) of the picture, metres, 0 = sky, which is placed at ``FAR``.
-        rows: rows (H,) of the picture to which ``depth`` belongs; all by default.
-        numbers: (H, W) of the moving objects that are seen, 0 = none; none by default.
-        stride: ``depth`` has every ``stride``-th column of the picture.
+        geometry: geometry of the sequence.
+        source: the image.
+        depth: (H, W) depth map of the image, metres; 0: sky, which is placed at ``FAR``.
+        rows: rows (H,) of the image to which ``depth`` belongs; all by default.
+        numbers: (H, W) numbers of the visible moving objects, 0: none; none by default.
+        stride: ``depth`` has every ``stride``-th column of the image.
     """
 
     def __init__(
@@ -515,7 +515,7 @@ class SeenSurfaces:
             poses = row_poses(geometry.rig, shutter, geometry.motion, source.side, source.frame)
         rays = camera.unproject(self.grid) if camera.lens is None else _pixel_rays(camera)[chosen]
         self.points = np.where(self.sky, FAR, depth)[..., None] * rays
-        """(H, W, 3) world frame, metres."""
+        """(H, W, 3) surface points, world frame, metres."""
         eyes = inverse(poses).t
         if shutter.axis(source.side) == 1:
             lines = self.grid[:, 0, 1].astype(np.int64)
@@ -532,22 +532,22 @@ class SeenSurfaces:
 
     @property
     def tau(self) -> FloatArray | None:
-        """(H W) times of the pixels; None where nothing moves."""
+        """(H W) times of the pixels; None if the scene is static."""
         return times_at(self.geometry, self.source, self.grid).ravel() if self.geometry.objects else None
 
 
 @lru_cache(maxsize=2)
 def _pixel_rays(camera: PinholeCamera) -> FloatArray:
-    """(H, W, 3) with z = 1: a lens is inverted once for all of its pictures."""
+    """(H, W, 3) rays with z = 1, cached so that a lens is inverted once for all of its images."""
     return camera.unproject(camera.pixel_grid())
 
 
 class Carried(NamedTuple):
-    """The surfaces that the pixels of a source see, in another picture."""
+    """The surface points of a source image, reprojected to a target image."""
 
     landed: Reprojected
     points: FloatArray
-    """(H, W, 3) where they are when the target sees them, world frame, metres."""
+    """(H, W, 3) the points at the time of their target pixels, world frame, metres."""
 
 
 def carry(
@@ -556,7 +556,7 @@ def carry(
     in_camera: FloatArray | None = None,
     **options: Any,
 ) -> Carried:
-    """Where another picture sees what every pixel of a picture sees, hidden or not; ``options`` as of ``find``."""
+    """Reproject surface points to a target image, even hidden ones; ``options`` are those of ``find``."""
     start = _first_lines(surfaces, target)
     landed = find(surfaces.geometry, target, surfaces.points, start, in_camera=in_camera, **options)
     if surfaces.numbers is None or not surfaces.geometry.objects:
@@ -564,14 +564,15 @@ def carry(
     points = surfaces.points.copy()
     for number in np.unique(surfaces.numbers[surfaces.numbers > 0]):
         chosen = surfaces.numbers == number
-        points[chosen], own = _landed_with(surfaces, target, int(number), chosen, start, in_camera, **options)
+        points[chosen], own = _carry_object(surfaces, target, int(number), chosen, start, in_camera, **options)
         for whole, part in zip(landed, own, strict=True):
             whole[chosen] = part
     return Carried(landed, points)
 
 
 def _first_lines(surfaces: SeenSurfaces, target: ImageView) -> FloatArray:
-    """Lines (H, W) at which the search begins: a pixel's own; in a general rig those seen from the middle line."""
+    """Lines (H, W) at which the search starts: those of the source pixels, or, for a rig that is not aligned, the
+    projections with the pose of the middle line."""
     rig, shutter = surfaces.geometry.rig, surfaces.geometry.shutter
     axis = shutter.axis(target.side)
     if rig.aligned:
@@ -584,12 +585,12 @@ def _first_lines(surfaces: SeenSurfaces, target: ImageView) -> FloatArray:
 
 
 def pair_truth(surfaces: SeenSurfaces, target: ImageView, carried: Carried, blocked: Blocked) -> PairTruth:
-    """What became of the pixels that ``carry`` carried into the target; ``blocked`` is called once."""
+    """The displacement and visibility of reprojected pixels; ``blocked`` is called once."""
     landed, points = carried
     return PairTruth(landed.pixels - surfaces.grid, _classes(surfaces, target, landed, points, blocked))
 
 
-def _landed_with(
+def _carry_object(
     surfaces: SeenSurfaces,
     target: ImageView,
     number: int,
@@ -598,11 +599,11 @@ def _landed_with(
     in_camera: FloatArray | None,
     **options: Any,
 ) -> tuple[FloatArray, Reprojected]:
-    """The chosen points (n, 3) of an object when the target sees them, world frame, and where it sees them."""
+    """The chosen points (n, 3) of a moving object at the times of their target pixels, and these pixels."""
     geometry, thing = surfaces.geometry, surfaces.geometry.objects[number - 1]
     tau = times_at(geometry, surfaces.source, surfaces.grid[chosen])
     X = transform(inverse(thing.world_from_object(tau)), surfaces.points[chosen])
-    # Each alone: its neighbours in the row may be other things.
+    # Search for each point separately, as its neighbours in the row may belong to other objects.
     seen = None if in_camera is None else np.zeros((len(X), 1, 3))
     found = find(
         seen_from(geometry, number), target, X[:, None], start[chosen][:, None], in_camera=seen, **options
@@ -615,7 +616,7 @@ def _landed_with(
 
 
 def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
-    """Normals (H, W, 3) and instances (H, W) of the pixels of a rolling-shutter frame; 0 in the sky."""
+    """Normals (H, W, 3) and instances (H, W) at the pixels of a rolling-shutter frame; 0 in the sky."""
     shape = surfaces.sky.shape
     seen = rays.surfaces(surfaces.eyes.reshape(-1, 3), surfaces.points.reshape(-1, 3), surfaces.tau)
     normals, instances = seen.normals.reshape(*shape, 3), seen.instances.reshape(shape)
@@ -626,7 +627,7 @@ def surface_truth(surfaces: SeenSurfaces, rays: Rays) -> Surfaces:
 def _classes(
     surfaces: SeenSurfaces, target: ImageView, landed: Reprojected, points: FloatArray, blocked: Blocked
 ) -> NDArray[np.uint8]:
-    """(H, W) of ``PixelClass``; ``points`` (H, W, 3) where they are when the target sees them."""
+    """(H, W) values of ``PixelClass``; ``points`` (H, W, 3) are those at the times of their target pixels."""
     inside = np.isfinite(landed.pixels[..., 0])
     moves = bool(surfaces.geometry.objects)
     tau = times_at(surfaces.geometry, target, landed.pixels).ravel() if moves else None

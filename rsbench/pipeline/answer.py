@@ -1,4 +1,5 @@
-"""The answer to a problem, as ``rsbench solve --json`` prints it: docs/reference/problem-format.md."""
+"""Solve a problem file and build the answer that ``rsbench solve --json`` prints
+(docs/reference/problem-format.md)."""
 
 from __future__ import annotations
 
@@ -39,17 +40,17 @@ def solve_problem(
     extras: Collection[Extra] = (),
     motion_model: str | None = None,
 ) -> Answer:
-    """Answer to a problem, ready for JSON; a failure has null for every motion, and the reason.
+    """The answer to a problem, for JSON; if the solver fails, motions are None and ``reason`` says why.
 
     Args:
         motion_model: ``auto`` or a model to use instead of the solver's; None: the solver's.
 
     Raises:
-        RsbenchError: there is no such motion model, or the solver can take no other than its own.
+        RsbenchError: there is no such motion model, or the solver has a fixed one.
     """
     joined, spec, choice = join_stereo(problem.correspondences), entry.solver.spec, None
     shutter, capture, doubt = _shutter_of(problem, joined.correspondences, entry, options, seed)
-    matches = _at_rest(joined.correspondences, problem.rig, shutter, capture)
+    matches = _recalibrated(joined.correspondences, problem.rig, shutter, capture)
     given, rng = Matched(matches, problem.rig, shutter), np.random.default_rng(seed)
 
     def solve(entry: SolverEntry) -> RobustEstimate:
@@ -78,11 +79,11 @@ def solve_problem(
         "direction_known": estimate.direction_known,
         "reference_point": spec.reference_point,
         "d_body": None if isinstance(body, str) else body.d.tolist(),
-        **({} if problem.rig.aligned else {"cameras": _of_cameras(estimate, spec, body, problem.rig)}),
+        **({} if problem.rig.aligned else {"cameras": _camera_motions(estimate, spec, body, problem.rig)}),
         "motion_model": spec.motion_model if choice is None else choice.used,
         **({} if motion_model is None else {"model_choice": None if choice is None else choice.record()}),
         "shutter": spec.shutter,
-        "readout_ratio": shutter.readout_ratio if _says(problem, capture, doubt) else None,
+        "readout_ratio": shutter.readout_ratio if _knows_ratio(problem, capture, doubt) else None,
         **({} if capture is None else {"readout": record_of(capture)}),
         "assumes": spec.assumes,
         "inliers": result.inlier_count,
@@ -98,7 +99,7 @@ def solve_problem(
 def _shutter_of(
     problem: Problem, matches: Correspondences, entry: SolverEntry, options: RobustOptions, seed: int
 ) -> tuple[RollingShutter, Capture | None, str]:
-    """The shutter of a problem; if it is not given, how it was found, or why it cannot be determined."""
+    """The shutter of a problem, the capture from which it was estimated, and why it cannot be determined."""
     still = problem.rig.shutter_of(Scanning(), 0.0)
     if problem.known_shutter is not None or entry.solver.spec.shutter == "global":
         return problem.known_shutter or still, None, ""
@@ -112,17 +113,17 @@ def _shutter_of(
         return still, capture, str(error)
 
 
-def _at_rest(
+def _recalibrated(
     matches: Correspondences, rig: StereoRig, shutter: RollingShutter, capture: Capture | None
 ) -> Correspondences:
-    """The matches without the errors of the calibration that were found with the shutter."""
+    """The matches corrected for the calibration errors that were estimated with the shutter."""
     if capture is None or not rig.rows_together(shutter.scanning):
         return matches
     return recalibrated(matches, rig, capture.calibration)
 
 
-def _says(problem: Problem, capture: Capture | None, doubt: str) -> bool:
-    """Whether a ratio was given or found; solvers of a global shutter look for none."""
+def _knows_ratio(problem: Problem, capture: Capture | None, doubt: str) -> bool:
+    """Whether a readout ratio was given or estimated; solvers for global shutters estimate none."""
     return not doubt and (problem.known_shutter is not None or capture is not None)
 
 
@@ -131,10 +132,10 @@ def _unsolved(reason: str, options: RobustOptions) -> RobustEstimate:
     return RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=options.threshold_px)
 
 
-def _of_cameras(
+def _camera_motions(
     estimate: MotionEstimate, spec: SolverSpec, body: Motion | str, rig: StereoRig
 ) -> dict[str, Any] | None:
-    """The motion of each camera in its own axes; without metres d of the left one alone, where that is known."""
+    """The motion of each camera in its own axes; without scale, only the left camera's d may be known."""
     if not estimate.success:
         return None
     out = dict[str, Any]()
@@ -155,7 +156,7 @@ def _extras(problem: Problem, result: RobustEstimate, extras: Collection[Extra])
     if "noise" in extras:
         out["noise_px"] = estimate.noise_px
     if "inliers" in extras:
-        # Tracks that were joined come after those of the file; their ends are in the file's pairs.
+        # Joined tracks come after those of the file; their points belong to pairs of the file.
         tracks = len(problem.correspondences.tracks)
         out["inlier_indices"] = {
             str(name): np.flatnonzero(mask[:tracks] if name == "tracks" else mask).tolist()

@@ -1,7 +1,7 @@
-"""The whole chain on four frames of a rolling-shutter rig: match, motion, depth, corrected frames.
+"""The correction of four frames of a rolling-shutter rig: matching, motion, depth, corrected frames.
 
-Images in, arrays out; files are the business of others. What a caller knows already is given (``Given``) and not
-looked for: one chain serves users, tables, and studies with their oracles.
+The functions take images and return arrays, without files. Values that the caller knows are passed as ``Given``
+and not estimated, so that users, tables and studies with true values share this code.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, of_offset
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, offset_error
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.two_frame_estimate import Capture
@@ -43,41 +43,42 @@ STEPS = ("matching", "motion", "depth", "correction")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Given:
-    """What need not be found; None is found when the corrector needs it."""
+    """Values that are given; None is estimated if the corrector needs it."""
 
     matches: Correspondences | None = None
-    """Taken as they are, without a look at whether the frames are in order."""
+    """Matches, which are used without a check that the frames fit the rig."""
     motion: Motion | None = None
-    """Of the body, metres, of any model; the readout ratio must be known then."""
+    """Motion of the body, metres, of any model; the readout ratio must then be given too."""
     pairs: Pairs | None = None
-    """Frames with their depth; ``depth_from_motion`` still fills what is unknown in it."""
+    """Frames with their depth; with ``depth_from_motion``, unknown depth is still estimated."""
     gyro: FloatArray | None = None
-    """(n, 4) samples of a gyroscope, as in ``Correspondences``: the one thing that frames do not show."""
+    """(n, 4) samples of a gyroscope, as in ``Correspondences``; they cannot be estimated from frames."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CorrectedFrames:
-    """The result for four frames; None is what neither was given nor needed. A frame may have failed by value."""
+    """The result for four frames; None: the value was neither given nor needed."""
 
     motion: Motion | None
-    """Of the body, with which the frames were corrected."""
+    """Motion of the body that was used for the correction."""
     found: FoundMotion | None
-    """Where it comes from; None when it was given."""
+    """The estimate of the motion; None if it was given."""
     shutter: RollingShutter
     capture: Capture | None
-    """How the shutter was found; None when it was given."""
+    """The estimate of the shutter; None if it was given."""
     matches: Correspondences | None
     pairs: Pairs | None
-    """The frames with the depth that they were corrected with."""
+    """The frames with the depth that was used for the correction."""
     rig: StereoRig
-    """The cameras, with estimated values where ``rsbench.correct`` estimated some."""
+    """The cameras, including values that ``rsbench.correct`` estimated."""
     rig_found: FoundRig | None
-    """What the frames showed of the rig's calibration; None where their rows agree with it."""
+    """The estimated errors of the rig's calibration; None if the rows of the frames agree with it."""
     frames: dict[View, Fused]
+    """Corrected frames; each has a field that says whether its correction succeeded."""
     at_rows: list[dict[View, Fused]]
-    """At each of the further requested rows."""
+    """The frames corrected to each of the further target rows."""
     seconds: dict[str, float]
-    """Of each of ``STEPS``."""
+    """Duration of each of ``STEPS``."""
 
 
 def correct_four(
@@ -95,31 +96,31 @@ def correct_four(
     """Correct four frames (H, W[, 3]), uint8 or uint16, of a rig over one frame period.
 
     Args:
-        images: by side and frame.
-        rig: its cameras have the images' size.
-        readout_ratio: None has it found from the matches.
-        options: components and what happens between them.
-        step: called with the name of each of the 4 steps done.
-        given: what is known already.
-        views: the frames that are wanted.
-        disparity_offset: px by which disparities are too large, of a calibration that is right otherwise; None has
-            its errors found where the row differences of the matches show some.
-        scanning: how the cameras read their lines; None: found with the readout ratio, or where that is given,
-            rows from the top, both at once.
-        rows: further target rows, at whose times the frames are wanted too.
+        images: images by side and frame.
+        rig: the rig, whose cameras have the images' size.
+        readout_ratio: readout ratio; None: it is estimated from the matches.
+        options: the components, and options of the steps between them.
+        step: called with the name of each of the 4 steps when it is done.
+        given: further given values.
+        views: the frames to correct.
+        disparity_offset: px by which disparities are too large, if the calibration is right otherwise; None:
+            calibration errors are estimated if the row differences of the matches show some.
+        scanning: scan of the cameras; None: it is estimated with the readout ratio, or, if that is given, both
+            cameras read rows from the top at the same time.
+        rows: further target rows, to whose times the frames are corrected too.
 
     Raises:
-        RsbenchError: frames that cannot be what the arguments state, cameras that the options do not take (see
+        RsbenchError: the frames contradict the arguments, the options do not support the cameras (see
             ``check_cameras``), or a component of another package failed.
-        NoMotionError: the matches determine no motion or readout ratio.
-        ValueError: a motion is given and no readout ratio.
+        NoMotionError: the matches do not determine a motion or readout ratio.
+        ValueError: a motion is given without a readout ratio.
     """
     given = given or Given()
     check_cameras(rig, scanning or Scanning(), options, disparity_offset, given.pairs is not None)
     if given.motion is not None and readout_ratio is None:
-        raise ValueError("readout_ratio must be known where the motion is given: the matches would give another")
+        raise ValueError("readout_ratio must be given with the motion: one estimated from matches may not fit it")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    calibration = None if disparity_offset is None else of_offset(disparity_offset)
+    calibration = None if disparity_offset is None else offset_error(disparity_offset)
     inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration)
     wanted, matches = given.motion is None and "motion" in needs, given.matches
     if readout_ratio is not None and not wanted and (matches is not None or "matches" not in needs):
@@ -164,10 +165,10 @@ def check_cameras(
     disparity_offset: float | None,
     depth_is_known: bool = False,
 ) -> None:
-    """Whether these cameras can be corrected with these options.
+    """Check that the options support the cameras.
 
     Raises:
-        RsbenchError: depth is requested without motion where the two images of a pair have different times; or an
+        RsbenchError: depth is needed without motion although the two images of a pair have different times; or an
             offset is given for cameras with a lens or another scan, or for a matcher that needs the motion.
     """
     needs = options.corrector.component.spec.needs
@@ -176,8 +177,8 @@ def check_cameras(
     if not (depth_is_known or rig.rows_together(scanning)) and "depth" in needs and "motion" not in needs:
         raise RsbenchError(
             f"scan = {scanning.scan!r}, right_scan = {scanning.right_scan!r}, "
-            f"right_delay = {scanning.right_delay}: depth is found with the motion between the times of both "
-            f"cameras, for which corrector {options.corrector.name!r} does not ask"
+            f"right_delay = {scanning.right_delay}: depth needs the motion between the times of both cameras, "
+            f"which corrector {options.corrector.name!r} does not use"
         )
     lens = rig.camera.lens
     what = f"camera.lens = {lens.model!r}" if lens is not None else f"scan = {scanning.scan!r}"
@@ -189,11 +190,11 @@ def check_cameras(
 
 
 def _check_matcher(options: CorrectionOptions, disparity_offset: float | None) -> None:
-    """Raises RsbenchError where the matcher needs a motion and there is none, or only one of a doubtful rig."""
+    """Raise RsbenchError if the matcher needs a motion and there is none, or a disparity offset is given too."""
     if not needs_motion(options.matcher):
         return
     if "motion" not in options.corrector.component.spec.needs:
-        refuse_motion(options.matcher, f"corrector {options.corrector.name!r} does not ask for one")
+        refuse_motion(options.matcher, f"corrector {options.corrector.name!r} does not use one")
     if disparity_offset:
         raise RsbenchError(
             f"disparity_offset = {disparity_offset}: must be 0 with matcher {options.matcher.name!r}; "
@@ -211,18 +212,18 @@ def find_depth(
     disparity_offset: float = 0.0,
     frames: tuple[int, ...] = FRAMES,
 ) -> Pairs:
-    """The frames with their depth: by the matcher unless ``pairs`` has it, then from the motion, of ``frames``."""
-    asks = needs_motion(options.matcher)
-    if pairs is None and (asks or not rig.rows_together(shutter.scanning, shutter.readout_ratio)):
+    """The frames with depth by the matcher unless ``pairs`` has it, completed from the motion in ``frames``."""
+    by_motion = needs_motion(options.matcher)
+    if pairs is None and (by_motion or not rig.rows_together(shutter.scanning, shutter.readout_ratio)):
         if motion is None:
-            where = f"matcher {options.matcher.name!r} finds depth" if asks else "cameras read rows apart"
-            raise ValueError(f"the motion must be known where {where}")
+            needer = f"matcher {options.matcher.name!r}" if by_motion else "a pair of images with two times"
+            raise ValueError(f"the motion must be given: {needer} needs it")
         pairs = moving_pairs(images, rig, shutter, motion, options)
     elif pairs is None:
         pairs = frame_pairs(images, rig, options, disparity_offset)
     if not all(pair.timed for pair in pairs):
         if motion is None:
-            raise ValueError("the motion must be known where depth is found through a lens")
+            raise ValueError("the motion must be given for depth from cameras with a lens")
         pairs = timed_pairs(pairs, rig, shutter, motion)
     if options.depth_from_motion and motion is not None and not all(pair.with_motion for pair in pairs):
         pairs = complete_depth(pairs, rig, shutter, motion, frames)
@@ -239,7 +240,7 @@ def correct_frames(
     views: tuple[View, ...] = VIEWS,
     disparity_offset: float = 0.0,
 ) -> dict[View, Fused]:
-    """``correct_known_rows`` of one row and of correctors that need no more than a motion and a depth."""
+    """``correct_known_rows`` for one row and for correctors that need nothing but a motion and depth."""
     given = Given(motion=motion, pairs=pairs)
     return correct_known_rows(images, given, rig, shutter, options, views, disparity_offset)[0]
 
@@ -254,16 +255,16 @@ def correct_known_rows(
     disparity_offset: float,
     rows: Sequence[float] | None = None,
 ) -> list[dict[View, Fused]]:
-    """Corrected frames of the requested views at the times of target rows, through the same lens.
+    """Correct the given views to the times of target rows, as images of the same cameras and lenses.
 
-    A global shutter leaves nothing to correct: at a readout ratio of 0 the frames come back as they are.
+    At a readout ratio of 0 (global shutter) the frames are returned unchanged.
 
     Args:
-        rows: by default that of the options.
+        rows: target rows; by default the one in the options.
 
     Raises:
-        RsbenchError: the corrector needs a gyroscope's samples and there are none, or another package's corrector
-            failed, see ``find_corrected``.
+        RsbenchError: the corrector needs a gyroscope's samples and there are none, or the corrector of another
+            package failed, see ``find_corrected_rows``.
     """
     rows = (options.target_row,) if rows is None else rows
     pairs, needs = known.pairs, options.corrector.component.spec.needs
@@ -271,8 +272,8 @@ def correct_known_rows(
         return [uncorrected(images, views, pairs) for _ in rows]
     if "gyro" in needs and known.gyro is None:
         raise RsbenchError(
-            f"corrector {options.corrector.name!r}: needs the samples of a gyroscope, which frames do not show: "
-            "give them as gyro in Python, or evaluate a dataset that has the channel imu"
+            f"corrector {options.corrector.name!r}: needs the samples of a gyroscope: give them as gyro in "
+            "Python, or evaluate a dataset that has the channel imu"
         )
     problem = CorrectionProblem(
         images=images,
@@ -294,14 +295,14 @@ def correct_known_rows(
 
 
 def inpainted(fused: Fused, options: CorrectionOptions) -> Fused:
-    """A frame without holes, if the options ask for that."""
+    """The frame with its holes filled if the options request it."""
     if not (options.inpaint and fused.success):
         return fused
     return replace(fused, image=inpaint(fused.image, fused.origin == Origin.NOBODY))
 
 
 def uncorrected(images: Images, views: tuple[View, ...] = VIEWS, pairs: Pairs | None = None) -> dict[View, Fused]:
-    """The frames as they are, with the depth that is known of them: what a user has after a failure."""
+    """The uncorrected frames with their depth if it is known, the result for a global shutter."""
     frames = {view: Fused.seen(images[view], np.ones(images[view].shape[:2], dtype=np.bool_)) for view in views}
     if pairs is None:
         return frames
@@ -313,7 +314,7 @@ def uncorrected(images: Images, views: tuple[View, ...] = VIEWS, pairs: Pairs | 
 
 
 class _Clock:
-    """Seconds of each step."""
+    """Measures the seconds of each step."""
 
     def __init__(self, step: Step) -> None:
         self.seconds: dict[str, float] = {}

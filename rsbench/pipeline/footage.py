@@ -1,7 +1,7 @@
-"""A user's own footage: the card of the rig, and frames from files, folders and videos.
+"""A user's own footage: the rig's card, and frames from files, folders and videos.
 
-Frames are read as the sensor delivered them: an orientation tag is ignored, for turning an image turns its rows
-into columns, and rows are what a rolling shutter reads.
+Frames are read as the sensor delivered them, and orientation tags are ignored: rotating an image would turn its
+rows, which a rolling shutter reads one after the other, into columns.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import CardSigma, of_offset
+from rsbench.capture.calibration import CardSigma, offset_error
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml
 from rsbench.components.rig_tables import CameraTable, RightFromLeft, Size, rig_of_tables, tables_of, with_readouts
@@ -36,16 +36,16 @@ from rsbench.storage.untrusted_files import check_image_size, read_bytes
 from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, Times, VideoFile
 
 _SMALLEST = 32
-"""Pixels of the shorter side; below that there is nothing to match."""
+"""Least length of the shorter side, pixels; smaller images have too little to match."""
 _LARGEST_OFFSET_PX = 10.0
 _LONGEST_S = 1e4
-"""Of a frame period."""
+"""Longest frame period, seconds."""
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
 _READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
-"""Opens a display of a step, from its label and its number of parts; what it yields is called after each part."""
+"""Opens a progress display from a label and a number of parts; the yielded function is called after each part."""
 
 
 def no_progress(label: str, total: int) -> AbstractContextManager[Callable[[str], None]]:
@@ -68,11 +68,10 @@ class CameraCard:
     lens: Lens | None = None
     """Distortion of the lens. Absent: images without distortion."""
     focal_sigma: float = 0.0
-    """Standard deviation of fx, pixels (fx = 520 +- 20): the focal length is then found with the motion. Absent:
-    it is exact."""
+    """Standard deviation of fx, pixels (fx = 520 +- 20); it is then estimated with the motion. Absent: exact."""
     k1_sigma: float = 0.0
-    """Standard deviation of the lens's k1 (-0.20 +- 0.02), of 0 without a lens: it is then found with the motion.
-    Absent: it is exact."""
+    """Standard deviation of the lens's k1 (-0.20 +- 0.02; without a lens, of a k1 of 0), which is then estimated
+    with the motion. Absent: k1 is exact."""
 
     def __post_init__(self) -> None:
         check_number("focal_sigma", self.focal_sigma, least=0.0, most=0.3 * abs(self.fx))
@@ -80,20 +79,20 @@ class CameraCard:
 
     @property
     def sigma(self) -> CardSigma:
-        """How sure the card is of them."""
+        """Standard deviations of the intrinsics."""
         return CardSigma(focal=self.focal_sigma, k1=self.k1_sigma)
 
     def camera(self, size: Size) -> PinholeCamera:
-        """The camera of images of this (width, height); ValueError where its lens cannot be one of such images."""
+        """The camera for images of this (width, height); ValueError if its lens is impossible for such images."""
         (width, height), lens = size, self.lens
         return PinholeCamera(width=width, height=height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, lens=lens)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigCard(StatedShutter):
-    """What must be known of a rig to correct its frames: of two equal aligned cameras, or of any two.
+    """Calibration and shutter of a rig: of two equal aligned cameras, or of any two.
 
-    Sizes come from the images where the card has none.
+    If the card gives no sizes, those of the images are used.
     """
 
     SHORTHANDS: ClassVar = SHUTTER_KEY
@@ -103,20 +102,19 @@ class RigCard(StatedShutter):
     source: str = ""
     """Where the calibration comes from."""
     camera: CameraCard | None = None
-    """Intrinsics of both cameras, where they are the same and aligned."""
+    """Intrinsics of both cameras, if they are equal and aligned."""
     baseline: float | None = None
-    """Full distance between the cameras, metres; with ``left`` and ``right`` of cameras that look the same way."""
+    """Distance between the cameras, metres; with ``left`` and ``right``, both must look in the same direction."""
     left: CameraTable | None = None
     """The left camera, with ``right`` in place of ``camera``."""
     right: CameraTable | None = None
     """The right camera."""
     right_from_left: RightFromLeft | None = None
-    """Where the right camera is, in place of ``baseline``."""
+    """Pose of the right camera relative to the left one, in place of ``baseline``."""
     frame_period_s: float | None = None
-    """Seconds from one frame to the next, for what is given in seconds: ``shutter``, ``line_delay_s``,
-    ``delay_s``."""
+    """Time between frames, seconds; needed for values in seconds: ``shutter``, ``line_delay_s``, ``delay_s``."""
     disparity_offset: float | None = None
-    """Pixels by which matched disparities are too large; absent: found, where the matches show errors."""
+    """Error by which matched disparities are too large, pixels; absent: estimated if the matches show errors."""
 
     def __post_init__(self) -> None:
         two = self.left is not None and self.right is not None
@@ -142,29 +140,29 @@ class RigCard(StatedShutter):
 
     @property
     def inputs(self) -> KnownInputs:
-        """What the card gives of a capture."""
-        errors = None if self.disparity_offset is None else of_offset(self.disparity_offset)
+        """The values that the card gives to the estimation of a capture."""
+        errors = None if self.disparity_offset is None else offset_error(self.disparity_offset)
         return KnownInputs(readout_ratio=self.readout_ratio, scanning=self.scanning, calibration=errors)
 
     @property
     def sigma(self) -> CardSigma:
-        """How sure the card is of the intrinsics."""
+        """Standard deviations of the intrinsics; 0 for a card with [left] and [right]."""
         return CardSigma(focal=0.0, k1=0.0) if self.camera is None else self.camera.sigma
 
     @property
     def _sizes(self) -> tuple[Size, Size]:
-        """(width, height) of the left and the right images; of a part of them where the card does not say."""
+        """(width, height) of the left and the right images; a lower bound if the card does not give them."""
         if self.left is None or self.right is None:
             return (1, 1), (1, 1)
         left, right = (each.size or (_within(each.cx), _within(each.cy)) for each in (self.left, self.right))
         return left, right
 
     def rig(self, left: Size, right: Size | None = None) -> StereoRig:
-        """The rig with images of these (width, height); those of the right camera are as the left ones if absent.
+        """The rig for images of these (width, height); ``right`` is the same as ``left`` if absent.
 
         Raises:
-            ValueError: other sizes than the card's, a lens that cannot be one of such images, or impossible
-                extrinsics.
+            ValueError: the sizes differ from the card's, or a lens or the extrinsics are impossible for such
+                images.
         """
         right = right or left
         if self.camera is not None and self.baseline is not None:
@@ -179,25 +177,25 @@ class RigCard(StatedShutter):
         return rig_of_tables(self.left, self.right, apart, {"left": left, "right": right})
 
     def rig_of(self, left: NDArray[Any], right: NDArray[Any]) -> StereoRig:
-        """The rig with images like these two; RsbenchError where its cameras cannot be of such images."""
+        """The rig for a left and a right image; RsbenchError if the card contradicts their sizes."""
         sizes = [(image.shape[1], image.shape[0]) for image in (left, right)]
         try:
             return self.rig(*sizes)
         except ValueError as error:
             words = " and ".join(dict.fromkeys(f"{width} x {height}" for width, height in sizes))
-            raise RsbenchError(f"--rig: of images of {words} pixels: {error}") from error
+            raise RsbenchError(f"--rig: for images of {words} pixels: {error}") from error
 
 
 def _within(centre: float) -> int:
-    """Columns or rows that an image surely has whose principal point lies at this one."""
+    """Least number of columns or rows of an image with its principal point at this one."""
     return min(max(math.ceil(centre) + 1, 1), LARGEST_SIZE)
 
 
 def read_rig_card(path: Path) -> RigCard:
     """The card of a rig: ``baseline`` and ``[camera]``, or ``[left]``, ``[right]`` and ``[right_from_left]``.
 
-    ``readout_ratio`` or ``shutter``, ``scan`` are above the tables, or in those of the cameras. A word without an
-    ending is the name of a card in ``cards/rigs/``, unless there is such a file.
+    ``readout_ratio`` or ``shutter``, and ``scan``, stand above the tables or in those of the cameras. A path
+    without a folder and suffix is the name of a card in ``cards/rigs/``, unless such a file exists.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
@@ -207,13 +205,13 @@ def read_rig_card(path: Path) -> RigCard:
 
 
 def rig_path(path: Path) -> Path:
-    """The path, or that of the card in ``cards/rigs/`` that it names; RsbenchError where it names none."""
+    """The path, or that of the card in ``cards/rigs/`` with this name; RsbenchError if there is none."""
     named = not path.suffix and path == Path(path.name) and not path.exists()
     return card_path("rigs", path.name) if named else path
 
 
 def rig_card_of(rig: StereoRig, shutter: RollingShutter) -> RigCard:
-    """The card of cameras that are known."""
+    """The card of a given rig and shutter."""
     readout = {"readout_ratio": shutter.readout_ratio, **asdict(shutter.scanning)}
     if not rig.aligned:
         return parse_card(
@@ -227,10 +225,10 @@ def rig_card_of(rig: StereoRig, shutter: RollingShutter) -> RigCard:
 
 
 def read_frame(path: Path) -> NDArray[Any]:
-    """Image (H, W) grey or (H, W, 3) RGB, uint8 or uint16; transparency and orientation tags are ignored.
+    """Read an image as (H, W) grey or (H, W, 3) RGB, uint8 or uint16, without transparency and orientation tags.
 
     Raises:
-        RsbenchError: missing, not an image, too small, too large, or of another type.
+        RsbenchError: the file is missing, not an image, too small, too large, or of another type.
     """
     data = read_bytes(path)
     check_image_size(data, path)
@@ -241,7 +239,7 @@ def read_frame(path: Path) -> NDArray[Any]:
 
 
 def _checked(pixels: NDArray[Any], where: str) -> NDArray[Any]:
-    """RGB or grey image from OpenCV's BGR or grey."""
+    """Check an image of OpenCV, BGR or grey, and convert it to RGB or grey."""
     if pixels.dtype not in (np.uint8, np.uint16):
         raise RsbenchError(f"{where}: has {pixels.dtype} pixels; 8 and 16 bit are allowed")
     _checked_size(pixels, where)
@@ -259,7 +257,7 @@ def _checked_size(pixels: NDArray[Any], where: str) -> NDArray[Any]:
 
 
 def read_four(paths: dict[View, Path]) -> dict[View, NDArray[Any]]:
-    """The four frames of one motion; all of one kind, those of a camera of one size.
+    """Read the four frames of one motion: all of one type, and those of a camera of one size.
 
     Raises:
         RsbenchError: see ``read_frame`` and ``check_alike``.
@@ -272,10 +270,10 @@ def read_four(paths: dict[View, Path]) -> dict[View, NDArray[Any]]:
 
 
 def check_alike(frames: dict[str, NDArray[Any]], *, sizes: bool = True) -> None:
-    """All frames must have the channels and depth of the first, and its size unless ``sizes`` may differ.
+    """Check that all frames have the channels and depth of the first, and with ``sizes`` its size.
 
     Raises:
-        RsbenchError: names the frame that differs.
+        RsbenchError: a frame differs; the message names it.
     """
     first_name, first = next(iter(frames.items()))
     for name, frame in frames.items():
@@ -296,22 +294,22 @@ _ABOUT = 0.15
 
 
 def about_one(periods: Any) -> Any:
-    """Which intervals (...) are so near one frame period that a trajectory may take them as one."""
+    """Mask (...) of intervals that a trajectory may treat as one frame period."""
     return np.abs(np.asarray(periods) - 1.0) <= _ABOUT
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Timeline:
-    """When the frames of a camera were taken, and which of them are copies."""
+    """The times of a camera's frames, and which frames are copies of earlier ones."""
 
     twins: NDArray[np.intp]
-    """(n,) for each frame the number of the one that it repeats; its own where it is none."""
+    """(n,) for each frame the number of the frame that it repeats, or its own number."""
     starts: FloatArray
-    """(m,) of those that are no copies: first rows, frame periods since that of the first."""
+    """(m,) times of the first rows of ``originals``, frame periods since that of the first."""
     period_s: float | None
-    """Median time from one of those to the next, seconds; None of images."""
+    """Median interval between originals, seconds; None for images."""
     first_s: float
-    """Time of the first frame as the container has it, seconds."""
+    """Time of the first frame in the container, seconds."""
 
     @property
     def originals(self) -> NDArray[np.intp]:
@@ -320,11 +318,11 @@ class Timeline:
 
     @property
     def even(self) -> bool:
-        """Whether all of those are one frame period apart."""
+        """Whether all originals are one frame period apart."""
         return bool(np.all(np.diff(self.starts) == 1.0))
 
     def even_run(self) -> slice:
-        """Of those, the longest run of frames about one period apart, or all where none has ``_LEAST_RUN``."""
+        """The longest run of originals about one period apart, or all if no run has ``_LEAST_RUN`` frames."""
         breaks = np.flatnonzero(~about_one(np.diff(self.starts))) + 1
         edges = np.concatenate([[0], breaks, [len(self.starts)]])
         longest = int(np.argmax(np.diff(edges)))
@@ -333,44 +331,46 @@ class Timeline:
 
     @property
     def words(self) -> list[str]:
-        """What is not as of most videos, a line each."""
+        """One line of text for copies, and one for uneven intervals, if there are any."""
         lines, copies = list[str](), len(self.twins) - len(self.starts)
         if copies:
-            lines.append(f"{copies} of {len(self.twins)} frames repeat the one before: they get its result")
+            lines.append(f"{copies} of {len(self.twins)} frames repeat the previous one and get its result")
         uneven = np.diff(self.starts)
         if not self.even:
             lines.append(
                 f"{np.count_nonzero(uneven != 1.0)} of {len(uneven)} intervals between frames are not the usual "
                 f"{1000.0 * (self.period_s or 0.0):.1f} ms ({uneven.min():.2g} to {uneven.max():.3g} times that): "
-                "taken as their time stamps say"
+                "the time stamps are used"
             )
         return lines
 
 
 _LEAST_RUN = 12
-"""Frames by which a shutter is found as well as by more, or nearly."""
+"""With this many frames the shutter is estimated nearly as well as with more."""
 _NEARLY, _SHARE, _NEIGHBOURS = 0.5, 0.1, 3
-"""Grey levels, and share of the difference of neighbouring frames, below which a frame is a copy."""
+"""A frame is a copy if it differs from the previous one by fewer grey levels than the first value, and by less
+than the second times the largest difference among this many neighbours on either side."""
 _COPIES, _EVENLY, _SPREAD = 3, 1.05, 1.0
-"""Copies at like distances, and periods per original, from which on these were taken evenly, within so many."""
+"""Fewest regularly spaced copies, least periods per original, and largest deviation, periods, for which originals
+are taken to be evenly spaced in time (a video converted from a lower frame rate)."""
 _JITTER = 0.01
-"""Frame periods by which time stamps err, beside their rounding."""
+"""Error of time stamps in addition to their rounding, frame periods."""
 
 
-def _copies(nearly: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Twins (n,) of frames by the grey levels that each differs by from the one before."""
-    count = len(nearly)
-    finite = np.where(np.isfinite(nearly), nearly, 0.0)
+def _twins_of(difference: NDArray[np.float32]) -> NDArray[np.intp]:
+    """``Timeline.twins`` (n,) from the difference of each frame to the previous one, grey levels."""
+    count = len(difference)
+    finite = np.where(np.isfinite(difference), difference, 0.0)
     padded = np.pad(finite, _NEIGHBOURS)
     around = np.max(np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1), axis=1)
-    copies = (nearly == 0.0) | ((nearly < _NEARLY) & (nearly < _SHARE * around))
-    if np.count_nonzero(~copies) < 2:  # nothing moves at all
+    copies = (difference == 0.0) | ((difference < _NEARLY) & (difference < _SHARE * around))
+    if np.count_nonzero(~copies) < 2:  # a still scene
         return np.arange(count)
     return np.maximum.accumulate(np.where(copies, 0, np.arange(count)))
 
 
-def _spread(originals: NDArray[np.intp], count: int) -> float | None:
-    """Periods between frames that were taken evenly, where copies at like distances make up another rate."""
+def _even_spacing(originals: NDArray[np.intp], count: int) -> float | None:
+    """Container periods per original frame if regular copies fill up a higher frame rate; else None."""
     copies = np.setdiff1d(np.arange(count), originals)
     if len(copies) < _COPIES or len(originals) < 2 or np.ptp(np.diff(copies)) > 1:
         return None
@@ -382,16 +382,17 @@ def _spread(originals: NDArray[np.intp], count: int) -> float | None:
 
 
 def _timeline(twins: NDArray[np.intp], times: Times | None) -> Timeline:
+    """The timeline of frames with given twins (n,), from the time stamps of a video if there are some."""
     count = len(twins)
     originals = np.flatnonzero(twins == np.arange(count))
     seconds = None if times is None else times.seconds
     if len(originals) < 2:
         return Timeline(twins=twins, starts=np.arange(float(len(originals))), period_s=None, first_s=0.0)
-    spread = _spread(originals, count)
+    spread = _even_spacing(originals, count)
     if seconds is None or times is None:
         starts = np.arange(float(len(originals))) if spread else originals - float(originals[0])
         return Timeline(twins=twins, starts=starts.astype(np.float64), period_s=None, first_s=0.0)
-    period = float(np.quantile(np.diff(seconds[originals]), 0.5, method="lower"))  # one that there is
+    period = float(np.quantile(np.diff(seconds[originals]), 0.5, method="lower"))  # an interval that occurs
     first = float(seconds[0])
     if spread:
         period = spread * float(seconds[-1] - first) / (count - 1)
@@ -406,13 +407,13 @@ def _timeline(twins: NDArray[np.intp], times: Times | None) -> Timeline:
 
 
 def _natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-    """Key of an order in which 2 comes before 10."""
+    """Sort key by which 2 comes before 10."""
     parts = re.split(r"(\d+)", file.stem)
     return [(int(each), "") if k % 2 else (0, each) for k, each in enumerate(parts)], file.name
 
 
-def _tag_of(file: Path) -> int:
-    """EXIF's orientation of an image; that of an upright one where it says none."""
+def _orientation_of(file: Path) -> int:
+    """EXIF orientation of an image file; ``UPRIGHT`` if it has none."""
     from PIL import Image
 
     with suppress(Exception), Image.open(file) as image:  # Pillow raises various exceptions for a damaged file
@@ -429,10 +430,10 @@ class FrameSource:
     """Frames of one camera, in order, from a folder of images (by name) or a video; can be read repeatedly."""
 
     def __init__(self, path: Path, part: Part = "whole") -> None:
-        """Open a folder or video; ``part``: half of each frame, of two cameras side by side.
+        """Open a folder or video; ``part`` selects a half of frames that show two cameras side by side.
 
         Raises:
-            RsbenchError: missing, no frames, or not a video that can be read.
+            RsbenchError: the path is missing, has no frames, or is not a readable video.
         """
         self.path, self._part = path, part
         self._files: list[Path] = []
@@ -446,13 +447,13 @@ class FrameSource:
             self.count = len(self._files)
         elif path.is_file():
             self._video = VideoFile.open(path)
-            self.count = self._video.count  # as the file says: progress alone believes it
+            self.count = self._video.count  # from the header, which may be wrong: used for progress only
         else:
             raise RsbenchError(f"{path}: no such folder or video")
 
     @classmethod
     def of_files(cls, files: list[Path]) -> FrameSource:
-        """Frames of these files, in this order; RsbenchError where there are none."""
+        """Frames of these files, in this order; RsbenchError if there are none."""
         if not files:
             raise RsbenchError("no frames")
         source = cls.__new__(cls)
@@ -462,38 +463,38 @@ class FrameSource:
 
     @property
     def video(self) -> VideoFile | None:
-        """The file; None of images."""
+        """The video file; None for images."""
         return self._video
 
     @property
     def orientation(self) -> int:
-        """EXIF's number: how frames, which are read as they are stored, are to be turned for a person."""
-        return self._video.orientation if self._video is not None else _tag_of(self._files[0])
+        """EXIF orientation with which the frames, which are read as stored, should be displayed."""
+        return self._video.orientation if self._video is not None else _orientation_of(self._files[0])
 
     @cached_property
     def times(self) -> Times | None:
-        """Of a video's frames; None of images."""
+        """Time stamps of a video's frames; None for images."""
         return None if self._video is None else self._video.times()
 
     @cached_property
     def timeline(self) -> Timeline:
-        """When each frame was taken, and which of them are copies; reads all of them."""
+        """The times of the frames, and which are copies; this reads all frames."""
         if self.times is not None:
             self.count = len(self.times.seconds)
-            return _timeline(_copies(self.times.nearly), self.times)
+            return _timeline(_twins_of(self.times.nearly), self.times)
         digests = [hashlib.sha256(read_bytes(file)).digest() for file in self._files]
         same = [0.0 if a == b else np.inf for a, b in itertools.pairwise(digests)]
-        return _timeline(_copies(np.array([np.inf, *same], dtype=np.float32)), None)
+        return _timeline(_twins_of(np.array([np.inf, *same], dtype=np.float32)), None)
 
     def only(self, numbers: Iterable[int]) -> FrameSource:
-        """The frames of these numbers."""
+        """The source restricted to frames of these numbers."""
         source = copy.copy(self)
         source._kept = frozenset(int(each) for each in numbers)
         source.count = len(source._kept)
         return source
 
     def identity(self) -> list[str]:
-        """Of its files: paths, sizes and times of change; and which part of them is taken."""
+        """Text that identifies the frames: paths, sizes and modification times of the files, and the part."""
         files = [(path.resolve(), path.stat()) for path in self._files or [self.path]]
         part = [] if self._part == "whole" else [self._part]
         return part + [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in files]
@@ -513,9 +514,9 @@ class FrameSource:
                 if kept is None or number in kept
             )
         for frame in frames:
-            yield self._taken(frame)
+            yield self._part_of(frame)
 
-    def _taken(self, frame: NDArray[Any]) -> NDArray[Any]:
+    def _part_of(self, frame: NDArray[Any]) -> NDArray[Any]:
         if self._part == "whole":
             return frame
         half = frame.shape[1] // 2
@@ -523,7 +524,7 @@ class FrameSource:
 
 
 class ImageSource(FrameSource):
-    """Frames that are in memory, one a frame period."""
+    """Frames in memory, one per frame period."""
 
     def __init__(self, images: Iterable[NDArray[Any]]) -> None:
         """Images (H, W[, 3]) in order."""
@@ -532,7 +533,7 @@ class ImageSource(FrameSource):
 
     @cached_property
     def timeline(self) -> Timeline:
-        """Without copies."""
+        """Evenly spaced frames without copies."""
         return _timeline(np.arange(self.count), None)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
@@ -541,17 +542,17 @@ class ImageSource(FrameSource):
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
-    """What correcting frames of one camera takes, measured on two cores (``benchmarks/footage_sizes.py``)."""
+    """Time and memory to correct frames of one camera, measured on two cores (``benchmarks/footage_sizes.py``)."""
 
     seconds: float
-    """For a million pixels of a frame."""
+    """Seconds per frame and million pixels."""
     bytes: float
-    """For a pixel."""
+    """Bytes of memory per pixel."""
     start_s: float
     start_bytes: float
 
     def words(self, frames: int, pixels: int) -> str:
-        """In words, for so many frames of so many pixels."""
+        """Text with the time and memory for a number of frames with a number of pixels each."""
         seconds = self.start_s + self.seconds * frames * pixels / 1e6
         gigabytes = (self.start_bytes + self.bytes * pixels) / 1e9
         time = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"

@@ -1,7 +1,7 @@
-"""How the frames of two times of a rig were taken: matches found or refused, then all of it that is not given.
+"""Estimate the capture of four frames of a rig: find or refuse matches, then estimate what is not given.
 
-``know_four`` and ``know_matches`` end in one ``KnownCapture``; with that, motion, depth and corrected frames are
-functions of frames, matches and options.
+``know_four`` and ``know_matches`` return a ``KnownCapture`` (rig, shutter, calibration errors). Motion, depth and
+corrected frames are then functions of frames, matches, this object and options.
 """
 
 from __future__ import annotations
@@ -41,34 +41,34 @@ from rsbench.vision.features import ROW_TOLERANCE_PX
 from rsbench.vision.images import eight_bit
 
 BACKWARDS = (
-    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to what "
-    "is given (`scan` in the rig's card)"
+    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to the "
+    "given one (`scan` in the rig's card)"
 )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownCapture:
-    """How frames were taken, given or estimated, and where each estimate comes from."""
+    """Rig, shutter and calibration errors of frames, given or estimated, and the estimates that they come from."""
 
     rig: StereoRig
-    """The cameras; of one camera ``StereoRig.of_one``."""
+    """The cameras; for one camera ``StereoRig.of_one``."""
     shutter: RollingShutter
     capture: Capture | None = None
-    """How the shutter was estimated; None where it is given."""
+    """The estimate of the shutter; None if it is given."""
     calibration: tuple[float, ...] = NO_ERRORS
-    """Errors of the calibration, see ``calibration.TERMS``."""
+    """Calibration errors, see ``calibration.TERMS``."""
     models: Capture | None = None
-    """Motion models compared on the matches of the two times from which any of this was estimated; None: none."""
+    """The comparison of motion models, if shutter or calibration errors were estimated from these two times."""
     rig_found: FoundRig | None = None
-    """How rotation, focal lengths and delay of the right camera were estimated; None where they are as given."""
+    """The estimate of rotation, focal lengths and delay of the right camera; None if they are as given."""
     focal: FoundFocal | None = None
-    """How one camera's focal length was estimated; None where it is given."""
+    """The estimate of one camera's focal length; None if it is given."""
     camera_note: str = ""
-    """What was estimated of a rig's focal length and k1."""
+    """Report on the estimate of a rig's focal length and k1."""
     gyro: FloatArray | None = None
-    """(n, 4) samples of a gyroscope at the times of the frames; None without one."""
+    """(n, 4) samples of a gyroscope at the times of the frames; None: there is none."""
     clock: Clock | None = None
-    """Error of the gyroscope's clock; None where its times are exact."""
+    """Error of the gyroscope's clock; None if its times are exact."""
 
 
 def know_four(
@@ -79,11 +79,11 @@ def know_four(
     matches: Correspondences | None = None,
     step: Callable[[str], None] = lambda word: None,
 ) -> tuple[Correspondences, KnownCapture]:
-    """The matches of four frames, as ``solve_frames`` takes them, and how the frames were taken.
+    """Match four frames and estimate their capture, for ``solve_frames``.
 
     Args:
-        inputs: what is given; the errors of a rig that is not ideal are estimated as errors of the rig.
-        matches: given ones are taken as they are.
+        inputs: given values; calibration errors of a rig that is not aligned are estimated by ``refine_rig``.
+        matches: given matches, which are used unchanged; None: the frames are matched.
         step: called with ``matching`` when there are matches.
 
     Raises:
@@ -99,16 +99,16 @@ def know_four(
         return matches, replace(capture, rig_found=found)
 
     forget_matches()
-    own, found, doubt = matches is None and rig.rows_together(inputs.reading, inputs.readout_ratio), None, None
+    check, found, doubt = matches is None and rig.rows_together(inputs.reading, inputs.readout_ratio), None, None
     try:
         if matches is None:
             matches, doubt = match_given(images, rig, options, inputs)
         step("matching")
-        if own and doubt is None and not rig.aligned and inputs.calibration is None:
+        if check and doubt is None and not rig.aligned and inputs.calibration is None:
             found = rig_of_matches(matches, rig, inputs, options)
         return known(matches, found, doubt)
     except RefusedFramesError as refusal:
-        if refusal.stereo is None or not own:
+        if refusal.stereo is None or not check:
             raise
         found, matches = find_rig(images, rig, inputs, options, refusal)
     return known(matches, found)
@@ -121,15 +121,15 @@ def know_matches(
     options: CorrectionOptions,
     doubt: RefusedFramesError | None = None,
 ) -> tuple[Correspondences, KnownCapture]:
-    """How the frames of matches were taken, and the matches that are right for that.
+    """Estimate the capture from matches; returns the matches that are valid for it, and the capture.
 
     Args:
-        inputs: without a calibration its errors are estimated if the row differences of the matches show some;
-            without a scanning it is estimated with the readout ratio, or is rows from the top where that is given.
-        doubt: raised where the cameras read rows together, see ``match_unknown``.
+        inputs: calibration errors that are not given are estimated if row differences of the matches show some; a
+            scanning that is not given is estimated with the readout ratio, or rows from the top.
+        doubt: error that is raised if both cameras read rows at the same time, see ``match_unknown``.
 
     Raises:
-        RefusedFramesError: time runs backwards in the frames.
+        RefusedFramesError: the frames are in reverse order.
         NoMotionError: the matches do not determine the shutter.
     """
     if inputs.readout_ratio is not None:
@@ -149,7 +149,7 @@ def know_matches(
 def _calibrated(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> tuple[Capture | None, tuple[float, ...]]:
-    """What the matches say of a calibration that may be wrong, with a known shutter; None where it is right."""
+    """Estimate calibration errors with a known shutter, if the matches show some; None: no estimate was made."""
     if inputs.calibration is not None or not rig.rows_together(inputs.reading):
         return None, inputs.calibration or NO_ERRORS
     inputs = replace(inputs, scanning=inputs.reading)
@@ -162,8 +162,8 @@ def _calibrated(
 def find_capture(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> Capture:
-    """Motion of two times, and what ``inputs`` lacks of shutter and calibration, from matches."""
-    solver, models = options.solver.solver, models_asked(options.motion_model)
+    """Estimate from matches the motion between two times and the values of the capture that ``inputs`` lacks."""
+    solver, models = options.solver.solver, compared_models(options.motion_model)
     if options.motion_model is None and isinstance(solver, RefinedSolver):
         models = (solver.motion_model,)
     return capture_of(matches, rig, replace(inputs, models=models), options.robust, options.seed)
@@ -172,18 +172,18 @@ def find_capture(
 def capture_of(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, robust: RobustOptions, seed: int
 ) -> Capture:
-    """``find_capture`` under the motion models of ``inputs``; a nearly global shutter is a global one."""
+    """``find_capture`` for the motion models in ``inputs``; a nearly global shutter is made global."""
     known = known_of(matches, rig, inputs)
     capture = conclude([examine(matches, rig, known, robust, seed)])
     return as_global(capture, [matches], rig, known) if inputs.readout_ratio is None else capture
 
 
-def models_asked(motion_model: str | None) -> tuple[str, ...]:
-    """Those that ``auto`` chooses from, or the one that is requested."""
+def compared_models(motion_model: str | None) -> tuple[str, ...]:
+    """The motion models to compare: all for ``auto`` or None, otherwise the requested one."""
     return MODELS if motion_model in (None, AUTO) else (str(motion_model),)
 
 
-# Matches of the frames of a rig, and its calibration as they show it.
+# Matches of the frames of a rig, and the correction of its calibration by them.
 
 
 _FEWEST_MATCHES = 12
@@ -195,9 +195,9 @@ def find_matches(
     sides: tuple[Side, Side] = SIDES,
     rig: StereoRig | None = None,
 ) -> Correspondences:
-    """Correspondences of the four frames, whatever they are; ``sides`` says which images are taken for the left's.
+    """Correspondences of the four frames; ``sides`` names the images that are used as left and as right ones.
 
-    Those of frames that the cameras of ``rig`` took are in their pixels.
+    With a ``rig``, correspondences are in the pixels of its cameras.
 
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
@@ -210,11 +210,11 @@ def find_matches(
 def find_matches_of_rig(
     images: Images, rig: StereoRig, scanning: Scanning, options: CorrectionOptions
 ) -> Correspondences:
-    """``find_matches`` of cameras as they are, in pixels of their images.
+    """``find_matches`` for the cameras of a rig, in pixels of their images.
 
-    Other matchers get images without distortion. Where the cameras do not read rows together, the two ends of a
-    left-right match have two times and lie on two rows: rsbench's matchers search the whole image for it, and
-    those of other packages, which may search the row alone, give only their matches over time.
+    Matchers of other packages get undistorted images. If the cameras do not read rows at the same time, the points
+    of a left-right match have different times and lie on different rows. rsbench's matchers then search the whole
+    image; matchers of other packages may search the row only, so their left-right matches are not used.
 
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
@@ -236,23 +236,23 @@ def match_frames(
     *,
     judge_rig: bool = True,
 ) -> Correspondences:
-    """``find_matches_of_rig`` of frames that a user says to be those of a rig.
+    """``find_matches_of_rig`` for a user's frames, after a check that they fit the rig.
 
     Args:
-        scanning: how the cameras read; None: rows from the top, both at once.
-        judge_rig: whether to look if frame 0 is a rectified pair in the right order.
+        scanning: scan of the cameras; None: both read rows from the top at the same time.
+        judge_rig: whether to check that frame 0 is a rectified pair in the right order.
 
     Raises:
-        RefusedFramesError: no texture, sides exchanged, not rectified, or not of one time.
+        RefusedFramesError: no texture, sides exchanged, not rectified, or left and right of different times.
     """
     scanning = scanning or Scanning()
     if judge_rig and rig.rows_together(scanning):
         check_rig(images["left", 0], images["right", 0], rig)
-    return _enough(find_matches_of_rig(images, rig, scanning, options))
+    return _check_enough(find_matches_of_rig(images, rig, scanning, options))
 
 
 def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
-    """The same options, whose feature matcher may give tracks alone where there are as many as that."""
+    """The same options, with a feature matcher that may return only tracks if there are at least ``tracks``."""
     component = options.features.component.with_enough(tracks)
     return replace(options, features=replace(options.features, component=component))
 
@@ -260,15 +260,15 @@ def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
 def find_rig(
     images: Images, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions, refusal: RefusedFramesError
 ) -> tuple[FoundRig, Correspondences]:
-    """The rig as its frames show it, where their rows contradict its calibration, and the matches under it.
+    """Correct the calibration of a rig that the rows of its frames contradict, and match the frames with it.
 
     Args:
-        inputs: with or without a readout ratio.
-        refusal: why the frames are refused under ``rig``.
+        inputs: given values, with or without a readout ratio.
+        refusal: the error with which the frames were refused for ``rig``.
 
     Raises:
-        RefusedFramesError: the same, where no rotation of the right camera puts the matches on the epipolar lines.
-        NoMotionError: the frames determine no motion or readout ratio.
+        RefusedFramesError: ``refusal``, if no rotation of the right camera puts the matches on the epipolar lines.
+        NoMotionError: the frames do not determine a motion or readout ratio.
     """
     rows = None if refusal.stereo is None else rotation_of_rows(refusal.stereo, rig, options.seed)
     if rows is None:
@@ -278,25 +278,25 @@ def find_rig(
         matches = match_frames(images, turned, options, inputs.scanning)
     except RefusedFramesError:
         raise refusal from None
-    found = _refined(matches, rig, rows[0], inputs, options)
+    found = _refined_rig(matches, rig, rows[0], inputs, options)
     if found is None:
         raise refusal
     return found, matches
 
 
 _CLEAR = 3.0
-"""Deviations beyond which an error of a calibration is one: to estimate none costs accuracy of the motion."""
+"""Standard deviations above which a calibration error is corrected: needless corrections cost accuracy."""
 _LIKELY_ROWS_PX = 0.3
-"""Rows' error, px, up to which a calibration is first tried as it is."""
+"""Largest row difference, px, for which the given calibration is tested before an estimation."""
 
 
 def rig_of_matches(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> FoundRig | None:
-    """The rig as matches along its epipolar lines show it; None where they agree with its calibration.
+    """Correct a rig by matches along its epipolar lines; None if they agree with its calibration.
 
     Raises:
-        NoMotionError: the matches determine no readout ratio.
+        NoMotionError: the matches do not determine a readout ratio.
     """
     if not any(known_of(matches, rig, inputs).calibration_sigma):
         return None
@@ -306,8 +306,8 @@ def rig_of_matches(
         rows_moved(rows[0], rig) < _LIKELY_ROWS_PX and _as_calibrated(matches, rig, inputs, options)
     ):
         return None
-    found = _refined(matches, rig, rows[0], inputs, options)
-    # Rows differ by the motion too, where both cameras read a point at two times: that is no error.
+    found = _refined_rig(matches, rig, rows[0], inputs, options)
+    # If both cameras read a point at different times, rows differ by the motion too, without any error.
     agrees = found is None or bool(np.all(np.abs(found.errors) <= _CLEAR * found.sigma))
     return None if agrees else found
 
@@ -315,34 +315,34 @@ def rig_of_matches(
 def _as_calibrated(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> bool:
-    """Whether the matches agree with the calibration; False where the ratio is unknown, or that is not clear."""
+    """Whether the matches clearly agree with the calibration; False if the readout ratio is unknown."""
     if inputs.readout_ratio is None:
         return False
-    prior, model = prior_of(np.zeros(len(ERRORS))), _law(options)
+    prior, model = prior_of(np.zeros(len(ERRORS))), _model_name(options)
     return agrees([matches], rig, inputs.shutter_of(rig), prior, _CLEAR, options.robust, options.seed, model)
 
 
-def _law(options: CorrectionOptions) -> str:
+def _model_name(options: CorrectionOptions) -> str:
     return options.motion_model if options.motion_model in MODELS else "linear"
 
 
-def _refined(
+def _refined_rig(
     matches: Correspondences, rig: StereoRig, start: FloatArray, inputs: KnownInputs, options: CorrectionOptions
 ) -> FoundRig | None:
-    """``refine_rig`` under the shutter that is given, or that the matches show near the right rig."""
+    """``refine_rig`` with the given shutter, or with the one estimated for the rig with the errors ``start``."""
     inputs = replace(inputs, calibration=NO_ERRORS)
     shutter = know_matches(matches, with_errors(rig, start), inputs, options)[1].shutter
     prior = prior_of(start)
-    return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _law(options))
+    return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _model_name(options))
 
 
 def match_unknown(
     images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
 ) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` for cameras of any scan, and the evidence against a pair that reads rows at one time.
+    """``match_frames`` for an unknown scan; also the error to raise if both cameras read rows at the same time.
 
     Raises:
-        RefusedFramesError: no texture.
+        RefusedFramesError: the frames have no texture.
     """
     doubt = None
     try:
@@ -351,20 +351,20 @@ def match_unknown(
     except RefusedFramesError as error:
         doubt = error
     scanning = Scanning() if options.features.component.apart() is None else Scanning(scan="left")
-    return _enough(find_matches_of_rig(images, rig, scanning, options)), doubt
+    return _check_enough(find_matches_of_rig(images, rig, scanning, options)), doubt
 
 
 def match_given(
     images: Images, rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs, *, judge_rig: bool = True
 ) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` where readout ratio or scanning are given, else ``match_unknown``; their errors."""
+    """``match_frames`` if readout ratio or scanning are given, otherwise ``match_unknown``; raises as these do."""
     if inputs.readout_ratio is None and inputs.scanning is None:
         return match_unknown(images, rig, options, judge_rig=judge_rig)
     return match_frames(images, rig, options, inputs.scanning, judge_rig=judge_rig), None
 
 
 def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
-    """Without tracks whose left-right ends are not on one row, of cameras that read rows together."""
+    """The matches without tracks whose left and right points are on different rows."""
     tracks = without_lens(Correspondences(tracks=matches.tracks), rig).tracks
     off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
     near = off <= ROW_TOLERANCE_PX
@@ -373,7 +373,7 @@ def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
     )
 
 
-def _enough(matches: Correspondences) -> Correspondences:
+def _check_enough(matches: Correspondences) -> Correspondences:
     temporal = max(len(matches.left) + len(matches.right), 2 * len(matches.tracks))
     if temporal < _FEWEST_MATCHES:
         raise RefusedFramesError(

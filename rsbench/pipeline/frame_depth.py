@@ -1,4 +1,4 @@
-"""What decides the correction of four frames, apart from the frames and the rig."""
+"""Options of the correction of four frames, and the depth of the frames of a rig."""
 
 from __future__ import annotations
 
@@ -37,34 +37,35 @@ from rsbench.vision.stereo_matcher import (
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionOptions:
-    """The four components of the chain, each of which may be anybody's, and what happens between them."""
+    """The four components of the correction, which may come from other packages, and options between them."""
 
     features: FeatureEntry = field(default_factory=lambda: load_features("sift-refined"))
-    """Finds the matches that the motion is solved from; commands take ``dense``, boards and studies this one."""
+    """Finds the matches for the motion; commands use ``dense`` by default, boards and studies this one."""
     solver: SolverEntry = field(default_factory=lambda: load_solver_entry("rs-stereo-refined"))
-    """Any solver that gives the length of d."""
+    """Estimates the motion; its translation must be metric."""
     matcher: MatcherEntry = field(default_factory=lambda: load_matcher("sgm"))
-    """Finds depth."""
+    """Estimates depth."""
     corrector: CorrectorEntry = field(default_factory=lambda: load_corrector("fusion"))
     robust: RobustOptions = field(default_factory=RobustOptions)
     motion_model: str | None = None
     """``auto`` or a model to use instead of the solver's, see ``rsbench.capture.model_choice``."""
     target_row: float = 0.0
-    """The time of this row of the frame is the time of its corrected image."""
+    """The row at whose readout time the corrected image is."""
     one_time: bool = False
-    """Whether the right camera's corrected image is of the left one's time, where theirs differ."""
+    """Whether the right camera's image is corrected to the left one's time if their times differ."""
     depth_from_motion: bool = True
-    """Where the other camera gives no depth, take it from the flow to the other frame and the motion."""
+    """Estimate depth from optical flow and motion where the other camera gives none."""
     find_sky: bool = True
+    """Set the depth of regions that look like the sky to infinity."""
     inpaint: bool = False
-    """Invent pixels that no frame shows; they stay marked."""
+    """Fill pixels that no frame shows; they stay marked."""
     seed: int = 0
 
     def faster(self) -> CorrectionOptions:
-        """The same sooner: matches and depth at half the size, and no depth from the motion.
+        """Faster options: matches and depth at half the size, and no depth from the motion.
 
         Raises:
-            RsbenchError: features or matcher are not ours, which know no other size.
+            RsbenchError: features or matcher are from another package and cannot work at half the size.
         """
         entries: dict[str, Any] = {"features": self.features, "matcher": self.matcher}
         sgm = self.matcher.component
@@ -87,7 +88,7 @@ class CorrectionOptions:
 
     @property
     def key(self) -> str:
-        """Hash of all that decides a result: options of equal keys give equal frames."""
+        """Hash of all options; options with equal keys give equal frames."""
         values = {name: getattr(self, name) for name in sorted(option.name for option in fields(self))}
         parts = [f"{name}={value.key if isinstance(value, Entry) else value!r}" for name, value in values.items()]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
@@ -101,17 +102,17 @@ Images = Mapping[View, NDArray[Any]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FramePair:
-    """One time of the rig: both images with their depth."""
+    """Both images of one frame time, with their depth."""
 
     images: dict[Side, NDArray[Any]]
     depth: dict[Side, NDArray[np.float32]]
-    """(H, W) metres in each row's own camera; inf in the sky and at no disparity, 0 unknown."""
+    """(H, W) metres along the camera's axis at each row's time; inf: sky or disparity 0; 0: unknown."""
     guess: dict[Side, NDArray[np.float32]]
-    """(H, W) the same where ``depth`` is unknown, from the neighbours; 0 elsewhere."""
+    """(H, W) depth guessed from the neighbours where ``depth`` is unknown; 0 elsewhere."""
     with_motion: bool = False
-    """Whether the depth that the motion gives is in it already."""
+    """Whether depth from the motion is included already."""
     timed: bool = True
-    """Whether the depth counts that both cameras saw a point at two times; only with a lens they differ."""
+    """Whether depth accounts for different readout times of a point in both cameras, which a lens causes."""
 
 
 Pairs = tuple[FramePair, FramePair]
@@ -125,9 +126,9 @@ def frame_pair(
     options: CorrectionOptions,
     disparity_offset: float = 0.0,
 ) -> FramePair:
-    """Depth of both images (H, W[, 3]), uint8 or uint16, of one time, on the pixels that they have.
+    """Depth of both images (H, W[, 3]), uint8 or uint16, of one frame time, at their own pixels.
 
-    ``disparity_offset``: what a disparity is too large by, px.
+    ``disparity_offset`` is subtracted from disparities, px.
 
     Raises:
         RsbenchError: another package's matcher failed, see ``find_disparities``.
@@ -147,11 +148,10 @@ def depth_of_pair(
     *,
     find_sky: bool,
 ) -> FramePair:
-    """Depth from the disparities (H, W), NaN where unknown, of both images (H, W[, 3]) of one time.
+    """Depth from the disparities (H, W), NaN: unknown, of both images (H, W[, 3]) of one frame time.
 
-    With a lens it is that of a rig at rest: ``timed_pairs`` makes it that of a moving one.
-
-    ``find_sky``: put at infinity what looks like the sky.
+    With a lens it is valid for a rig at rest; ``timed_pairs`` converts it to that of a moving rig. With
+    ``find_sky``, regions that look like the sky are set to infinity.
     """
     images = dict(zip(SIDES, (left, right), strict=True))
     levels = dict(zip(SIDES, eight_bit([left, right]), strict=True))
@@ -169,7 +169,7 @@ def depth_of_pair(
 def _without_holes(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -> NDArray[np.float32]:
     """Disparity (H, W) with its holes filled along the baseline by the farther neighbour, see ``fill_holes``.
 
-    Cameras that differ see different rows: one that the other does not show at all is filled by those beside it.
+    If the cameras differ, a row may be invisible in the other image; it is then filled across the baseline.
     """
     if rig.aligned:
         return fill_holes(disparity)
@@ -183,7 +183,7 @@ def _without_holes(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -
 def moving_pairs(
     images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion, options: CorrectionOptions
 ) -> Pairs:
-    """``frame_pairs`` by a known motion: of cameras that do not read rows together, or a matcher that needs it.
+    """``frame_pairs`` with a known motion: for cameras that read rows at different times, or by its matcher.
 
     Raises:
         RsbenchError: see ``find_depths``.
@@ -211,9 +211,9 @@ def motion_disparities(
     motion: Motion,
     views: Sequence[View] | None = None,
 ) -> dict[View, NDArray[np.float32]]:
-    """Disparity (H, W), ideal px, that depth in each line's own camera means; 0 infinitely far, NaN unknown.
+    """Disparity (H, W), ideal px, equivalent to depth at each line's time; 0: infinitely far, NaN: unknown.
 
-    ``views``: whose is wanted; of all images when None.
+    ``views`` selects the views; None: all.
     """
     levels = dict(zip(images, eight_bit(list(images.values())), strict=True))
     found = find_depths(entry, levels, rig, shutter, motion, views)
@@ -225,7 +225,7 @@ def motion_disparities(
 def pair_with_motion(
     images: Images, both: Sequence[NDArray[np.float32]], frame: int, rig: StereoRig, *, find_sky: bool
 ) -> FramePair:
-    """``depth_of_pair`` of disparities that a motion is in already."""
+    """``depth_of_pair`` for disparities that account for the motion already."""
     pair = depth_of_pair(images["left", frame], images["right", frame], both, rig, find_sky=find_sky)
     return replace(pair, timed=True)
 
@@ -233,8 +233,8 @@ def pair_with_motion(
 def frame_pairs(
     images: Images, rig: StereoRig, options: CorrectionOptions, disparity_offset: float = 0.0
 ) -> Pairs:
-    """``frame_pair`` of frame 0 and of frame 1; ours side by side, for it keeps one core busy."""
-    # Nothing is known of whether another package's matcher may run twice at a time.
+    """``frame_pair`` for frame 0 and frame 1, in two threads with a built-in matcher."""
+    # A matcher of another package may not be thread-safe.
     with ThreadPoolExecutor(len(FRAMES) if options.matcher.built_in else 1) as pool:
         first, second = pool.map(
             lambda frame: frame_pair(
@@ -246,7 +246,7 @@ def frame_pairs(
 
 
 def known_depth(images: Images, depth: Mapping[View, NDArray[np.float32]]) -> Pairs:
-    """Frames with a given depth (H, W) of every view: metres, inf at infinity, 0 unknown; no guesses."""
+    """Frames with a given depth (H, W) for each view: metres, inf: infinitely far, 0: unknown; without guesses."""
     first, second = (
         FramePair(
             images={side: images[side, frame] for side in SIDES},
@@ -259,7 +259,7 @@ def known_depth(images: Images, depth: Mapping[View, NDArray[np.float32]]) -> Pa
 
 
 def timed_pairs(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> Pairs:
-    """The same frames with the depth of a rig that moves between the times of both ends of a disparity."""
+    """The frames with depth that accounts for the motion between the times of both points of a disparity."""
     first, second = (
         pair
         if pair.timed
@@ -277,7 +277,7 @@ def timed_pairs(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: M
 def complete_depth(
     pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: tuple[int, ...] = FRAMES
 ) -> Pairs:
-    """The same frames with depth from the motion where the other camera gave none, in the requested ones."""
+    """The frames with depth from the motion where the other camera gives none, for the given frame indices."""
 
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])
@@ -297,7 +297,7 @@ def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> Frame
 
 
 def metres(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -> NDArray[np.float32]:
-    """Metres (H, W) along the camera's axis: inf where there is no disparity, 0 where it is unknown."""
+    """Depth (H, W), metres along the camera's axis: inf where the disparity is 0, 0 where it is unknown."""
     depth = np.where(np.isnan(disparity), 0.0, rig.depth(disparity))
     if not rig.aligned:
         depth = depth * own_depths(rig, side)

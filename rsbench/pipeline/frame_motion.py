@@ -1,6 +1,6 @@
-"""The motion of a rig's body between two times whose capture is known, from their matches.
+"""Estimate the motion of a rig's body between two frame times with a known shutter and calibration.
 
-A solver's answer under the motion model that the matches prefer, or a spline in its place.
+The motion is a solver's answer under the motion model that the matches support most, or a spline in its place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.frame_capture import BACKWARDS, KnownCapture, models_asked
+from rsbench.pipeline.frame_capture import BACKWARDS, KnownCapture, compared_models
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
@@ -36,22 +36,22 @@ from rsbench.solvers.refined import RefinedSolver
 
 
 def body_motion(estimate: MotionEstimate, spec: SolverSpec, rig: StereoRig) -> Motion | str:
-    """The body's motion in metres that an estimate stands for, or the reason why it stands for none.
+    """Convert a solver's estimate to the body's motion in metres, or return the reason why this is impossible.
 
     A left camera's translation t becomes the body's: d = t - o + R o, with o the left camera's offset. The pose
-    after one period is then exact. Between the rows a constant twist of the camera is one of the body too; a
-    camera that moves linearly has a body that does so up to |w|^2 |o| / 8.
+    after one period is then exact. At times between, a constant twist of the camera is a constant twist of the
+    body too; under the linear model of the camera, the body deviates from linear motion by up to |w|^2 |o| / 8.
 
     Args:
-        estimate: a solver's answer.
-        spec: what that solver declares: the point whose translation d is, and the motion model.
-        rig: where the left camera is.
+        estimate: the solver's answer.
+        spec: the solver's specification: the point whose translation d is, and the motion model.
+        rig: the rig, for the offset of the left camera.
     """
     if not estimate.success:
         return estimate.reason
     if not estimate.metric:
         whose = "the left camera's " if spec.reference_point == "left" else ""
-        return f"the length of d is not known in metres, only {whose}direction of translation"
+        return f"the length of d is not known in metres, only the direction of {whose}translation"
     d = estimate.d
     if spec.reference_point == "left":
         offset = rig.offset("left")
@@ -60,39 +60,40 @@ def body_motion(estimate: MotionEstimate, spec: SolverSpec, rig: StereoRig) -> M
 
 
 SHAKES = (
-    "cannot tell the readout ratio: the rig shakes as no motion model does, which two frames do not tell from a "
-    "readout. Give readout_ratio in the rig's card, or four frames and more"
+    "cannot tell the readout ratio: the rig shakes, and two frames do not distinguish a shake that no model "
+    "describes from a readout. Give readout_ratio in the rig's card, or four frames or more"
 )
-_BEYOND_DOUBT = 23.0
-"""Logarithm of odds between splines: 7, as of a probability of 0.999, did tracks count 0.15 and not a half."""
+_CERTAIN_LOG_ODDS = 23.0
+"""Log-odds threshold for choosing one spline over another: 7, i.e. a probability of 0.999, if each track had
+weight 0.15 instead of 0.5."""
 _MOMENTS = 33
-"""Of a frame period, at which poses are compared."""
+"""Number of times in a frame period at which poses are compared."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundMotion:
-    """The motion of the rig's body, and the solver's answer that it comes from."""
+    """The motion of the rig's body, and the solver's answer from which it was computed."""
 
     motion: Motion
-    """Of the model that the solver assumes, or that the matches prefer to it; metres."""
+    """The body's motion, metres, under the solver's motion model or the one that was chosen."""
     robust: RobustEstimate
-    """As the solver gave it: about its own reference point."""
+    """The solver's answer, about the solver's reference point."""
     solver: str
     """Name of the solver's entry."""
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
     calibration: tuple[float, ...] = NO_ERRORS
-    """What was taken from the matches before, see ``calibration.TERMS``."""
+    """Calibration errors that were removed from the matches, see ``calibration.TERMS``."""
     choice: ModelChoice | None = None
-    """How the motion model was chosen; None when it is the solver's."""
+    """How the motion model was chosen; None if it is the solver's."""
     gyro: GyroFound | None = None
-    """What was found of a gyroscope; None: there is none."""
+    """Estimated errors of a gyroscope; None: there is none."""
 
     @property
     def unevenness(self) -> tuple[float, float]:
-        """How far the body is off an even motion through its poses at 0 and 1: root mean square over them.
+        """Root mean square deviation from a uniform motion through the poses at times 0 and 1.
 
-        Radians, and metres of the middle of the rig: none of a rig that coasts, much of one that shakes.
+        Returns radians, and metres of the middle of the rig: near 0 for uniform motion, large for a shaking rig.
         """
         tau = np.linspace(0.0, 1.0, _MOMENTS)
         (R, t), w = self.motion.body_from_world(tau), self.motion.w
@@ -104,7 +105,7 @@ class FoundMotion:
 
     @property
     def disparity_offset(self) -> float:
-        """px that were taken from the disparities."""
+        """Offset that was subtracted from the disparities, px."""
         return self.calibration[OFFSET]
 
 
@@ -117,20 +118,20 @@ def find_motion(
     compared: Capture | None = None,
     splines: bool = True,
 ) -> FoundMotion:
-    """The body's motion by the solver of the options; ``rng`` draws RANSAC's samples, by default from the seed.
+    """Estimate the body's motion with the solver of the options; ``rng`` is for RANSAC, by default from the seed.
 
-    With a motion model in the options the matches decide which is used, see ``under_model``. Another package's
-    solver answers from a process of its own, within the time limit of its card.
+    With a motion model in the options, the model is selected by ``under_model``. The solver of another package
+    runs in a separate process with the time limit of its card.
 
     Raises:
-        RsbenchError: the solver cannot take the motion model of the options.
-        NoMotionError: the solver found none, failed, or found only the direction of the translation.
+        RsbenchError: the solver does not support the motion model of the options.
+        NoMotionError: the solver failed, found no motion, or only the direction of the translation.
     """
     entry, choice, given = options.solver, None, Matched(matches, rig, shutter)
     rng, requested = np.random.default_rng(options.seed) if rng is None else rng, options.motion_model
 
     def solve(entry: SolverEntry) -> RobustEstimate:
-        return _solved(entry, *given, options, rng)
+        return _solver_answer(entry, *given, options, rng)
 
     if requested is not None:
         robust, entry, choice, law = under_model(
@@ -147,7 +148,7 @@ def find_motion(
 
 
 class Matched(NamedTuple):
-    """Matches of two times, and the cameras that took them."""
+    """Matches of two frame times with their rig and shutter."""
 
     matches: Correspondences
     rig: StereoRig
@@ -155,14 +156,14 @@ class Matched(NamedTuple):
 
 
 class UnderModel(NamedTuple):
-    """The answer of a solver under the motion model that matches prefer, or that is requested."""
+    """The answer of a solver under the motion model that matches support most, or that is requested."""
 
     robust: RobustEstimate
     entry: SolverEntry
     choice: ModelChoice | None
-    """None where nothing could be concluded: it is the solver's own model."""
+    """None if no model could be chosen, and the solver's own model was used."""
     motion: Motion | str
-    """Of the body, metres; or why there is none."""
+    """Motion of the body, metres; or why there is none."""
 
 
 def under_model(
@@ -175,13 +176,13 @@ def under_model(
     compared: Capture | None = None,
     splines: bool = True,
 ) -> UnderModel:
-    """The answer of a solver under a motion model: that of ``chosen_model``, or of an estimate of more than it.
+    """Solve under the requested or selected motion model, or replace the answer by a spline.
 
     Args:
-        requested: ``auto`` or a name; with ``auto`` a spline may be used, if ``splines`` may be.
-        entry: of a solver that ``takes_models``.
-        solve: gives the answer of a solver.
-        compared: the models on these matches, where more than the motion was estimated; else they are compared.
+        requested: ``auto`` or the name of a model; with ``auto`` and ``splines``, a spline may be used.
+        entry: entry of a solver that ``takes_models``.
+        solve: returns the answer of a solver.
+        compared: comparison of the models from an estimate that included the shutter; None: compare them here.
     """
     choice = None if compared is None else choose_model(compared, requested)
     entry = entry if choice is None else entry_of(entry, choice)
@@ -211,7 +212,7 @@ def or_spline(
     shutter: RollingShutter,
     seed: int,
 ) -> tuple[RobustEstimate, ModelChoice | None, Motion]:
-    """An answer of a solver that ``takes_models``, or in its place a spline, where the matches ask for it."""
+    """The given answer of a solver under ``law``, or a spline in its place if the matches clearly support one."""
     found = two_frame_spline(matches, rig, shutter, law, seed)
     if found is None or found.probability < CERTAIN:
         return scaled(robust, dispersion_of_rows(matches, rig, shutter, law)), choice, law
@@ -230,7 +231,7 @@ def or_spline(
 
 
 def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:
-    """With what unknowns add to the covariance."""
+    """The estimate with ``spread`` (6, 6) added to its covariance."""
     known = robust.estimate.covariance
     return (
         robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=known + spread))
@@ -238,12 +239,12 @@ def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:
 
 
 def scaled(robust: RobustEstimate, factor: float) -> RobustEstimate:
-    """With a covariance of so many times the variance."""
+    """The estimate with its covariance multiplied by a factor."""
     known = robust.estimate.covariance
     return robust if known is None else widened(robust, (factor - 1.0) * known)
 
 
-def _solved(
+def _solver_answer(
     entry: SolverEntry,
     matches: Correspondences,
     rig: StereoRig,
@@ -266,15 +267,15 @@ def chosen_model(
     robust: RobustOptions,
     seed: int,
 ) -> ModelChoice | None:
-    """The motion model that matches prefer, of a shutter that is known; None where nothing can be concluded.
+    """Choose the motion model by the matches, for a known shutter; None if no model fits.
 
     Args:
-        requested: ``auto`` or a name.
-        start: a motion near theirs, of any model.
+        requested: ``auto`` or the name of a model.
+        start: a motion near the true one, of any model.
     """
     known = Known().with_shutter(shutter)
     capture = conclude([examine(matches, rig, known, robust, seed, start)])
-    if requested not in (AUTO, *capture.peaks):  # one that the matches exclude, or another package's
+    if requested not in (AUTO, *capture.peaks):  # the matches exclude it, or it is from another package
         alone = conclude([examine(matches, rig, replace(known, models=(requested,)), robust, seed, start)])
         models, peaks = {**capture.models, requested: 0.0}, {**capture.peaks, **alone.peaks}
         capture = replace(capture, models=models, peaks=peaks)
@@ -288,18 +289,18 @@ def takes_models(entry: SolverEntry) -> bool:
 
 
 def check_model(requested: str, entry: SolverEntry) -> None:
-    """Raises RsbenchError when there is no such model to ask for, or the solver cannot take another one."""
+    """Raise RsbenchError if there is no such motion model, or the solver has a fixed one."""
     if requested != AUTO:
         load_kernel(requested)
     if not takes_models(entry):
         spec = entry.solver.spec
-        known_to = f"solver {entry.name!r} knows only {spec.motion_model} motion and a {spec.shutter} shutter"
-        known_to += "" if spec.metric else ", without a length"
-        raise RsbenchError(f"--motion-model {requested}: {known_to}; take rs-stereo-refined")
+        limits = f"solver {entry.name!r} supports only {spec.motion_model} motion and a {spec.shutter} shutter"
+        limits += "" if spec.metric else ", without scale"
+        raise RsbenchError(f"--motion-model {requested}: {limits}; use --solver rs-stereo-refined")
 
 
 def model_to_use(requested: str | None, entry: SolverEntry) -> str | None:
-    """The one that is requested; else ``auto`` where the solver takes it. RsbenchError as of ``check_model``."""
+    """The requested motion model, by default ``auto`` if supported. Raises as ``check_model`` does."""
     if requested is None:
         return AUTO if takes_models(entry) else None
     check_model(requested, entry)
@@ -307,7 +308,7 @@ def model_to_use(requested: str | None, entry: SolverEntry) -> str | None:
 
 
 def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
-    """A refined solver with another motion model."""
+    """The entry of a refined solver with the chosen motion model."""
     solver = entry.solver
     assert isinstance(solver, RefinedSolver)
     if choice.used == solver.motion_model and not choice.parameters:
@@ -318,10 +319,10 @@ def entry_of(entry: SolverEntry, choice: ModelChoice) -> SolverEntry:
 
 
 def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> Motion:
-    """The body's motion, metres, that a solver's answer means, in the model that the solver assumes.
+    """The body's motion, metres, for a solver's answer, under the solver's motion model.
 
     Raises:
-        NoMotionError: the answer is a failure, or has no length.
+        NoMotionError: the solver failed, or its translation has no scale.
     """
     motion = body_motion(estimate, entry.solver.spec, rig)
     if isinstance(motion, Motion):
@@ -330,26 +331,26 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
         raise NoMotionError(f"solver {entry.name!r} found no motion: {motion}")
     if entry.solver.spec.metric:
         raise NoMotionError(f"solver {entry.name!r}: {motion}: more matches must be seen by both cameras")
-    raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres, as rs-stereo-refined finds")
+    raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres: use rs-stereo-refined")
 
 
 def solve_frames(
     matches: Correspondences, known: KnownCapture, options: CorrectionOptions, *, in_order: bool = False
 ) -> FoundMotion:
-    """The motion between two times whose capture is known.
+    """Estimate the motion between two frame times with a known shutter and calibration.
 
     Args:
         matches, known: as ``know_four`` and ``know_matches`` return them.
-        in_order: whether the frames are known to be in the order of time, and the shutter not from them alone.
+        in_order: whether the frames are known to be in temporal order, and the shutter is not from them alone.
 
     Raises:
-        RefusedFramesError: time runs backwards in the frames.
+        RefusedFramesError: the frames are in reverse order.
         NoMotionError: no motion explains the matches.
     """
     rig, shutter, errors = known.rig, known.shutter, known.calibration
-    at_rest = recalibrated(matches, rig, errors)
-    found = find_motion(at_rest, rig, shutter, options, compared=known.models)
-    if known.capture is None and not in_order and _runs_backwards(at_rest, rig, found, shutter, options):
+    corrected = recalibrated(matches, rig, errors)
+    found = find_motion(corrected, rig, shutter, options, compared=known.models)
+    if known.capture is None and not in_order and _runs_backwards(corrected, rig, found, shutter, options):
         raise RefusedFramesError(BACKWARDS)
     if known.capture is not None and not in_order and isinstance(found.motion, ContinuousMotion):
         raise NoMotionError(SHAKES)
@@ -363,18 +364,18 @@ def _runs_backwards(
     shutter: RollingShutter,
     options: CorrectionOptions,
 ) -> bool:
-    """Whether time runs backwards in the frames: their lines then seem to be read from the opposite side.
+    """Whether the frames are in reverse order: their lines then seem to be read from the opposite side.
 
-    The laws must find the opposite scan beyond doubt, and near the given ratio: where no law fits they find any
-    ratio. For a shaken rig splines under both scans decide, unless the laws find the given shutter.
+    Motion models must give the opposite scan with certainty and a ratio near the given one, as an arbitrary ratio
+    results if none fits. For a shaking rig, splines under both scans decide, unless models confirm the given scan.
     """
     if shutter.readout_ratio < LEAST_BACKWARDS or not shutter.plain:
         return False
     shakes, opposite = isinstance(found.motion, ContinuousMotion), reversed_scans(scans_of(shutter))
     if shakes:
         other = replace(shutter, scan=opposite.left, right_scan=opposite.right)  # pyrefly: ignore
-        if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _BEYOND_DOUBT:
+        if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _CERTAIN_LOG_ODDS:
             return False
-    models, start = models_asked(options.motion_model), None if shakes else found.motion
+    models, start = compared_models(options.motion_model), None if shakes else found.motion
     scans = scans_by_laws(matches, rig, shutter, models, options.robust, options.seed, start)
     return scans != scans_of(shutter) if shakes else scans == opposite

@@ -1,7 +1,7 @@
-"""Solvers run for scores: rsbench's own here, other packages' each in a child process of its own.
+"""Run components: rsbench's own in this process, those of other packages each in a separate child process.
 
-Whatever another package's solver does is a failed estimate with the reason. What goes wrong in rsbench's own code
-raises, wherever it runs.
+Any fault of another package's solver becomes a failed estimate with the reason. Errors of rsbench's own code are
+raised, in either process.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ _MASKS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 
 
 class SolverRunner:
-    """Runs solvers with a limit of time for those of other packages; use as a context manager."""
+    """Runs solvers, with a time limit for those of other packages; use it as a context manager."""
 
     def __init__(
         self,
@@ -97,10 +97,9 @@ class SolverRunner:
     ) -> None:
         """
         Args:
-            time_limit_s: for one problem, instead of what each solver's card says.
-            single_thread: whether children compute with one thread, as results that must not depend on the
-                machine need.
-            memory_mb: what a child may use; see ``IsolatedWorker``.
+            time_limit_s: time limit for one problem, instead of that on each solver's card.
+            single_thread: whether children use one thread, so that results do not depend on the machine.
+            memory_mb: memory limit of a child, see ``IsolatedWorker``.
         """
         self._memory_mb = memory_mb
         self._time_limit_s, self._single_thread = time_limit_s, single_thread
@@ -117,12 +116,12 @@ class SolverRunner:
         options: RobustOptions,
         rng: np.random.Generator,
     ) -> RobustEstimate:
-        """``estimate_motion``, all of it in the child; ``rng`` then stays as it is here."""
+        """``estimate_motion``; in the child for another package's solver, and ``rng`` is not advanced."""
         loop = entry.options.robust
         if entry.built_in:
             if entry.key not in self._warm:
                 self._warm.add(entry.key)
-                _compile(entry.solver)  # not in the seconds of its first problem
+                _compile(entry.solver)  # so that the first problem's time does not include it
             return estimate_motion(correspondences, rig, shutter, entry.solver, options, rng, loop)
         start = time.perf_counter()
         outcome = self._call(entry, "robust", correspondences, rig, shutter, options, rng, loop)
@@ -139,7 +138,7 @@ class SolverRunner:
     def bare(
         self, entry: SolverEntry, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> tuple[MotionEstimate, float]:
-        """``Solver.estimate`` on all matches, and its seconds of processor time; NaN when its process ended."""
+        """``Solver.estimate`` from all matches, and its processor time, seconds; NaN if its process ended."""
         try:
             correspondences, rig, shutter = inputs_of(entry.solver.spec, correspondences, rig, shutter)
         except ValueError as error:
@@ -154,10 +153,10 @@ class SolverRunner:
 
     def _call(self, entry: SolverEntry, *arguments: object) -> Outcome:
         place = os.fspath(entry.path.resolve()) if entry.path is not None else entry.name
-        known = (place, entry.key)  # a card may be edited meanwhile
+        known = (place, entry.key)  # the key changes if the card is edited meanwhile
         if known not in self._workers:
-            with suppress(RsbenchError):  # of a motion that does not exist, as the child will tell
-                warm_up([entry.solver.spec.motion_model])  # here, where the progress line announces it
+            with suppress(RsbenchError):  # for an unknown motion model, which the child reports
+                warm_up([entry.solver.spec.motion_model])  # compile here, where a progress line announces it
             worker = IsolatedWorker(
                 _serve_solver,
                 place,
@@ -183,7 +182,7 @@ class SolverRunner:
 
 
 def _fits(answer: object, correspondences: Correspondences) -> bool:
-    """Whether it is an answer with masks over these matches."""
+    """Whether an answer is a ``RobustEstimate`` with masks over these matches."""
     return isinstance(answer, RobustEstimate) and all(
         mask.dtype == np.bool_ and mask.shape == (len(getattr(correspondences, name, ())),)
         for name, mask in answer.inliers.items()
@@ -202,16 +201,16 @@ def _timed(
 
 
 def _serve_solver(place: str, single_thread: bool) -> Callable[..., object]:
-    """What answers calls to a solver."""
+    """The function that answers calls to a solver in the child."""
     if single_thread:
         use_one_thread()
-    with entrys_own():
+    with as_entry_failure():
         solver = GuardedSolver(load_solver_entry(place).solver)
     if not isinstance(solver.spec, SolverSpec):
         raise EntryFailure(f"declares a {type(solver.spec).__name__}, not a SolverSpec")
     try:
-        warm_up([solver.spec.motion_model])  # not in the entry's time
-    except RsbenchError as error:  # it assumes a motion that does not exist
+        warm_up([solver.spec.motion_model])  # before the entry's time is measured
+    except RsbenchError as error:  # unknown motion model
         raise EntryFailure(str(error)) from error
 
     def answer(what: str, *arguments: Any) -> object:
@@ -224,16 +223,16 @@ def _serve_solver(place: str, single_thread: bool) -> Callable[..., object]:
 
 
 def _compile(solver: Solver) -> None:
-    """Run a small problem, so that what a solver of ours compiles and loads is there."""
+    """Run a small problem, so that all code of a built-in solver is compiled and loaded."""
     problem, options = read_problem(EXAMPLE), RobustOptions(max_iterations=10)
     given = problem.correspondences
     estimate_motion(given, problem.rig, problem.shutter, solver, options, np.random.default_rng(0))
 
 
 class GuardedSolver(Solver):
-    """Another package's solver, checked against the contract: each violation is an ``EntryFailure``.
+    """Another package's solver, checked against the contract: each violation raises an ``EntryFailure``.
 
-    Methods that it leaves as ``Solver`` has them run here, on the guarded ``estimate``.
+    Methods that it does not override run here, with the guarded ``estimate``.
     """
 
     def __init__(self, solver: Solver) -> None:
@@ -244,18 +243,18 @@ class GuardedSolver(Solver):
 
     @cached_property
     def spec(self) -> SolverSpec:
-        with entrys_own():
+        with as_entry_failure():
             return self._solver.spec
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        with entrys_own():
+        with as_entry_failure():
             estimate = self._solver.estimate(correspondences, rig, shutter)
         return checked_estimate(estimate)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        with entrys_own():
+        with as_entry_failure():
             sizes = dict(self._solver.sample_sizes(correspondences))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 0 for n in sizes.values()):
             raise EntryFailure(f"returned sample sizes {sizes}")
@@ -264,7 +263,7 @@ class GuardedSolver(Solver):
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         if self._leaves("propose"):
             return super().propose(sample, rig, shutter)
-        with entrys_own():
+        with as_entry_failure():
             models = list(self._solver.propose(sample, rig, shutter))
         return [checked_estimate(model) for model in models]
 
@@ -274,10 +273,10 @@ class GuardedSolver(Solver):
         if self._leaves("propose_all"):
             yield from super().propose_all(samples, rig, shutter)
             return
-        with entrys_own():
+        with as_entry_failure():
             proposals = iter(self._solver.propose_all(samples, rig, shutter))
         for _ in samples:
-            with entrys_own():
+            with as_entry_failure():
                 models = list(next(proposals, ()))
             yield [checked_estimate(model) for model in models]
 
@@ -291,14 +290,14 @@ class GuardedSolver(Solver):
     ) -> MotionEstimate:
         if self._leaves("improve"):
             return super().improve(motion, correspondences, rig, shutter, quick)
-        with entrys_own():
+        with as_entry_failure():
             estimate = self._solver.improve(motion, correspondences, rig, shutter, quick=quick)
         return checked_estimate(estimate)
 
 
 @contextmanager
-def entrys_own() -> Iterator[None]:
-    """Whatever is raised inside is the entry's fault, also an exit or an interrupt."""
+def as_entry_failure() -> Iterator[None]:
+    """Convert anything raised inside, including an exit or an interrupt, to an ``EntryFailure``."""
     try:
         yield
     except EntryFailure:
@@ -319,10 +318,10 @@ _FIELD_TYPES: dict[str, tuple[type, ...]] = {
 
 
 def checked_estimate(estimate: object) -> MotionEstimate:
-    """An estimate made anew from fields of the right types and shapes, with finite numbers.
+    """Copy an estimate after a check that its fields have the right types and shapes, and finite numbers.
 
     Raises:
-        EntryFailure: it is something else.
+        EntryFailure: the check failed.
     """
     if not isinstance(estimate, MotionEstimate):
         raise EntryFailure(f"returned a {type(estimate).__name__}, not a MotionEstimate")
@@ -353,23 +352,23 @@ def checked_estimate(estimate: object) -> MotionEstimate:
 AnyEntry = TypeVar("AnyEntry", bound=Entry[Any, Any])
 Caller = Callable[..., Any]
 Proxy = Callable[[Any, Caller], Any]
-"""Makes a component that answers by the caller, from the original component."""
+"""Creates a component that answers by a caller, from the original component and the caller."""
 
 
 class Isolation:
-    """The children; use as a context manager."""
+    """Runs feature matchers, stereo matchers and correctors of other packages in children; a context manager."""
 
     def __init__(self, *, time_limit_s: float | None = None, memory_mb: float | None = None) -> None:
         """
         Args:
-            time_limit_s: for one call, instead of what each entry's card says.
-            memory_mb: what a child may use; see ``IsolatedWorker``.
+            time_limit_s: time limit for one call, instead of that on each entry's card.
+            memory_mb: memory limit of a child, see ``IsolatedWorker``.
         """
         self._time_limit_s, self._memory_mb = time_limit_s, memory_mb
         self._stack = ExitStack()
 
     def chain(self, options: CorrectionOptions) -> CorrectionOptions:
-        """The options with all but the solver isolated, which ``find_motion`` runs apart by itself."""
+        """The options with all components isolated except the solver, which ``find_motion`` isolates itself."""
         with_motion = needs_motion(options.matcher)
         find, matcher = (find_depths, _MotionMatcher) if with_motion else (find_disparities, _Matcher)
         features = partial(_serve, load_features, find_correspondences)
@@ -392,8 +391,8 @@ class Isolation:
         """The entry with a component that answers from a child, which starts with the first call.
 
         Args:
-            kind: of the entry; its options say ``time_limit_s``.
-            entry: of any package.
+            kind: kind of the entry.
+            entry: entry of any package; its options have ``time_limit_s``.
             factory: see ``IsolatedWorker``; called with the entry's name or the path of its card.
             classes: see ``IsolatedWorker``.
             proxy: see ``Proxy``.
@@ -478,12 +477,12 @@ class _Corrector(Corrector):
 
 
 def _serve(load: Callable[[str], Any], find: Callable[..., Any], place: str) -> Callable[..., object]:
-    """What answers calls to an entry that ``load`` loads: by ``find``, which is given it first."""
-    with entrys_own():
+    """The function that answers calls in the child: ``find`` with the entry that ``load`` loads."""
+    with as_entry_failure():
         entry = load(place)
 
     def answer(*given: object) -> object:
-        with entrys_own():
+        with as_entry_failure():
             found = find(entry, *given)
         return {f"{view[0]}_{view[1]}": each for view, each in found.items()} if isinstance(found, dict) else found
 

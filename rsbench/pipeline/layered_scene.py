@@ -1,9 +1,9 @@
-"""Correction with one camera alone that believes in a scene of a few planes: layers and motion in turn.
+"""Correction with one camera alone for a scene of a few planes: layers and motion are estimated alternately.
 
 Vasu, Mohan M. R., Rajagopalan, "Occlusion-aware rolling shutter rectification of 3D scenes", CVPR 2018. We had its
-abstract and not its text: motion of the camera and structure of the scene one after the other, with shutter and
-occlusion in mind, then a rectification that knows depth and occlusion, of several frames. All else is our choice
-and stands at the fields, in ``rsbench.vision.layers``, ``layer_fit`` and ``layer_motion``.
+abstract but not its text: camera motion and scene structure are estimated alternately, considering shutter and
+occlusion, then several frames are rectified with depth and occlusion. All other choices are ours; they are
+described at the fields and in ``rsbench.vision.layers``.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ from rsbench.vision.layers import (
 from rsbench.vision.reprojection import F32
 
 _STILL_PX = 0.1
-"""Matches that move by less, in the median, show no motion."""
+"""Least median displacement of the matches, px, for an estimate of the motion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LayeredScene:
-    """What one camera knows after its two frames."""
+    """The layers and the motion that were estimated from two frames of one camera."""
 
     camera: MovingCamera
-    """With its motion, about its own centre; d has length 1, or 0 where there is no translation."""
+    """The camera with its motion about its own centre; d has length 1, or 0 if there is no translation."""
     planes: FloatArray
     """(n, 3), see ``rsbench.vision.layers``."""
     labelled: Labelled
     rounds: int
-    """In which layers and motion were found."""
+    """Number of rounds in which layers and motion were estimated."""
 
     def depth(self, frame: int) -> F32:
-        """(H, W) of a frame, in the row's own camera and the unit of d; inf at infinity, NaN behind the camera."""
+        """(H, W) depth of a frame at each row's time, in the unit of d; inf at infinity, NaN behind the camera."""
         rho = self.camera.inverse_depths(self.planes, frame)
         chosen = np.take_along_axis(rho, self.labelled.labels[frame][None], axis=0)[0]
         with np.errstate(divide="ignore"):
@@ -65,18 +65,18 @@ class LayeredScene:
 @final
 @dataclass(frozen=True, kw_only=True)
 class LayersCorrector(Corrector):
-    """Each camera's frames as layers of a few planes, rendered nearer ones over farther ones, from both frames."""
+    """Correct each camera alone by a few planar layers; nearer ones are rendered over farther ones."""
 
     motion_model: str = "linear"
-    """Of the rows' poses: constant velocity over both frames, in place of a pose of each row."""
+    """Motion model of the rows' poses: constant velocity over both frames instead of one pose per row."""
     planes: PlaneOptions = field(default_factory=PlaneOptions)
-    """Planes that are fitted."""
+    """Options of the fitted planes."""
     labels: LabelOptions = field(default_factory=LabelOptions)
     """Assignment of pixels to planes."""
     rounds: int = 3
-    """Of layers and motion, at most; the first one that costs no less than the one before is the last."""
+    """Most rounds of layers and motion; they end when the cost does not decrease."""
     use_other_frame: bool = True
-    """Fill what the frame did not see from the other one of its camera."""
+    """Fill areas that the frame does not show from the camera's other frame."""
     robust: RobustOptions = field(default_factory=RobustOptions)
     """RANSAC of the motion."""
     seed: int = 0
@@ -88,8 +88,7 @@ class LayersCorrector(Corrector):
         needs={"matches"},
         reference="Vasu, Mohan M. R., Rajagopalan: Occlusion-aware rolling shutter rectification of 3D scenes, "
         "CVPR 2018",
-        assumes="one camera, two frames: constant velocity; a scene that stands still and is a few planes, each "
-        "at one depth",
+        assumes="one camera, two frames: constant velocity; a static scene of a few planes, each at one depth",
     )
 
     def __post_init__(self) -> None:
@@ -113,7 +112,7 @@ class LayersCorrector(Corrector):
         return [{view: corrected(view, row) for view in views} for row in rows]
 
     def scene(self, problem: CorrectionProblem, side: Side) -> LayeredScene | str:
-        """Layers and motion of one camera, or why there are none. Raises ValueError without matches."""
+        """Estimate layers and motion of one camera, or return why not. Raises ValueError without matches."""
         started = self._start(problem, side)
         if isinstance(started, str):
             return started
@@ -136,13 +135,13 @@ class LayersCorrector(Corrector):
         return label_pixels(greys, camera, planes, self.labels, self.planes.thickness_px)
 
     def _start(self, problem: CorrectionProblem, side: Side) -> tuple[MovingCamera, FloatArray] | str:
-        """The camera with the motion that explains its matches over time, and those (n, 4) that it explains."""
+        """The camera with the motion estimated from its temporal matches, and the inliers (n, 4)."""
         if problem.matches is None:
             raise ValueError("the matches are not known: 'matches' must be among the needs of the corrector")
         pairs = temporal_pairs(problem.matches, side)
         moved = float(np.median(np.linalg.norm(pairs[:, 2:] - pairs[:, :2], axis=1))) if len(pairs) else 0.0
         if len(pairs) and moved < _STILL_PX:
-            return f"the matches of the {side} camera move by {moved:.2g} px: no motion, nothing to correct it by"
+            return f"the matches of the {side} camera move by {moved:.2g} px only: there is no motion to correct"
         rng = np.random.default_rng([self.seed, SIDES.index(side)])
         rig = problem.rig.about(side)
         given = Correspondences(left=pairs)
@@ -154,7 +153,7 @@ class LayersCorrector(Corrector):
         return MovingCamera(rig, problem.shutter, side, motion), pairs[found.inliers["left"]]
 
     def rendered(self, problem: CorrectionProblem, view: View, scene: LayeredScene) -> Fused:
-        """A frame of a camera whose scene is known: nearer layers hide farther ones."""
+        """Render the corrected frame of a view from the layers, nearer ones over farther ones."""
         side, frame = view
         known = replace(problem, rig=scene.camera.rig, motion=scene.camera.motion)
         order = [(frame, Origin.HERE)]

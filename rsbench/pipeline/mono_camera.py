@@ -1,4 +1,4 @@
-"""The card of a camera whose frames are corrected alone."""
+"""The card of a camera whose frames are corrected alone, and the estimate of what the card does not give."""
 
 from __future__ import annotations
 
@@ -50,21 +50,20 @@ _WIDEST_DEG = 170.0
 
 @dataclass(frozen=True, kw_only=True)
 class OneCameraCard:
-    """What is known of a camera whose frames are corrected alone; the size comes from the images."""
+    """Calibration and shutter of a camera whose frames are corrected alone; its size comes from the images."""
 
     SHORTHANDS: ClassVar = SHUTTER_KEY
 
     readout_ratio: float | None = None
-    """Readout time over frame period, 0 to 1. Absent: found from the frames, or the command says why not."""
+    """Readout time divided by frame period, 0 to 1. Absent: estimated from the frames."""
     frame_period_s: float | None = None
-    """Seconds from one frame to the next, beside ``shutter`` where it is not that of its mode. A video of another
+    """Time between frames, seconds, if it is not that of the mode that ``shutter`` names. A video with another
     frame rate is recognised."""
     scan: Scan | None = None
-    """Side of the image at which the readout begins. Absent: found with the readout ratio, or ``top`` where that
-    is given."""
+    """Side of the image at which the readout begins. Absent: estimated with the readout ratio, else ``top``."""
     fov_deg: float | None = None
-    """Horizontal field of view, degrees, in place of ``camera``. Absent both: the focal length is found from the
-    frames, or is that of the width of the image where they cannot tell."""
+    """Horizontal field of view, degrees, in place of ``camera``. Without both, the focal length is estimated from
+    the frames; if they do not determine it, the width of the image is used."""
     camera: CameraCard | None = None
     """Intrinsics."""
 
@@ -76,13 +75,13 @@ class OneCameraCard:
         if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
             raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
         if self.fov_deg is not None and self.camera is not None:
-            raise ValueError("fov_deg: leave it out beside [camera], which has the focal length")
+            raise ValueError("fov_deg: leave it out, since [camera] gives the focal length")
         if self.camera is not None and self.camera.sigma:
             raise ValueError("camera.focal_sigma, k1_sigma: leave them out; neither is estimated for one camera")
 
     @classmethod
     def of(cls, camera: PinholeCamera | float | None, readout_ratio: float | None) -> OneCameraCard:
-        """Of known intrinsics, of a horizontal field of view in degrees, or of neither; RsbenchError of others."""
+        """The card for intrinsics, a field of view in degrees, or neither; RsbenchError if impossible."""
         known: dict[str, Any] = {} if camera is None else {"fov_deg": camera}
         if isinstance(camera, PinholeCamera):
             c = camera
@@ -98,48 +97,49 @@ class OneCameraCard:
         return self.camera is None and self.fov_deg is None
 
     def camera_of(self, width: int, height: int) -> PinholeCamera:
-        """The camera of images of this size; of ``DEFAULT_FOCAL`` if none is given."""
+        """The camera for images of this size, with ``DEFAULT_FOCAL`` if no focal length is given."""
         if self.camera is not None:
             try:
                 return self.camera.camera((width, height))
             except ValueError as error:
-                raise RsbenchError(f"--camera: of images of {width} x {height} pixels: {error}") from error
+                raise RsbenchError(f"--camera: for images of {width} x {height} pixels: {error}") from error
         if self.fov_deg is not None:
             focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
             return PinholeCamera.centred(width, height, focal)
         return PinholeCamera.centred(width, height, DEFAULT_FOCAL * width)
 
 
-# How the camera of a video reads its lines: as its card says, or as its frames show.
+# The shutter of a video, from its camera's card or estimated from its frames.
 
 
 WINDOWS = 8
-"""Pairs of frames, at most, by which the shutter is found; they lie evenly over the video."""
+"""Most pairs of frames from which the shutter is estimated; they are evenly spaced in the video."""
 IN_ORDER = 5
-"""First pairs that must all fit better backwards before frames of a known shutter are called so. One that trembles
-may look like either: 14 of 50 pairs of ten rendered sequences did, four of these chosen because one pair did."""
-_LEAST_IN_A_ROW, _LOOKED_AT = 6, 60
-"""Successive pairs that determine a trajectory; so many pairs are examined."""
-TOO_FEW = "frames: fewer than two; one camera shows its motion in at least two"
+"""Frames with a given shutter are in reverse order if this many first pairs all fit better in that order. A single
+pair may do so by a tremble of the hand: 14 of 50 pairs of ten rendered sequences did, four of these sequences
+chosen because one pair did."""
+_FEWEST_PAIRS, _MOST_EXAMINED = 6, 60
+"""Fewest successive pairs that determine a trajectory; number of pairs that are examined for them."""
+TOO_FEW = "frames: fewer than two; the motion of one camera needs at least two"
 BACKWARDS = (
-    "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to what "
-    "is given (`scan` in the camera's card)"
+    "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to the "
+    "given one (`scan` in the camera's card)"
 )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundShutter:
-    """How a camera reads, and where that is known from."""
+    """The shutter of a camera, and the estimate that it comes from."""
 
     shutter: RollingShutter
     capture: Capture | None
-    """None where the card says it."""
+    """None if the card gives the shutter."""
     focal: FoundFocal | None = None
-    """Of a focal length that was found with the shutter."""
+    """The focal length, if it was estimated with the shutter."""
 
     @property
     def scan(self) -> Scan:
-        """Where the readout begins."""
+        """The side at which the readout begins."""
         return self.shutter.scan_of("left")
 
 
@@ -151,22 +151,22 @@ def find_shutter(
     seed: int = 0,
     advance: Callable[[str], None] = lambda word: None,
 ) -> FoundShutter:
-    """The shutter of a camera, from its card or its frames (H, W[, 3]), and whether these are in order.
+    """The shutter of a camera, from its card or its frames (H, W[, 3]); refuses frames in reverse order.
 
     Args:
-        frames: in order; they are gone through once.
-        count: of the frames, about; 0 where nobody knows.
-        card: what is known.
-        options, seed: of the search for a motion.
-        advance: called for each pair that is looked at.
+        frames: frames in order; they are iterated once.
+        count: approximate number of the frames; 0: unknown.
+        card: given values.
+        options, seed: settings of the search for a motion.
+        advance: called after each pair that is examined.
 
     Raises:
-        NoMotionError: the frames do not show how their lines are read.
-        RefusedFramesError: time runs backwards in them.
-        RsbenchError: fewer than two frames, or frames of two sizes.
+        NoMotionError: the frames do not determine the shutter.
+        RefusedFramesError: the frames are in reverse order.
+        RsbenchError: there are fewer than two frames, or frames of two sizes.
     """
     if card.readout_ratio is None:
-        return _found(frames, count, card, options, seed, advance)
+        return _estimate_shutter(frames, count, card, options, seed, advance)
     scan, ratio = card.scan or "top", card.readout_ratio
     found, shutter = list[FloatArray](), None
     for matches, _, camera in matched_pairs(frames, card, 1, IN_ORDER if ratio >= LEAST_BACKWARDS else 0, seed):
@@ -189,7 +189,7 @@ def _refuse_backwards(capture: Capture, shutter: RollingShutter) -> None:
         raise RefusedFramesError(BACKWARDS)
 
 
-def _found(
+def _estimate_shutter(
     frames: Iterable[NDArray[Any]],
     count: int,
     card: OneCameraCard,
@@ -197,14 +197,14 @@ def _found(
     seed: int,
     advance: Callable[[str], None],
 ) -> FoundShutter:
-    """The shutter that the frames show: from successive pairs along one trajectory, else from single pairs."""
-    run, camera = _in_a_row(frames, card, seed, advance)
+    """Estimate the shutter from a trajectory through successive pairs, or else from single pairs."""
+    run, camera = _successive_matches(frames, card, seed, advance)
     focal_sigma = PRIOR if card.focal_unknown else 0.0
-    many = len(run) >= _LEAST_IN_A_ROW
-    along = capture_of_video(run, camera, card.scan, seed, focal_sigma) if many else None
-    if along is not None:
-        focal = focal_of_capture(along, camera.width) if card.focal_unknown else None
-        return replace(_settled(along, camera, card), focal=focal)
+    many = len(run) >= _FEWEST_PAIRS
+    on_trajectory = capture_of_video(run, camera, card.scan, seed, focal_sigma) if many else None
+    if on_trajectory is not None:
+        focal = focal_of_capture(on_trajectory, camera.width) if card.focal_unknown else None
+        return replace(_conclude(on_trajectory, camera, card), focal=focal)
     known, windows, camera, why = known_alone(card.scan, focal_sigma), list[Window](), None, ""
     for matches, reason, camera in matched_pairs(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
         why = why or reason
@@ -216,21 +216,21 @@ def _found(
         raise NoMotionError(why)
     if not windows:
         raise NoMotionError(f"cannot tell the readout ratio: {why}. Give readout_ratio in the camera's card")
-    return _settled(conclude_alone(windows), camera, card)
+    return _conclude(conclude_alone(windows), camera, card)
 
 
-def _settled(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> FoundShutter:
+def _conclude(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> FoundShutter:
     if card.scan is not None:
         _refuse_backwards(capture, Scanning(scan=card.scan).shutter_of(camera.width, camera.height, 1.0))
     return FoundShutter(shutter=shutter_alone(capture, camera), capture=capture)
 
 
-def _in_a_row(
+def _successive_matches(
     frames: Iterable[NDArray[Any]], card: OneCameraCard, seed: int, advance: Callable[[str], None]
 ) -> tuple[list[FloatArray], PinholeCamera]:
-    """Matches of the first pairs in a row that can be judged, as of ``trajectory_matches``, ``LONGEST`` at most.
+    """``trajectory_matches`` of the first usable successive pairs, at most ``LONGEST``; and the camera.
 
-    Raises RsbenchError as of ``matched_pairs``.
+    Raises RsbenchError as ``matched_pairs`` does.
     """
     run, number, camera = list[FloatArray](), 0, None
     for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
@@ -240,11 +240,11 @@ def _in_a_row(
         if not refusal([before, image], flows):
             run.append(trajectory_matches(flows, seed))
             advance(f"pair {number}")
-        elif len(run) >= _LEAST_IN_A_ROW:
+        elif len(run) >= _FEWEST_PAIRS:
             break
         else:
             run.clear()
-        if len(run) == LONGEST or number >= _LOOKED_AT:
+        if len(run) == LONGEST or number >= _MOST_EXAMINED:
             break
     if camera is None:
         raise RsbenchError(TOO_FEW)
@@ -254,9 +254,9 @@ def _in_a_row(
 def matched_pairs(
     frames: Iterable[NDArray[Any]], card: OneCameraCard, every: int, most: int, seed: int
 ) -> Iterator[tuple[FloatArray | None, str, PinholeCamera]]:
-    """Matches of at most so many pairs, each ``every``-th, or why a pair has none; and the camera.
+    """For every ``every``-th pair: its matches or the reason why it has none, and the camera.
 
-    Raises RsbenchError for fewer than two frames and for frames that are not alike.
+    It stops after ``most`` pairs with matches. Raises RsbenchError for fewer than two frames or unequal frames.
     """
     number, found = 0, 0
     for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
@@ -275,11 +275,11 @@ def matched_pairs(
         raise RsbenchError(TOO_FEW)
 
 
-# The camera of a video: as its card says, with a focal length that its frames show, or with a stated default.
+# The camera of a video: from its card, with a focal length estimated from its frames, or with the default.
 
 
 PAIRS = 5
-"""Of frames, at most, by which the focal length is found; they lie evenly over the video."""
+"""Most pairs of frames from which the focal length is estimated; they are evenly spaced in the video."""
 
 
 def find_camera_alone(
@@ -292,15 +292,15 @@ def find_camera_alone(
     advance: Callable[[str], None] = lambda word: None,
     found: FoundFocal | None = None,
 ) -> tuple[PinholeCamera, FoundFocal | None]:
-    """The camera, and what the frames say of its focal length; None where the card says that.
+    """The camera, and the estimate of its focal length from the frames; None if the card gives it.
 
     Args:
-        frames, count, card, options, seed, advance: as of ``find_shutter``.
-        shutter: of the camera.
-        found: a focal length that was found with the shutter.
+        frames, count, card, options, seed, advance: see ``find_shutter``.
+        shutter: shutter of the camera.
+        found: the focal length if it was estimated with the shutter.
 
     Raises:
-        RsbenchError: fewer than two frames, or frames of two sizes.
+        RsbenchError: there are fewer than two frames, or frames of two sizes.
     """
     camera, pairs = None, list[PairFocal | None]()
     wanted = PAIRS if card.focal_unknown and found is None else 0

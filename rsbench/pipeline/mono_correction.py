@@ -1,4 +1,4 @@
-"""Which law of motion one camera followed, from its matches: ``inertial`` unless they ask for another one."""
+"""Correct frames of one camera: its motion from dense flow, one trajectory for several pairs, and any scan."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from rsbench.vision.images import eight_bit, local_variance
 from rsbench.vision.mono_fusion import Flows, MonoFusion, MonoFusionOptions, OwnMotion, find_flows
 
 _CLEARLY_LESS = 0.75
-"""Of the error of the best law of constant speed, that is left where one that accelerates is believed. It has a
-number more, which takes up what dense flow and a focal length err by: 0.85 and 0.88 on published pairs that it
-made worse by 3 to 7 dB, 0.44 to 0.75 on simulated accelerations of 0.15 and 0.3."""
+"""An accelerated motion is used only if its error is at most this share of that of the best constant-speed model,
+as its additional parameter also absorbs errors of flow and focal length: the share was 0.85 and 0.88 on published
+pairs that it made worse by 3 to 7 dB, and 0.44 to 0.75 on simulated accelerations of 0.15 and 0.3."""
 _LARGEST_PX = 1.25
-"""Errors count up to here."""
-_REACH = 3.0
-"""Deviations up to which a match is right."""
+"""Errors are clipped to this."""
+_INLIER_SIGMAS = 3.0
+"""Largest error of an inlier, standard deviations."""
 
 
 def select_motion_model(
@@ -50,15 +50,15 @@ def select_motion_model(
     options: RobustOptions,
     seed: int = 0,
 ) -> tuple[RobustEstimate, Motion]:
-    """The motion by the law that the matches ask for, and its estimate; that of ``found`` without such a one.
+    """Select the motion model by the matches; returns the estimate under it and the motion.
 
     Args:
-        found: under ``inertial``, a success; it stays where no other law is clearly more probable.
+        found: a successful estimate under ``inertial``, kept unless another model is clearly more probable.
         matches: (n, 4) x0, y0, x1, y1, px, with outliers.
-        rig: its body is where the camera is, the left one.
-        shutter: of the camera.
+        rig: a rig whose left camera is the camera and whose body is at this camera.
+        shutter: shutter of the camera.
         options: RANSAC of the search.
-        seed: of the search.
+        seed: seed of the search.
     """
     inertial = InertialMotion(found.estimate.w, found.estimate.d)
     given = Correspondences(left=matches)
@@ -72,10 +72,10 @@ def select_motion_model(
         best = min([inertial, *steady], key=lambda each: error_px(each, matches, rig, shutter))
         if error_px(law, matches, rig, shutter) > _CLEARLY_LESS * error_px(best, matches, rig, shutter):
             law = best
-    return (found, inertial) if law is inertial else _settled(found, law, matches, rig, shutter, capture.noise_px)
+    return (found, inertial) if law is inertial else _refined(found, law, matches, rig, shutter, capture.noise_px)
 
 
-def _settled(
+def _refined(
     found: RobustEstimate,
     law: Motion,
     matches: FloatArray,
@@ -83,28 +83,28 @@ def _settled(
     shutter: RollingShutter,
     noise_px: float,
 ) -> tuple[RobustEstimate, Motion]:
-    """The maximum of likelihood next to a motion by a law, with points before the camera."""
-    right = np.abs(rs_sampson_error(rig, shutter, law, "left", matches)) <= _REACH * noise_px
+    """Refine a motion under its model by maximum likelihood, with points in front of the camera."""
+    right = np.abs(rs_sampson_error(rig, shutter, law, "left", matches)) <= _INLIER_SIGMAS * noise_px
     solver = RefinedSolver(motion_model=law.name, motion_parameters=dict(law.parameters), one_camera=True)
     near = MotionEstimate(w=law.w, d=law.d, success=True)
     estimate = solver.improve(near, Correspondences(left=matches[right]), rig, shutter)
     count = MatchCount(inliers=int(np.count_nonzero(right)), matches=len(matches))
     if not (estimate.success and np.any(estimate.d)):
         return found, InertialMotion(found.estimate.w, found.estimate.d)
-    robust_of_law = replace(
+    refined = replace(
         found,
         estimate=estimate,
         inliers={**found.inliers, "left": right},
         counts={"left": count},
         motion_model=law.name,
     )
-    return robust_of_law, law.with_endpoint(estimate.w, estimate.d)
+    return refined, law.with_endpoint(estimate.w, estimate.d)
 
 
 def error_px(
     motion: Motion, matches: FloatArray, rig: StereoRig, shutter: RollingShutter, side: Side = "left"
 ) -> float:
-    """Root mean square Sampson error, px, of matches (n, 4) with outliers: each counts up to ``_LARGEST_PX``."""
+    """Root mean square Sampson error, px, of matches (n, 4), each clipped to ``_LARGEST_PX``."""
     errors = np.abs(rs_sampson_error(rig, shutter, motion, side, matches))
     return float(np.sqrt(np.mean(np.fmin(errors, _LARGEST_PX) ** 2)))
 
@@ -113,25 +113,25 @@ def error_px(
 
 
 _MATCHES = 1500
-"""Of the dense flow, drawn at random: what a motion of six unknowns is solved from."""
+"""Number of random matches of the dense flow from which a motion with six unknowns is estimated."""
 _PIXELS = 600
-"""Random pixels, the same in each frame, that are followed to the frames before and after it for a trajectory."""
+"""Number of random pixels, the same in each frame, whose flow gives the matches for a trajectory."""
 _FEWEST = 50
 _RETURNS_PX = 0.3
-"""Flow there and back ends so near where it began, for a match; DIS errs by about 0.1 px where it does."""
+"""Largest forward-backward error of the flow at a match; the flow (DIS) is then accurate to about 0.1 px."""
 _TEXTURE_LEVELS = 3.0
-"""Standard deviation of grey levels in a window, above which it shows something; noise of cameras is 1 to 2."""
+"""Least standard deviation of grey levels in a textured window; camera noise is 1 to 2."""
 _TEXTURED = 0.01
 _STILL_PX, _MOST, _CLEAREST = 0.25, 0.95, 0.1
-"""Flow below which, in most of the tenth of the pixels with the most texture, nothing moved. On frames of six
-real and rendered pairs it stayed below 0.23 px under noise of 2 levels or JPEG of quality 70, and 0.3 px of motion
-showed as 0.43; where there is less texture, noise alone moves DIS by pixels."""
-_FOLLOWED = 0.05
-"""Share of the pixels whose flow returns, below which two frames show different scenes: at least 0.21 in each of
-twelve real and rendered pairs with up to 43 px of flow, at most 0.001 in pairs of different ones of them, and 0.02
-where blurred noise meets other noise."""
+"""The camera is still if the flow is below the first value in the second share of the third share of pixels, those
+with most texture. On six real and rendered pairs it stayed below 0.23 px under noise of 2 levels or JPEG of
+quality 70, and 0.3 px of motion gave 0.43; with less texture, noise alone changes DIS by pixels."""
+_LEAST_RETURNING = 0.05
+"""Share of pixels with a small forward-backward error below which two frames show different scenes: at least 0.21
+in each of twelve real and rendered pairs with up to 43 px of flow, at most 0.001 between different pairs, and 0.02
+between two images of blurred noise."""
 STILL = "nothing moves between the frames: a still camera needs no correction"
-CUT = "shows another scene than the frame before it: a cut, or frames that are missing"
+CUT = "shows another scene than the previous frame: there is a cut, or frames are missing"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,11 +140,11 @@ class FoundOwnMotion:
 
     own: OwnMotion
     robust: RobustEstimate | None
-    """Where it comes from; None without matches."""
+    """The estimate of the motion; None if there were too few matches."""
     reason: str = ""
-    """Why everything goes its flow; empty with a motion."""
+    """Why there is no motion and the frames are warped by scaled flow; empty with a motion."""
     unused: str = ""
-    """Why the samples of a gyroscope were given and not used; empty otherwise."""
+    """Why given samples of a gyroscope were not used; empty otherwise."""
 
 
 def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
@@ -152,17 +152,17 @@ def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
     variances = [local_variance(image) for image in eight_bit(list(images))]
     for name, variance in zip(("first", "second"), variances, strict=True):
         if np.mean(variance > _TEXTURE_LEVELS**2) < _TEXTURED:
-            return f"the {name} frame shows no texture: nothing to find its motion by"
+            return f"the {name} frame shows no texture: its motion cannot be estimated"
     clear = variances[1] >= np.quantile(variances[1], 1.0 - _CLEAREST)
     if float(np.quantile(np.linalg.norm(flows.flow[1][clear], axis=-1), _MOST)) < _STILL_PX * flows.scale:
         return STILL
-    if float(np.mean(flows.returns[1] < _RETURNS_PX)) < _FOLLOWED:
+    if float(np.mean(flows.returns[1] < _RETURNS_PX)) < _LEAST_RETURNING:
         return CUT
     return ""
 
 
 def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
-    """Matches (n, 4) x0, y0, x1, y1 at random pixels of frame 1 whose flow returns to where it began."""
+    """Matches (n, 4) x0, y0, x1, y1 at random pixels of frame 1 with a small forward-backward error."""
     flow = flows.flow[1]
     height, width = flow.shape[:2]
     x, y = (
@@ -179,7 +179,7 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
 def trajectory_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatArray:
     """Matches (n, 4) by the flow, from the same random pixels of both frames; in random order.
 
-    One that ends at such a pixel goes on in the next pair with the one that begins there.
+    A match that ends at such a pixel is continued by a match of the next pair, which begins there.
     """
     height, width = flows.returns[0].shape
     rng = np.random.default_rng(seed)
@@ -196,9 +196,9 @@ def trajectory_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatA
 def find_own_motion(
     flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """The motion of one camera, by the law that its flow asks for, or as it shook; its translation has length 1.
+    """The motion of one camera, by the model selected from its flow or a spline; its translation has length 1.
 
-    Of laws of constant speed, and one that accelerates.
+    The models are those of constant speed and an accelerated one.
     """
     return with_best_motion(find_steady_motion(flows, rig, shutter, side, robust, seed), flows, robust, seed)
 
@@ -206,12 +206,12 @@ def find_own_motion(
 def find_steady_motion(
     flows: Flows, rig: StereoRig, shutter: RollingShutter, side: Side, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """As of ``find_own_motion``, by the law ``inertial`` whatever the flow asks for."""
+    """``find_own_motion`` with the fixed motion model ``inertial``."""
     own = rig.about(side)
     nothing = OwnMotion(rig=own, shutter=shutter, side=side, motion=None)
     matches = flow_matches(flows, np.random.default_rng(seed))
     if len(matches) < _FEWEST:
-        return FoundOwnMotion(own=nothing, robust=None, reason=f"only {len(matches)} pixels have a certain flow")
+        return FoundOwnMotion(own=nothing, robust=None, reason=f"only {len(matches)} pixels have reliable flow")
     solver = RefinedSolver(motion_model=InertialMotion.name, one_camera=True)
     found = estimate_motion(
         Correspondences(left=matches), own, shutter, solver, robust, np.random.default_rng(seed)
@@ -226,20 +226,18 @@ def find_steady_motion(
 def with_selected_model(
     found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """A steady motion by the law that the flow asks for, if another one; what else is found stays."""
+    """The motion under the model that is selected from the flow, in place of ``inertial``."""
     own = found.own
     if found.robust is None or own.motion is None:
         return found
     matches = flow_matches(flows, np.random.default_rng(seed))
-    robust_of_law, motion = select_motion_model(
-        found.robust, matches, own.rig.about("left"), own.shutter, robust, seed
-    )
+    refined, motion = select_motion_model(found.robust, matches, own.rig.about("left"), own.shutter, robust, seed)
     motion = motion.with_endpoint(motion.w, motion.d / np.linalg.norm(motion.d))
-    return replace(found, own=replace(own, motion=motion), robust=robust_of_law)
+    return replace(found, own=replace(own, motion=motion), robust=refined)
 
 
 def with_best_motion(found: FoundOwnMotion, flows: Flows, robust: RobustOptions, seed: int = 0) -> FoundOwnMotion:
-    """As ``with_selected_model``, or shaken, where two frames show how (``camera_two_frame_spline``)."""
+    """``with_selected_model``, or a spline if two frames determine one (``camera_two_frame_spline``)."""
     lawful = with_selected_model(found, flows, robust, seed)
     own = lawful.own
     if lawful.robust is None or own.motion is None:
@@ -249,7 +247,7 @@ def with_best_motion(found: FoundOwnMotion, flows: Flows, robust: RobustOptions,
 
 
 def with_motion(found: FoundOwnMotion, path: Motion) -> FoundOwnMotion:
-    """What is found of two frames, with another motion."""
+    """The result for two frames with another motion."""
     robust = found.robust
     if robust is not None:
         estimate = replace(robust.estimate, w=path.w, d=path.d, covariance=None)
@@ -260,12 +258,12 @@ def with_motion(found: FoundOwnMotion, path: Motion) -> FoundOwnMotion:
 @final
 @dataclass(frozen=True, kw_only=True)
 class MonoFusionCorrector(Corrector):
-    """Each camera by itself: geometry where its rows' epipolar curves explain the flow, scaled flow elsewhere."""
+    """Correct each camera alone: by geometry where epipolar curves explain the flow, else by scaled flow."""
 
     geometry: bool = True
-    """Whether depth and motion are looked for; without, everything goes its flow, scaled by the times of rows."""
+    """Whether depth and motion are estimated; otherwise all pixels move by flow scaled by the times of rows."""
     fusion: MonoFusionOptions = field(default_factory=MonoFusionOptions)
-    """How two frames become one image."""
+    """Options of the fusion of two frames to one image."""
     robust: RobustOptions = field(default_factory=RobustOptions)
     """RANSAC of the motion."""
     seed: int = 0
@@ -274,7 +272,7 @@ class MonoFusionCorrector(Corrector):
     spec = CorrectorSpec(
         needs=frozenset(),
         reference="rsbench; flow: Kroeger et al., ECCV 2016; search: Hirschmueller, PAMI 2008",
-        assumes="one camera, two frames: constant velocity; what moves by itself does so evenly in the image",
+        assumes="one camera, two frames: constant velocity; moving objects move uniformly in the image",
         sees={"time"},
     )
 
@@ -296,7 +294,7 @@ class MonoFusionCorrector(Corrector):
         return [{view: corrected(view, row) for view in views} for row in rows]
 
     def _ready(self, problem: CorrectionProblem, side: Side) -> MonoFusion | str:
-        """The two frames of a camera; or why they cannot be corrected."""
+        """The fusion of a camera's two frames; or why they cannot be corrected."""
         images = [problem.images[side, frame] for frame in (0, 1)]
         flows = find_flows(images)
         if reason := refusal(images, flows):
@@ -308,22 +306,22 @@ class MonoFusionCorrector(Corrector):
 
 
 # One trajectory of a camera through neighbouring pairs of frames, in place of a motion model for each pair.
-# Two frames do not show what both shake alike; several do, for each frame is in two pairs. Pairs are worked
-# on in groups with some on both sides that help: what is found of a pair does not depend on where a run
-# began, and memory does not grow with the number of frames.
+# Two frames cannot reveal a shake that is the same in both; several can, as each frame is in two pairs. A
+# trajectory is fitted to a fixed group of pairs and some on either side: thus the result for a pair does not
+# depend on the frame at which a run begins, and memory does not grow with the number of frames.
 
 
 _GROUP, _BESIDE = 10, 2
-"""Pairs of a group, and those on either side that help."""
+"""Number of pairs in a group, and of additional pairs on either side."""
 _FEWEST_PAIRS = 3
 """Fewest successive pairs that determine a trajectory."""
 PIXELS = 300
-"""As of ``trajectory_matches``: fewer than of two frames alone do, for each frame is in two pairs."""
+"""Pixels for ``trajectory_matches`` in a sequence: fewer than for two frames, as each frame is in two pairs."""
 _LEAST = 50
-"""Matches."""
+"""Fewest matches of a pair in a trajectory."""
 _FLOW_PX = 0.15
-"""Root mean square error of dense flow, px: up to here a trajectory explains a pair, and where it explains it as
-well as a motion of its own."""
+"""A trajectory explains a pair if its error is below this error of dense flow (root mean square, px), or not above
+the error of the pair's own motion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -331,7 +329,7 @@ class SeenPair:
     """Two successive frames."""
 
     found: FoundOwnMotion | None
-    """None where they show none at all."""
+    """None: the pair cannot be corrected."""
     matches: FloatArray
     """(n, 4) x0, y0, x1, y1, px, see ``trajectory_matches``."""
     even: bool = True
@@ -343,18 +341,18 @@ class SeenPair:
 
 
 def group_of(pair: int) -> tuple[int, int]:
-    """First pair that decides what is found of a pair, and the one after the last."""
+    """Number of the first pair on which the result for a pair depends, and the number after the last."""
     return max(_next_group(pair) - _GROUP - _BESIDE, 0), _next_group(pair) + _BESIDE
 
 
 def with_shared_trajectory(
     pairs: Iterable[SeenPair], begin: int = 0, first: int = 0
 ) -> Iterator[FoundOwnMotion | None]:
-    """Motions of pairs, in order: from the trajectory through their neighbours where it explains them as well.
+    """The results for pairs, in order, with the motion of a shared trajectory where it explains the pair as well.
 
     Args:
-        pairs: in order, from number ``begin`` on: ``group_of(first)[0]`` at the latest.
-        first: number of the first pair that is requested.
+        pairs: pairs in order, starting with number ``begin``, at most ``group_of(first)[0]``.
+        first: number of the first pair that is returned.
     """
     pending, group, number = dict[int, SeenPair](), first, begin - 1
     for number, pair in enumerate(pairs, start=begin):
@@ -373,21 +371,21 @@ def _next_group(pair: int) -> int:
 
 
 def _group_motions(pending: dict[int, SeenPair], first: int) -> list[FoundOwnMotion | None]:
-    """Of the group of one pair, from that pair on."""
+    """The results for the group of pair ``first``, from that pair on."""
     low, high = group_of(first)
     numbers = [k for k in range(low, high) if k in pending]
     found = {k: pending[k].found for k in numbers}
-    for shows, run in itertools.groupby(numbers, lambda k: _shows(pending[k])):
-        found |= _along([(k, pending[k]) for k in run]) if shows else {}
+    for usable, run in itertools.groupby(numbers, lambda k: _is_usable(pending[k])):
+        found |= _trajectory_motions([(k, pending[k]) for k in run]) if usable else {}
     return [found[k] for k in range(first, _next_group(first)) if k in found]
 
 
-def _shows(pair: SeenPair) -> bool:
+def _is_usable(pair: SeenPair) -> bool:
     return pair.even and pair.motion is not None and len(pair.matches) >= _LEAST
 
 
-def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
-    """Motions of successive pairs that follow the one trajectory of all of them."""
+def _trajectory_motions(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
+    """Fit a trajectory to successive pairs; returns the results of those that it explains, by number."""
     motions = [pair.motion for _, pair in run if pair.motion is not None]
     owns = [pair.found.own for _, pair in run if pair.found is not None]
     if len(run) < _FEWEST_PAIRS or owns[0].shutter.readout_ratio == 0.0:
@@ -403,40 +401,40 @@ def _along(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
     return out
 
 
-# Frames whose lines are read from any side, as frames whose rows are read from the top: mirrored, or turned.
-# A phone pending upright reads columns. A mirror keeps motions and times valid, so what corrects rows
-# from the top corrects the others; a rotation's axis turns round in it.
+# Frames whose lines are read from any side are mirrored or transposed to frames whose rows are read from the
+# top: a phone in upright position, for instance, reads columns. Motions and times stay valid in a mirror, so
+# one correction serves all scans; only the axis of a rotation changes its sign.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Turned:
-    """A camera that reads rows from the top, and how the frames of the real one become its frames."""
+    """A camera that reads rows from the top, and the transform of the real camera's frames to its frames."""
 
     camera: PinholeCamera
     shutter: RollingShutter
     exchanged: bool
-    """Whether x and y are."""
+    """Whether x and y are exchanged."""
     flipped: bool
-    """Whether the lines are in the opposite order after that."""
+    """Whether the order of the lines is then reversed."""
 
     def image(self, image: NDArray[Any]) -> NDArray[Any]:
-        """A frame (H, W[, 3]) as this camera has it."""
+        """A frame (H, W[, 3]) of the real camera as a frame of this camera."""
         lines_first = np.swapaxes(image, 0, 1) if self.exchanged else image
         return np.ascontiguousarray(lines_first[::-1] if self.flipped else lines_first)
 
     def paced(self, period: float) -> Turned:
-        """The same where so many frame periods lie between two frames."""
+        """The same camera for two frames that are ``period`` frame periods apart."""
         if period == 1.0:
             return self
         ratio = min(self.shutter.readout_ratio / period, 1.0)
         return replace(self, shutter=replace(self.shutter, readout_ratio=ratio))
 
     def line(self, row: float) -> float:
-        """The number of lines read at the time of so many rows; of columns, a like share of the width."""
+        """The line of this camera for a row of the real one; if columns are read, at the same share."""
         return row * (self.camera.height - 1) / (self.camera.width - 1) if self.exchanged else row
 
     def back(self, fused: Fused) -> Fused:
-        """A corrected frame as the real camera has it."""
+        """A corrected frame of this camera as a frame of the real one."""
         image, origin, depth = map(self._image_back, (fused.image, fused.origin, fused.depth))
         return replace(fused, image=image, origin=origin, depth=depth)
 
@@ -445,7 +443,7 @@ class Turned:
         return np.ascontiguousarray(np.swapaxes(lines, 0, 1) if self.exchanged else lines)
 
     def found(self, found: FoundOwnMotion | None) -> FoundOwnMotion | None:
-        """A motion as the real camera makes it."""
+        """A result of this camera with the motion in the real camera's axes."""
         if found is None or found.own.motion is None:
             return found
         motion, P = found.own.motion, self._axes()
@@ -459,22 +457,22 @@ class Turned:
         return replace(found, own=replace(found.own, motion=real))
 
     def gyro(self, samples: FloatArray) -> FloatArray:
-        """Samples (n, 4) tau, w of a gyroscope as this camera turns."""
+        """Gyroscope samples (n, 4) tau, w of the real camera in this camera's axes."""
         return _axial(samples, self._axes())
 
     def _axes(self) -> FloatArray:
-        """(3, 3) this camera's axes from the real one's."""
+        """(3, 3) transform from the real camera's axes to this camera's."""
         exchange = np.eye(3)[[1, 0, 2]] if self.exchanged else np.eye(3)
         return np.diag([1.0, -1.0 if self.flipped else 1.0, 1.0]) @ exchange
 
 
 def _axial(samples: FloatArray, P: FloatArray) -> FloatArray:
-    """Samples (n, 4) tau, w after a change of axes (3, 3); in a mirror, a rotation's axis turns round."""
+    """Samples (n, 4) tau, w after a change of axes (3, 3); a mirror reverses the sign of rotations."""
     return np.column_stack([samples[:, 0], np.linalg.det(P) * samples[:, 1:] @ P.T])
 
 
 def turned(camera: PinholeCamera, shutter: RollingShutter) -> Turned:
-    """The camera that reads rows from the top in place of one that reads from any side."""
+    """The camera that reads rows from the top, for a camera that reads from any side."""
     scan, c = shutter.scan_of("left"), camera
     exchanged, flipped = scan in ("left", "right"), scan in ("bottom", "right")
     if exchanged:

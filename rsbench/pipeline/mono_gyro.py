@@ -1,7 +1,7 @@
-"""How far the clock of a gyroscope's log is off that of one camera's frames, from how both turn.
+"""Gyroscope samples for one camera: the offset of their clock, and motions with their rotation.
 
-Each pair of frames shows a rate of turn: the mean of what the gyroscope measured between the two moments at which
-a row is read, over the rows. The shift at which both agree best is looked for, beside a bias of the gyroscope.
+Each pair of frames gives an angular rate: the mean over all rows of the gyroscope's mean rate between the two
+times at which a row is read. ``find_clock`` finds the time shift at which both agree best, up to a bias.
 """
 
 from __future__ import annotations
@@ -37,46 +37,47 @@ from rsbench.solvers.gyro_and_gravity import GyroSolver
 from rsbench.vision.mono_fusion import Flows, OwnMotion, find_flows
 
 FARTHEST_S = 0.5
-"""Largest shift that is looked for."""
+"""Largest shift that is searched for, seconds."""
 PAIRS = 24
-"""Of frames, at most, by which it is found; they lie evenly over the video."""
+"""Most pairs of frames from which the shift is estimated; they are evenly spaced in the video."""
 _STEP = 1.0 / 32
-"""Frame periods between shifts that are tried; a tenth of the period of a hand's fastest shakes at 30 frames/s."""
+"""Step of the search, frame periods; a tenth of the period of a hand's fastest shakes at 30 frames/s."""
 _FREEDOM = 4.0
-"""Of the t distribution of the differences: a pair whose motion is wrong counts little."""
+"""Degrees of freedom of the t distribution of the differences, which gives wrong pairs little weight."""
 _LEAST_RATE = 2e-4
-"""Standard deviation, rad per frame period, that a pair's rate has at least: 0.1 px of a focal length of 500."""
+"""Least standard deviation of a pair's rate, rad per frame period: 0.1 px at a focal length of 500 px."""
 _APART = 1.0
-"""Frame periods beyond which a shift is another one."""
+"""Two shifts that differ by more than this, frame periods, are different solutions."""
 _CERTAIN, _MOST_SIGMA, _FEWEST = 0.99, 0.15, 6
 """Least probability, largest deviation (frame periods) and fewest pairs of a shift that counts as determined."""
 _CLEARLY = 2.5
-"""Deviations from 0 of a shift that is used: who recorded both together knows the clock better than frames do."""
+"""A shift is applied if it exceeds this many standard deviations: recorded times are mostly better."""
 _EXPLAINED = 0.2
-"""Of the variance of the pairs' rates, at most, may be left where both agree best. On rendered sequences of eight
-frames and more the log of another one, or its own with another sign, left 0.28 and more."""
+"""Largest share of the variance of the pairs' rates that may remain at the best shift. On rendered sequences of
+eight frames and more, the log of another sequence, or the right one with another sign, left 0.28 and more."""
 _LEAST_SIGMA = 0.02
-"""Standard deviation, frame periods: a pair's rate is no exact mean over its rows."""
+"""Least standard deviation of a shift, frame periods, as a pair's rate is not exactly the mean over its rows."""
 
 
 class Clock(NamedTuple):
-    """What frames say of the clock of a gyroscope."""
+    """The estimated error of a gyroscope's clock."""
 
     shift: float
-    """Frame periods to take from the times of its samples; 0 where the frames do not tell it."""
+    """Frame periods to subtract from the times of its samples; 0 if the frames do not determine it."""
     sigma: float
-    told: bool
+    told: bool  # a key of motion.json
+    """Whether the frames determine the shift."""
     used: bool
-    """Whether it is large enough to be taken from the times; a smaller one may be the noise of the frames."""
+    """Whether the shift is applied; a smaller one may be due to noise."""
     pairs: int
-    """That it rests on."""
+    """Number of pairs of frames that were used."""
 
 
 class PairRates(NamedTuple):
-    """What pairs of frames show of a camera's turning."""
+    """Angular rates of a camera from pairs of frames."""
 
     starts: FloatArray
-    """(n,) frame periods: first row of the first frame of each."""
+    """(n,) time of the first row of each pair's first frame, frame periods."""
     rates: FloatArray
     """(n, 3) rad per frame period, in the convention of ``Correspondences.gyro``."""
 
@@ -91,12 +92,12 @@ def pair_rates(
     advance: Callable[[str], None] = lambda word: None,
     begins: FloatArray | None = None,
 ) -> PairRates:
-    """Of some pairs of frames (H, W[, 3]), in the axes of the camera whose lines are rows from the top.
+    """The rates of some pairs of frames (H, W[, 3]), in the axes of the ``turned`` camera.
 
     Args:
-        frames, count: in order, gone through once, and how many there are, about.
-        advance: called for each pair that is looked at.
-        begins: (n,) times of the frames' first rows, frame periods; pairs not about 1 apart are left out.
+        frames, count: frames in order, which are iterated once, and their approximate number.
+        advance: called before each pair that is examined.
+        begins: (n,) times of the frames' first rows, frame periods; pairs that are not about 1 apart are left out.
     """
     turn = turned(camera, shutter)
     rig = StereoRig.of_one(turn.camera)
@@ -117,20 +118,20 @@ def pair_rates(
     return PairRates(np.array(starts), np.reshape(rates, (-1, 3)))
 
 
-def in_time(
+def with_clock_corrected(
     pairs: PairRates, samples: FloatArray, camera: PinholeCamera, shutter: RollingShutter, farthest: float
 ) -> tuple[FloatArray, Clock]:
-    """The samples (n, 4) of the camera with the shift of their clock taken from their times, where it is used."""
+    """The samples (n, 4) with their clock's shift subtracted if it is used; and the clock."""
     turn = turned(camera, shutter)
     clock = find_clock(pairs, turn.gyro(samples), turn.shutter.readout_ratio, farthest)
     return (samples - [clock.shift, 0.0, 0.0, 0.0] if clock.used else samples), clock
 
 
 def find_clock(pairs: PairRates, samples: FloatArray, readout_ratio: float, farthest: float) -> Clock:
-    """The shift of samples (n, 4) tau, w, at which they turn as the pairs do.
+    """Estimate the time shift at which samples (n, 4) tau, w agree best with the rates of pairs.
 
     Args:
-        farthest: frame periods, the largest shift that is looked for.
+        farthest: largest shift of the search, frame periods.
     """
     count = len(pairs.starts)
     if count < _FEWEST:
@@ -139,7 +140,7 @@ def find_clock(pairs: PairRates, samples: FloatArray, readout_ratio: float, fart
     differences = pairs.rates - mean_rates(samples, pairs.starts + shifts[:, None], readout_ratio)
     differences -= np.median(differences, axis=1, keepdims=True)  # the bias
     squares = np.sum(differences**2, axis=-1)
-    # Of three normal errors half have a sum of squares below 2.37 variances.
+    # The median of chi-squared with three degrees of freedom is 2.37.
     left = float(np.min(np.median(squares, axis=1)))
     shaken = float(np.median(np.sum((pairs.rates - np.median(pairs.rates, axis=0)) ** 2, axis=-1)))
     variance = max(left / 2.37, _LEAST_RATE**2)
@@ -157,7 +158,7 @@ def find_clock(pairs: PairRates, samples: FloatArray, readout_ratio: float, fart
 
 
 def mean_rates(samples: FloatArray, starts: FloatArray, readout_ratio: float) -> FloatArray:
-    """(..., 3) mean rates of samples (n, 4) over a period from each row's time, over the rows.
+    """(..., 3) mean over the rows of the mean rate of samples (n, 4) during a period from each row's time.
 
     ``starts`` (...) are times of first rows. Rates are linear between the samples and 0 beyond them.
     """
@@ -177,33 +178,33 @@ def mean_rates(samples: FloatArray, starts: FloatArray, readout_ratio: float) ->
 
 
 # Motion of one camera whose rotation a gyroscope measured: its bias and the translation, from dense flow.
-# Two frames tell a constant rate of turn. A gyroscope tells how the rate changes between the rows, up to a
-# bias that hardly changes in two frames: three numbers, as many as the constant rate has. They are found with
-# the translation from the flow, and expected to be small where the flow leaves them open.
+# Two frames determine a constant angular rate. A gyroscope measures how the rate changes between the rows, up
+# to a bias that is constant during two frames: three unknowns, as many as the constant rate has. The bias is
+# estimated with the translation from the flow, with a prior that keeps it small if the flow does not determine it.
 
 
-NOT_COVERED = "the gyroscope's samples do not reach over these frames"
+NOT_COVERED = "the gyroscope's samples do not cover these frames"
 CONTRADICTED = "the gyroscope contradicts the frames"
 _BIAS = 1e-3
-"""Standard deviation of the bias, rad per frame period: 0.03 rad/s at 30 frames a second."""
+"""Prior standard deviation of the bias, rad per frame period: 0.03 rad/s at 30 frames a second."""
 _MATCHES = 400
 _SAMPLES = 100
-"""Of two matches, at most, in the search for the translation: enough for three wrong ones in four."""
+"""Most RANSAC samples of two matches for the translation: enough if three in four matches are wrong."""
 _WORTH = 200.0
-"""Matches, at most, that count as apart: neighbours in dense flow err alike."""
+"""Largest effective number of independent matches, as neighbours in dense flow are correlated."""
 _NOISE_PX = 0.05
-"""Standard deviation of the flow, at least."""
+"""Least standard deviation of the flow, px."""
 _PX_PER_SIGMA = 2.5
-"""Of the robust loop's threshold."""
+"""The robust loop's threshold, in standard deviations."""
 _WORSE, _BIASED, _FAR_WORSE = 1.15, 2.0, 2.0
-"""A gyroscope contradicts the frames where it fits them by so much worse than a constant rate of turn does, at a
-bias of so many standard deviations, or by far worse. On shakes of three kinds in a closed-form world, right
-samples had one of the first two at most, and 1.63 times the error; those with another sign, axes or time that
-fitted so much worse had both."""
+"""A gyroscope contradicts the frames if its error exceeds that of a constant angular rate by the first factor at a
+bias of more standard deviations than the second value, or by the third factor at any bias. On shakes of three
+kinds in a closed-form world, right samples fulfilled at most one of the first two and had at most 1.63 times the
+error; samples with another sign, axes or time with such an error fulfilled both."""
 
 
 def around(samples: FloatArray, first: float, last: float) -> FloatArray | None:
-    """Samples (n, 4) tau, w from half a period before a time to half after another; None: not over both."""
+    """Samples (n, 4) tau, w from half a period before ``first`` to as much after ``last``; None: not covered."""
     tau = samples[:, 0]
     chosen = samples[(tau >= first - 0.5) & (tau <= last + 0.5)]
     if len(chosen) < 2 or chosen[:, 0].min() > first or chosen[:, 0].max() < last:
@@ -212,7 +213,7 @@ def around(samples: FloatArray, first: float, last: float) -> FloatArray | None:
 
 
 def rotation_alone(rig: StereoRig, shutter: RollingShutter, side: Side, samples: FloatArray) -> FoundOwnMotion:
-    """What the samples say, and everything infinitely far: frames that show nothing to find a translation by."""
+    """The rotation of the samples with all points at infinity, for frames that do not show a translation."""
     motion = GyroMotion(samples, np.zeros(3))
     own = OwnMotion(rig=rig.about(side), shutter=shutter, side=side, motion=motion, far=True)
     return FoundOwnMotion(own=own, robust=None)
@@ -221,9 +222,9 @@ def rotation_alone(rig: StereoRig, shutter: RollingShutter, side: Side, samples:
 def with_gyro(
     found: FoundOwnMotion, flows: Flows, samples: FloatArray, robust: RobustOptions, seed: int = 0
 ) -> FoundOwnMotion:
-    """The motion with the rotation of the samples (n, 4), and their bias, in place of one that turns evenly.
+    """Replace the constant rate of a motion by the rotation of the samples (n, 4) with an estimated bias.
 
-    ``found`` is that of the images alone. It stays where the samples contradict it; its ``unused`` says so.
+    ``found`` is the result from the images alone. It is kept, with a reason in ``unused``, if they contradict it.
     """
     own, rng = found.own, np.random.default_rng(seed)
     rig, shutter, side = own.rig, own.shutter, own.side

@@ -1,7 +1,7 @@
-"""Frames of one camera, any number of them, corrected in order, each with the frame before or after it.
+"""Correct any number of frames of one camera in order, each with the frame before or after it.
 
-That is the one nearer to the target's time, for a camera's speed changes; the other one fills what neither of
-these shows. A frame that does not go on from the one before it, as after a cut, is corrected with the next one.
+The neighbour nearer to the target's time is used, as the camera's speed changes; the other one fills areas that
+neither frame shows. A frame after a cut is corrected with the next one.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import inpainted
 from rsbench.pipeline.footage import about_one, check_alike
 from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.mono_camera import TOO_FEW
 from rsbench.pipeline.mono_correction import (
     CUT,
     PIXELS,
@@ -50,9 +51,9 @@ from rsbench.vision.images import grey_u8, map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
 _AT_ONCE = 2
-"""Pairs that are worked on at once: the rest of a pair's work fills the second of two cores."""
-_HELD, _HELD_BYTES = 14, 4e8
-"""Pairs that wait for those after them, and what their flow may take."""
+"""Number of pairs that are processed in parallel; parts of a pair's work use two cores by themselves."""
+_PENDING, _PENDING_BYTES = 14, 4e8
+"""Number of pairs that wait for later ones, and the memory that their flow may take."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,26 +63,26 @@ class _Pair:
     fusion: MonoFusion | None
     found: FoundOwnMotion | None
     reason: str
-    """Why they cannot be; empty where they can."""
+    """Why they cannot be corrected; empty if they can."""
 
 
 class _Seen(NamedTuple):
-    """Two successive frames as they came, and what their flow shows."""
+    """Two successive frames as read, with their flow and a first motion."""
 
     number: int
-    """Of the first one."""
+    """Number of the first frame."""
     images: tuple[NDArray[Any], NDArray[Any]]
     flows: Flows | None
-    """None where they are large: then they are found again."""
+    """None if the flow takes too much memory; it is then computed again."""
     found: FoundOwnMotion | None
     reason: str
-    """Why they cannot be corrected; empty where they can."""
+    """Why they cannot be corrected; empty if they can."""
     matches: FloatArray
     """See ``trajectory_matches``."""
 
 
 def options_of_camera(inpaint: bool | None, seed: int, target_row: float) -> CorrectionOptions:
-    """Options of the correction of one camera's frames; those of a rig's components have no effect on it."""
+    """Options for the correction of one camera's frames; options for components of a rig have no effect on it."""
     corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=False), seed=seed)
     entry = replace(load_corrector("mono-fusion"), component=corrector)
     return CorrectionOptions(corrector=entry, target_row=target_row, seed=seed, inpaint=bool(inpaint))
@@ -96,22 +97,22 @@ def correct_frames(
     gyro: FloatArray | None = None,
     starts: FloatArray | None = None,
 ) -> Iterator[CorrectedMoment]:
-    """Every frame (H, W[, 3]), uint8 or uint16, of one camera at the time of its target row, in order.
+    """Correct each frame (H, W[, 3]), uint8 or uint16, of one camera to the time of its target row, in order.
 
-    Memory does not grow with the number of frames: a few pairs are worked on at once.
+    Memory does not grow with the number of frames, as only a few pairs are kept.
 
     Args:
-        frames: in order; they are gone through once.
-        camera, shutter: of the frames.
-        options: as of ``options_of_camera``; None: at the time of the middle row.
-        done: so many first frames are left out.
-        gyro: (n, 4) tau, w of a gyroscope, as of ``Correspondences``: tau 0 is the first row of the first frame.
+        frames: frames in order; they are iterated once.
+        camera, shutter: camera and shutter of the frames.
+        options: options from ``options_of_camera``; None: the target is the middle row.
+        done: number of first frames that are left out.
+        gyro: (n, 4) tau, w of a gyroscope, as in ``Correspondences``: tau 0 is the first row of the first frame.
         starts: (n,) increasing times of the frames' first rows, frame periods; 0, 1, 2, ... if absent. The readout
-            takes a smaller share of a longer interval, and a trajectory goes through intervals of about 1 alone.
+            is a smaller share of a longer interval, and a trajectory uses only intervals of about 1.
 
     Raises:
-        RsbenchError: fewer than two frames, frames of two sizes, or two frames alone that cannot be corrected. Of
-            more frames such a pair is a failure by value.
+        RsbenchError: there are fewer than two frames, frames of two sizes, or only two frames, which cannot be
+            corrected. Among more frames, such a pair gives a result with a reason.
     """
     options = options or options_of_camera(None, 0, (camera.height - 1) / 2)
     turn = turned(camera, shutter)
@@ -124,29 +125,30 @@ def correct_frames(
             raise RsbenchError(f"frames: {each.before.reason}")
         if pending is not None:
             yield pending
-        pending = _moment(each, turn, options)
-        if each.number > 0:  # a first one waits for whether others follow the second
+        pending = _corrected(each, turn, options)
+        if each.number > 0:  # the first frame waits until it is known whether a third one follows
             yield pending
             pending = None
     if each is None:
-        raise RsbenchError("frames: fewer than two; one camera shows its motion in at least two")
+        raise RsbenchError(TOO_FEW)
 
 
 class _Frame(NamedTuple):
-    """A frame and what is known of it and its neighbours; None where there is none, or it is done."""
+    """A frame and the pairs that contain it; None where there is none, or it is done."""
 
     number: int
     image: NDArray[Any]
     previous: NDArray[Any] | None
     before: _Pair | None
-    """The frame before it and the frame."""
+    """The pair of the previous frame and this one."""
     after: _Pair | None
+    """The pair of this frame and the next one."""
 
 
 def _with_neighbours(
     pairs: Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]],
 ) -> Iterator[_Frame]:
-    """Each frame of those of ``_pairs``."""
+    """The frames of ``_pairs``, each with the pairs that contain it."""
     previous: NDArray[Any] | None = None
     before: _Pair | None = None
     last: tuple[int, NDArray[Any]] | None = None
@@ -165,13 +167,13 @@ def _pairs(
     gyro: FloatArray | None,
     starts: FloatArray | None,
 ) -> Iterator[tuple[int, NDArray[Any], NDArray[Any], _Pair | None]]:
-    """Number of the second frame, both frames, and what is known of them, of all pairs in order; None: done."""
+    """For each pair in order: number of the second frame, both frames, and the pair; None: it is done."""
     first = max(done - 1, 0)
     begin = group_of(first)[0] if gyro is None else first
     turned_gyro, waiting = None if gyro is None else turn.gyro(gyro), deque[_Seen]()
 
     def look(at: tuple[int, tuple[NDArray[Any], NDArray[Any]]]) -> _Seen:
-        return _seen(*at, turn, options, turned_gyro, *_span(at[0], starts))
+        return _analyse(*at, turn, options, turned_gyro, *_span(at[0], starts))
 
     def kept(seen: Iterable[_Seen]) -> Iterator[SeenPair]:
         for each in seen:
@@ -202,13 +204,13 @@ def _pairs(
 
 
 def _span(number: int, starts: FloatArray | None) -> tuple[float, float]:
-    """When a pair begins and how long it is, frame periods."""
+    """Start and length of a pair, frame periods."""
     if starts is None or number + 1 >= len(starts):
         return float(number), 1.0
     return float(starts[number]), float(starts[number + 1] - starts[number])
 
 
-def _seen(
+def _analyse(
     number: int,
     images: tuple[NDArray[Any], NDArray[Any]],
     turn: Turned,
@@ -217,7 +219,7 @@ def _seen(
     start: float,
     period: float,
 ) -> _Seen:
-    """``gyro``: samples (n, 4) of the sequence, as this camera turns; ``start``, ``period``: frame periods."""
+    """Flow and a first motion of a pair; ``gyro``: (n, 4) of the sequence in axes of ``turn``; frame periods."""
     turn = turn.paced(period)
     check_alike({f"frame {number + place}": image for place, image in enumerate(images)})
     given = [turn.image(image) for image in images]
@@ -226,15 +228,15 @@ def _seen(
     if gyro is not None:
         samples = around(gyro, start, start + period * (1.0 + turn.shutter.readout_ratio))
     local = None if samples is None else (samples - [start, 0.0, 0.0, 0.0]) * [1.0 / period, *3 * [period]]
-    found, reason = _found(given, flows, turn, options, local)
+    found, reason = _first_motion(given, flows, turn, options, local)
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
     matches = trajectory_matches(flows, options.seed, PIXELS) if gyro is None else np.zeros((0, 4))
-    small = _HELD * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _HELD_BYTES
+    small = _PENDING * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _PENDING_BYTES
     return _Seen(number, images, flows if small else None, found, reason, matches)
 
 
-def _found(
+def _first_motion(
     images: Sequence[NDArray[Any]],
     flows: Flows,
     turn: Turned,
@@ -255,18 +257,19 @@ def _found(
 
 
 def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: CorrectionOptions) -> _Pair:
+    """Prepare the fusion of a pair with its final motion."""
     if found is None:
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
     flows, corrector = seen.flows or find_flows(images), options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
-    if isinstance(found.own.motion, InertialMotion):  # on no trajectory
+    if isinstance(found.own.motion, InertialMotion):  # the motion is not from a trajectory
         found = with_best_motion(found, flows, options.robust, options.seed)
     return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
 
 
-def _moment(each: _Frame, turn: Turned, options: CorrectionOptions) -> CorrectedMoment:
-    """A frame corrected with one neighbour, filled from both; or none, with the reason."""
+def _corrected(each: _Frame, turn: Turned, options: CorrectionOptions) -> CorrectedMoment:
+    """Correct a frame with one neighbour and fill it from the other; or return why not."""
     line = turn.line(options.target_row)
     sources = [(each.before, 1), (each.after, 0)]
     if line > (turn.camera.height - 1) / 2:
@@ -276,49 +279,49 @@ def _moment(each: _Frame, turn: Turned, options: CorrectionOptions) -> Corrected
     ]
     why = "" if each.before is None else each.before.reason
     moment = CorrectedMoment(number=each.number, images={"left": each.image}, frames={}, found=None, reason=why)
-    # A camera that stood still is in place; the same frame twice stands for one that was not taken.
+    # A still camera needs no correction; an identical frame, however, replaces one that was not recorded.
     stays = why == STILL and each.previous is not None and not np.array_equal(each.previous, each.image)
     if stays or not good:
         return replace(moment, reason=why or (each.after.reason if each.after else ""))
     fusion, place, found = good[0]
-    # A gyroscope sees shakes between frames, which no path through three of them does.
+    # A gyroscope measures shakes between frames, which the parabolas of ``expected_errors`` do not follow.
     if fusion.own.shutter.readout_ratio > 0.0 and not isinstance(fusion.own.motion, GyroMotion):
         drawn = fusion.places(place, _target(fusion, place, line))[..., :2]
         errors = expected_errors(turn.image(each.image), drawn, [pair[:2] for pair in good], line)
-        if errors[0] > _TRUSTED[len(good)] * errors[1]:
+        if errors[0] > _LARGEST_RATIO[len(good)] * errors[1]:
             return replace(moment, reason=UNTRUSTED)
     beyond = Beyond(*good[1][:2], _target(*good[1][:2], line)) if len(good) > 1 else None
     fused = inpainted(turn.back(fusion.corrected(place, _target(fusion, place, line), beyond)), options)
     return replace(moment, frames={"left": fused}, found=turn.found(found))
 
 
-# Whether a corrected frame is nearer to the truth than the one that was read.
+# Test whether a corrected frame is nearer to the truth than the frame as read.
 
 
-_TRUSTED = {2: 1.3, 1: 2.0}
-"""Largest error that is expected of a corrected frame, over that of the one that was read, in squares of grey
-levels, by the number of neighbours: a change of speed makes the path err, beside one neighbour more. A video that
-shakes within each frame has up to 1.2 and 1.7 where its corrected frames err by a third of what they did."""
+_LARGEST_RATIO = {2: 1.3, 1: 2.0}
+"""Largest expected mean square error of a corrected frame divided by that of the frame as read, by the number of
+neighbours: with one neighbour, the path is less accurate when the speed changes. A video that shakes within each
+frame has up to 1.2 and 1.7 although its corrected frames have a third of the error."""
 _CONSISTENT_PX, _CLIPPED_PX, _SMOOTHED_PX = 0.5, 4.0, 1.5
-"""Distance from where it began at which flow there and back ends, up to which it counts; so many px off, a pixel
-shows something else, and errors grow no more; and blur of the image whose gradients turn px into grey levels."""
-UNTRUSTED = "its correction cannot be trusted more than the frame that was read, which is kept"
+"""Largest forward-backward error of usable flow; displacement beyond which errors do not grow, since the pixel
+shows something else; blur of the image by whose gradients displacements become grey levels; all in px."""
+UNTRUSTED = "its correction is not expected to be better than the frame as read, which is kept"
 
 
 def expected_errors(
     image: NDArray[Any], drawn: FloatArray, seen: Sequence[tuple[MonoFusion, int]], line: float
 ) -> tuple[float, float]:
-    """Mean square errors, grey levels, of a corrected frame and of the one that was read, by how pixels move.
+    """Expected mean square errors, grey levels, of a corrected frame and of the frame as read, from optical flow.
 
-    Taken for true is where each pixel's path in the image is at the target's time: a parabola through its places
-    in the frame and in both neighbours, by the flow to each; a line, where there is one neighbour. It knows no
-    depth, focal length, law or trajectory, by which geometry may err; it shares the readout ratio with it.
+    The reference for each pixel is its path in the image at the target's time: a parabola through its positions in
+    the frame and in both neighbours, or a line if there is one neighbour. The path does not depend on depth, focal
+    length, motion model or trajectory, whose errors affect the correction, but on the same readout ratio.
 
     Args:
-        image: the frame (H, W[, C]), rows read from the top.
-        drawn: (H, W, 2) px, where each of its pixels is drawn.
-        seen: the pairs that contain it, and which of their frames it is; with a ratio above 0.
-        line: whose time is the target's.
+        image: the frame (H, W[, C]), with rows read from the top.
+        drawn: (H, W, 2) position of each of its pixels in the corrected frame, px.
+        seen: the pairs that contain the frame, and its index in each; the readout ratio must be above 0.
+        line: the line at whose time the target is.
     """
     grey = cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _SMOOTHED_PX)
     height, width = grey.shape
@@ -345,5 +348,5 @@ def expected_errors(
 
 
 def _target(fusion: MonoFusion, place: int, line: float) -> float:
-    """The time of a line of one of a pair's frames, in that pair's periods."""
+    """The time of a line of frame ``place`` of a pair, in the pair's periods."""
     return float(fusion.own.shutter.time_after(line, place, "left"))

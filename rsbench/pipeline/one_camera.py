@@ -1,4 +1,4 @@
-"""Motions as simpler assumptions find them, on the same matches and in the same robust loop."""
+"""Motions under simpler assumptions (global shutter, one camera alone), from the same matches and robust loop."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from rsbench.vision.fusion import Fused
 def global_shutter_motion(
     matches: Correspondences, rig: StereoRig, options: RobustOptions, rng: np.random.Generator
 ) -> Motion | None:
-    """Metric motion of the rig from all matches as if the shutter were global; None when there is none.
+    """Metric motion of the rig from all matches as if the shutter were global; None if none is found.
 
-    The same maximum-likelihood solver as for the rolling shutter, with a readout ratio of 0.
+    The solver is the maximum-likelihood solver for rolling shutters with a readout ratio of 0.
     """
     shutter = RollingShutter(height=rig.camera.height, readout_ratio=0.0)
-    # Rolling-shutter matches miss a global-shutter motion by pixels: the threshold must let them in.
+    # Rolling-shutter matches have errors of pixels under a global-shutter motion, so enlarge the threshold.
     loose = replace(options, threshold_px=4.0 * options.threshold_px)
     estimate = estimate_motion(matches, rig, shutter, RefinedSolver(), loose, rng).estimate
     return LinearMotion(estimate.w, estimate.d) if estimate.success else None
@@ -45,12 +45,11 @@ def global_shutter_motion(
 def monocular_motion(
     inliers: Correspondences, rig: StereoRig, shutter: RollingShutter, side: Side, start: Motion
 ) -> Motion | None:
-    """Constant-velocity motion of one camera alone, about its own centre (``rig.about(side)``); None for none.
+    """Constant-velocity motion of one camera alone, about its own centre (``rig.about(side)``); None: no motion.
 
-    Maximum likelihood on the matches over time of one side, which must be free of outliers, descending from the
-    rig's motion ``start``: the most that one camera can know, spared the false minima that its own search may end
-    in. The translation has length 1: one camera does not know it. A depth map made with it has the same unit, so
-    the correction does not need to.
+    It is the maximum of the likelihood of one side's temporal matches, without outliers, near the rig's motion
+    ``start``: the best that one camera can achieve, without the risk of a wrong local minimum. The translation has
+    length 1, as its scale is unknown. Depth computed with it has the same unit, so a correction needs no scale.
     """
     d = translation_of_offset(start.w, start.d, rig.offset(side))
     pairs = Correspondences(**{side: temporal_pairs(inliers, side)})
@@ -71,10 +70,10 @@ def solved_alone(
     rng: np.random.Generator,
     model: str = LinearMotion.name,
 ) -> Motion | None:
-    """Motion of one camera about its own centre by a solver of the left camera, from its matches over time.
+    """Motion of one camera about its own centre from its temporal matches, by a solver for the left camera.
 
-    It follows ``model``, with the parameters that the solver found. The translation has length 1; None when the
-    solver finds none. Right matches are handed over as left ones: the cameras are equal.
+    It follows ``model``, with the parameters that the solver found, and its translation has length 1; None if the
+    solver finds none. Right matches are passed as left ones, since the cameras are equal.
     """
     pairs = Correspondences(left=temporal_pairs(matches, side))
     estimate = estimate_motion(pairs, rig, shutter, solver, options, rng).estimate
@@ -89,7 +88,7 @@ def _unit(d: FloatArray) -> FloatArray:
 
 
 def kept_matches(matches: Correspondences, robust: RobustEstimate) -> Correspondences:
-    """The temporal matches and tracks that a robust estimate kept."""
+    """The temporal matches and tracks that are inliers of a robust estimate."""
     return Correspondences(
         left=matches.left[robust.inliers["left"]],
         right=matches.right[robust.inliers["right"]],
@@ -103,9 +102,9 @@ def kept_matches(matches: Correspondences, robust: RobustEstimate) -> Correspond
 def depth_alone(
     images: Images, rig: StereoRig, shutter: RollingShutter, motion: Motion, view: View
 ) -> NDArray[np.float32]:
-    """Depth (H, W) of a frame from its flow to the other one of its camera, in the unit of that camera's motion.
+    """Depth (H, W) of a frame from its flow to the camera's other frame, in the unit of the camera's motion.
 
-    ``rig`` has its body where that camera is.
+    ``rig`` has its body at that camera.
     """
     side, frame = view
     flow = dense_flow(images[view], images[side, 1 - frame])
@@ -115,14 +114,14 @@ def depth_alone(
 @final
 @dataclass(frozen=True, kw_only=True)
 class ZhuangCorrector(Corrector):
-    """Each frame warped by the motion that its camera's matches tell, and by the depth of its camera's flow.
+    """Warp each frame by the motion from its camera's matches and by depth from its camera's flow.
 
-    The motion is that of the paper's solver in our robust loop. Depth is triangulated, each end of the flow at the
-    time of its own row, where the paper reads it from the differential flow: the same to first order.
+    The motion is that of the paper's solver in our robust loop. Depth is triangulated from the flow with the
+    readout times of both ends, while the paper uses differential flow; both agree to first order.
     """
 
     acceleration: Literal["none", "constant"] = "none"
-    """As of ``ZhuangSolver``."""
+    """Acceleration model of ``ZhuangSolver``."""
     robust: RobustOptions = field(default_factory=RobustOptions)
     """RANSAC of the motion."""
     seed: int = 0
@@ -163,13 +162,13 @@ class ZhuangCorrector(Corrector):
     def motion(
         self, matches: Correspondences, rig: StereoRig, shutter: RollingShutter, side: Side
     ) -> Motion | None:
-        """Of one camera about its own centre, d of length 1, from its matches over time; None for none."""
+        """The motion of one camera about its own centre, with d of length 1, from its matches; None: no motion."""
         solver = ZhuangSolver(acceleration=self.acceleration)
         rng = np.random.default_rng([self.seed, SIDES.index(side)])
         return solved_alone(matches, rig, shutter, side, solver, self.robust, rng, solver.spec.motion_model)
 
     def _moved(self, problem: CorrectionProblem, view: View, motion: Motion | None) -> CorrectionProblem | None:
-        """That of one frame whose motion and depth are known; None without a motion."""
+        """The problem of one frame with the camera's own motion and depth; None without a motion."""
         if motion is None:
             return None
         rig = problem.rig.about(view[0])

@@ -1,4 +1,5 @@
-"""Problems in files, for people with correspondences of their own; format: docs/reference/problem-format.md."""
+"""Read and write problem files, which have a user's own correspondences; format:
+docs/reference/problem-format.md."""
 
 from __future__ import annotations
 
@@ -43,29 +44,29 @@ _BESIDE = {
     "gravity": "tau, gx, gy, gz",
     "lines": ", ".join(f"{xy}{image}{end}" for image in ("l0", "r0", "l1", "r1") for end in "ab" for xy in "xy"),
 }
-"""What most solvers do without, and JSON alone holds."""
+"""Columns of sets that few solvers need, and that only JSON files can have."""
 SUFFIXES = (".json", *_LINES, ".npz")
 EXAMPLE = shipped_folder("examples", "_docs/examples") / "problem.json"
-"""A small problem that every installation has."""
+"""A small problem that is installed with the package."""
 _Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """What a solver is given."""
+    """The input of a solver: correspondences, rig and shutter."""
 
     name: str
     correspondences: Correspondences
-    """As in the file: left-right matches are not joined yet."""
+    """Correspondences as in the file, without joining left-right matches to tracks."""
     rig: StereoRig
     known_shutter: RollingShutter | None
-    """None: its readout ratio is to be found with the motion."""
+    """None: the readout ratio is estimated with the motion."""
     scanning: Scanning | None = None
-    """How the cameras of an unknown shutter read their lines; None: that is to be found too."""
+    """The given scan if the readout ratio is not given; None: it is estimated too."""
 
     @property
     def shutter(self) -> RollingShutter:
-        """The shutter; RsbenchError where it is to be found."""
+        """The given shutter; RsbenchError if there is none."""
         if self.known_shutter is None:
             raise RsbenchError(f"{self.name}: readout_ratio is required")
         return self.known_shutter
@@ -82,7 +83,7 @@ class _Content(StatedShutter):
     camera: PinholeCamera | None = None
     baseline: float | None = None
     cameras: _Cameras | None = None
-    """With ``right_from_left`` in place of those two: format 2, of any rig."""
+    """Format 2, for any rig: ``cameras`` and ``right_from_left`` in place of ``camera`` and ``baseline``."""
     right_from_left: RightFromLeft | None = None
     name: str = ""
     left: _Rows = ()
@@ -97,10 +98,10 @@ class _Content(StatedShutter):
 
 
 def read_problems(source: str | Path, stdin: TextIO) -> Iterator[Problem | RsbenchError]:
-    """The problems of a file, of all files of a folder, or of ``stdin`` for ``-``, one by one.
+    """Yield the problems of a file, of all files in a folder, or of ``stdin`` for ``-``.
 
-    A problem that is wrong is an error in its place, and the rest follows; the error names the file and, where a
-    file holds many, the line.
+    For a wrong problem, an error is yielded, and reading goes on; the error names the file and, if the file has
+    several problems, the line.
     """
     if str(source) == "-":
         try:
@@ -120,21 +121,21 @@ def read_problems(source: str | Path, stdin: TextIO) -> Iterator[Problem | Rsben
 
 
 def read_problem(path: str | Path) -> Problem:
-    """The one problem of a file.
+    """Read a file with one problem.
 
     Raises:
-        RsbenchError: the file cannot be read, is wrong, or holds more than one.
+        RsbenchError: the file cannot be read, is wrong, or does not have exactly one problem.
     """
     problems = list(_read_file(Path(path)))
     if len(problems) != 1:
-        raise RsbenchError(f"{path}: holds {len(problems)} problems, not one")
+        raise RsbenchError(f"{path}: has {len(problems)} problems, not one")
     if isinstance(problems[0], RsbenchError):
         raise problems[0]
     return problems[0]
 
 
 def problem_record(problem: Problem) -> dict[str, Any]:
-    """A problem as JSON holds it: ``parse_problem`` reads it. Sets without a match are left out, but not all."""
+    """The JSON content of a problem, for ``parse_problem``; empty sets are left out, but not all."""
     sets = {key: getattr(problem.correspondences, key).tolist() for key in COLUMNS}
     return {
         "name": problem.name,
@@ -162,8 +163,8 @@ def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
     try:
         if path.suffix.lower() in _PICTURES:
             raise RsbenchError(
-                f"{path}: is an image or a video, and not matches: rsbench correct takes it, and inspect four "
-                "images with --rig"
+                f"{path}: is an image or a video, but matches are needed: use rsbench correct, or rsbench inspect "
+                "with --rig for four images"
             )
         if path.suffix == ".npz":
             yield _from_npz(path)
@@ -182,7 +183,7 @@ def _read_file(path: Path) -> Iterator[Problem | RsbenchError]:
 
 
 def _parsed(file: TextIO, where: str, name: str, lines: bool | None) -> Iterator[Problem | RsbenchError]:
-    """One problem of a text, or one per line; None: the first line tells, for it is a problem of its own."""
+    """Parse one problem, or one per line; with None, one per line if the first line is a complete JSON object."""
     first = ""
     if lines is None:
         first = next((line for line in _lines(file, where) if line.strip()), "")
@@ -222,17 +223,17 @@ def _attempt(text: str, where: str, name: str) -> Problem | RsbenchError:
 
 
 def parse_problem(text: str, where: str, name: str = "") -> Problem:
-    """A problem in JSON.
+    """Parse a problem in JSON.
 
     Args:
         text: JSON.
         where: file name, for messages.
-        name: of the problem, where the text gives it none.
+        name: name of the problem if the text gives none.
 
     Raises:
         RsbenchError: one line with the file, the field, the value and what is allowed.
     """
-    data = parse_json(text, where)  # reads NaN, which parse_card refuses with the field's name
+    data = parse_json(text, where)  # accepts NaN, which parse_card refuses with the field's name
     content = parse_card(_Content, data, where)
     _check_sets(data, where)
     given = COLUMNS | _BESIDE
@@ -266,7 +267,7 @@ def _rig_of(content: _Content, where: str) -> StereoRig:
 
 
 def _check_sets(data: Mapping[str, Any], where: str) -> None:
-    """Empty sets are a problem without an answer; none at all is a slip."""
+    """Refuse a file without any set of matches; empty sets are allowed and give a problem without an answer."""
     if not any(key in data for key in COLUMNS):
         raise RsbenchError(f"{where}: no matches: at least one of {', '.join(COLUMNS)} is required")
 
@@ -298,7 +299,7 @@ def _problem(
 
 
 def _from_npz(path: Path) -> Problem:
-    """A problem in arrays: ``camera`` (6,) as width, height, fx, fy, cx, cy, and the other keys as in JSON."""
+    """Read a problem from arrays: ``camera`` (6,) is width, height, fx, fy, cx, cy; other keys are as in JSON."""
     arrays = load_arrays(path)
     known = ("camera", "baseline", "readout_ratio", "name", *COLUMNS)
     for key in arrays:

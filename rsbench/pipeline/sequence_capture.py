@@ -1,6 +1,6 @@
-"""How the frames of a sequence were taken, by a rig or by one camera: given, or estimated from some of them.
+"""Estimate the capture of a sequence, of a rig or of one camera, from some of its frames.
 
-``know_capture`` ends in one ``KnownCapture``; with that, a correction needs nothing but the frames and options.
+``know_capture`` returns a ``KnownCapture``; with it, a correction needs nothing but the frames and options.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import FrameSource, Progress, RigCard, check_alike, no_progress
 from rsbench.pipeline.frame_capture import (
     KnownCapture,
+    compared_models,
     find_rig,
     match_frames,
     match_given,
-    models_asked,
     rig_of_matches,
     with_enough,
 )
@@ -44,42 +44,42 @@ from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, OneCameraCard, find_camera_alone, find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
-from rsbench.pipeline.mono_gyro import in_time, pair_rates
+from rsbench.pipeline.mono_gyro import pair_rates, with_clock_corrected
 from rsbench.vision.fusion import Fused
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Gyroscope:
-    """A gyroscope's log beside frames."""
+    """A gyroscope's log for a sequence."""
 
     samples: FloatArray
-    """(n, 4) tau, w, as of ``Correspondences.gyro``; tau 0 is the first row of the first frame."""
+    """(n, 4) tau, w, as in ``Correspondences.gyro``; tau 0 is the first row of the first frame."""
     clock_error: float = 0.0
-    """Frame periods by which its clock may be off; 0: the times are exact."""
+    """Largest error of its clock, frame periods; 0: the times are exact."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CorrectedMoment:
-    """The images of one time of a sequence."""
+    """The corrected images of one frame time of a sequence."""
 
     number: int
     images: dict[Side, NDArray[Any]]
-    """As they were read."""
+    """The images as read."""
     frames: dict[Side, Fused]
-    """Corrected; empty when a motion was needed and not found, or the corrector found no correction."""
+    """The corrected images; empty if a motion is needed and not found, or the corrector failed."""
     found: FoundMotion | FoundOwnMotion | None
-    """The motion that they were corrected with."""
+    """The motion that was used for the correction."""
     reason: str
-    """With frames, why they were corrected with the motion between two other times than usual; without, why there
-    are none. Empty for the last time of a rig, whose motion comes from the one before."""
+    """With ``frames``, why the motion of other times than usual was used; without, why there are none. Empty for
+    the last time of a rig, which always uses the motion from the previous time."""
     pose: Pose | None = None
-    """Body from world at the start of the frame, where a trajectory was found; the world is the first body."""
+    """body_from_world at the start of the frame, if there is a trajectory; the world is the first body."""
     line_poses: Pose | None = None
-    """(lines, 3, 3), (lines, 3) likewise, at the time of each line of the left camera, in order of time."""
+    """(lines, 3, 3), (lines, 3) body_from_world at the time of each line of the left camera, sorted by time."""
 
     @property
     def shown(self) -> dict[Side, Fused]:
-        """The corrected frames; without them the images as they were read, with the reason."""
+        """The corrected frames; if there are none, the images as read, with the reason."""
         images = {side: image.copy() for side, image in self.images.items()}
         return self.frames or {
             side: replace(Fused.failed(image, self.reason), image=image) for side, image in images.items()
@@ -93,15 +93,15 @@ def know_capture(
     gyro: Gyroscope | None = None,
     progress: Progress = no_progress,
 ) -> KnownCapture:
-    """Estimates from the frames of a rig or of one camera what their card leaves open.
+    """Estimate from the frames of a rig or of one camera the values that their card does not give.
 
     Args:
-        sources: frames of the left and the right camera, or of one; read once for each quantity that is estimated.
+        sources: frames of the left and the right camera, or of one camera; they are read once per estimate.
 
     Raises:
-        NoMotionError: the frames do not show how their lines are read.
+        NoMotionError: the frames do not determine the shutter.
         RefusedFramesError: the frames contradict the card.
-        RsbenchError: too few frames, frames of two sizes, or cameras that cannot be of such images.
+        RsbenchError: there are too few frames, frames of two sizes, or the card contradicts their size.
     """
     if isinstance(card, OneCameraCard):
         return _know_camera(sources[0], card, options, gyro, progress)
@@ -110,11 +110,11 @@ def know_capture(
     rig, note = with_found_camera(rig, card.sigma, shown, options, inputs, progress)
     turned = with_found_rig(rig, left, right, options, inputs)
     rig = rig if turned is None else turned.rig
-    if not rig.aligned:  # found as errors of the rig
+    if not rig.aligned:  # its calibration errors are estimated by ``refine_rig``
         inputs = replace(inputs, calibration=inputs.calibration or NO_ERRORS)
     capture, shutter, errors = None, None, inputs.calibration
     if inputs.readout_ratio is None or errors is None:
-        with progress("looking at the shutter", min(max(left.count - 1, 1), WINDOWS)) as advance:
+        with progress("estimating the shutter", min(max(left.count - 1, 1), WINDOWS)) as advance:
             capture, shutter = estimate_sequence_capture(left, right, rig, options, inputs, advance)
         nothing = capture is None or not rig.rows_together(shutter.scanning)
         errors = NO_ERRORS if nothing else capture.calibration
@@ -130,7 +130,7 @@ def know_capture(
 
 
 def frames_with_times(source: FrameSource) -> tuple[FrameSource, FloatArray | None]:
-    """The frames of one camera without copies, and the times of their first rows, frame periods; None: even."""
+    """The frames of one camera without copies, and times (n,) of their first rows, periods; None: even."""
     timeline = source.timeline
     frames = source if len(timeline.starts) == len(timeline.twins) else source.only(timeline.originals)
     return frames, None if timeline.even else timeline.starts
@@ -144,24 +144,24 @@ def _know_camera(
     progress: Progress,
 ) -> KnownCapture:
     frames, starts = frames_with_times(source)
-    if starts is not None:  # the longest run of even intervals, which most of this assumes
+    if starts is not None:  # use the longest run of even intervals, as most estimates assume these
         run = source.timeline.even_run()
         frames, starts = source.only(source.timeline.originals[run]), starts[run]
     robust, seed, pairs = options.robust, options.seed, max(frames.count - 1, 1)
     unknown = card.readout_ratio is None
-    with progress("looking at the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
+    with progress("estimating the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
         found = find_shutter(frames, frames.count, card, robust, seed, advance)
         if unknown:
             advance("all pairs together")
     shutter = found.shutter
-    wanted, words = card.focal_unknown and found.focal is None, "looking at the focal length"
+    wanted, words = card.focal_unknown and found.focal is None, "estimating the focal length"
     with progress(words, min(pairs, PAIRS)) if wanted else no_progress("", 0) as advance:
         camera, focal = find_camera_alone(frames, frames.count, card, shutter, robust, seed, advance, found.focal)
     samples, clock = None if gyro is None else gyro.samples, None
     if gyro is not None and gyro.clock_error > 0.0:
-        with progress("looking at the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
+        with progress("estimating the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
             rates = pair_rates(frames, frames.count, camera, shutter, robust, seed, advance, starts)
-        samples, clock = in_time(rates, gyro.samples, camera, shutter, gyro.clock_error)
+        samples, clock = with_clock_corrected(rates, gyro.samples, camera, shutter, gyro.clock_error)
     return KnownCapture(
         rig=StereoRig.of_one(camera),
         shutter=shutter,
@@ -172,39 +172,40 @@ def _know_camera(
     )
 
 
-# Windows of a sequence of a rig, and what is refused of them.
+# Windows of a sequence of a rig, and refusals of windows.
 
 
 JUDGED = 3
-"""First windows whose rig is looked at; when all of them are refused, so is the sequence."""
+"""Number of first windows that are checked against the rig; if all of them are refused, so is the sequence."""
 
 
 class Refusals:
-    """Windows that were refused; when these are all that were seen first, or all, so is the sequence."""
+    """Counts refused windows; refuses the sequence if the first ``JUDGED`` or all windows are refused."""
 
     def __init__(self, source: FrameSource) -> None:
         self._source, self._count = source, 0
         self._last: RefusedFramesError | None = None
 
     def add(self, number: int, error: RefusedFramesError) -> None:
-        """Window ``number`` was refused."""
+        """Record that window ``number`` was refused."""
         self._count, self._last = self._count + 1, error
         if number + 1 == JUDGED:
             self.end(JUDGED)
 
     def end(self, windows: int) -> None:
-        """There are no more than ``windows``."""
+        """Raise RefusedFramesError if all of the first ``windows`` windows were refused."""
         if self._last is not None and self._count == windows:
             raise RefusedFramesError(self._last.reason, f"{self._source.path}, frames 0 to {windows}")
 
 
 def window_images(left: FrameSource, right: FrameSource) -> Iterator[Images]:
+    """The images of each window, i.e. of two successive frame times."""
     for pair in itertools.pairwise(_both(left, right)):
         yield {(side, frame): both[side] for frame, both in enumerate(pair) for side in SIDES}
 
 
 def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[Any]]]:
-    """Left and right image of every time, all of one kind, those of a camera of one size."""
+    """Left and right image of every frame time, all of one type, those of a camera of one size."""
     first: tuple[NDArray[Any], NDArray[Any]] | None = None
     number = -1
     for number, (a, b) in enumerate(itertools.zip_longest(left, right)):
@@ -220,13 +221,13 @@ def _both(left: FrameSource, right: FrameSource) -> Iterator[dict[Side, NDArray[
         raise RsbenchError(f"{left.path}: has {number + 1} frames; at least 2 are needed")
 
 
-# How the cameras of a sequence read, from some of its windows.
+# The shutter of a sequence, from some of its windows.
 
 
 WINDOWS = 8
-"""At most, of those by which the shutter is found."""
+"""Most windows from which the shutter is estimated under motion models."""
 FEWEST_FRAMES = 4
-"""Of a sequence through which a trajectory is fitted: fewer do not show what two frames shake alike."""
+"""Fewest frames for a trajectory: fewer do not reveal a shake that is the same in both frames of a window."""
 
 
 def estimate_sequence_capture(
@@ -237,14 +238,14 @@ def estimate_sequence_capture(
     inputs: KnownInputs | None = None,
     advance: Callable[[str], None] = lambda word: None,
 ) -> tuple[Capture | None, RollingShutter]:
-    """How the cameras of a sequence read, from windows that lie evenly over it: their shutter does not change.
+    """Estimate the shutter of a sequence, which is constant, from windows that are evenly spaced in it.
 
-    With a known ratio the calibration alone is looked for; no capture where the first window shows no errors. Of a
-    shutter that is found to be global it is found as if that had been known.
+    With a given ratio, only the calibration errors are estimated; the capture is None if the first window shows
+    none. If the shutter proves to be global, the rest is estimated as for a given global shutter.
 
     Args:
-        inputs: what is given, see ``know_matches``.
-        advance: called for each window.
+        inputs: given values, see ``know_matches``.
+        advance: called after each window.
 
     Raises:
         RefusedFramesError: the first windows contradict the given rig.
@@ -258,28 +259,28 @@ def estimate_sequence_capture(
         still = replace(inputs, readout_ratio=0.0, scanning=Scanning())
         return estimate_sequence_capture(left, right, rig, options, still, advance)[0]
 
-    look, refusals = _Look(rig, options, inputs, under_global), Refusals(left)
+    estimate, refusals = _ShutterEstimate(rig, options, inputs, under_global), Refusals(left)
     doubts = list[RefusedFramesError | None]()
     every, number = max((left.count - 1) // WINDOWS, 1), -1
     for number, images in enumerate(window_images(left, right)):
-        look.judge(number)
-        chosen = not look.shaken and number % every == 0 and len(look.used) < WINDOWS
-        if not (chosen or number < look.successive):
+        estimate.check_shake(number)
+        chosen = not estimate.shaken and number % every == 0 and len(estimate.used) < WINDOWS
+        if not (chosen or number < estimate.successive):
             continue
-        matching = with_enough(options, ENOUGH) if look.shaken else options
+        matching = with_enough(options, ENOUGH) if estimate.shaken else options
         try:
             matches, doubt = match_given(images, rig, matching, inputs, judge_rig=number < JUDGED)
             doubts.append(doubt)
         except RefusedFramesError as error:
             refusals.add(number, error)
             matches, chosen = Correspondences(), False
-        look.add(number, matches, chosen)
-        if look.is_right:
+        estimate.add(number, matches, chosen)
+        if estimate.nothing_unknown:
             break
         if chosen:
             advance(f"window {number}")
     refusals.end(number + 1)
-    capture = None if look.is_right else look.concluded()
+    capture = None if estimate.nothing_unknown else estimate.concluded()
     if capture is None or inputs.readout_ratio is not None:
         return capture, inputs.shutter_of(rig)
     shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
@@ -288,8 +289,8 @@ def estimate_sequence_capture(
     return capture, shutter
 
 
-class _Look:
-    """What windows so far show of a shutter."""
+class _ShutterEstimate:
+    """The estimate of a shutter from the windows so far."""
 
     def __init__(
         self,
@@ -299,7 +300,7 @@ class _Look:
         under_global: Callable[[], Capture | None],
     ) -> None:
         self._rig, self._options, self._under_global = rig, options, under_global
-        self._inputs = replace(inputs, models=models_asked(options.motion_model))
+        self._inputs = replace(inputs, models=compared_models(options.motion_model))
         self._examined, self.used, self._first = list[Examined](), list[Correspondences](), list[Correspondences]()
         self._known: Known | None = None
         self._waiting = list[Correspondences]()
@@ -307,40 +308,40 @@ class _Look:
 
     @property
     def successive(self) -> int:
-        """How many of the first windows are looked at, whichever others are."""
+        """Number of first windows that are always matched, for a trajectory through them."""
         return LONGEST if self.shaken else SUCCESSIVE
 
     @property
-    def is_right(self) -> bool:
-        """Whether there is nothing to look for: the ratio is known, and the calibration shows no errors."""
+    def nothing_unknown(self) -> bool:
+        """Whether there is nothing to estimate: the ratio is given and the calibration shows no errors."""
         return (
             self._inputs.readout_ratio is not None
             and self._known is not None
             and not any(self._known.calibration_sigma)
         )
 
-    def judge(self, number: int) -> None:
-        """Whether the rig shakes, once there are enough windows before ``number``: no motion model helps then."""
+    def check_shake(self, number: int) -> None:
+        """Decide whether the rig shakes, once there are enough windows: motion models are then not used."""
         if number + 1 == FEWEST_FRAMES and self._examined and self._inputs.readout_ratio is None:
             self.shaken = shakes(conclude(self._examined), self._first, self._rig, self._options.seed)
             if not self.shaken:
                 self._examine_waiting()
 
     def add(self, number: int, matches: Correspondences, chosen: bool) -> None:
-        """A window; ``chosen``: to be judged under the motion models."""
+        """Add a window; if ``chosen``, motion models are fitted to it."""
         if number < self.successive:
             self._first.append(matches)
         if not chosen:
             return
         self._waiting.append(matches)
-        if not self._examined or number + 1 >= FEWEST_FRAMES:  # those between wait for ``judge``: they take long
+        if not self._examined or number + 1 >= FEWEST_FRAMES:  # others wait for ``check_shake``: fits are slow
             self._examine_waiting()
 
     def _examine_waiting(self) -> None:
         options = self._options
         for matches in self._waiting:
             known = self._known = self._known or known_of(matches, self._rig, self._inputs)
-            if self.is_right:
+            if self.nothing_unknown:
                 return
             self._examined.append(examine(matches, self._rig, known, options.robust, options.seed))
             self.used.append(matches)
@@ -348,11 +349,11 @@ class _Look:
         self._waiting.clear()
 
     def concluded(self) -> Capture:
-        """What all say: under the motion models, or, of a rig that shakes, along one trajectory."""
+        """The estimate from all windows: by motion models, or by one trajectory if the rig shakes."""
         if not self.shaken:
             self._examine_waiting()
         if self._known is None:
-            raise NoMotionError("no window of the sequence can be judged: put readout_ratio into the rig's card")
+            raise NoMotionError("no window of the sequence has matches: put readout_ratio into the rig's card")
         capture = conclude(self._examined)
         if self._inputs.readout_ratio is None:
             capture = as_global(capture, self.used, self._rig, self._known, self._under_global)
@@ -365,22 +366,22 @@ class _Look:
 
 
 def _narrowed(known: Known, capture: Capture) -> Known:
-    """Without scans that the windows so far exclude."""
+    """The known values without scans that the windows so far exclude."""
     if not capture.candidates or capture.candidates[0].probability < CERTAIN:
         return known
     left = {candidate.scans for candidate in capture.candidates} | {GLOBAL}
     return replace(known, scans=tuple(each for each in known.scans if each in left))
 
 
-# The focal length and k1 of a rig whose card says how sure it is of them, from some of its frames.
+# The focal length and k1 of a rig whose card gives their standard deviations, from some of its frames.
 
 
 _WINDOWS = 8
-"""At most, of a sequence."""
+"""Most windows for the focal length and k1."""
 
 
 def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
-    """Some windows of a sequence, evenly spread."""
+    """Evenly spaced windows of a sequence."""
     every = max((left.count - 1) // _WINDOWS, 1)
     return islice(window_images(left, right), every // 2, None, every)
 
@@ -388,10 +389,10 @@ def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
 def camera_of_frames(
     windows: Iterable[Images], rig: StereoRig, sigma: CardSigma, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundCamera:
-    """``find_camera`` from the matches of a few windows; those without matches say nothing."""
+    """``find_camera`` from the matches of a few windows; windows without matches are skipped."""
     matches = list[Correspondences]()
     for images in islice(windows, _WINDOWS):
-        with suppress(RefusedFramesError):  # the correction says so of each
+        with suppress(RefusedFramesError):  # the correction reports refused windows
             matches.append(match_given(images, rig, options, inputs, judge_rig=False)[0])
     if not matches:
         return FoundCamera(rig=rig, sigma=sigma, determined=(False, False))
@@ -407,10 +408,10 @@ def with_found_camera(
     inputs: KnownInputs,
     progress: Progress = no_progress,
 ) -> tuple[StereoRig, str]:
-    """The rig with the focal length and k1 that are estimated where ``sigma`` is not 0, and words on both."""
+    """The rig with focal length and k1 estimated if their ``sigma`` is not 0, and a report on both."""
     if not sigma:
         return rig, ""
-    with progress("looking at the calibration", 1) as advance:
+    with progress("estimating the calibration", 1) as advance:
         found = camera_of_frames(windows, rig, sigma, options, inputs)
         advance("")
     return found.rig, found.words(rig, sigma)
@@ -419,7 +420,7 @@ def with_found_camera(
 def with_found_rig(
     rig: StereoRig, left: FrameSource, right: FrameSource, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundRig | None:
-    """The rig as the first frames show it; None where their rows agree with its calibration, or do not tell."""
+    """Correct the rig's calibration by the first frames; None if their rows agree with it or are inconclusive."""
     images = next(iter(window_images(left, right)), None)
     if images is None or not rig.rows_together(inputs.reading, inputs.readout_ratio):
         return None
@@ -433,4 +434,4 @@ def with_found_rig(
         try:
             return find_rig(images, rig, inputs, options, refusal)[0]
         except (RefusedFramesError, NoMotionError):
-            return None  # the correction says so of each window
+            return None  # the correction reports refused windows

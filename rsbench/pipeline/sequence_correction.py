@@ -1,7 +1,7 @@
-"""The motion of every window of a sequence from one trajectory through all of them.
+"""Correct a sequence: the motion of each window (two successive frames) comes from one trajectory through all.
 
-Two frames do not show what both shake alike; a sequence does, for its windows overlap. Windows wait until those
-after them have been seen too, some at a time, so that memory does not grow with the length of the footage.
+Two frames cannot reveal a shake that is the same in both; a sequence can, because its windows overlap. A window is
+finished when some later ones have been matched, so memory does not grow with the length of the footage.
 """
 
 from __future__ import annotations
@@ -43,36 +43,37 @@ from rsbench.vision.images import ahead, map_ahead
 from rsbench.vision.stereo_matcher import needs_motion
 
 BRIDGED = "few of the matches agree with the motion"
-TURNED = "; they turn as the gyroscope says, and stay where they are"
+TURNED = "; their rotation is that of the gyroscope, without a translation"
 _LONGEST_BRIDGE = 2
-"""Windows from the nearest one with matches up to which a spline is believed: the middle one of eight without any
-is wrong by 1 deg where a hand turns by 1.5 deg a frame, that of four by 0.16 deg."""
+"""Largest distance, in windows, to one with matches at which the spline is used: if eight windows have none and a
+hand rotates by 1.5 deg per frame, the middle one is wrong by 1 deg; for four windows it is 0.16 deg."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Window:
-    """What was found for two consecutive frames; ``found`` is None and ``reason`` says why when no motion was."""
+    """Two successive frames of a rig, with what was estimated from them."""
 
     images: Images
     pairs: Pairs | None
-    """With depth from the other camera; None when the corrector needs none, or it is found with the motion."""
+    """Stereo depth; None if the corrector needs none, or if depth is estimated after the motion."""
     found: FoundMotion | None
+    """None: there is no motion, and ``reason`` says why."""
     reason: str = ""
     matches: Correspondences | None = None
-    """None when the corrector needs none, or they were refused."""
+    """None if the corrector needs none, or the frames were refused."""
     pose: Pose | None = None
-    """Body from world at the start of its first frame, where a trajectory was found; the world: the first body."""
+    """body_from_world at the start of the first frame, from the trajectory; the world is the first body."""
 
 
 def on_one_trajectory(windows: Iterable[Window], known: KnownCapture, seed: int, solver: str) -> Iterator[Window]:
-    """Windows with the motion of one trajectory in place of that of each; those without matches are bridged.
+    """Replace the motion of each window by that of one trajectory; windows without matches are interpolated.
 
     Args:
-        windows: in order.
-        known: how they were taken. A gyroscope bridges any number of windows: far from those with matches it alone
-            shows how the rig turns, and nothing shows where it is.
-        seed: of the search for motions of single windows.
-        solver: name for the motions that are found.
+        windows: the windows in order.
+        known: rig, shutter and gyroscope. With a gyroscope any number of windows is bridged: far from windows with
+            matches it gives the rotation alone, and the translation is unknown.
+        seed: seed of the search for motions of single windows.
+        solver: name that is recorded for the motions.
     """
     waiting, rig, calibration = deque[Window](), known.rig, known.calibration
 
@@ -88,12 +89,13 @@ def on_one_trajectory(windows: Iterable[Window], known: KnownCapture, seed: int,
         pose = streamed.body_from_world
         if streamed.apart > _LONGEST_BRIDGE:
             by_gyro = streamed.gyro is not None and streamed.gyro.used
-            found, pose = _turning(found) if by_gyro else None, None
+            found, pose = _rotation_only(found) if by_gyro else None, None
             reason += TURNED if by_gyro else ""
         yield replace(window, found=found, reason=reason, pose=pose)
 
 
 def _found(streamed: StreamedWindow, solver: str, calibration: tuple[float, ...]) -> FoundMotion:
+    """The motion of a window of the trajectory in the form that a solver's answer has."""
     motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
     estimate = MotionEstimate(
         w=motion.w,
@@ -122,8 +124,8 @@ def _found(streamed: StreamedWindow, solver: str, calibration: tuple[float, ...]
     )
 
 
-def _turning(found: FoundMotion) -> FoundMotion:
-    """Of a rig that turns as it does and stays where it is."""
+def _rotation_only(found: FoundMotion) -> FoundMotion:
+    """The same motion with its rotation alone."""
     assert isinstance(found.motion, ContinuousMotion)
     curve = found.motion.curve
     motion = ContinuousMotion.of(curve._replace(p=np.zeros_like(curve.p)))
@@ -135,26 +137,25 @@ def _turning(found: FoundMotion) -> FoundMotion:
 
 
 _AHEAD = 4
-"""Windows that are matched, and frames that are corrected, ahead: as many as leave a trajectory together."""
+"""Number of windows that are matched, and of frames that are corrected, in advance."""
 
 
 def correct_sequence(
     sources: Sequence[FrameSource], known: KnownCapture, options: CorrectionOptions, first: int = 0
 ) -> Iterator[CorrectedMoment]:
-    """Every time of a sequence of a rig or of one camera corrected, in order.
+    """Correct the frames of a sequence of a rig or of one camera, in order.
 
-    A rig's frames are corrected with the motion to the next time; the last ones, and those from which no motion
-    leads to the next, with the motion from the one before. For one camera see ``correct_frames``; copies of frames
-    are left out.
+    A rig's frames are corrected with the motion to the next frame time, the last ones, and those without such a
+    motion, with the motion from the previous time. For one camera see ``correct_frames``; copies are left out.
 
     Args:
-        sources: frames of the left and the right camera, or of one.
-        known: how they were taken; with a gyroscope a sequence that ``takes_gyro``.
-        first: number of the first frame that is wanted.
+        sources: frames of the left and the right camera, or of one camera.
+        known: rig, shutter and, for a sequence with ``takes_gyro``, a gyroscope.
+        first: number of the first frame that is returned.
 
     Raises:
         RefusedFramesError: the first three windows, or all, contradict the given rig.
-        RsbenchError: frames that differ in size, or cannot be read; cameras that the options do not take.
+        RsbenchError: frames differ in size or cannot be read, or the options do not support the cameras.
     """
     rig, shutter = known.rig, known.shutter
     if not rig.metric:
@@ -166,19 +167,19 @@ def correct_sequence(
         return
     left, right = sources
     check_cameras(rig, shutter.scanning, options, known.calibration[OFFSET])
-    along = takes_gyro(left, options) and not shutter.still
-    windows = ahead(_windows(left, right, known, options, not along), _AHEAD)
-    if along:
+    on_trajectory = takes_gyro(left, options) and not shutter.still
+    windows = ahead(_windows(left, right, known, options, not on_trajectory), _AHEAD)
+    if on_trajectory:
         windows = on_one_trajectory(windows, known, options.seed, options.solver.name)
     deep = _with_depth(windows, known, options, first)
-    places = (each for each in _places(deep) if each[0] >= first)
-    # Nothing is known of whether another package's may run twice at a time.
+    places = (each for each in _frames_of(deep) if each[0] >= first)
+    # A component of another package may not be thread-safe.
     threads = 2 if options.corrector.built_in and options.matcher.built_in else 1
-    yield from map_ahead(lambda each: _moment(*each, known, options), places, _AHEAD, threads)
+    yield from map_ahead(lambda each: _corrected_moment(*each, known, options), places, _AHEAD, threads)
 
 
-def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]]:
-    """Number of each frame, its number in the first of the windows that show it, and these."""
+def _frames_of(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]]:
+    """For each frame its number, its index 0 or 1 in the first of its windows, and the windows that contain it."""
     last, number = None, 0
     for number, window in enumerate(windows):
         yield number, 0, [window] if last is None else [window, last]
@@ -188,7 +189,7 @@ def _places(windows: Iterable[Window]) -> Iterator[tuple[int, int, list[Window]]
 
 
 def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
-    """Whether a trajectory is fitted if the shutter rolls: of four frames and more whose motion model is open."""
+    """Whether a rolling-shutter sequence gets a trajectory: it has four frames and no fixed motion model."""
     chosen = options.motion_model == AUTO and "motion" in options.corrector.component.spec.needs
     return chosen and not 0 < left.count < FEWEST_FRAMES
 
@@ -196,7 +197,7 @@ def takes_gyro(left: FrameSource, options: CorrectionOptions) -> bool:
 def _windows(
     left: FrameSource, right: FrameSource, known: KnownCapture, options: CorrectionOptions, with_motion: bool
 ) -> Iterator[Window]:
-    """The windows of a sequence, each for itself; ``with_motion``: with a motion where the corrector needs one."""
+    """The windows of a sequence, matched and, with ``with_motion``, solved independently of each other."""
     needs, refusals = options.corrector.component.spec.needs, Refusals(left)
     matching = options if with_motion or "matches" in needs else with_enough(options, ENOUGH)
     number = -1
@@ -220,7 +221,7 @@ def _windows(
 def _with_depth(
     windows: Iterator[Window], known: KnownCapture, options: CorrectionOptions, first: int
 ) -> Iterator[Window]:
-    """The windows with depth from the other camera, that of each frame from ``first`` on found once."""
+    """The windows with stereo depth, which is computed once for each frame from ``first`` on."""
     rig, shutter, offset = known.rig, known.shutter, known.calibration[OFFSET]
     apart = not rig.rows_together(shutter.scanning, shutter.readout_ratio) or needs_motion(options.matcher)
     if apart or "depth" not in options.corrector.component.spec.needs:
@@ -235,10 +236,10 @@ def _with_depth(
         yield replace(window, pairs=(earlier, later))
 
 
-def _moment(
+def _corrected_moment(
     number: int, frame: int, windows: list[Window], known: KnownCapture, options: CorrectionOptions
 ) -> CorrectedMoment:
-    """Frame 0 or 1 of the first window; as frame 1 of the second one when only that knows a motion."""
+    """Correct frame 0 or 1 of the first window, or, if only the second window has a motion, its frame 1."""
     here, needs, rig, shutter = windows[0], options.corrector.component.spec.needs, known.rig, known.shutter
     images = {side: here.images[side, frame] for side in SIDES}
     places = list(zip(windows, (frame, 1), strict=False))
@@ -252,7 +253,7 @@ def _moment(
     motion = None if window.found is None else window.found.motion
     pairs = window.pairs
     if "depth" in needs:
-        # Of a trajectory every frame is corrected by itself: the other one's own depth hardly shows in it.
+        # With a trajectory, depth of the corrected frame suffices: that of the other frame has little effect.
         frames = FRAMES if window.pose is None else (place,)
         pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=frames)
     views = tuple((side, place) for side in SIDES)
@@ -276,14 +277,14 @@ def _moment(
 
 
 def _pose_at(window: Window, frame: int) -> Pose | None:
-    """Of the body at the start of a frame of a window."""
+    """body_from_world at the start of a frame of a window; None without a trajectory."""
     if window.pose is None or window.found is None or frame == 0:
         return window.pose
     return compose(window.found.motion.body_from_world(float(frame)), window.pose)
 
 
 def _line_poses(window: Window, frame: int, shutter: RollingShutter) -> Pose | None:
-    """Of the body at the times of the left camera's lines, in order of time."""
+    """body_from_world at the times of the left camera's lines, sorted by time; None without a trajectory."""
     if window.pose is None or window.found is None:
         return None
     return compose(window.found.motion.body_from_world(np.sort(shutter.line_times(frame, "left"))), window.pose)

@@ -30,7 +30,7 @@ from rsbench.benchmark.leaderboard.pictures import (
 from rsbench.benchmark.leaderboard.standings import Standing, standings, table
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score, Split, Track, Truth
 from rsbench.benchmark.leaderboard.tracks import track_of_id
-from rsbench.benchmark.statistics import in_words, score_interval
+from rsbench.benchmark.statistics import format_interval, score_interval
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import read_pairs
@@ -214,7 +214,7 @@ def _brief(lines: Sequence[Standing]) -> list[list[str]]:
     rows = [[*head, *(titles[key] for key in track.beside), *brief_medians(track)]]
     rows[0] += list(lines[0].stated_words) if stated else []
     for line in lines:
-        primary, *beside = [in_words(*line.means[key]) for key in (track.primary.key, *track.beside)]
+        primary, *beside = [format_interval(*line.means[key]) for key in (track.primary.key, *track.beside)]
         parts = [f"{triple[0]:.2f}" for triple in line.parts.values()]
         medians = [f"{line.medians[key]:.3g}" for key in track.of_kind("median")[:BRIEF]]
         assumed = [line.assumes] if track.parting else []
@@ -461,7 +461,7 @@ def _entry_scores(line: Standing) -> list[dict[str, str]]:
     found = [{"title": "rank", "text": line.rank_words, "hint": "among those that use no more"}]
     for score in line.track.scores:
         if score.kind != "median":
-            text = in_words(*line.means[score.key])
+            text = format_interval(*line.means[score.key])
         else:
             value = line.medians[score.key]
             text = "–" if np.isnan(value) else f"{value:.3g}"
@@ -475,7 +475,7 @@ def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, A
         primary = part[track.primary.key].to_numpy()
         value, low, high = score_interval(primary, list(part["scene"]), track.primary.kind == "share")
         # One scene bounds nothing: an interval of it would only round its value away.
-        share = f"{value:.3g}" if part["scene"].nunique() == 1 else in_words(value, low, high)
+        share = f"{value:.3g}" if part["scene"].nunique() == 1 else format_interval(value, low, high)
         medians = (part[key].median() for key in track.of_kind("median")[:BRIEF])
         rows.append([str(kind), len(part), share, *(f"{x:.3g}" for x in medians), int(part["failure"].sum())])
     return {
@@ -512,16 +512,16 @@ def _calibration(line: Standing) -> dict[str, Any] | None:
     if found is None:
         return None
     rows = [
-        {"level": f"{100.0 * level:.0f} %", "text": in_words(*(100.0 * x for x in triple)) + " %"}
+        {"level": f"{100.0 * level:.0f} %", "text": format_interval(*(100.0 * x for x in triple)) + " %"}
         for level, triple in zip(LEVELS, found.covers, strict=True)
     ]
     return {
         "stated": found.stated,
         "of": len(line.scored.scores),
-        "spread": in_words(*found.spread),
+        "spread": format_interval(*found.spread),
         "mean": f"{found.mean:.3g}",
         "unknowns": line.track.unknowns,
-        "log_score": in_words(*found.log_score) if found.log_score else "",
+        "log_score": format_interval(*found.log_score) if found.log_score else "",
         "log_rank": line.stated_words["log rank"] if line.log_rank else "",
         "rows": rows,
         "figure": reliability(found.covers),
@@ -733,18 +733,18 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
     ]
     for key, triple in line.means.items():
         drawn = bar(*triple) if key == primary else None
-        cells.append({"value": _value(triple[0]), "text": in_words(*triple), "bar": drawn})
+        cells.append({"value": _value(triple[0]), "text": format_interval(*triple), "bar": drawn})
     for value in line.medians.values():
         cells.append({"value": _value(value), "text": "–" if np.isnan(value) else f"{value:.3g}", "bar": None})
     if _stated(each):
         for triple in named_numbers(line.calibration, _log_scored(each)).values():
-            text = "–" if np.isnan(triple[0]) else in_words(*triple)
+            text = "–" if np.isnan(triple[0]) else format_interval(*triple)
             cells.append({"value": _value(triple[0]), "text": text, "bar": None})
         if _log_scored(each):
             place = "" if line.log_rank is None else line.log_rank.place
             cells.append({"value": place, "text": line.stated_words.get("log rank", "–"), "bar": None})
     for triple in line.parts.values():
-        cells.append({"value": _value(triple[0]), "text": in_words(*triple), "bar": None})
+        cells.append({"value": _value(triple[0]), "text": format_interval(*triple), "bar": None})
     return {
         "method": header.method,
         "uses": line.uses.replace(" + ", " "),

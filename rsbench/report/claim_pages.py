@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from rsbench.benchmark.simulated.sweep_card import SweepCard
-from rsbench.benchmark.statistics import in_words
+from rsbench.benchmark.statistics import format_interval
 from rsbench.benchmark.studies.claims import CLAIMS, GLOBAL, GRID_NOISE_PX, GRID_TRIALS, OURS, SETTINGS, Claim
 from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
 from rsbench.report.markup import table_lines
@@ -227,4 +227,4 @@ def _wrong_motion(table: pd.DataFrame) -> list[str]:
 
 def _words(row: Mapping[Hashable, Any], name: str) -> str:
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))
-    return "-" if pd.isna(value) else in_words(value, low, high)
+    return "-" if pd.isna(value) else format_interval(value, low, high)

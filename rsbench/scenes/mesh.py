@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from rsbench.components.imports import in_words
+from rsbench.components.imports import exception_text
 from rsbench.core.errors import RsbenchError
 from rsbench.scenes.mesh_files import TEXTURE, Surface, read_mesh_file
 from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
@@ -140,7 +140,7 @@ class MeshBuilder(SceneBuilder):
         except RsbenchError:
             raise
         except Exception as error:  # trimesh raises various errors on a broken file, often late
-            raise RsbenchError(f"mesh file {path}: cannot be read: {in_words(error)}") from error
+            raise RsbenchError(f"mesh file {path}: cannot be read: {exception_text(error)}") from error
 
     def _meshes(self, path: Path) -> tuple[SceneMesh, ...]:
         model, surfaces = read_mesh_file(path)

@@ -1,52 +1,52 @@
-"""Two frames of one rolling-shutter camera, each with a velocity of its own that nothing ties to the other.
+"""Solvers for two frames of one rolling-shutter camera, with an independent velocity in each frame.
 
-Time s is a ray's second coordinate (of rows read from the top at constant speed) less that of a row to start
-from. The camera of frame 0 moves as ``(exp(s w0), s v0)``, that of frame 1 as ``(exp(s w1) R, t + s v1)``, both
-relative to the camera of frame 0 at s = 0. Between two rows the pose is
+Time s is a ray's second coordinate (rows are read from the top at constant speed) relative to a reference row. The
+camera of frame 0 moves as ``(exp(s w0), s v0)``, that of frame 1 as ``(exp(s w1) R, t + s v1)``, both relative to
+the camera of frame 0 at s = 0. Between two rows the pose is
 
     R(s0, s1) = exp(s1 w1) R exp(-s0 w0),   T(s0, s1) = t + s1 v1 - s0 R(s0, s1) v0.
 
-The paper's motion is one of these when s is 0 at the first row; linearisations hold best with 0 in the middle.
-All solvers end with least squares of the Sampson errors. The length of T(s0, s1), beside that of t, is
-undetermined where its direction and the rotation are the same for all rows: any factor 1 + a s1 - b s0 leaves
-every constraint as it is. A constant velocity is that but for terms of second order, so that two of the
-velocities' numbers are lost in noise of 1e-3 px, and least squares alone lets T vanish in the middle of the
-image. What is minimised is therefore the most probable motion for velocities that in a whole frame lead as far
-as t, within a standard deviation: with C the sum of squares of n matches,
+The paper's motion is a special case if s is 0 at the first row; linearisations are best with 0 in the middle. All
+solvers end with least squares of the Sampson errors. If the direction of T(s0, s1) and the rotation are the same
+for all rows, the length of T relative to that of t is undetermined: any factor 1 + a s1 - b s0 leaves all
+constraints unchanged. Constant velocity is such a case up to second-order terms, so that two components of the
+velocities are lost in noise of 1e-3 px, and plain least squares lets T vanish in the middle of the image. The
+velocities therefore have a prior: their displacement in a whole frame has a standard deviation of |t|. With C the
+sum of squares of n matches, the solvers minimise
 
     C (1 + (|v0|^2 + |v1|^2) (height / fy)^2 / n),
 
-which on exact matches has its minimum at the truth. The solvers differ in their linear part.
+which for exact matches has its minimum at the truth. The solvers differ in their linear part.
 
 ``DaiSolver``: Y. Dai, H. Li, L. Kneip, Rolling Shutter Camera Relative Pose: Generalized Epipolar Geometry,
 CVPR 2016. With the rows s0 and s1 as times, the essential matrix of two rows is a polynomial in them,
 
     E(s0, s1) = [t + s1 v1]x Q - Q [s0 v0]x,   Q = (I + s1 [w1]x) R (I - s0 [w0]x),
 
-of degree 1 in each where w0 = w1 = 0 (linear), else 2 (uniform); the length of the readout matters to neither.
+of degree 1 in each if w0 = w1 = 0 (linear), else 2 (uniform); neither depends on the length of the readout.
 y^T E x is then a bilinear form of the monomials
 
     (p s^i, i <= degree; s^j, j <= degree + 1)   of each ray (p, s, 1),
 
-5 x 5 or 7 x 7 of them without the 2 x 2 products of the highest ones, which do not occur: 21 or 45
-coefficients, of 20 or 44 matches. Several entries of the E's fall into one coefficient, so that the E's cannot
-be read off alone; R, t and the velocities are those whose coefficients come nearest to the null vector. The
-coefficients are linear in R, in (t, v0, v1), and of first degree in w0 and in w1.
+with 5 x 5 or 7 x 7 products, of which the 2 x 2 of the highest degree do not occur: 21 or 45 coefficients, from 20
+or 44 matches. Several entries of the E's add up in one coefficient, so the E's cannot be read off; R, t and the
+velocities are those whose coefficients are nearest to the null vector. The coefficients are linear in R, in
+(t, v0, v1), and of first degree in w0 and in w1.
 
-``TwelveParameterSolver``: one essential matrix for the frame, then twelve velocities by linear least squares,
-the rolling-shutter baseline of D. Barath (Rolling Shutter Made Practical, ECCV 2026), named there after the
+``TwelveParameterSolver``: one essential matrix for the frame, then twelve velocities by linear least squares. This
+is the rolling-shutter baseline of D. Barath (Rolling Shutter Made Practical, ECCV 2026), named there after the
 solvers of Dai et al., whose algorithm it is not.
 
-``AffineSolver``: one essential matrix and twelve velocities from seven affine correspondences, a match p0 to p1
-with A = dp1/dp0. The constraint f(p0, p1) = 0 holds for the pixels around p0 too, so that its total derivative
+``AffineSolver``: one essential matrix and twelve velocities from seven affine correspondences, i.e. matches p0 to
+p1 with A = dp1/dp0. The constraint f(p0, p1) = 0 holds around p0 too, so its total derivative vanishes,
 
-    f_p0 + A^T f_p1 = 0
+    f_p0 + A^T f_p1 = 0,
 
-is zero, in which a row that moves is another time: three equations a match, 21 of seven for 17 unknowns. They
-are of first order in the velocities, beside R and t of any size: Gauss-Newton steps in all unknowns from the
-essential matrix of a camera at rest. What they leave is of second order in the velocities. The equations, and
-that seven matches suffice, are those of D. Barath, ECCV 2026, which finds all their solutions algebraically;
-this is the one next to a camera at rest.
+where a change of the row is also a change of the time. This gives three equations per match, 21 from seven matches
+for 17 unknowns. They are of first order in the velocities, for any R and t, and are solved by Gauss-Newton steps
+in all unknowns from the essential matrix of a camera at rest; the error is of second order in the velocities. The
+equations, and that seven matches suffice, are those of D. Barath, ECCV 2026, which finds all their solutions
+algebraically; this solver finds the one nearest to a camera at rest.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ from rsbench.solvers.linear import null_vector
 
 
 class FreeMotion(NamedTuple):
-    """R (3, 3) and t, v0, v1, w0, w1 (3,), the velocities by s; all translations have one unknown unit."""
+    """R (3, 3) and t, v0, v1, w0, w1 (3,), velocities per unit of s; translations in one unknown unit."""
 
     R: FloatArray
     t: FloatArray
@@ -100,31 +100,31 @@ class FreeMotion(NamedTuple):
         return Pose(R, self.t + s1 * self.v1 - s0 * (R @ self.v0))
 
     def moved(self, step: FloatArray) -> FreeMotion:
-        """With a step (..., 18) or, without rotations in the frames, (..., 12)."""
+        """The motion after a step (..., 18) or, without rotations within the frames, (..., 12)."""
         step = np.concatenate([step, np.zeros((*step.shape[:-1], 18 - step.shape[-1]))], axis=-1)
         turn, *rest = np.split(step, 6, axis=-1)
         return FreeMotion(so3.exp(turn) @ self.R, *(a + b for a, b in zip(self[1:], rest, strict=True)))
 
     def of_unit_length(self) -> FreeMotion:
-        """With |t| = 1."""
+        """The motion scaled to |t| = 1."""
         length = max(float(np.linalg.norm(self.t)), 1e-300)
         return self._replace(t=self.t / length, v0=self.v0 / length, v1=self.v1 / length)
 
     def flipped(self) -> FreeMotion:
-        """All translations reversed: the other sign of the essential matrices."""
+        """The motion with all translations reversed, which changes the sign of the essential matrices."""
         return self._replace(t=-self.t, v0=-self.v0, v1=-self.v1)
 
     def twin(self) -> FreeMotion:
-        """Frame 1 turned by half a turn about t: where all translations are along t, the same constraints."""
+        """The motion with frame 1 rotated by 180 deg about t: same constraints for translations along t."""
         return self._replace(R=so3.exp(np.pi * self.t / np.linalg.norm(self.t)) @ self.R)
 
     def at_rest(self) -> FreeMotion:
-        """Without velocities."""
+        """The motion with velocities of 0."""
         return FreeMotion(self.R, self.t, *np.zeros((4, 3)))
 
 
 class Rows(NamedTuple):
-    """Matches of one camera: rays (n, 3) of frames 0 and 1, z = 1, and their s (n,)."""
+    """Matches of one camera: rays (n, 3) of frames 0 and 1 with z = 1, and their times s (n,)."""
 
     x: FloatArray
     y: FloatArray
@@ -132,22 +132,22 @@ class Rows(NamedTuple):
     s1: FloatArray
     camera: PinholeCamera
     affine: FloatArray
-    """(n, 4) of ``Correspondences.affine``, or (n, 0)."""
+    """(n, 4) ``Correspondences.affine``, or (n, 0)."""
 
     @classmethod
     def of(cls, matches: FloatArray, camera: PinholeCamera, first: float) -> Rows:
-        """From matches (n, 4), or (n, 8) with affine frames, with s = 0 at the row ``first``."""
+        """Convert matches (n, 4), or (n, 8) with affine frames, with s = 0 at the row ``first``."""
         x, y = camera.unproject(matches[:, :2]), camera.unproject(matches[:, 2:4])
         s0, s1 = (matches[:, 1] - first) / camera.fy, (matches[:, 3] - first) / camera.fy
         return cls(x, y, s0, s1, camera, matches[:, 4:])
 
     def packed(self) -> FloatArray:
-        """(n, 6) as the kernels take them."""
+        """(n, 6) x0, y0, x1, y1, s0, s1 in the form that the compiled functions take."""
         return np.column_stack([self.x[:, :2], self.y[:, :2], self.s0, self.s1])
 
 
 def errors(motion: FreeMotion, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """Rolling-shutter Sampson errors (n,), px, and (n, 18) by ``FreeMotion.moved``: see ``free_terms``."""
+    """Rolling-shutter Sampson errors (n,), px, and derivatives (n, 18) by ``FreeMotion.moved``."""
     r, J = np.zeros(len(rows.x)), np.zeros((len(rows.x), 18))
     focal = np.array([rows.camera.fx, rows.camera.fy])
     free_terms(motion.R, np.stack(motion[1:]), rows.packed(), focal, r, J)
@@ -163,17 +163,17 @@ def squares(motion: FreeMotion, rows: Rows) -> float:
 
 
 def signed(motion: FreeMotion, rows: Rows) -> tuple[FreeMotion, int]:
-    """The sign of the translations that has more points in front of both cameras, and how many.
+    """Choose the sign of the translations with more points in front of both cameras; and their number.
 
-    The length of T over that of t is the least certain of all: estimates of it pass zero in the middle of the
-    image, where then half of the points would vote for either sign of t. T is taken to lie on the side of t.
+    The length of T relative to t is the least certain quantity: estimates of it may pass zero in the middle of the
+    image, so that half of the points vote for either sign. T is therefore assumed to lie on the side of t.
     """
     front, back = (free_in_front(each.R, np.stack(each[1:]), rows.packed()) for each in (motion, motion.flipped()))
     return (motion, front) if front >= back else (motion.flipped(), back)
 
 
 def from_row(motion: FreeMotion, s: float) -> FreeMotion:
-    """The motion with s = 0 at another row: its pose exactly, its velocities as they are there."""
+    """The motion with s = 0 at another row, with the exact pose and the velocities at that row."""
     R, vectors = np.zeros((3, 3)), np.zeros((5, 3))
     free_from_row(motion.R, np.stack(motion[1:]), s, R, vectors)
     return FreeMotion(R, *vectors)
@@ -181,9 +181,9 @@ def from_row(motion: FreeMotion, s: float) -> FreeMotion:
 
 @functools.cache
 def places(degree: int) -> NDArray[np.int64]:
-    """(m, m), m = 2 degree + 3: which coefficient a product of monomials has, frame 1 first; -1 of none.
+    """(m, m), m = 2 degree + 3: coefficient index of a product of monomials, frame 1 first; -1: none.
 
-    The products of both frames' highest ones do not occur.
+    Products of the monomials of highest degree of both frames do not occur.
     """
     m = 2 * degree + 3
     highest = np.zeros(m, dtype=np.bool_)
@@ -200,7 +200,7 @@ def coefficients(motion: FreeMotion, degree: int) -> FloatArray:
 
 
 def with_derivatives(motion: FreeMotion, degree: int) -> tuple[FloatArray, FloatArray]:
-    """The (21,) or (45,) coefficients, and what they change by with ``FreeMotion.moved``, (18, 21) or (18, 45)."""
+    """The (21,) or (45,) coefficients, and their derivatives (18, 21) or (18, 45) by ``FreeMotion.moved``."""
     place = places(degree)
     out, by = np.zeros(np.max(place) + 1), np.zeros((18, np.max(place) + 1))
     fill_coefficients(motion.R, np.stack(motion[1:]), place, out, by)
@@ -208,15 +208,15 @@ def with_derivatives(motion: FreeMotion, degree: int) -> tuple[FloatArray, Float
 
 
 _EXACT_PX, _EXACT = 1e-11, 1e-14
-"""Root mean square errors, and misfit of unit coefficients, that rounding leaves."""
+"""Root mean square error, px, and misfit of unit coefficients, that are due to rounding alone."""
 
 
 def refine(start: FreeMotion, rows: Rows, *, turning: bool, most: int) -> tuple[FreeMotion, float]:
-    """Where a descent from a start ends, and what was minimised, px^2; the start where matches are too few.
+    """Minimise the cost from a start; returns the motion and the cost, px^2, or the start if matches are too few.
 
     Args:
-        turning: whether the camera turns within a frame.
-        most: evaluations.
+        turning: whether the camera rotates within a frame.
+        most: largest number of evaluations.
     """
     unknowns, camera = 17 if turning else 11, rows.camera
     if len(rows.x) < unknowns:
@@ -231,7 +231,7 @@ def refine(start: FreeMotion, rows: Rows, *, turning: bool, most: int) -> tuple[
 
 
 def nearest(start: FreeMotion, F: FloatArray, degree: int, most: int) -> tuple[FreeMotion, float]:
-    """The motion whose unit coefficients (see ``generalised_essential``) have least across F, and its square."""
+    """The motion with the smallest component of its unit coefficients orthogonal to F; and the square of that."""
     R, vectors, unknowns = np.array(start.R), np.stack(start[1:]), 11 if degree == 1 else 17
     target = (np.zeros((0, 6)), np.ones(2), 0.0, F / np.linalg.norm(F), places(degree))
     cost = descend(R, vectors, unknowns, most, _EXACT**2, target)
@@ -239,23 +239,23 @@ def nearest(start: FreeMotion, F: FloatArray, degree: int, most: int) -> tuple[F
 
 
 _MOST_TURN = 1.0
-"""Radians in a frame; cameras that spin faster pass every match nearly, and fit what there is."""
+"""Largest rotation within a frame, radians; faster rotations fit almost any matches."""
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUICK, _FULL = 8, 100
-"""Evaluations of a descent that is one of several or a step of a search, and of the final one."""
+"""Evaluations of a descent from one of several starts or within a search, and of the final descent."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FreeVelocitySolver(Solver):
-    """Linear on the left camera's matches, then least squares of the Sampson error of the same model."""
+    """Linear solution from the left camera's matches, then least squares of the model's Sampson errors."""
 
     refinement: Literal["none", "sampson"] = "sampson"
-    """``sampson``: least squares of the Sampson errors of all matches at the end; ``none``: without."""
+    """``sampson``: final least squares of the Sampson errors of all matches; ``none``: no refinement."""
 
     @property
     @abstractmethod
     def turning(self) -> bool:
-        """Whether the camera turns within a frame."""
+        """Whether the camera rotates within a frame."""
 
     @property
     @abstractmethod
@@ -269,14 +269,14 @@ class FreeVelocitySolver(Solver):
 
     @abstractmethod
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
-        """Motions of rows whose s = 0 is the principal point's, their signs open, or why there is none."""
+        """Linear solutions, up to sign, for rows with s = 0 at the principal point; or why there is none."""
 
     def starts(self, rows: Rows) -> list[FreeMotion]:
-        """Other motions to descend from, of the same rows."""
+        """Further motions from which descents start, for the same rows."""
         return []
 
     def matches_of(self, correspondences: Correspondences) -> FloatArray:
-        """The matches (n, 4) that it uses, or (n, 8) with their affine frames."""
+        """The matches (n, 4) that the solver uses, or (n, 8) with affine frames."""
         return temporal_pairs(correspondences, "left")
 
     @property
@@ -302,7 +302,7 @@ class FreeVelocitySolver(Solver):
         return self._estimated(self.matches_of(correspondences), rig, [])
 
     def _estimated(self, matches: FloatArray, rig: StereoRig, near: list[FreeMotion]) -> MotionEstimate:
-        """From the linear solutions, those of smaller models, and motions from the first row that may be near."""
+        """Refine from linear solutions, those of smaller models, and start motions ``near``, s = 0 at row 0."""
         found = self.from_equations(matches, rig)
         if self.refinement == "none" or len(matches) < self.least:
             return first_of(found, matches, rig)
@@ -312,11 +312,11 @@ class FreeVelocitySolver(Solver):
             return MotionEstimate.failed(found)
         begun = [*near, *(_at_first_row(each, rig.camera) for each in middle)]
         rows = Rows.of(matches, rig.camera, 0.0)
-        # Noise may dominate a linear solution's velocities: each starts a descent with them and one without.
+        # Noise may dominate a linear solution's velocities, so start a descent with and one without them.
         ends = [self._refined(each, rows, _QUICK) for each in [*begun, *(each.at_rest() for each in begun)]]
-        gentle = [end for end in ends if _turn(end[0], rig.camera) < _MOST_TURN] or ends
-        best = min(_in_front([end for end, _ in gentle], rows), key=lambda k: gentle[k][1])
-        return _reported(self._refined(gentle[best][0], rows, _FULL)[0], rows)
+        gentle = [end for end in ends if _rotation_within(end[0], rig.camera) < _MOST_TURN] or ends
+        best = min(_mostly_in_front([end for end, _ in gentle], rows), key=lambda k: gentle[k][1])
+        return _answer(self._refined(gentle[best][0], rows, _FULL)[0], rows)
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         matches = self.matches_of(sample)
@@ -337,18 +337,18 @@ class FreeVelocitySolver(Solver):
         least = self.sample_sizes(correspondences)["left"]
         if len(rows.x) < least:
             return MotionEstimate.failed(f"{len(rows.x)} left matches, need {least}")
-        rate = float(shutter.rate("left")[1]) * rig.camera.fy  # frame periods in a unit of s
+        rate = float(shutter.rate("left")[1]) * rig.camera.fy  # frame periods per unit of s
         w, d = rate * motion.w, rate * motion.d
         start = FreeMotion(so3.exp(motion.w), np.array(motion.d), d, d, w, w)
         if quick or len(rows.x) < self.least:
-            return _reported(self._refined(start, rows, _QUICK)[0], rows)
+            return _answer(self._refined(start, rows, _QUICK)[0], rows)
         return self._estimated(matches, rig, [start])
 
     def _refined(self, start: FreeMotion, rows: Rows, most: int) -> tuple[FreeMotion, float]:
         return refine(start, rows, turning=self.turning, most=most)
 
     def from_equations(self, matches: FloatArray, rig: StereoRig) -> list[FreeMotion] | str:
-        """The linear solutions, s = 0 at the principal point: with most points in front first, by their errors."""
+        """The linear solutions with s = 0 at the principal point: those with most points in front first."""
         frames = len(matches) if matches.shape[1] > 4 else 0
         short = self.spec.shortage({"left": len(matches), "affine": frames})
         if short is not None:
@@ -359,53 +359,53 @@ class FreeVelocitySolver(Solver):
             return found
         finite = [each.of_unit_length() for each in found if all(np.all(np.isfinite(part)) for part in each)]
         order = sorted(range(len(finite)), key=lambda k: squares(finite[k], rows))
-        front = set(_in_front(finite, rows))
+        front = set(_mostly_in_front(finite, rows))
         return [finite[k] for k in sorted(order, key=lambda k: k not in front)] or "no finite motion fits"
 
 
 def without_velocities(rows: Rows) -> FreeMotion | None:
-    """R and t of one essential matrix for all rows, of the eight-point algorithm; None where there are more."""
+    """R and t of one essential matrix for all rows, by the eight-point algorithm; None if it is not unique."""
     E = eight_point(rows.x, rows.y)
     return None if E is None else at_rest_of(E, rows)
 
 
 def at_rest_of(E: FloatArray, rows: Rows) -> FreeMotion:
-    """R and t of an essential matrix (3, 3), those with more points in front; no velocities."""
+    """R and t of an essential matrix (3, 3) with most points in front of the cameras; velocities are 0."""
     U, _, Vt = np.linalg.svd(E)
     R = U @ QUARTER @ Vt
     motion = FreeMotion(R * np.sign(np.linalg.det(R)), U[:, 2], *np.zeros((4, 3)))
     return max((signed(each, rows) for each in (motion, motion.twin())), key=lambda found: found[1])[0]
 
 
-def _in_front(motions: list[FreeMotion], rows: Rows) -> list[int]:
-    """Which have more than half as many points in front as any has: the twins of right motions have not."""
+def _mostly_in_front(motions: list[FreeMotion], rows: Rows) -> list[int]:
+    """Indices of motions with at least half as many points in front as the best, to exclude wrong twins."""
     fronts = [signed(each, rows)[1] for each in motions]
     return [k for k, front in enumerate(fronts) if 2 * front >= max(fronts)]
 
 
-def _turn(motion: FreeMotion, camera: PinholeCamera) -> float:
-    """Radians within a frame."""
+def _rotation_within(motion: FreeMotion, camera: PinholeCamera) -> float:
+    """Rotation within a frame, radians."""
     return max(float(np.linalg.norm(w)) for w in (motion.w0, motion.w1)) * camera.height / camera.fy
 
 
 def first_of(found: list[FreeMotion] | str, matches: FloatArray, rig: StereoRig) -> MotionEstimate:
-    """The first of linear solutions, as it is."""
+    """The first of the linear solutions, unrefined."""
     if isinstance(found, str):
         return MotionEstimate.failed(found)
-    return _reported(_at_first_row(found[0], rig.camera), Rows.of(matches, rig.camera, 0.0))
+    return _answer(_at_first_row(found[0], rig.camera), Rows.of(matches, rig.camera, 0.0))
 
 
 def _at_first_row(motion: FreeMotion, camera: PinholeCamera) -> FreeMotion:
     return from_row(motion, -camera.cy / camera.fy)
 
 
-def _reported(motion: FreeMotion, rows: Rows) -> MotionEstimate:
+def _answer(motion: FreeMotion, rows: Rows) -> MotionEstimate:
     motion, _ = signed(motion.of_unit_length(), rows)
     return motion_of(so3.log(motion.R), motion.t)
 
 
 def motion_of(w: FloatArray, d: FloatArray) -> MotionEstimate:
-    """w and d (3,) as an answer."""
+    """The answer with w and d (3,)."""
     if not np.all(np.isfinite([*w, *d])):
         return MotionEstimate.failed("no finite motion fits")
     reason = "the length of d is not determined by one camera"
@@ -413,9 +413,9 @@ def motion_of(w: FloatArray, d: FloatArray) -> MotionEstimate:
 
 
 def velocities(still: FreeMotion, rows: Rows) -> FreeMotion:
-    """The velocities that fit best to first order beside an R and t that keep the rows of the principal point.
+    """The motion with the velocities that fit best to first order, for given R and t at the principal point's row.
 
-    y^T E x is linear in (v0, v1, w0, w1) where these are small. Each row is weighed by its Sampson norm.
+    y^T E x is linear in small (v0, v1, w0, w1). Each equation is weighted by its Sampson norm.
     """
     r, J = errors(still, rows)
     found = np.asarray(np.linalg.lstsq(J[:, 6:], -r, rcond=None)[0], dtype=np.float64)
@@ -425,7 +425,7 @@ def velocities(still: FreeMotion, rows: Rows) -> FreeMotion:
 @final
 @dataclass(frozen=True, kw_only=True)
 class TwelveParameterSolver(FreeVelocitySolver):
-    """The eight-point algorithm, then a linear correction by the velocities of both frames."""
+    """Essential matrix by the eight-point algorithm, then velocities of both frames by linear least squares."""
 
     @property
     def turning(self) -> bool:
@@ -445,35 +445,35 @@ class TwelveParameterSolver(FreeVelocitySolver):
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
         still = without_velocities(rows)
         if still is None:
-            return "the matches fit more than one essential matrix: degenerate scene or motion"
+            return _DEGENERATE
         return [velocities(still, rows)]
 
 
 _MOST = 30
 _SAMPLE, _SAMPLE_MOST = 20, (10, 16)
-"""Matches of a sample of the robust search; evaluations of its descents to coefficients and of Sampson errors."""
+"""Matches per RANSAC sample; evaluations of its descents on coefficients and on Sampson errors."""
 _SINGULAR = "the linear system has more than one solution: degenerate motion, scene or readout ratio"
 _ROUNDING = 1e-14
-"""The 45 coefficients of slow motion are separate by 1e-10 of the largest singular value and less."""
+"""For slow motion, the singular values that separate the 45 coefficients are at most 1e-10 of the largest one."""
 
 
 def monomials(x: FloatArray, degree: int) -> FloatArray:
-    """(..., 2 degree + 3) of rays (..., 3)."""
+    """(..., 2 degree + 3) monomials of rays (..., 3)."""
     p, s = x[..., 0], x[..., 1]
     return np.stack([*(p * s**i for i in range(degree + 1)), *(s**j for j in range(degree + 2))], axis=-1)
 
 
 def system(x: FloatArray, y: FloatArray, degree: int) -> FloatArray:
-    """(..., 21) or (..., 45) of rays (..., 3) of frames 0 and 1, z = 1: s = 0 is the principal point's row."""
+    """(..., 21) or (..., 45) equations of rays x, y (..., 3), z = 1, with s = 0 at the principal point."""
     products = monomials(y, degree)[..., :, None] * monomials(x, degree)[..., None, :]
     return products[..., places(degree) >= 0]
 
 
 def extract(F: FloatArray, degree: int) -> list[FreeMotion]:
-    """Motions whose coefficients are near to F, (21,) or (45,) of arbitrary length and sign; the nearest first.
+    """Motions whose coefficients are near F, (21,) or (45,) of arbitrary length and sign, sorted from the nearest.
 
-    Least squares over all unknowns, from either rotation of an essential matrix. Where all velocities are along t,
-    as in slow motion nearly, the twin of each has nearly the same coefficients.
+    They are found by least squares over all unknowns, from both rotations of an essential matrix. If all
+    velocities are along t, as nearly in slow motion, the twin of each motion has nearly the same coefficients.
     """
     F = F / np.linalg.norm(F)
     begun = [FreeMotion(R, *vectors) for R, vectors in zip(*_starts(F, degree), strict=True)]
@@ -486,9 +486,10 @@ def extract(F: FloatArray, degree: int) -> list[FreeMotion]:
 
 
 def _starts(F: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """R (..., 2, 3, 3) and t, v0, v1, 0, 0 (..., 2, 5, 3) of unit coefficients (..., 21 or 45).
+    """R (..., 2, 3, 3) and t, v0, v1, 0, 0 (..., 2, 5, 3) from unit coefficients (..., 21 or 45).
 
-    Either rotation of t's essential matrix, whose entries the velocities share, with the translations that fit it.
+    They are both rotations of the essential matrix of t, to whose entries the velocities contribute too, with the
+    translations that fit each.
     """
     block = places(degree)[np.ix_([0, degree + 2, degree + 1], [0, degree + 2, degree + 1])]
     U, _, Vt = np.linalg.svd(F[..., None, block])
@@ -499,22 +500,22 @@ def _starts(F: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _translations(F: FloatArray, R: FloatArray, degree: int) -> FloatArray:
-    """t, v0 and v1 (..., 3, 3) that fit best to coefficients and a rotation (..., 3, 3), without w0 and w1."""
-    basis = np.tensordot(R, _translating(degree), axes=2)
+    """t, v0 and v1 (..., 3, 3) that best fit coefficients for a rotation (..., 3, 3), without w0 and w1."""
+    basis = np.tensordot(R, _translation_basis(degree), axes=2)
     found = np.linalg.solve(basis @ np.swapaxes(basis, -1, -2), basis @ F[..., None])
     return np.asarray(found.reshape(*R.shape[:-2], 3, 3), dtype=np.float64)
 
 
 @functools.cache
-def _translating(degree: int) -> FloatArray:
-    """(3, 3, 9, 21 or 45): coefficients by R and by (t, v0, v1), without rotations in the frames."""
+def _translation_basis(degree: int) -> FloatArray:
+    """(3, 3, 9, 21 or 45) derivatives of the coefficients by R and by (t, v0, v1), without w0 and w1."""
     units = np.eye(9).reshape(3, 3, 3, 3)
     still = np.zeros((5, 3))
     return np.array([[with_derivatives(FreeMotion(R, *still), degree)[1][3:12] for R in row] for row in units])
 
 
-def _sampled(matches: FloatArray, camera: PinholeCamera, refined: bool) -> list[MotionEstimate]:
-    """Motions by the linear model of samples (b, n, 4), n >= 20."""
+def _sample_motions(matches: FloatArray, camera: PinholeCamera, refined: bool) -> list[MotionEstimate]:
+    """Motions of samples (b, n, 4), n >= 20, by the linear model."""
     x, y = camera.unproject(matches[..., :2]), camera.unproject(matches[..., 2:])
     A = system(x, y, 1)
     norms = np.maximum(np.linalg.norm(A, axis=1), 1e-300)
@@ -545,13 +546,13 @@ def _sampled(matches: FloatArray, camera: PinholeCamera, refined: bool) -> list[
 class DaiSolver(FreeVelocitySolver):
     """The null vector of 21 or 45 coefficients, the motion nearest to it, and a descent on Sampson errors.
 
-    The velocities of both frames are free and are not returned: on data that have one velocity, 6 or 12 unknowns
-    are estimated for nothing, and what noise does grows by a factor of ten and more. In slow motion s0 and s1 are
+    The velocities of both frames are estimated independently and not returned. For a constant velocity these are 6
+    or 12 redundant unknowns, which multiply the effect of noise by ten and more. In slow motion s0 and s1 are
     nearly equal, and the 45 coefficients nearly collinear.
     """
 
     model: Literal["linear", "uniform"] = "linear"
-    """Whether the camera turns within a frame; the linear one leaves that out and is biased where it does."""
+    """``uniform``: with a rotation within a frame; ``linear``: without one."""
 
     @property
     def turning(self) -> bool:
@@ -575,7 +576,7 @@ class DaiSolver(FreeVelocitySolver):
         return reason if F is None else extract(F, degree)
 
     def starts(self, rows: Rows) -> list[FreeMotion]:
-        """Motions of the smaller models: noise spoils 45 coefficients long before it spoils 21 or 9."""
+        """Motions of the smaller models, as 45 coefficients are far more sensitive to noise than 21 or 9."""
         F, _ = null_vector(system(rows.x, rows.y, 1), unit_columns=True) if self.turning else (None, "")
         still = without_velocities(rows)
         return [*([] if F is None else extract(F, 1)), *([] if still is None else [still])]
@@ -589,25 +590,20 @@ class DaiSolver(FreeVelocitySolver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        """By the linear model: noise of 0.3 px leaves nothing of 44 matches, and few 44 are free of outliers."""
+        """Propose by the linear model: 44 matches are useless at 0.3 px of noise, and rarely all inliers."""
         matches = np.stack([temporal_pairs(sample, "left") for sample in samples])
         if matches.shape[1] < _SAMPLE:
             return [[MotionEstimate.failed(f"{matches.shape[1]} left matches, need {_SAMPLE}")] for _ in matches]
-        return [[each] for each in _sampled(matches, rig.camera, self.refinement == "sampson")]
+        return [[each] for each in _sample_motions(matches, rig.camera, self.refinement == "sampson")]
 
 
 _STEPS = 6
-"""Gauss-Newton steps: on exact matches at 6 degrees and 1.2 m a frame the last changes w by 1e-9 rad."""
-_ROUNDING = 1e-14
-"""Smallest singular value relative to the largest."""
+"""Gauss-Newton steps: for exact matches at 6 degrees and 1.2 m per frame, the last one changes w by 1e-9 rad."""
 _DEGENERATE = "the matches fit more than one essential matrix: degenerate scene or motion"
 
 
 def jets(rows: Rows, patch_px: float) -> tuple[FloatArray, FloatArray]:
-    """Rays of both frames (n, 3, 3): the ray, and what it changes by where frame 0's pixel moves along x and y.
-
-    By as many px as ``patch_px``, to first order.
-    """
+    """(n, 3, 3) for each frame: rays, and their changes if frame 0's pixel moves by ``patch_px`` along x, y."""
     focal = np.array([rows.camera.fx, rows.camera.fy])
     x, y = np.zeros((2, len(rows.x), 3, 3))
     x[:, 0], y[:, 0] = rows.x, rows.y
@@ -617,7 +613,7 @@ def jets(rows: Rows, patch_px: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _product(of: Callable[[FloatArray, FloatArray], FloatArray], a: FloatArray, b: FloatArray) -> FloatArray:
-    """A bilinear product of jets (..., 3, c), to first order."""
+    """Bilinear product of jets (..., 3, c): its value and first-order changes."""
     moved = [of(a[..., k, :], b[..., 0, :]) + of(a[..., 0, :], b[..., k, :]) for k in (1, 2)]
     return np.stack([of(a[..., 0, :], b[..., 0, :]), *moved], axis=-2)
 
@@ -627,19 +623,19 @@ def _outer(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def essential_of_jets(x: FloatArray, y: FloatArray) -> FloatArray | None:
-    """Like ``eight_point``, from the rays and their changes (n, 3, 3)."""
+    """``eight_point`` for jets (n, 3, 3), i.e. rays and their changes."""
     T0, T1 = normalising_transform(x[:, 0, :2]), normalising_transform(y[:, 0, :2])
     E = null_essential(_product(_outer, y @ T1.T, x @ T0.T).reshape(-1, 9))
     return None if E is None else T1.T @ E @ T0
 
 
 def equations(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Values (..., n, 3) of a camera at rest, and their derivatives (..., n, 3, 18) by ``FreeMotion.moved``.
+    """Residuals (..., n, 3) of a camera at rest, and their derivatives (..., n, 3, 18) by ``FreeMotion.moved``.
 
-    Those by the velocities are exact; those by R and t are the ones of a camera at rest.
+    Derivatives by the velocities are exact; those by R and t are those of a camera at rest.
 
     Args:
-        R, t: (..., 3, 3), (..., 3).
+        R, t: pose (..., 3, 3), (..., 3).
         x, y: jets (..., n, 3, 3).
     """
     R, t = R[..., None, :, :], t[..., None, None, :]
@@ -653,7 +649,7 @@ def equations(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tup
 
 
 def moving(stills: list[FreeMotion], x: FloatArray, y: FloatArray, camera: PinholeCamera) -> list[FreeMotion]:
-    """R, t and velocities that fit the jets (k, n, 3, 3) of k samples best, to first order in the velocities."""
+    """R, t and velocities that best fit the jets (k, n, 3, 3) of k samples, to first order in the velocities."""
     R, t = np.stack([each.R for each in stills]), np.stack([each.t for each in stills])
     v = np.zeros((len(R), 12))
     for _ in range(_STEPS):
@@ -676,13 +672,13 @@ def moving(stills: list[FreeMotion], x: FloatArray, y: FloatArray, camera: Pinho
 @final
 @dataclass(frozen=True, kw_only=True)
 class AffineSolver(FreeVelocitySolver):
-    """An essential matrix of affine correspondences, then all unknowns together; points alone in the descent.
+    """An essential matrix from affine correspondences, then all unknowns jointly, then a descent that uses points.
 
-    The descent on Sampson errors needs 17 matches; of fewer the answer is what the equations give.
+    The descent on Sampson errors needs 17 matches; with fewer, the solution of the equations is returned.
     """
 
     patch_px: float = 10.0
-    """Noise of points over that of affine frames, px: as far from its point a frame is as uncertain as that."""
+    """Noise of points divided by that of affine frames, px: the distance at which both weigh the same."""
 
     def __post_init__(self) -> None:
         check_number("patch_px", self.patch_px, 1e-3, 1e3)
@@ -726,7 +722,7 @@ class AffineSolver(FreeVelocitySolver):
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> list[list[MotionEstimate]]:
-        """With the velocities, and at rest: noise of a few matches may dominate them."""
+        """Propose each solution with its velocities and at rest, since noise of few matches may dominate them."""
         sets = [self.matches_of(sample) for sample in samples]
         short = self.spec.shortage({"left": len(sets[0]), "affine": len(samples[0].affine)})
         if short is not None:

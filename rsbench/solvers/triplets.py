@@ -1,33 +1,31 @@
-"""Stereo relative pose from three features, each in three of the four images, of a global shutter.
+"""Global-shutter stereo relative pose from three features, each in three of the four images.
 
-A. Vakhitov, V. Lempitsky, Y. Zheng, Stereo Relative Pose from Line and Point Feature Triplets, ECCV 2018. A
-point that both cameras of a frame see is known in that frame's body; the third image sees it from the other:
+A. Vakhitov, V. Lempitsky, Y. Zheng, Stereo Relative Pose from Line and Point Feature Triplets, ECCV 2018. Stereo
+in one frame gives a point in that frame's body; a third image shows it in the other frame:
 
     lambda x = R X + d + o      (known in frame 0, seen in frame 1)
     lambda x = R^T (Y - d) + o      (known in frame 1, seen in frame 0; o, where the camera stands).
 
-Each gives two equations, and three points the motion. The paper's solvers are algebraic and give all roots;
-here Newton's steps from no motion give the one that a sequence of frames has, of exact points in 95 of 100
-samples at 2 degrees and 0.3 m, in 92 at 5 degrees and 0.5 m, in 72 at 15 degrees and 1 m. Of a track, which is
-in all four images, a sample leaves one image out; the last least squares, of the reprojection errors of tracks,
-have them all.
+Each point gives two equations, so three points give the motion. The paper's solvers are algebraic and find all
+roots. Here Newton steps from zero motion find the root that successive frames have: for exact points in 95 of 100
+samples at 2 degrees and 0.3 m, in 92 at 5 degrees and 0.5 m, in 72 at 15 degrees and 1 m. A sample ignores one of
+the four images of a track; the final least squares of reprojection errors use all four.
 
-A line that both cameras of a frame see is where its two planes meet. The third image, of the other frame, sees
-it in a plane of normal n, in which two points A and B of it lie after the motion:
+A line that both cameras of a frame show is the intersection of two planes. A third image, of the other frame,
+shows it in a plane with normal n, which contains two points A and B of the line after the motion:
 
     n . (R A + d + o) = n . (R B + d + o) = 0      (known in frame 0, seen in frame 1)
 
-and the inverse motion for lines that frame 1 knows. ``LineTripletSolver`` has a robust loop of its own, since a
-sample has either kind: samples of three among all, rsbench's RANSAC, then least squares of the reprojection
-errors of both kinds over all inliers, each over the noise that its own errors show. A line whose image is
-within 10 degrees of the baseline's direction has no depth, and is left out. Lines that are all parallel leave
-the shift along them open: a failure.
+and likewise with the inverse motion for lines known in frame 1. A sample may have points and lines, so
+``LineTripletSolver`` has its own robust loop: rsbench's RANSAC with samples of three features, then least squares
+of the reprojection errors of both kinds over all inliers, each weighted by its estimated noise. A line whose image
+is within 10 degrees of the baseline's direction has no depth and is not used. If all lines are parallel, the
+translation along them is undetermined, and the solver fails.
 
-A 3-D line has four unknowns. In its least squares they are where it passes the two ends that the left camera
-saw at time 0, in that image across the line that was seen, and the inverse depths there: its images are nearly
-linear in them at any distance. An error is the distance of an observed end from the line's image. For a given
-motion the four are eliminated by Gauss-Newton steps, each line alone; what is left of its eight errors has four
-degrees of freedom.
+A 3-D line has four unknowns in the least squares: at both end points in the left image of time 0, the displacement
+across the observed line and the inverse depth. The line's images are nearly linear in them at any distance. An
+error is the distance of an observed end point from the line's image. For a given motion, the four unknowns of each
+line are eliminated by Gauss-Newton steps; its eight errors then have four degrees of freedom.
 """
 
 from __future__ import annotations
@@ -53,37 +51,37 @@ from rsbench.solvers.engine.ransac import IntArray, RansacOptions, ransac
 from rsbench.solvers.engine.robust_motion import SIGMAS, quantile, truncated
 
 View = tuple[Literal[0, 1], Side]
-"""The frame that sees a point which the other one knows, and its camera."""
+"""The third image of a feature: its frame, in which the feature's depth is not used, and its camera."""
 _LEAST = 3
 _STEPS = 8
 _QUICK, _FULL = 10, 50
 LONGEST = 100.0
-"""Metres beyond which a motion is none."""
+"""Largest length of a translation, metres."""
 PATTERNS: tuple[tuple[View, View, View], ...] = (
     ((1, "left"), (1, "right"), (0, "left")),
     ((1, "right"), (0, "left"), (0, "right")),
 )
-"""The third images of the points of a sample: two and one of a frame, one and two."""
+"""Third images of the three features of a sample: two of frame 1 and one of frame 0, and one and two."""
 ALL: tuple[View, ...] = ((1, "left"), (1, "right"), (0, "left"), (0, "right"))
 _COLUMNS: dict[View, int] = {(0, "left"): 0, (0, "right"): 2, (1, "left"): 4, (1, "right"): 6}
 
 
 class Triplets(NamedTuple):
-    """Features known in one frame and seen in the other: each says c . P = 0 twice; batch axes (...)."""
+    """Features known in one frame and seen in a third image; each gives two equations c . P = 0; batches (...)."""
 
     X: FloatArray
-    """(..., n, k, 3) k points of a feature, metres, in the body of the frame that knows them."""
+    """(..., n, k, 3) k points of a feature, metres, in the body of the frame in which they are known."""
     c: FloatArray
-    """(..., n, k, 2 / k, 3) what each is at right angles to in the third image's camera: (1, 0, -x) and (0, 1, -y)
-    of a point's ray (x, y, 1)."""
+    """(..., n, k, 2 / k, 3) vectors orthogonal to each point in the third image's camera: (1, 0, -x) and (0, 1,
+    -y) for a point's ray (x, y, 1)."""
     offset: FloatArray
-    """(..., n, 3)"""
+    """(..., n, 3) offset o of the third image's camera, metres."""
     backward: FloatArray
     """(..., n) bool: known in frame 1, seen in frame 0."""
 
     @classmethod
     def of(cls, tracks: FloatArray, views: Sequence[View], rig: StereoRig) -> Triplets:
-        """From tracks (..., n, 8) with depth in both frames; one view for each of n."""
+        """Convert tracks (..., n, 8) with depth in both frames; ``views`` has the third image of each of n."""
         shape = (*tracks.shape[:-1], 3)
         X = [stereo_points(tracks.reshape(-1, 8)[:, columns:], rig).reshape(shape) for columns in (0, 4)]
         backward = np.array([frame == 0 for frame, _ in views])
@@ -98,7 +96,7 @@ class Triplets(NamedTuple):
 
 
 def point_rows(rays: FloatArray) -> FloatArray:
-    """Rows (..., 2, 3) at right angles to rays (..., 3), z = 1."""
+    """Vectors (..., 2, 3) orthogonal to rays (..., 3), z = 1."""
     out = np.zeros((*rays.shape[:-1], 2, 3))
     out[..., 0, 0] = out[..., 1, 1] = 1.0
     out[..., 2] = -rays[..., :2]
@@ -106,7 +104,7 @@ def point_rows(rays: FloatArray) -> FloatArray:
 
 
 def newton(triplets: Triplets) -> Pose:
-    """Motion (..., 3, 3), (..., 3) of n >= 3 features by Gauss-Newton steps, of three Newton's; NaN where open."""
+    """Motion (..., 3, 3), (..., 3) of n >= 3 features by Gauss-Newton steps (n = 3: Newton); NaN: undetermined."""
     X, c, offset, back = triplets.X, triplets.c, triplets.offset[..., None, :], triplets.backward[..., None, None]
     batch = X.shape[:-3]
     R: FloatArray = np.broadcast_to(np.eye(3), (*batch, 3, 3))
@@ -118,7 +116,7 @@ def newton(triplets: Triplets) -> Pose:
         by_turn = np.where(turned, inverse @ hat(rest), -hat(moved))
         by_shift = np.broadcast_to(np.where(turned, -inverse, eye), by_turn.shape)
         J = np.concatenate([by_turn, by_shift], axis=-1)
-        # c . P = 0, over the depth.
+        # c . P = 0, divided by the depth.
         A = (c @ J) / P[..., 2:, None]
         e = (c @ P[..., None])[..., 0] / P[..., 2:]
         step = _step(A.reshape(*batch, -1, 6), e.reshape(*batch, -1))
@@ -127,7 +125,7 @@ def newton(triplets: Triplets) -> Pose:
 
 
 def _step(A: FloatArray, e: FloatArray) -> FloatArray:
-    """Least squares (..., 6) of A step = -e; NaN where a batch holds one that is open."""
+    """Least-squares solution (..., 6) of A step = -e; NaN for singular systems."""
     At = np.swapaxes(A, -1, -2)
     square = A.shape[-2] == A.shape[-1]
     try:
@@ -142,7 +140,7 @@ def _step(A: FloatArray, e: FloatArray) -> FloatArray:
 @final
 @dataclass(frozen=True, kw_only=True)
 class TripletSolver(Solver):
-    """Samples of three points in three images each; least squares of the reprojection errors of tracks."""
+    """Motion from samples of three points in three images each, then least squares of reprojection errors."""
 
     spec = SolverSpec(
         needs=frozenset({"tracks"}),
@@ -152,7 +150,7 @@ class TripletSolver(Solver):
         shutter="global",
         reference_point="body",
         reference="Vakhitov, Lempitsky, Zheng: Stereo Relative Pose from Feature Triplets, ECCV 2018 (points)",
-        assumes="global shutter; a motion that is small beside the distance of the points",
+        assumes="global shutter; a motion that is small compared with the distance of the points",
     )
 
     def estimate(
@@ -206,15 +204,15 @@ class TripletSolver(Solver):
 
 
 def with_depths(tracks: FloatArray) -> FloatArray:
-    """Tracks (m, 8) with a positive disparity in both frames, of (n, 8)."""
+    """The tracks (m, 8) among (n, 8) with a positive disparity in both frames."""
     near = with_depth(tracks)
     return near[near[:, 4] - near[:, 6] > 0.0]
 
 
 def motion_of(pose: Pose) -> MotionEstimate:
-    """The estimate that a motion is; a failure where it is not finite."""
+    """The estimate with a given motion; a failure if it is not finite."""
     if not (np.all(np.isfinite(pose.R)) and np.all(np.isfinite(pose.t))):
-        return MotionEstimate.failed("the points leave the motion open")
+        return MotionEstimate.failed("the points do not determine the motion")
     return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True, metric=True)
 
 
@@ -224,9 +222,9 @@ def propose_together(
     usable: Callable[[FloatArray], FloatArray],
     solve: Callable[[FloatArray], Iterable[list[MotionEstimate]]],
 ) -> list[list[MotionEstimate]]:
-    """The motions of each sample, of all in one call of ``solve``, which takes tracks (b, least, 8).
+    """The motions of each sample, by one call of ``solve`` for all, which takes tracks (b, least, 8).
 
-    A sample with fewer tracks that are ``usable`` has failed.
+    A sample with fewer ``usable`` tracks has failed.
     """
     tracks = [usable(sample.tracks)[:least] for sample in samples]
     whole = [each for each in tracks if len(each) == least]
@@ -237,26 +235,28 @@ def propose_together(
 
 FREEDOM = 4
 LEAST_SLOPE = np.sin(np.radians(10.0))
-"""Sine of the least angle to the baseline, below which a line's left and right planes are nearly one."""
+"""Sine of the smallest angle to the baseline; below it, a line's left and right planes nearly coincide."""
 _RIDGE = 1e-12
-"""Share of the diagonal that keeps a line without depth from failing the others."""
+"""Relative increase of the diagonal, so that the batch can be solved if one line has no depth."""
 
 
 def line_rays(lines: FloatArray, rig: StereoRig) -> FloatArray:
-    """Rays (..., 4, 2, 3) of the ends of lines (..., 16): images left 0, right 0, left 1, right 1."""
+    """Rays (..., 4, 2, 3) of the end points of lines (..., 16) in the images left 0, right 0, left 1, right 1."""
     return rig.camera.unproject(lines.reshape(*lines.shape[:-1], 4, 2, 2))
 
 
 def line_normals(rays: FloatArray) -> FloatArray:
-    """Normals (..., 4, 3) of the planes of image lines, (a, b, c) with a^2 + b^2 = 1: a ray's product with it is
-    its distance from the line, in units of the focal length; NaN where both ends are one."""
+    """Normals (..., 4, 3) of the planes of image lines, (a, b, c) with a^2 + b^2 = 1; NaN for equal end points.
+
+    The dot product with a ray is its distance from the line in units of the focal length.
+    """
     n = cross(rays[..., 0, :], rays[..., 1, :])
     with np.errstate(invalid="ignore"):
         return np.asarray(n / np.hypot(n[..., 0], n[..., 1])[..., None])
 
 
 def inverse_depths(rays: FloatArray, rig: StereoRig) -> FloatArray:
-    """Inverse depths (..., 2, 2) by frame and end, 1 / m, of the ends that the left camera saw in either frame."""
+    """Inverse depths (..., 2, 2), 1 / m, of the end points in the left images, by frame and end."""
     normals = line_normals(rays)[..., 1::2, :]
     with np.errstate(divide="ignore", invalid="ignore"):
         along = np.sum(normals[..., None, :] * rays[..., ::2, :, :], axis=-1)
@@ -264,21 +264,21 @@ def inverse_depths(rays: FloatArray, rig: StereoRig) -> FloatArray:
 
 
 def usable_lines(lines: FloatArray, rig: StereoRig) -> BoolArray:
-    """Mask (n,) of the lines whose stereo is no degenerate one, and in front of the cameras at both times."""
+    """Mask (n,) of lines whose stereo is not degenerate and which are in front of the cameras at both times."""
     rays = line_rays(lines, rig)
     steep = np.all(np.abs(line_normals(rays)[..., 0]) >= LEAST_SLOPE, axis=-1)
     return np.asarray(steep & np.all(inverse_depths(rays, rig) > 0.0, axis=(-2, -1)))
 
 
 def stereo_ends(rays: FloatArray, rig: StereoRig) -> FloatArray:
-    """Points (..., 2, 2, 3) of lines by frame, two each, metres, in the body as it is then."""
+    """Two points (..., 2, 2, 3) of each line by frame, metres, in the body at that time."""
     near = inverse_depths(rays, rig)
     return np.asarray(rays[..., ::2, :, :] / near[..., None] - rig.offset("left"))
 
 
 class _State(NamedTuple):
-    """Errors (n, 8), px, with their derivatives by the line (n, 8, 4) and the motion (n, 8, 6), by a turn from
-    the left and a shift; ``front``, whether the line is in front of all cameras."""
+    """Errors (n, 8), px, and their derivatives by the line (n, 8, 4) and by the motion (n, 8, 6): rotation from
+    the left, translation; ``front``: whether the line is in front of all cameras."""
 
     r: FloatArray
     by_line: FloatArray
@@ -288,32 +288,32 @@ class _State(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LineErrors:
-    """Lines of one problem."""
+    """Reprojection errors of lines as a function of the motion."""
 
     rays: FloatArray
-    """(n, 4, 2, 3)"""
+    """(n, 4, 2, 3) rays of the end points, see ``line_rays``."""
     across: FloatArray
     """(n, 3) direction in the left image of frame 0 across the line."""
     start: FloatArray
-    """(n, 4): shifts across, 0, then inverse depths of both ends, 1 / m."""
+    """(n, 4) start of the unknowns: displacements across, 0, then inverse depths of both end points, 1 / m."""
     rig: StereoRig
 
     @classmethod
     def of(cls, lines: FloatArray, rig: StereoRig) -> LineErrors:
-        """From lines (n, 16) that are usable."""
+        """The errors of usable lines (n, 16)."""
         rays = line_rays(lines, rig)
         across = line_normals(rays)[:, 0] * [1.0, 1.0, 0.0]
         near = inverse_depths(rays, rig)[:, 0]
         return cls(rays=rays, across=across, start=np.concatenate([0.0 * near, near], axis=1), rig=rig)
 
     def only(self, wanted: BoolArray) -> LineErrors:
-        """The lines of a mask (n,)."""
+        """The lines selected by a mask (n,)."""
         return LineErrors(
             rays=self.rays[wanted], across=self.across[wanted], start=self.start[wanted], rig=self.rig
         )
 
     def squares(self, w: FloatArray, d: FloatArray, steps: int = 1) -> FloatArray:
-        """Sums (n,) of squared errors, px^2, after so many steps of each line; infinite behind a camera."""
+        """Sums (n,) of squared errors, px^2, after ``steps`` steps per line; infinite behind a camera."""
         state = self._settled(so3.exp(w), d, steps)
         squares = np.sum(state.r**2, axis=1)
         return np.where(state.front & (squares >= 0.0), squares, np.inf)
@@ -331,7 +331,7 @@ class LineErrors:
         return 0.5 * float(np.sum(state.r**2)), gradient, 0.5 * (H + H.T)
 
     def _settled(self, R: FloatArray, d: FloatArray, steps: int) -> _State:
-        """At the lines that fit all images best."""
+        """The errors at the lines that fit all images best for a given motion."""
         unknowns = self.start
         for _ in range(steps):
             state = self._state(R, d, unknowns)
@@ -355,7 +355,7 @@ class LineErrors:
             seen = self.rays[:, k] / h
             r[:, k] = np.sum(seen * m[:, None], axis=-1)
             g = seen - r[:, k, :, None] * (slope / focal)[:, None] / h**2
-            # By the points a and b (n, ends, 3) whose plane it is.
+            # Derivatives by the points a and b (n, ends, 3) that span the plane.
             by = (cross(ends[:, None, 1], g), cross(g, ends[:, None, 0]))
             for p in (0, 1):
                 by_line[:, k, :, p] = np.sum(by[p] * (self.across @ Q.T)[:, None], axis=-1)
@@ -367,7 +367,7 @@ class LineErrors:
 
 
 def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
-    """Least squares (n, 4, k) of A (n, 8, 4) x = b (n, 8, k)."""
+    """Least-squares solution (n, 4, k) of A (n, 8, 4) x = b (n, 8, k)."""
     At = np.swapaxes(A, -1, -2)
     N = At @ A
     diagonal = np.arange(N.shape[-1])
@@ -377,31 +377,31 @@ def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
 
 
 _SAMPLES = 10
-"""Fewest samples, as in rsbench's robust loop."""
+"""Fewest RANSAC samples, as in rsbench's robust loop."""
 _LINE_QUICK = 5
 _TRACK_FREEDOM = 5
 _SECOND_TRY = 3.0
 _REFITS = 5
 _NOISE_STEPS = 8
 _RANGE = (0.2, 4.0)
-"""Times the threshold, between which it follows the noise."""
+"""Limits of the adapted threshold, as factors on the given one."""
 _MAX_DIRECTION_SIGMA = 0.5
-"""Share of the length of d: radians, as in the refined solvers."""
+"""Largest standard deviation of a known direction of d, radians, as in refined solvers."""
 _MANY = 10
-"""Fewest inliers of a kind from which its noise is estimated."""
+"""Fewest inliers of points or of lines for an estimate of their noise."""
 
 
 class Features(NamedTuple):
-    """Points, then lines: what either frame knows of each, and what each image sees of it."""
+    """Points, then lines: their positions known from each frame, and their equations in each image."""
 
     X: FloatArray
-    """(2, n, 2, 3) two points by frame, metres, in the body as it is then; a point's are one."""
+    """(2, n, 2, 3) two points of each feature by frame, metres, in the body at that time; a point's are equal."""
     c: FloatArray
-    """(4, n, 2, 3) by image what they are at right angles to."""
+    """(4, n, 2, 3) vectors orthogonal to these points, by image."""
 
     @classmethod
     def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig) -> Features:
-        """From tracks (m, 8) with depth in both frames and lines (n, 16) that are usable."""
+        """Convert tracks (m, 8) with depth in both frames, and usable lines (n, 16)."""
         points = np.stack([stereo_points(tracks[:, at:], rig) for at in (0, 4)])
         rays = line_rays(lines, rig)
         normals = np.repeat(line_normals(rays)[:, :, None], 2, axis=2)
@@ -413,7 +413,7 @@ class Features(NamedTuple):
         )
 
     def triplets(self, chosen: IntArray, views: Sequence[View], rig: StereoRig) -> Triplets:
-        """Triplets of the chosen features (..., n), each known in the frame other than its view's."""
+        """Triplets of the chosen features (..., n), each known in the frame that is not its view's."""
         frames = np.array([frame for frame, _ in views])
         images = np.array([2 * frame + SIDES.index(side) for frame, side in views])
         offsets = np.array([rig.offset(side) for _, side in views])
@@ -470,7 +470,7 @@ class _Problem:
         return np.where(tracks >= 0.0, tracks, np.inf), lines  # a point next to a camera's plane overflows
 
     def residuals(self, model: MotionEstimate) -> FloatArray:
-        """In standard deviations: an inlier's is within ``SIGMAS``, whichever it is."""
+        """(n,) errors in standard deviations; those of inliers, points or lines, are at most ``SIGMAS``."""
         squares = self.squares(model)
         scales = SIGMAS / (self.noise * np.sqrt([quantile(_TRACK_FREEDOM), quantile(FREEDOM)]))
         return np.concatenate([np.sqrt(each) * scale for each, scale in zip(squares, scales, strict=True)])
@@ -480,7 +480,7 @@ class _Problem:
         return found if found.success else None
 
     def descent(self, model: MotionEstimate, inliers: BoolArray, most: int) -> MotionEstimate:
-        """Least squares of the inliers' errors over their noise."""
+        """Minimise the inliers' squared errors, each weighted by its noise."""
         tracks, wanted = np.split(inliers, [len(self.points.tracks)])
         points, lines = self.points.only(tracks), self.lines.only(wanted)
         weights = self.noise**-2
@@ -498,12 +498,14 @@ class _Problem:
         w, d = points.motion(end.theta)
         covariance = inverse_definite(end.H) if np.all(np.isfinite(end.H)) else None
         if covariance is None:
-            return MotionEstimate.failed("the points and lines leave the motion open, as parallel lines do")
+            return MotionEstimate.failed(
+                "the points and lines do not determine the motion (are all lines parallel?)"
+            )
         distance = float(np.median(np.linalg.norm(self.features.X[0, :, 0], axis=-1)))
         return _with_direction(motion_of(Pose(so3.exp(w), d)), covariance, distance)
 
     def with_noise_of(self, model: MotionEstimate, least: float, most: float) -> _Problem:
-        """With the noise that the errors of a motion's inliers show, of each kind by itself where it has many."""
+        """The problem with the noise of points and of lines estimated from the inliers of a motion."""
         noise = self.noise.copy()
         for k, (squares, freedom) in enumerate(zip(self.squares(model), (_TRACK_FREEDOM, FREEDOM), strict=True)):
             for _ in range(_NOISE_STEPS):
@@ -518,14 +520,14 @@ class _Problem:
 @final
 @dataclass(frozen=True, kw_only=True)
 class LineTripletSolver(Solver):
-    """Samples of three points or lines in three images each; a card of it says ``robust = "own"``."""
+    """Motion from samples of three points or lines in three images each; its card has ``robust = "own"``."""
 
     threshold_px: float = 0.625
-    """Largest error of an inlier, as of pairs in rsbench's robust loop; then it follows each kind's noise."""
+    """Largest error of an inlier at the start, as of pairs in rsbench's robust loop; adapted to the noise."""
     confidence: float = 0.999
-    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
+    """Required probability that RANSAC draws a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
-    """Samples that RANSAC draws, at most."""
+    """Largest number of RANSAC samples."""
 
     def __post_init__(self) -> None:
         check_number("threshold_px", self.threshold_px, 1e-6)
@@ -540,7 +542,7 @@ class LineTripletSolver(Solver):
         shutter="global",
         reference_point="body",
         reference="Vakhitov, Lempitsky, Zheng: Stereo Relative Pose from Feature Triplets, ECCV 2018",
-        assumes="global shutter; a motion that is small beside the distance; lines may stand for tracks",
+        assumes="global shutter; a motion that is small compared with the distance; lines may replace tracks",
     )
 
     def estimate(
@@ -548,7 +550,7 @@ class LineTripletSolver(Solver):
     ) -> MotionEstimate:
         tracks, lines = with_depths(correspondences.tracks), correspondences.lines
         lines = lines[usable_lines(lines, rig)]
-        # In one order, for the samples to be the same.
+        # Sort them, so that the samples do not depend on the order of the input.
         tracks, lines = (rows[np.lexsort(rows.T)] for rows in (tracks, lines))
         count = len(tracks) + len(lines)
         if count < _LEAST:
@@ -556,7 +558,7 @@ class LineTripletSolver(Solver):
                 f"{len(tracks)} tracks with positive disparities and {len(lines)} lines with depth, need {_LEAST}"
             )
         problem = _Problem.of(tracks, lines, rig, self.threshold_px / SIGMAS)
-        if count == _LEAST:  # none to spare: a consensus would prove nothing
+        if count == _LEAST:  # without further features, RANSAC has nothing to count
             return self._of_all(problem)
         reason = ""
         for factor in (1.0, _SECOND_TRY):
@@ -581,7 +583,7 @@ class LineTripletSolver(Solver):
         return problem.descent(start, np.ones(len(every), dtype=np.bool_), _FULL) if start.success else start
 
     def _concluded(self, problem: _Problem, model: MotionEstimate) -> MotionEstimate:
-        """Least squares of all inliers, until these stay the same, of the noise that they show."""
+        """Repeat least squares over the inliers, with re-estimated noise, until the inliers stay the same."""
         least, most = (factor * self.threshold_px / SIGMAS for factor in _RANGE)
         before = np.zeros(problem.num_data, dtype=np.bool_)
         for _ in range(_REFITS):
@@ -597,9 +599,9 @@ class LineTripletSolver(Solver):
 
 
 def _with_direction(motion: MotionEstimate, covariance: FloatArray, distance: float) -> MotionEstimate:
-    """The motion, and whether the direction of d is known, by the covariance (6, 6) of (w, d).
+    """Decide by the covariance (6, 6) of (w, d) whether the direction of d is known.
 
-    Of lines that are nearly parallel d runs along them, farther than to what is seen, at the distance, metres.
+    For nearly parallel lines, d diverges along them to more than the ``distance`` of the features, metres.
     """
     length = float(np.linalg.norm(motion.d))
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))

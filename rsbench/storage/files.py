@@ -293,9 +293,7 @@ def read_table(
     """A CSV file; ``options`` are those of ``pandas.read_csv``.
 
     Raises:
-        RsbenchError: it cannot be read, is not a table, lacks one of the ``columns`` or ``numbers``, or a column
-        of
-            ``numbers`` is not numeric.
+        RsbenchError: it cannot be read, is not a table, or lacks ``columns`` or numeric columns ``numbers``.
     """
     import pandas as pd
 

@@ -146,7 +146,7 @@ def channels_again(
             everywhere = np.ones(wrong.shape, dtype=np.bool_)
             of_a_row = _OF_A_ROW if channel.name in PAIR_CHANNELS else 1.0
             bad = _many(wrong, everywhere, _FEW_AGAIN, of_a_row)
-            what = f"{_percent(wrong, everywhere)} differ from what is made again"
+            what = f"{_percent(wrong, everywhere)} differ from a new computation"
             in_rows = np.isin(
                 np.arange(sequence.rig.sensor(view.side).height), np.asarray(rows)[np.any(wrong, axis=1)]
             )
@@ -195,13 +195,14 @@ def _mask_faults(
     everywhere = np.ones(classes.shape, dtype=np.bool_)
     unsolved, empty = classes == PixelClass.UNSOLVED, np.isin(classes, _NO_VALUE)
     hidden, of_sky = np.isin(classes, _HIDDEN), np.isin(classes, _OF_SKY)
+    reference = f"according to {there.depth}"
     surface, behind = ~empty & (derived.hidden == 0), derived.hidden == 1
     for words, wrong, among, many in (
         ("not solved", unsolved, everywhere, _many),
         ("wrongly in or out of view", ~unsolved & (empty != lost), everywhere, _many),
         (f"wrongly sky or surface by {view.depth}", ~empty & (of_sky != sky), everywhere, _many),
-        (f"hidden, but visible by {there.depth}", hidden, surface, _many_thin),
-        (f"visible, but hidden by {there.depth}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
+        (f"marked hidden, but visible {reference}", hidden, surface, _many_thin),
+        (f"marked visible, but hidden {reference}", ~empty & ~hidden, behind, partial(_many_gaps, ~empty)),
     ):
         if many(wrong & among, among):
             rows = rows_with_most(wrong & among, stride, height)

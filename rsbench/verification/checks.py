@@ -503,6 +503,6 @@ def _check_channels(state: State) -> None:
     if state.again is None or not accused:
         return
     cleared = state.again.cleared(state.all_content, files_of(accused))
-    what = "others contradict it, and it is what is made again, all of it"
+    what = "others contradict it, but it equals a new computation"
     state.notes += sorted(str(Finding(file, what)) for file in cleared)
     state.findings[first:last] = [each for each in accused if each.file not in cleared]

@@ -1,4 +1,4 @@
-"""The pictures of a sequence: read, and those that share a row compared bit for bit."""
+"""Read the images and depth maps of a sequence, compare all pairs, and compare shared rows bit for bit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGB
 
 
 def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
-    """The reason why a file is no 8-bit RGB image of ``size`` (width, height); only its header is read."""
+    """The fault of a file that is not an 8-bit RGB PNG of ``size`` (width, height), by its header, or None."""
     try:
         with open_regular(path) as stream:
             head = stream.read(26)
@@ -57,12 +57,12 @@ def png_fault(path: Path, name: str, size: tuple[int, int]) -> Finding | None:
 
 
 Judge = Callable[[ImageView], bool]
-"""Whether a file of a view is correct, by evidence that the dataset's author cannot change."""
+"""Whether a file of a view is correct according to evidence that the dataset's author cannot change."""
 
 
 @dataclass(eq=False)
 class Content:
-    """The depth maps and images of a sequence that can be read, and the faults of those that cannot."""
+    """The readable depth maps and images of a sequence, and the faults of the unreadable ones."""
 
     sequence: Sequence
     maps: dict[ImageView, DepthMap] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class Content:
     """Numbers of the frames that were read."""
 
     def followed_by(self, other: Content, reported: Collection[str]) -> Content:
-        """The last frame and the next, but for files that are ``reported``: they accuse the next ones no more."""
+        """The last frame of this content and the next, without ``reported`` files, which would accuse others."""
         last = self.times[-1:]
         maps = {
             view: each for view, each in self.maps.items() if view.frame in last and view.depth not in reported
@@ -86,7 +86,7 @@ class Content:
 
 
 def read_content(sequence: Sequence, missing: Collection[str] = (), times: tuple[int, ...] = FRAMES) -> Content:
-    """Read all views of some frames but ``missing`` files, one fault for each that cannot be."""
+    """Read all views of some frames except ``missing`` files; each unreadable file gives a fault."""
     content = Content(sequence, times=times)
     for view in image_views(times):
         read_view(content, view, missing)
@@ -94,7 +94,7 @@ def read_content(sequence: Sequence, missing: Collection[str] = (), times: tuple
 
 
 def read_view(content: Content, view: ImageView, missing: Collection[str]) -> None:
-    """Add what can be read of a view, and the faults of what cannot."""
+    """Read the files of a view into ``content``, with faults for unreadable ones."""
     sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     noisy = isinstance(renderer, dict) and renderer.get("integrator") == "path"
@@ -122,15 +122,15 @@ def read_view(content: Content, view: ImageView, missing: Collection[str]) -> No
 
 
 def clean_picture(sequence: Sequence, view: ImageView) -> str:
-    """The image of a view that shows light alone: where a sensor blurs and errs, its clean twin."""
+    """The file of a view's image without effects of a sensor: the clean twin if the dataset has a sensor."""
     blurred = sequence.sensor is not None and view.shutter == "rs"
     return clean_file(view.side, view.frame) if blurred else view.image
 
 
 def twin_faults(content: Content) -> Iterator[Finding]:
-    """The first row of a rolling-shutter frame and of its global-shutter twin are the same rays and values.
+    """Compare the first row (or column) of rolling-shutter frames and their global-shutter twins.
 
-    Where columns are read, it is the first column.
+    Both are rendered with the same rays and must have the same values.
     """
     for view in image_views(content.times):
         twin, maps, pictures = view._replace(shutter="gs"), content.maps, content.pictures
@@ -153,26 +153,26 @@ def twin_faults(content: Content) -> Iterator[Finding]:
 
 
 def _rounding(axis: int, most: float) -> float:
-    """How much the values of a line that two images share may differ anywhere: see ``spare_pixels``."""
+    """Tolerance of the values of a line that two images share, see ``spare_pixels``."""
     return 0.0 if axis == 0 else most
 
 
 def spare_pixels(axis: int, size: int) -> int:
-    """How many pixels may differ in a line that two images share: none in a row.
+    """Number of pixels that may differ in a line that two images share: none in a row, some in a column.
 
-    Some in a column: rays are traced in packets along rows, and beside others a ray is rounded otherwise.
+    Rays are traced in packets along rows, and the rounding of a ray depends on the others in its packet.
     """
     return 0 if axis == 0 else max(2, size // 20)
 
 
 def shared_line(sequence: Sequence, twin: ImageView) -> tuple[int, int, str]:
-    """Axis, number and name ("row 3") of the line that a global-shutter picture shares with its frame."""
+    """Axis, number and name ("row 3") of the line that a global-shutter image shares with its frame."""
     axis, line = 1 - sequence.shutter.axis(twin.side), sequence.shutter.line_after(twin.row, twin.side)
     return axis, line, f"{'row' if axis == 0 else 'column'} {line}"
 
 
 def _first_of_twin(depth: NDArray[np.float32], twin: NDArray[np.float32]) -> str:
-    """Where these maps (H, W) begin to be read, in words, by the one line that they share; "" for none."""
+    """Text on the side at which two depth maps (H, W) share a line, where the readout begins; "": unclear."""
     ends = (("top", 0, 0), ("bottom", 0, -1), ("left", 1, 0), ("right", 1, -1))
     lines = {side: (depth.take(place, axis), twin.take(place, axis)) for side, axis, place in ends}
     same = [side for side, (own, other) in lines.items() if np.array_equal(own, other) and np.any(own)]
@@ -181,7 +181,7 @@ def _first_of_twin(depth: NDArray[np.float32], twin: NDArray[np.float32]) -> str
 
 @dataclass(eq=False)
 class Comparison:
-    """All pairs of a sequence compared, step by step."""
+    """The comparison of all pairs of views of a sequence, step by step."""
 
     content: Content
     stride: int
@@ -190,7 +190,7 @@ class Comparison:
     colour_agreements: list[image_checks.ColourAgreement] = field(default_factory=list)
     votes: dict[ImageView, image_checks.ImageVotes] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    """What could not be compared well; these are no faults."""
+    """Notes on what could not be compared well; these are no faults."""
 
     def __post_init__(self) -> None:
         self.evidence = {
@@ -200,7 +200,7 @@ class Comparison:
         self.votes = {view: image_checks.ImageVotes.none(each.colours.shape[:2]) for view, each in pictures}
 
     def pairs(self) -> Iterator[DepthAgreement | None]:
-        """Compare one pair after the other; None where a file of it could not be read."""
+        """Compare one pair after the other; yields None for a pair with an unreadable file."""
         maps, pictures = self.content.maps, self.content.pictures
         for source, target in view_pairs((self.content.times[0], self.content.times[-1])):
             if not {source, target} <= maps.keys():
@@ -221,7 +221,7 @@ class Comparison:
             yield agreement
 
     def geometry(self) -> depth_checks.GeometryFault | None:
-        """What the pairs show of sequence.json; where that is wrong they show nothing else."""
+        """A fault of sequence.json that the pairs reveal; they are then useless for other checks."""
         return depth_checks.geometry_fault(self.agreements, self.content.sequence.rig)
 
     def faults(
@@ -230,10 +230,10 @@ class Comparison:
         depth_is_rendered: Judge = lambda view: False,
         image_is_rendered: Judge = lambda view: False,
     ) -> Iterator[Finding]:
-        """What the pairs show, each with its likely cause.
+        """Faults of depth maps and images that the pairs reveal, each with its likely cause.
 
-        ``depth_is_rendered`` and ``image_is_rendered`` say which depth maps and images are what is rendered again;
-        these are left out.
+        Depth maps and images that equal their new rendering, according to ``depth_is_rendered`` and
+        ``image_is_rendered``, are left out.
         """
         wrong = self._wrong_maps(depth_is_rendered)
         for view, fault in wrong.items():
@@ -245,14 +245,14 @@ class Comparison:
     def _without_rendered(
         self, accused: list[tuple[ImageView, Finding]], image_is_rendered: Judge
     ) -> Iterator[Finding]:
-        """Faults of images without those that are what is rendered again: fine things look different from each
-        place. A partner that is not what is rendered again is then what was wrong."""
+        """Faults of images without those that equal their new rendering: fine structures look different from each
+        viewpoint. If a partner of such an image differs from its new rendering, it is accused instead."""
         judged = lru_cache(maxsize=None)(image_is_rendered)
         for view, fault in accused:
             if not judged(view):
                 yield fault
                 continue
-            what = "others contradict it, and it is what is rendered again, all of it"
+            what = "others contradict it, but it equals a new rendering"
             self.notes.append(str(Finding(view.image, what)))
             pairs = {(each.source, each.target) for each in self.colour_agreements}
             for other in sorted(
@@ -262,25 +262,27 @@ class Comparison:
                     yield Finding(other.image, f"shows other colours than {view.image} at the same surface")
 
     def _wrong_maps(self, depth_is_rendered: Judge) -> dict[ImageView, depth_checks.MapFault]:
-        """Faults of maps; one without a flat place is none, where it is roughly what others see."""
+        """Faults of depth maps; a map without flat surfaces is accepted if it roughly agrees with others."""
         wrong, right = depth_checks.map_faults(self.evidence), set[ImageView]()
         while confirmed := {view for view in wrong if depth_is_rendered(view)}:
             right |= confirmed
             wrong = depth_checks.map_faults(self.evidence, right)
         for view in right:
-            what = "others contradict it, and it is what is rendered again, all of it"
+            what = "others contradict it, but it equals a new rendering"
             self.notes.append(str(Finding(view.depth, what)))
         for view in [view for view, fault in wrong.items() if fault.uncompared]:
             if roughly_agree(self.content.sequence, self.content.maps, view):
                 del wrong[view]
-                what = "no place is flat enough to be compared with another frame; it is roughly what others see"
+                what = (
+                    "no surface is flat enough for a comparison with another frame; it roughly agrees with others"
+                )
                 self.notes.append(str(Finding(view.depth, what)))
         return wrong
 
     def _image_faults(
         self, wrong: Collection[ImageView], other_images: OtherImages
     ) -> Iterator[tuple[ImageView, Finding]]:
-        """Images compared through depth that is in order; a wrong map would accuse its image too."""
+        """Faults of images compared through correct depth maps, as a wrong map would accuse its image too."""
         content, reported = self.content, set()
         for view, picture in content.pictures.items():
             fault = image_checks.single_colour_fault(picture, content.pictures)
@@ -300,7 +302,7 @@ class Comparison:
 
 
 def images_of_others(sequence: Sequence, others: Callable[[], Iterable[Sequence]]) -> OtherImages:
-    """Images of frames of a sequence near one, then of other sequences, those of the same name first."""
+    """Images of nearby frames of a sequence, then of other sequences, those with the same name first."""
 
     def candidates(view: ImageView) -> Iterator[tuple[str, NDArray[np.uint8]]]:
         if sequence.frames > len(FRAMES):
@@ -318,14 +320,14 @@ def images_of_others(sequence: Sequence, others: Callable[[], Iterable[Sequence]
 
 
 _SAME_SURFACE, _LEAST_SHARED = 0.05, 100
-"""Relative distance within which surfaces are one and the same, badly placed; beyond, one hides the other. And the
-smallest number of shared pixels that is judged."""
+"""Relative distance up to which two surfaces are the same one with an error, while otherwise one hides the other;
+smallest number of shared pixels for a check."""
 _MOST_WRONG = 0.1
-"""Share of them: what is thinner than a pixel, and edges that are nearly flat."""
+"""Largest share of different pixels, for objects thinner than a pixel and edges that are nearly flat."""
 
 
 def read_twins(sequence: Sequence, missing: Collection[str], times: tuple[int, ...]) -> Content:
-    """As ``content.read_content``, of the twins at other rows than the first."""
+    """``read_content`` for the global-shutter twins at rows other than the first."""
     content = Content(sequence, times=times)
     for row in sequence.twins:
         for side, frame in product(SIDES, times):
@@ -334,7 +336,7 @@ def read_twins(sequence: Sequence, missing: Collection[str], times: tuple[int, .
 
 
 def other_twin_faults(content: Content, twins: Content, stride: int = 1) -> Iterator[Finding]:
-    """A twin shares a row with its rolling-shutter frame, bit for bit; it sees the surfaces that this one sees."""
+    """Check that a twin shares a row with its rolling-shutter frame, bit for bit, and shows the same surfaces."""
     sequence = content.sequence
     for row in sequence.twins:
         for side, frame in product(SIDES, content.times):
@@ -379,14 +381,14 @@ def _twin_depth_faults(
 
 
 def with_twins(content: Content, twins: Content) -> Content:
-    """Both, for checks of channels and of rows rendered again."""
+    """Both contents joined, for checks of channels and of rows rendered again."""
     maps, pictures = content.maps | twins.maps, content.pictures | twins.pictures
     return Content(content.sequence, maps, pictures, times=content.times)
 
 
 def stack_faults(content: Content, missing: Collection[str], stride: int = 1) -> Iterator[Finding]:
-    """Row y of image y is row y of the rolling-shutter frame, and image 0 is its global-shutter twin; every
-    ``stride``-th image is read."""
+    """Check that row y of stack image y is row y of the rolling-shutter frame, and that image 0 is its
+    global-shutter twin; every ``stride``-th image is read."""
     sequence = content.sequence
     for view, picture in content.pictures.items():
         rows_scanned = sequence.shutter.axis(view.side) == 1
@@ -417,7 +419,7 @@ def stack_faults(content: Content, missing: Collection[str], stride: int = 1) ->
 
 
 def stack_rows(sequence: Sequence, view: ImageView, rows: Rows[int], of: Rows[int]) -> NDArray[np.uint8]:
-    """(H, W, 3) of which row ``rows[k]`` is that of image ``of[k]``, and others are black.
+    """(H, W, 3) image in which row ``rows[k]`` is that of stack image ``of[k]``, and other rows are black.
 
     Raises:
         RsbenchError: an image cannot be read.

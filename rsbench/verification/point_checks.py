@@ -1,4 +1,4 @@
-"""Channels of points (``tracks``, ``affine``, ``matches``) against depth, the row equation, images and rays."""
+"""Check the channels of points (``tracks``, ``affine``, ``matches``) by depth, row equation, images and rays."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher
 
 _SAME, _SAME_PX = 1e-9, 1e-6
-"""Relative distance of points, and px: roundings, and the 1e-9 px to which rows are solved over a small slope."""
+"""Tolerances for equal points, relative, and equal pixels, px: rounding, and 1e-9 px at a small slope."""
 _BEFORE, _BEHIND, _FEW = 1e-2, 1e-2, 0.15
-"""Relative distance beyond which a point is before or behind all that the pixels around it see; the share that may
-be, by what is thinner than a pixel: leaves far away, and gaps between them."""
+"""Relative distance at which a point is in front of or behind the surfaces of all pixels around it; share of
+points that may be so, because of objects thinner than a pixel, such as distant leaves and gaps between them."""
 _NEARLY_ALL = 0.8
-"""Share of the points that lie so above which thin leaves and gaps cannot explain their class."""
+"""Share among such points with a wrong class that thin objects cannot explain."""
 _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
@@ -71,9 +71,9 @@ def track_faults(
     reported: Collection[str],
     times: tuple[int, ...] = FRAMES,
 ) -> Iterator[Finding]:
-    """What the tracks show in frames at these times that depth maps and motion cannot have made.
+    """Find faults of the tracks in the frames ``times`` that depth maps and motion reveal.
 
-    But for files ``reported``.
+    Files in ``reported`` are ignored.
     """
     if "tracks" not in sequence.channels or TRACKS in reported:
         return
@@ -92,7 +92,7 @@ def track_faults(
 
 
 def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, name: str) -> Iterator[Finding]:
-    """Points are those of the depth map at the whole pixels from which they were drawn."""
+    """Check that points equal those of the depth map at the whole pixels from which they were drawn."""
     own = tracks.sources == k
     pixels, points = tracks.pixels[own, k], tracks.points[own]
     inside = depth.camera.contains(pixels)[:, None]
@@ -106,12 +106,12 @@ def _source_faults(sequence: Sequence, tracks: Tracks, k: int, depth: DepthMap, 
         ratio = float(np.median(np.linalg.norm(points, axis=1) / np.maximum(np.linalg.norm(X, axis=1), 1e-9)))
         scaled = np.median(np.linalg.norm(points - ratio * X, axis=1)) < 1e-6 and abs(ratio - 1) > _SAME
         cause = f"looks scaled by {ratio:.6g}" if scaled else ""
-        what = f"{np.sum(off > _SAME)} of {len(X)} points are not what {depth.view.depth} sees"
+        what = f"{np.sum(off > _SAME)} of {len(X)} points differ from {depth.view.depth}"
         yield Finding(TRACKS, what, cause=cause, part=name)
 
 
 def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjection, name: str) -> Iterator[Finding]:
-    """Known where and only where a row sees the point; and where that row sees it."""
+    """Check that a track has a pixel exactly if a row shows the point, and that it is the pixel in that row."""
     pixels, tau, classes = tracks.pixels[:, k], tracks.tau[:, k], tracks.classes[:, k]
     view = track_views(sequence.frames)[k]
     known, own = np.isin(classes, (PixelClass.VISIBLE, PixelClass.OCCLUDED)), tracks.sources == k
@@ -125,7 +125,7 @@ def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjectio
     off = np.max(np.abs(pixels[known] - exact), axis=1)
     for words, bad in (
         ("have another time than their row", late),
-        ("are not where their row sees them", off > _SAME_PX),
+        ("are not at the pixel in their row", off > _SAME_PX),
     ):
         if np.any(bad):
             size = f", typically by {np.median(off[bad]):.2g} px" if words.startswith("are") else ""
@@ -133,13 +133,13 @@ def _pixel_faults(sequence: Sequence, tracks: Tracks, k: int, found: RSProjectio
 
 
 def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap, name: str) -> Iterator[Finding]:
-    """Visible points are not far behind the pixels around them, hidden ones not before all of them."""
+    """Check that visible points are not behind all surfaces around them, and hidden ones not in front of all."""
     known = np.isfinite(found.tau) & (tracks.sources != k)
     low, high = depths_around(depth.depth, found.pixels[known])
     z, classes = found.depth[known], tracks.classes[known, k]
     for words, so, wrong in (
-        ("are visible, but hidden by", z > high * (1 + _BEHIND), PixelClass.VISIBLE),
-        ("are hidden, but visible by", z < low * (1 + _BEFORE), PixelClass.OCCLUDED),
+        ("are marked visible, but hidden according to", z > high * (1 + _BEHIND), PixelClass.VISIBLE),
+        ("are marked hidden, but visible according to", z < low * (1 + _BEFORE), PixelClass.OCCLUDED),
     ):
         bad = int(np.sum(classes[so] == wrong))
         if bad > max(min(_FEW * np.sum(known), _NEARLY_ALL * np.sum(so)), _LEAST):
@@ -147,7 +147,7 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
 
 
 def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least and largest depth (n,) of the 4 x 4 pixels around pixels (n, 2); sky is infinitely far."""
+    """Smallest and largest depth (n,) of the 4 x 4 pixels around pixels (n, 2); sky is infinitely far."""
     far = np.where(depth > 0, depth.astype(np.float64), np.inf)
     x, y = np.floor(pixels).astype(np.int64).T
     height, width = depth.shape
@@ -162,7 +162,7 @@ def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[Float
 
 @skips_unreadable
 def tracks_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
-    """As ``channel_checks.channels_again``, of tracks: what rays say of each frame."""
+    """``channel_checks.channels_again`` for tracks: compute the visibility in each frame again by ray casting."""
     if "tracks" not in sequence.channels or TRACKS in reported:
         return
     tracks = sequence.tracks()
@@ -170,7 +170,7 @@ def tracks_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> I
     wrong: list[BoolArray] = [_classes_unlike(sequence, tracks, k, view, rays) for k, view in views]
     share = float(np.mean(wrong)) if len(tracks.points) else 0.0
     bad = np.sum(wrong) > max(_FEW_AGAIN * np.size(wrong), _LEAST)
-    what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from what rays say"
+    what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from ray casting"
     yield TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong)
 
 
@@ -180,10 +180,9 @@ def _classes_unlike(sequence: Sequence, tracks: Tracks, k: int, view: View, rays
 
 
 _UNIT = 1e-6
-"""Tolerance of a length: normals are rounded to float32."""
+"""Tolerance of the length of a normal, as normals are rounded to float32."""
 _SAME_DERIVATIVE = 1e-6
-"""Tolerance of a derivative, relative to its largest entry: what rounding of normals and rows leaves at a grazing
-view."""
+"""Tolerance of a derivative, relative to its largest entry: rounding of normals and rows at grazing angles."""
 _FEW_WITHOUT_NORMAL = 0.02
 
 
@@ -194,15 +193,16 @@ def affine_faults(
     reported: Collection[str],
     times: tuple[int, ...] = FRAMES,
 ) -> Iterator[Finding]:
-    """What affine frames show that tracks, depth maps and motion cannot have made, but for files ``reported``.
+    """Find faults of affine frames that tracks, depth maps and motion reveal; files in ``reported`` are ignored.
 
-    Derivatives are looked at once, with frame 0 among these ``times``; normals with the maps that there are.
+    Derivatives are checked once, if frame 0 is among ``times``; normals are checked by the available maps.
     """
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
     affine, tracks = sequence.affine(), sequence.tracks()
     if affine.jacobians.shape[:2] != tracks.tau.shape:
-        yield Finding(AFFINE, f"is of {affine.jacobians.shape[:2]} points and views, tracks of {tracks.tau.shape}")
+        shapes = f"{affine.jacobians.shape[:2]} points and views, but tracks.npz {tracks.tau.shape}"
+        yield Finding(AFFINE, f"has {shapes}")
         return
     if 0 in times:
         yield from _jacobian_faults(sequence, affine, tracks)
@@ -225,7 +225,7 @@ def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -
         empty = np.any(np.isnan(stored), axis=(1, 2)) != np.any(np.isnan(own), axis=(1, 2))
         if np.any(empty):
             yield Finding(
-                AFFINE, f"{np.sum(empty)} derivatives are there without a pixel, or lack with one", part=name
+                AFFINE, f"{np.sum(empty)} derivatives are present without a pixel, or missing with one", part=name
             )
             continue
         size = np.maximum(np.max(np.abs(own), axis=(1, 2)), 1.0)[:, None, None]
@@ -238,7 +238,7 @@ def _jacobian_faults(sequence: Sequence, affine: AffineFrames, tracks: Tracks) -
 
 
 def _affine_cause(stored: FloatArray, made: FloatArray) -> str:
-    """What derivatives (n, 2, 2) are instead, in words; "" where nothing explains most of them."""
+    """Text on the likely error of derivatives (n, 2, 2); "" if none explains most of them."""
     tried = {"transposed": np.swapaxes(stored, 1, 2), "x and y exchanged": stored[:, ::-1, ::-1]}
     tried["inverted"] = inverse_2x2(stored)
     near = {words: np.mean(np.all(np.abs(each - made) < 1e-3, axis=(1, 2))) for words, each in tried.items()}
@@ -249,7 +249,7 @@ def _affine_cause(stored: FloatArray, made: FloatArray) -> str:
 def _normal_faults(
     sequence: Sequence, depth: DepthMap, normals: FloatArray, pixels: FloatArray
 ) -> Iterator[Finding]:
-    """Normals (n, 3) at whole pixels (n, 2) stand upright on the surface around them, where it is flat."""
+    """Check that normals (n, 3) at whole pixels (n, 2) are perpendicular to flat surfaces."""
     x, y = pixels.astype(np.int64).T
     flat = depth.flat[y, x]
     x, y, normals = x[flat], y[flat], normals[flat]
@@ -263,35 +263,34 @@ def _normal_faults(
     for step in (seen(1, 0) - seen(-1, 0), seen(0, 1) - seen(0, -1)):
         bent |= np.abs(np.sum(step * normals, axis=-1)) > LEVEL * np.linalg.norm(step, axis=-1)
     if np.sum(bent) > max(FEW_BENT * len(x), _LEAST):
-        what = f"{np.sum(bent)} of {len(x)} normals are not upright on the surface of {depth.view.depth}"
+        what = f"{np.sum(bent)} of {len(x)} normals are not perpendicular to the surface of {depth.view.depth}"
         yield Finding(AFFINE, what, part=f"{depth.view.side}_{depth.view.frame}")
 
 
 @skips_unreadable
 def affine_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
-    """As ``channel_checks.channels_again``, of affine frames: what rays meet at the points of the tracks."""
+    """``channel_checks.channels_again`` for affine frames: compute normals of tracks by ray casting."""
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
     stored, tracks = sequence.affine(), sequence.tracks()
     made = make_affine(sequence, tracks, rays)
     wrong = np.any(np.abs(made.normals - stored.normals) > 10 * _UNIT, axis=1)
     bad = np.sum(wrong) > max(_FEW_AGAIN * len(wrong), _LEAST)
-    what = f"{np.sum(wrong)} of {len(wrong)} normals differ from what rays meet"
+    what = f"{np.sum(wrong)} of {len(wrong)} normals differ from ray casting"
     names = ("normals", "jacobians")
     same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
     yield AFFINE, Finding(AFFINE, what) if bad else None, same
 
 
 _BESIDE_ALL, _FEW_BESIDE = 1e-2, 0.15
-"""Relative distance from all that the pixels around see, and the share of what may lie beyond, by things thinner
-than a pixel: keypoints sit at edges."""
+"""Relative distance from the surfaces of all pixels around, and share of points that may lie beyond, because of
+objects thinner than a pixel: keypoints are at edges."""
 _FEW_OTHERS = 0.02
-"""Share of matches that may differ on flat surfaces, when matched again on another processor, and by other
-rays."""
+"""Share of matches that may differ on flat surfaces, if matched again on another processor, and by ray casting."""
 _AGREES_PX = 1e-3
-"""Tolerance of places computed again by rays, px: depth is rounded to float32."""
+"""Tolerance of pixels computed again by ray casting, px, as depth is rounded to float32."""
 Report = Callable[..., Finding]
-"""Makes findings of one pair of views, from their words."""
+"""Creates a finding for one pair of views from its text."""
 _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 
 
@@ -299,9 +298,9 @@ _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 def match_faults(
     sequence: Sequence, maps: Mapping[ImageView, DepthMap], reported: Collection[str], first: int = 0
 ) -> Iterator[Finding]:
-    """What the labels of frame ``first`` and the next show that depth maps and motion cannot have made.
+    """Find faults in the labels of frame ``first`` and the next that depth maps and motion reveal.
 
-    But for files ``reported``.
+    Files in ``reported`` are ignored.
     """
     if "matches" not in sequence.channels:
         return
@@ -316,7 +315,7 @@ def match_faults(
         ends = zip((source, target), np.moveaxis(part.pixels, 1, 0), strict=True)
         outside = ~np.all([sequence.rig.sensor(view[0]).contains(pixels) for view, pixels in ends], axis=0)
         if np.any(outside):
-            yield found(f"{np.sum(outside)} matches have a keypoint beside the images")
+            yield found(f"{np.sum(outside)} matches have a keypoint outside the images")
             continue
         yield from _depth_faults(sequence, part, source, maps, reported, found)
         yield from _truth_faults(sequence, part, source, target, found)
@@ -325,7 +324,7 @@ def match_faults(
 
 @reports_unreadable
 def _record_faults(sequence: Sequence, matching: Matching, reported: Collection[str]) -> Iterator[Finding]:
-    """matcher.json against sequence.json, and against the card of the same name where this version wrote it."""
+    """Compare matcher.json with sequence.json, and with the card of that name if this version wrote it."""
     if MATCHER in reported:
         return
     record = sequence.matcher()
@@ -333,7 +332,7 @@ def _record_faults(sequence: Sequence, matching: Matching, reported: Collection[
     made = matcher_record(matching) if own else asdict(matching)
     for key, value in made.items():
         if record.get(key) != value:
-            yield Finding(MATCHER, f"{key} = {record.get(key)!r}, sequence.json and its matcher say {value!r}")
+            yield Finding(MATCHER, f"{key} = {record.get(key)!r}, but {value!r} by sequence.json and its matcher")
     versions = record.get("versions")
     if not isinstance(versions, dict) or not all(isinstance(versions.get(k), str) for k in ("rsbench", "opencv")):
         yield Finding(MATCHER, f"versions = {versions!r}: those of rsbench and opencv are needed")
@@ -349,7 +348,7 @@ def _depth_faults(
     reported: Collection[str],
     found: Report,
 ) -> Iterator[Finding]:
-    """The depth of keypoints is that of the flat surface around them, or between those of the pixels around."""
+    """Check that a keypoint's depth is that of a flat surface around it, or between those of pixels around."""
     view = ImageView("rs", *source)
     if view not in maps or view.depth in reported:
         return
@@ -373,25 +372,23 @@ def _depth_faults(
 def _truth_faults(
     sequence: Sequence, part: PairLabels, source: View, target: View, found: Report
 ) -> Iterator[Finding]:
-    """True places are those where a row sees the point at its own time, and errors the distances from them."""
+    """Check that true pixels satisfy the row equation, and that errors are the distances from them."""
     points = _points(sequence, part, source)
     _, tau, unsolved = seen_near(sequence, target, points, part.pixels[:, 1])
     known = np.all(np.isfinite(part.truth), axis=1)
     wrong = (known != np.isfinite(tau)) & ~unsolved
     if np.any(wrong):
-        yield found(f"{np.sum(wrong)} of {len(wrong)} true places are wrongly in or out of view")
+        yield found(f"{np.sum(wrong)} of {len(wrong)} true pixels are wrongly in or out of view")
         return
     times = sequence.shutter.pixel_time(part.truth[known], target[1], target[0])
     exact = project_at(sequence.rig, sequence.motion, target[0], times, points[known])[:, :2]
     off = np.max(np.abs(part.truth[known] - exact), axis=1)
-    if np.any(~(off <= _SAME_PX)):
-        what = (
-            f"{np.sum(~(off <= _SAME_PX))} of {np.sum(known)} true places are not where their row sees the point"
-        )
-        yield found(f"{what}, typically by {np.nanmedian(off[~(off <= _SAME_PX)]):.2g} px")
+    if np.any(bad := ~(off <= _SAME_PX)):
+        what = f"{np.sum(bad)} of {np.sum(known)} true pixels are not those of the point in their row"
+        yield found(f"{what}, typically by {np.nanmedian(off[bad]):.2g} px")
     error = np.linalg.norm(part.pixels[:, 1] - part.truth, axis=1)
     if np.any(bad := ~((np.abs(error - part.error) <= _SAME) | (np.isnan(error) & np.isnan(part.error)))):
-        yield found(f"{np.sum(bad)} of {len(bad)} errors are not the distance from the true place")
+        yield found(f"{np.sum(bad)} of {len(bad)} errors are not the distance from the true pixel")
 
 
 def _class_faults(
@@ -404,13 +401,13 @@ def _class_faults(
     bound_px: float,
     found: Report,
 ) -> Iterator[Finding]:
-    """Classes are those of the errors; hidden points lie behind what the target sees, others do not."""
+    """Check that classes follow from errors, and that only hidden points lie behind the target's surfaces."""
     hidden = part.classes == MatchClass.OCCLUDED
     unsolved = part.classes == MatchClass.UNSOLVED
     made = classes_of(part.pixels, part.depth, part.truth, hidden, unsolved, bound_px)
     if np.any(made != part.classes):
-        what = f"{np.sum(made != part.classes)} of {len(made)} classes are not what error and depth make"
-        yield found(f"{what}, within {bound_px:g} px")
+        what = f"{np.sum(made != part.classes)} of {len(made)} classes do not follow from error and depth"
+        yield found(f"{what}, with a bound of {bound_px:g} px")
     view, seen = ImageView("rs", *target), np.isfinite(part.error) & (part.depth > 0.0)
     if view not in maps or view.depth in reported:
         return
@@ -419,16 +416,16 @@ def _class_faults(
     z = project_at(sequence.rig, sequence.motion, target[0], times, points)[:, 2]
     low, high = depths_around(maps[view].depth, places)
     for words, so, wrong in (
-        ("are in sight, but hidden by", z > high * (1 + _BESIDE_ALL), ~hidden[seen]),
-        ("are hidden, but in sight by", z < low * (1 + _BESIDE_ALL), hidden[seen]),
+        ("are marked visible, but hidden according to", z > high * (1 + _BESIDE_ALL), ~hidden[seen]),
+        ("are marked hidden, but visible according to", z < low * (1 + _BESIDE_ALL), hidden[seen]),
     ):
-        # Where few points are hidden, all of them may be by things thinner than a pixel.
+        # If few points are hidden, objects thinner than a pixel may hide all of them.
         if np.sum(so & wrong) > max(_FEW_BESIDE * np.sum(so), _FEW_OTHERS * np.sum(seen), _LEAST):
             yield found(f"{np.sum(so & wrong)} of {np.sum(seen)} points {words} {view.depth}")
 
 
 def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
-    """World points (n, 3) that the first keypoints see; those in the sky far away."""
+    """World points (n, 3) of the first keypoints; those in the sky are placed at ``FAR``."""
     eyes, ahead = looks(sequence, source, part.pixels[:, 0])
     return eyes + np.where(part.depth > 0.0, part.depth, FAR)[:, None] * (ahead - eyes)
 
@@ -436,9 +433,9 @@ def _points(sequence: Sequence, part: PairLabels, source: View) -> FloatArray:
 def matched_again(
     sequence: Sequence, reported: Collection[str], first: int = 0
 ) -> tuple[list[Finding], list[str]]:
-    """Faults of matches that the stated matcher does not find in the pictures, and notes where it was not run.
+    """Match the images again; returns faults of matches that are not found, and a note if this was not possible.
 
-    Only rsbench's own matcher is run, in the versions that made them: what a dataset names is never imported.
+    Only rsbench's own matcher is run, in the recorded versions: a class that a dataset names is never imported.
     """
     images_of, file = [ImageView("rs", *at(view, first)) for view in VIEWS], matches_file(first)
     if "matches" not in sequence.channels or {*(each.image for each in images_of), file, MATCHER} & set(reported):
@@ -470,7 +467,7 @@ def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Itera
 
 @skips_unreadable
 def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Collection[str]) -> Iterator[Again]:
-    """As ``channel_checks.channels_again``, of matches of frame ``first`` and the next: what rays say of each."""
+    """``channel_checks.channels_again`` for matches of frame ``first`` and the next: label them by ray casting."""
     if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
         return
     stored = sequence.matches(first)
@@ -480,7 +477,7 @@ def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Col
         near = np.abs(made.error - stored.error) <= _AGREES_PX
     alike = (made.classes == stored.classes) & (near | (np.isnan(made.error) & np.isnan(stored.error)))
     wrong = int(np.sum(~alike))
-    what = f"{wrong} of {len(alike)} labels differ from what rays say"
+    what = f"{wrong} of {len(alike)} labels differ from ray casting"
     names = ("depth", "truth", "classes")
     same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
     yield file, Finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else None, same

@@ -95,7 +95,7 @@ def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int])
     if stored.labels is None:
         return
     wrong, file = stored.labels[rows] != rendered, stored.view.labels
-    what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from what is rendered again"
+    what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from a new rendering"
     in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
     bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
     yield RowCheck(file, Finding(file, what, rows_of(in_rows)) if bad else None, not np.any(wrong))
@@ -112,7 +112,7 @@ def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]
     middle = float(np.median(ratio))
     scaled = np.median(np.abs(ratio / middle - 1)) < 1e-6 and abs(middle - 1) > SAME_DEPTH
     cause = f"looks scaled by {middle:.7g}" if scaled else ""
-    what = f"depth differs from what is rendered again on {100 * share:.3g} % of {wrong.size} pixels"
+    what = f"depth differs from a new rendering on {100 * share:.3g} % of {wrong.size} pixels"
     if np.any(both):
         what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
     return RowCheck(file, Finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
@@ -130,7 +130,7 @@ def image_check(
     if np.mean(far) <= few and np.mean(other) <= _OTHER_CODES:
         return RowCheck(file, None, not np.any(difference))
     what = (
-        f"the image differs from what is rendered again on {100 * np.mean(other):.3g} % of {far.size} pixels, "
+        f"the image differs from a new rendering on {100 * np.mean(other):.3g} % of {far.size} pixels, "
         f"by up to {np.max(difference):g} codes"
     )
     y, x = (each.ravel() for each in np.meshgrid(rows, np.arange(truth.shape[1]), indexing="ij"))
@@ -442,7 +442,7 @@ def _stack_check(
 
 
 def _by_gpu(content: Content) -> bool:
-    """Whether a GPU rendered the one, what is stored or what is rendered again, and not the other."""
+    """Whether a GPU rendered only one of the two, the stored image or the new rendering."""
     from rsbench.renderers.backend import VARIANTS, start_backend
 
     variants = {start_backend().variant, _table(content.sequence.manifest, "made_by").get("variant")}

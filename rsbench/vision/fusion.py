@@ -1,14 +1,13 @@
-"""Filling the holes of a corrected frame: from the other camera, from the other frame, at last by a guess.
+"""Fill the holes of a corrected frame from the other camera, from the other frame, and at last by a guess.
 
-A pixel of the target is a hole of the corrected frame for one of three reasons: something hid the place, it lies
-outside the frame, or its depth is unknown. Another image of the same scene may have seen it. Each is warped to the
-target like the frame itself; where several see the place, the nearest surface is what the target camera sees, and
-among those that agree in depth the earlier in the list wins.
+A pixel of the target is a hole of the corrected frame if the surface was hidden, lies outside the frame, or has
+unknown depth. Another image of the same scene may show it. Each image is warped to the target like the frame
+itself; if several show the point, the nearest surface is used, or the first view of those that agree in depth.
 
-``finished`` makes the frame one to look at: it closes specks and slits that no frame shows and evens seams. A
-narrow hole that is closed can hide nothing; filling a wide one would be a guess at the scene, so it stays. The
-border between a near thing and what another frame shows behind it is cut along pixels: such a seam is a
-staircase, whereas the frame's own edges are as fine as its optics.
+``finished`` prepares the frame for viewing: it closes specks and slits that no frame shows, and smooths seams. A
+narrow hole can hide nothing and is closed; filling a wide one would be a guess about the scene, so it stays. The
+border between a near object and the background from another frame follows pixels, so such a seam is a staircase,
+whereas the frame's own edges are as fine as its optics.
 """
 
 from __future__ import annotations
@@ -34,41 +33,41 @@ Mask = NDArray[np.bool_]
 
 
 class Origin(IntEnum):
-    """Where a pixel of a corrected frame comes from."""
+    """The source of a pixel of a corrected frame."""
 
     NOBODY = 0
-    """No frame saw the place, as far as depth is known."""
+    """No frame shows the point, as far as depth is known."""
     HERE = 1
-    """The frame itself, at a measured depth, at infinity, or where its depth hardly moves it."""
+    """The frame itself, at a measured depth, at infinity, or where the depth has little effect."""
     GUESSED = 2
-    """At a depth guessed from its neighbours: the frame itself, or, in a tear that it does not show, another."""
+    """The frame itself at a depth guessed from neighbours; in a tear that it does not show, another frame."""
     OTHER_CAMERA = 3
     """The other camera's frame of the same time."""
     OTHER_FRAME = 4
     """A frame of the other time, of either camera."""
     INVENTED = 5
-    """No frame: a hole so narrow that it was closed from its surroundings."""
+    """No frame: a narrow hole that was closed from its surroundings."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SourceView(LineView):
-    """One image that may know something about the target."""
+    """An image that may show parts of the target."""
 
     origin: Origin
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fused:
-    """A corrected frame with its holes filled as far as anything is known."""
+    """A corrected frame with its holes filled as far as possible."""
 
     image: NDArray[Any]
     """(H, W) or (H, W, C), type of the sources; 0 where the origin is NOBODY, unless invented."""
     origin: NDArray[np.uint8]
-    """(H, W) of ``Origin``."""
+    """(H, W) values of ``Origin``."""
     depth: NDArray[np.float32]
     """(H, W) z in the target camera, metres; inf at infinity, NaN where it is unknown or the origin is NOBODY."""
     reason: str = ""
-    """Why the corrector found no correction of this frame; empty when it did."""
+    """Why the corrector failed for this frame; empty if it succeeded."""
 
     @property
     def success(self) -> bool:
@@ -77,18 +76,18 @@ class Fused:
 
     @classmethod
     def seen(cls, image: NDArray[Any], mask: Mask) -> Fused:
-        """A corrected frame (H, W[, C]) drawn from the frame itself where ``mask`` (H, W) is True; no depth."""
+        """A corrected frame (H, W[, C]) that shows the frame itself where ``mask`` (H, W) is True; no depth."""
         origin = np.where(mask, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
         return cls(image=image, origin=origin, depth=np.full(mask.shape, np.nan, dtype=np.float32))
 
     @classmethod
     def failed(cls, image: NDArray[Any], reason: str) -> Fused:
-        """No correction of a frame (H, W[, C]), because of ``reason``: a black one that nobody saw."""
+        """The result for a frame (H, W[, C]) that could not be corrected: a black image with the ``reason``."""
         nothing = cls.seen(np.zeros_like(image), np.zeros(image.shape[:2], dtype=np.bool_))
         return replace(nothing, reason=reason)
 
     def shares(self) -> dict[str, float]:
-        """Share of the pixels of each origin, by its name in lower case."""
+        """Share of the pixels of each origin by its lower-case name."""
         counts = np.bincount(self.origin.ravel(), minlength=len(Origin))
         return {origin.name.lower(): float(counts[origin]) / self.origin.size for origin in Origin}
 
@@ -96,12 +95,12 @@ class Fused:
 _AGREE = 0.03
 """Relative difference of depth below which two views show the same surface."""
 _DIFFERENT = 0.06
-"""Share of the full range: colours that differ by more show different surfaces."""
+"""Difference of colours, as a share of the full range, above which they show different surfaces."""
 _ROW_STEPS = 6
-"""Rounds until the row that sees a point is found; each leaves a share of the error below the readout ratio times
-the motion over the height of the image."""
+"""Iterations for the row of a point; each multiplies the error by less than the readout ratio times the motion,
+relative to the height of the image."""
 _MARGIN = 3
-"""Pixels around a hole whose sources are drawn too, so that the mesh reaches its rim."""
+"""Width, px, of the area around a hole that is drawn too, so that the mesh reaches the hole's border."""
 
 
 def fuse(
@@ -109,10 +108,10 @@ def fuse(
 ) -> Fused:
     """Warp the first view to ``target_pose`` and fill its holes from the others.
 
-    First with what they measured and the frame does not contradict, then with GUESSED ones, then with the rest; at
-    last, with a GUESSED view only, tears in one surface are closed.
+    Measured pixels that the frame does not contradict come first, then GUESSED ones, then the contradicted ones.
+    If there is a GUESSED view, tears in one surface are closed at last.
 
-    Raises ValueError as ``rsbench.vision.correction.warp``.
+    Raises ValueError as ``rsbench.vision.correction.warp`` does.
     """
     first, others = views[0], views[1:]
     corrected = warp(first, camera, target_pose, options=options)
@@ -129,7 +128,7 @@ def fuse(
             candidate = _warp_into(view, holes, camera, target_pose, options)
             if candidate is None:
                 continue
-            # Where two know a pixel of a hole, the nearer surface hides the other.
+            # If two views show a pixel of a hole, the nearer surface hides the other.
             known = np.where(np.isnan(depth), np.float32(np.inf), depth)
             nearer = candidate.depth < known * (1.0 - _AGREE)
             take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
@@ -139,7 +138,7 @@ def fuse(
                 take &= ~against
             image[take], depth[take] = candidate.image[take], candidate.depth[take]
             origin[take] = view.origin
-    for candidate, mask, source in contradicted:  # what nothing else fills, not even the frame's own guess
+    for candidate, mask, source in contradicted:  # only where nothing else fills the hole
         take = mask & (origin == Origin.NOBODY)
         image[take], depth[take], origin[take] = candidate.image[take], candidate.depth[take], source
     if guessed:
@@ -156,13 +155,13 @@ def _close_tears(
     target_pose: Pose,
     options: WarpOptions | None,
 ) -> None:
-    """Fill in place the holes that lie in one surface, GUESSED, by what the views show there, the first one first.
+    """Fill, in place, holes within one surface from the first view that shows them; their origin is GUESSED.
 
-    A gap past an edge opens between two surfaces. A hole between two places of one surface, in a row or a column,
-    is a tear, made by pixels whose depth is unknown or wrong. It has the depth of its sides, and a view shows it
-    unless that view knows something nearer there.
+    A gap at a depth edge lies between two surfaces. A hole between two points of one surface, in a row or column,
+    is a tear, due to pixels with unknown or wrong depth. It gets the depth of its sides, and is filled from a view
+    unless that view has a nearer surface there.
     """
-    rho, interpolation = _of_both_sides(inverse_depth(depth)), (options or WarpOptions()).interpolation
+    rho, interpolation = _surface_of_both_sides(inverse_depth(depth)), (options or WarpOptions()).interpolation
     for view in views:
         holes = (origin == Origin.NOBODY) & np.isfinite(rho)
         if not np.any(holes):
@@ -175,10 +174,10 @@ def _close_tears(
             depth[take] = 1.0 / rho[take]
 
 
-def _of_both_sides(rho: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Inverse depth (H, W) of the surface on both sides of a pixel, the farther one's; NaN where they differ.
+def _surface_of_both_sides(rho: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Inverse depth (H, W) of the farther of the surfaces on both sides of a pixel; NaN if these differ.
 
-    The sides are the nearest known pixels of its row, or of its column where those of the row lie apart.
+    The sides are the nearest known pixels in the row, or in the column if those in the row differ.
     """
     found = np.full_like(rho, np.nan)
     for sides in (known_beside(rho), tuple(side.T for side in known_beside(rho.T))):
@@ -190,12 +189,11 @@ def _of_both_sides(rho: NDArray[np.float32]) -> NDArray[np.float32]:
 def _contradicted(
     frame: SourceView, found: Corrected, wanted: Mask, camera: PinholeCamera, target_pose: Pose
 ) -> Mask:
-    """(H, W) where ``frame``, at the place where it would see what another view found, shows something else.
+    """(H, W) mask of points of another view whose reprojection to ``frame`` shows something else.
 
-    There the frame knows a surface behind it, or has no depth and another colour: something that only the frame
-    sees, often near and thin, stands before what was found, which must not be drawn over it. Where the frame knows
-    a nearer surface it was hidden, and nothing contradicts. The first view's own pixels decide, ``wanted`` (H, W)
-    says where to look.
+    There the frame has a farther surface, or no depth and another colour: an object that only the frame shows,
+    often near and thin, is in front of the point, which must not be drawn over it. If the frame has a nearer
+    surface, the point was hidden, which is no contradiction. Only points in ``wanted`` (H, W) are tested.
     """
     places, expected, known = _look_up(frame, inverse_depth(found.depth), wanted, camera, target_pose)
     seen = np.isfinite(places[..., 0])
@@ -206,11 +204,11 @@ def _contradicted(
 def _look_up(
     view: SourceView, rho: NDArray[np.float32], wanted: Mask, camera: PinholeCamera, target_pose: Pose
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Where a view would see the ``wanted`` (H, W) points of inverse depth ``rho`` (H, W) of the target.
+    """Reproject the ``wanted`` (H, W) points of the target, with inverse depth ``rho`` (H, W), to a view.
 
     Returns:
-        The places (H, W, 2), px, NaN outside the view; the inverse depth (H, W) of the points there; what the view
-        knows there, NaN where it knows none.
+        The pixels (H, W, 2), NaN outside the view; the inverse depth (H, W) of the points in the view; the view's
+        own inverse depth there, NaN where it is unknown.
     """
     own = view.camera or camera
     maps = line_maps(own, target_pose, view.poses, view.columns, camera)
@@ -218,7 +216,7 @@ def _look_up(
     expected = np.zeros(wanted.shape, dtype=np.float32)
     _find_in_lines(rho, wanted, maps, own.width, own.height, places, expected)
     inside, known = np.isfinite(places[..., 0]), np.full(wanted.shape, np.nan, dtype=np.float32)
-    # Half a pixel past the last centre still belongs to the frame, and rounds beyond it in float32.
+    # The frame ends half a pixel beyond the last centre, which may be rounded to the next pixel in float32.
     nearest = np.rint(places[inside]).astype(np.intp)
     x, y = np.clip(nearest, 0, (own.width - 1, own.height - 1)).T
     known[inside] = inverse_depth(view.depth[y, x])
@@ -226,7 +224,7 @@ def _look_up(
 
 
 def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:
-    """(H, W) whether images differ in the mean of 3 x 3 pixels, of those that are ``where``."""
+    """(H, W) whether images differ in the mean over those of 3 x 3 pixels that are in ``where``."""
     levels = np.iinfo(a.dtype).max if np.issubdtype(a.dtype, np.integer) else 1.0
     apart = np.zeros(where.shape, dtype=np.float32)
     each = np.abs(np.atleast_3d(a)[where].astype(np.float32) - np.atleast_3d(b)[where])
@@ -246,11 +244,10 @@ def _find_in_lines(
     places: NDArray[np.float32],
     seen_rho: NDArray[np.float32],
 ) -> None:
-    """Where a rolling-shutter frame sees points given by pixel and inverse depth ``rho`` (H, W) of the target.
+    """Reproject pixels of the target with inverse depth ``rho`` (H, W) to a rolling-shutter frame.
 
-    Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, of the ``wanted`` pixels
-    whose points lie inside the frame of ``view_width`` x ``view_height`` pixels. ``maps`` take them to each
-    line's camera.
+    Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, for ``wanted`` pixels whose
+    points lie inside the frame of ``view_width`` x ``view_height`` pixels. ``maps`` lead to each line's camera.
     """
     M, b, columns = maps.M, maps.b, maps.columns
     height, width = rho.shape
@@ -278,7 +275,7 @@ def _find_in_lines(
 def _warp_into(
     view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
 ) -> Corrected | None:
-    """The part of a view that falls into the holes; None when nothing does."""
+    """Warp the part of a view that lies in the holes; None if there is none."""
     maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
     depth = np.zeros_like(view.depth)
@@ -295,7 +292,7 @@ def _keep_landing(
     wanted: NDArray[np.uint8],
     kept: NDArray[np.float32],
 ) -> int:
-    """Copy to ``kept`` the depth (H, W) of pixels that land on wanted target pixels (h, w); how many these are.
+    """Copy to ``kept`` the depth (H, W) of pixels that are mapped to wanted target pixels (h, w); their number.
 
     ``rho`` is inverse depth, NaN where unknown.
     """
@@ -312,7 +309,7 @@ def _keep_landing(
 
 
 def inpaint(image: NDArray[Any], missing: Mask, radius: float = 3.0) -> NDArray[Any]:
-    """``image`` (H, W[, C]), uint8 or uint16, with its ``missing`` (H, W) pixels invented from those around them.
+    """``image`` (H, W[, C]), uint8 or uint16, with its ``missing`` (H, W) pixels filled from those around them.
 
     Telea, "An image inpainting technique based on the fast marching method", 2004 (OpenCV).
     """
@@ -327,20 +324,20 @@ def inpaint(image: NDArray[Any], missing: Mask, radius: float = 3.0) -> NDArray[
 
 
 _WIDTH_SHARE, _LEAST_PX = 0.015, 5
-"""Width of a hole that is closed, at most, as a share of the image's width; and px of small images."""
+"""Largest width of a hole that is closed, as a share of the image's width; least value, px, in small images."""
 _LARGE_DISCS = 16
-"""Area of a region that is left black, at least, in squares of that width: below that it is a blot."""
+"""Least area of a region that stays black, in squares of that width; smaller ones would look like blots."""
 _RADIUS_PX = 3.0
 _SEAM_PX, _JUMP = 0.5, 0.05
-"""Deviation of the blur along seams, and relative difference of depths from which they are borders of things."""
+"""Standard deviation of the blur along seams, px; least relative difference of depth at an object's border."""
 _FAR = 1e6
-"""Metres, or what else depth is in, in place of infinite and unknown depth."""
+"""Replaces infinite and unknown depth, in the unit of depth."""
 
 
 def narrow(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The parts of ``holes`` (H, W) that are closed: but for those where discs of that width make a large region.
+    """The parts of ``holes`` (H, W) that are closed: all but large regions that consist of discs of that width.
 
-    The border of the image ends a hole.
+    Holes end at the border of the image.
     """
     size = max(round(_WIDTH_SHARE * holes.shape[1]), _LEAST_PX) | 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -349,13 +346,13 @@ def narrow(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
     wide = cv2.dilate(core, disc)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] >= _LARGE_DISCS * size**2
-    large[0] = False  # what is no hole
+    large[0] = False  # label 0 is no hole
     return np.asarray(holes & ~large[labels])
 
 
 def finished(fused: Fused) -> Fused:
-    """With narrow holes INVENTED from what lies around them, and even seams; a failed one as it is."""
-    return _even_seams(_closed(fused)) if fused.success else fused
+    """The frame with narrow holes closed (INVENTED) and seams smoothed; a failed one is returned unchanged."""
+    return _smooth_seams(_closed(fused)) if fused.success else fused
 
 
 def _closed(fused: Fused) -> Fused:
@@ -363,15 +360,15 @@ def _closed(fused: Fused) -> Fused:
     closed = narrow(holes)
     if not np.any(closed):
         return fused
-    # Wide holes are invented too and put back: their black is nothing that a slit should be closed with.
+    # Wide holes are filled too and then restored, as slits must not be closed with their black.
     image = inpaint(fused.image, holes, _RADIUS_PX)
     image[holes & ~closed] = 0
     origin = np.where(closed, np.uint8(Origin.INVENTED), fused.origin)
     return replace(fused, image=image, origin=origin)
 
 
-def _even_seams(fused: Fused) -> Fused:
-    """Blurred by half a pixel where one source ends and another begins, at a jump of the depth."""
+def _smooth_seams(fused: Fused) -> Fused:
+    """Blur by half a pixel where two sources meet at a jump of the depth."""
     known = np.isfinite(fused.depth) & (fused.depth > 0.0)
     distance = np.log(np.where(known, fused.depth, np.float32(_FAR)))
     sources, jumps = (

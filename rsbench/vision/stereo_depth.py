@@ -1,17 +1,17 @@
 """Dense disparity of the rig's two images: semi-global matching, left-right check, sub-pixel refinement.
 
-The rig reads the same row of both cameras at the same time, so the pair of a rolling-shutter frame is rectified
-like a global-shutter one, and ``disparity = x_left - x_right`` needs no knowledge of the motion. Where cameras
-read their lines at different times, ``moving_disparities`` and ``timed_depth`` use a motion that is known.
+If both cameras read a row at the same time, the image pair is rectified like one with a global shutter, and
+``disparity = x_left - x_right`` does not depend on the motion. If they read it at different times,
+``moving_disparities`` and ``timed_depth`` use a known motion.
 
 Hirschmueller, "Stereo processing by semi-global matching and mutual information", PAMI 2008 (OpenCV's StereoSGBM).
 
-Semi-global matching interpolates its cost between whole disparities, which biases it by up to a quarter of a pixel
-with the fraction of the disparity (pixel locking). ``refine_disparity`` fits each pixel's disparity to the images:
-in the window around it the disparity is a plane, ``d(u, v) = d + a u + b v``, and each window pixel q measures
-``d_q + e_q / g_q`` with weight ``g_q^2``: its current disparity corrected by one Lucas-Kanade step along the row
-(``e`` the difference of the two images, ``g`` their slope). The matcher's own value enters as a weak measurement,
-so a window without texture is smoothed rather than lost. Pixels of another surface stay out of the window. On
+Semi-global matching interpolates its cost between whole disparities, which biases results by up to a quarter of a
+pixel, depending on the fraction of the disparity (pixel locking). ``refine_disparity`` fits each pixel's disparity
+to the images: in a window the disparity is a plane, ``d(u, v) = d + a u + b v``, and each window pixel q measures
+``d_q + e_q / g_q`` with weight ``g_q^2``, i.e. its current disparity corrected by one Lucas-Kanade step along the
+row (``e``: difference of the two images, ``g``: their slope). The matcher's value is included as a weak
+measurement, so that windows without texture are smoothed and not lost. Pixels of other surfaces are excluded. For
 smooth textures the bias falls from 0.25 px to 0.003 px and the median error from 0.15 px to 0.01 px.
 
 Lucas and Kanade, IJCAI 1981; along the row only, on the rectified pair.
@@ -87,10 +87,10 @@ def _in_bands(height: int, work: Callable[[int, int], None]) -> None:
 
 @compiled(error_model="numpy")
 def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weight: F32, pull: F32) -> None:
-    """Fill each pixel's weight ``g^2`` plus the prior's, and ``g e``: what the images say of its disparity.
+    """Fill each pixel's weight, ``g^2`` plus that of the prior, and ``g e``, for a step of its disparity.
 
-    ``g`` is the mean slope along the row of ``a`` and of ``b`` where the disparity puts it, ``e`` is ``b`` there
-    minus ``a``.
+    ``g`` is the mean of the slopes along the row of ``a`` and of ``b`` at the pixel's partner, and ``e`` is ``b -
+    a``.
     """
     width = a.shape[1]
     for y in range(first_row, end_row):
@@ -156,9 +156,9 @@ def _add_column(
     r0: F32,
     ru: F32,
 ) -> None:
-    """Add the window pixel u columns beside every pixel of a row to its sums: of w, w u, w u^2, r and r u.
+    """Add the window pixel at column offset u of every pixel of a row to its sums of w, w u, w u^2, r and r u.
 
-    All pixels of a row at once, contiguous and without a branch: the compiler makes vector instructions of it.
+    The loop over a row is contiguous and has no branch, so that the compiler can vectorise it.
     """
     for x in range(len(centre)):
         offset = disparity[x] - centre[x]
@@ -199,7 +199,7 @@ def _plane_at_centre(sums: FloatArray) -> float:
         sums[7],
         sums[8],
     )
-    # Moments about the weighted centre. A window one pixel wide has no slope across it: a little stiffness.
+    # Moments about the weighted centre, regularised for windows of one pixel's width, which have no slope across.
     uu, uv, vv = wuu - wu * wu / w0 + 0.1 * w0, wuv - wu * wv / w0, wvv - wv * wv / w0 + 0.1 * w0
     su, sv = ru - wu * r0 / w0, rv - wv * r0 / w0
     determinant = uu * vv - uv * uv
@@ -228,7 +228,7 @@ _RANGES = {
     "consistency_px": (1e-6, 1e6),
     "refine_iterations": (0, 100),
 }
-"""Beyond them the matcher overflows, or takes minutes for an image."""
+"""Allowed ranges; beyond them the matcher overflows, or takes minutes for an image."""
 _FRACTION = 16.0  # StereoSGBM counts sixteenths of a pixel
 _COARSE = 4
 _RANGE_MARGIN = 1.1
@@ -240,12 +240,11 @@ class SgmOptions:
     """Parameters of StereoSGBM and of the steps after it."""
 
     num_disparities: int | None = None
-    """Disparities searched, from 0; None derives them from ``nearest_depth``."""
+    """Number of disparities that are searched, from 0; None: derived from ``nearest_depth``."""
     least_disparity: float = 0.5
-    """Smaller disparities are unknown: they are hardly distinguishable from infinity, and what the matcher returns
-    without texture."""
+    """Smaller disparities are set to unknown: they hardly differ from infinity, or result without texture."""
     nearest_depth: float | None = None
-    """Metres; None finds the range in the images, by matching them at a quarter of the size."""
+    """Smallest depth, metres; None: the range is found by matching the images at a quarter of the size."""
     block_size: int = 5
     """Side of the matched window, pixels, odd."""
     p1: int = 8
@@ -253,21 +252,21 @@ class SgmOptions:
     p2: int = 32
     """Penalty of larger steps, times block_size squared."""
     mode: Literal["sgbm", "hh", "3way", "hh4"] = "3way"
-    """Paths along which OpenCV sums costs: ``sgbm`` 5, ``hh`` 8, ``3way`` 3, ``hh4`` 4."""
+    """Number of paths along which OpenCV sums costs: ``sgbm`` 5, ``hh`` 8, ``3way`` 3, ``hh4`` 4."""
     uniqueness_percent: int = 5
     """Per cent by which the best cost must be below the second-best."""
     prefilter_cap: int = 31
-    """Largest horizontal derivative before matching, grey levels."""
+    """Horizontal derivatives are clipped to this before matching, grey levels."""
     speckle_window: int = 100
-    """Connected pieces of at most this many pixels are dropped; 0 keeps all."""
+    """Connected regions of at most this many pixels are removed; 0: all are kept."""
     speckle_range: int = 2
-    """Largest difference of disparity inside a connected piece, px."""
+    """Largest difference of disparity within a connected region, px."""
     consistency_px: float = 1.0
-    """Largest difference between a pixel's disparity and that of its partner in the other image."""
+    """Largest difference between a pixel's disparity and that of its partner in the other image, px."""
     refine_iterations: int = 2
-    """Rounds of least squares on the images, see ``refine_disparity``; 0 keeps SGM's own interpolation."""
+    """Number of least-squares iterations on the images, see ``refine_disparity``; 0: SGM's is kept."""
     half: bool = False
-    """Match at half the size; borders of depth are then put where the image has its own."""
+    """Match at half the size; depth edges are then aligned with edges of the full image."""
 
     def __post_init__(self) -> None:
         if self.mode not in _MODES:
@@ -291,10 +290,10 @@ class SgmMatcher(SgmOptions, StereoMatcher):
 def stereo_disparity(
     left: NDArray[Any], right: NDArray[Any], rig: StereoRig, side: Side = "left", options: SgmOptions | None = None
 ) -> F32:
-    """Disparity (H, W), px, on the pixels of one image; NaN where it is unknown. ``rig.depth`` makes it metres.
+    """Disparity (H, W), px, on the pixels of one image; NaN where it is unknown. ``rig.depth`` gives metres.
 
-    Images (H, W[, 3]) are uint8 or uint16. Unknown are pixels without a consistent partner, which includes the
-    band that the other camera does not see. Raises ValueError when the images do not fit each other or the rig.
+    Images (H, W[, 3]) are uint8 or uint16. Pixels without a consistent partner are unknown, including the band
+    that the other camera does not show. Raises ValueError if the images' sizes do not match the rig's.
     """
     options = options or SgmOptions()
     grey_left, grey_right = _greys(left, right, rig)
@@ -340,12 +339,12 @@ def _raw_pair(left: U8, right: U8, rig: StereoRig, options: SgmOptions) -> tuple
 
 
 def _match_both(left: U8, right: U8, count: int, options: SgmOptions) -> tuple[F32, F32]:
-    # Seen in a mirror the right camera is the left one: the same matcher serves both.
+    # In mirrored images the right camera is the left one, so the same matcher serves both.
     return _sgm(left, right, count, options), _mirrored(_sgm(_mirrored(right), _mirrored(left), count, options))
 
 
 def _finish(reference: U8, other: U8, raw: F32, raw_other: F32, options: SgmOptions) -> F32:
-    """Checked against the other image's disparities, speckles dropped, refined; ``reference`` is the left."""
+    """Check disparities against the other image's, remove speckles and refine; ``reference`` is the left image."""
     kept = _without_speckles(_consistent(raw, raw_other, options.consistency_px), options)
     return refine_disparity(reference, other, kept, iterations=options.refine_iterations)
 
@@ -381,7 +380,7 @@ def _largest_disparity(left: U8, right: U8, options: SgmOptions) -> float:
 
 def _sgm(reference: U8, other: U8, count: int, options: SgmOptions) -> F32:
     """Raw disparity (H, W) of ``reference`` as the left image, NaN where there is none."""
-    # SGBM leaves the first ``count`` columns out: it gets them as padding instead.
+    # SGBM does not match the first ``count`` columns, so add as many as padding.
     a, b = (cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (reference, other))
     area = options.block_size**2
     matcher = cv2.StereoSGBM.create(
@@ -398,7 +397,7 @@ def _sgm(reference: U8, other: U8, count: int, options: SgmOptions) -> F32:
         mode=_MODES[options.mode],
     )
     disparity = np.asarray(matcher.compute(a, b)[:, count:], dtype=np.float32) / np.float32(_FRACTION)
-    # Beyond the other image's border there is only padding to match.
+    # Matches beyond the other image's border are matches to padding.
     columns = np.arange(disparity.shape[1], dtype=np.float32)
     return np.where(
         (disparity >= options.least_disparity) & (columns - disparity >= 0.0), disparity, np.float32(np.nan)
@@ -406,7 +405,7 @@ def _sgm(reference: U8, other: U8, count: int, options: SgmOptions) -> F32:
 
 
 def _consistent(reference: F32, other: F32, tolerance: float) -> F32:
-    """``reference`` (as the left image) where the partner in ``other`` points back within the tolerance, px."""
+    """``reference`` (as the left image) where the partner's disparity in ``other`` agrees to the tolerance, px."""
     columns = np.arange(reference.shape[1])
     partner = np.rint(columns - np.nan_to_num(reference)).astype(np.int64)
     back = np.take_along_axis(other, np.clip(partner, 0, reference.shape[1] - 1), axis=1)
@@ -428,8 +427,8 @@ def _mirrored(image: NDArray[Any]) -> NDArray[Any]:
 def fill_holes(disparity: F32) -> F32:
     """Disparity (H, W) with its holes filled along the rows by the farther of the two neighbours.
 
-    What one camera does not see lies behind what hides it, so the smaller disparity is the better guess; it stays
-    a guess. Rows without any value stay unknown.
+    Surfaces that are hidden from one camera lie behind the hiding ones, so the smaller disparity is the better
+    guess. Rows without any value stay unknown.
     """
     return np.fmin(*known_beside(disparity))
 
@@ -447,11 +446,11 @@ def known_beside(values: F32) -> tuple[F32, F32]:
 
 
 def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig, side: Side) -> NDArray[np.bool_]:
-    """Pixels (H, W) whose point the other camera sees too, from the true depth of both, metres.
+    """Pixels (H, W) whose point is visible in the other camera too, from the true depth of both, metres.
 
-    It does when its own disparity at that place is the same to a pixel: nothing nearer hides the point, which lies
-    inside the picture. A rolling shutter changes nothing where both cameras read a row at the same time; with a
-    lens the two times are so near that the difference is lost in that pixel.
+    A point is visible if it lies inside the other image and the disparity there is the same up to a pixel, so that
+    nothing nearer hides it. This holds for a rolling shutter too if both cameras read a row at the same time; with
+    a lens, the difference between the times is negligible at this tolerance.
     """
     sign, there_side = (1.0, "right") if side == "left" else (-1.0, "left")
     other_camera = rig.eye(there_side)
@@ -472,12 +471,11 @@ def depth_metrics(
 ) -> dict[str, float]:
     """Errors of a depth map (H, W), metres, over the surface pixels of ``truth`` (finite and positive).
 
-    ``part`` (H, W) restricts it to some of them.
-    ``coverage`` is the share of surface pixels with an estimate (finite and positive); the errors are over these:
-    ``median_m`` and ``rmse_m`` of the absolute depth error, ``over_2m`` the share beyond 2 m (the paper's figure),
-    ``bad_1px`` .. ``bad_3px`` the share beyond that disparity error. ``on_sky`` is the share of all pixels without
-    a surface, in any part, that have an estimate: depth that was invented. NaN where no pixel counts. Raises
-    ValueError when the shapes differ.
+    ``part`` (H, W) restricts them to some of these pixels. ``coverage`` is the share of surface pixels with an
+    estimate (finite and positive), over which the errors are computed: ``median_m`` and ``rmse_m`` of the absolute
+    depth error, ``over_2m`` the share above 2 m (the paper's figure), ``bad_1px`` .. ``bad_3px`` the share above
+    that disparity error. ``on_sky`` is the share of pixels without a surface, in any part, that have an estimate.
+    Values without pixels are NaN. Raises ValueError if the shapes differ.
     """
     if estimate.shape != truth.shape:
         raise ValueError(f"estimate must have the shape of truth, {truth.shape}, got {estimate.shape}")
@@ -502,14 +500,14 @@ def depth_metrics(
 
 Mask = NDArray[np.bool_]
 _SMOOTH_LEVELS = 2.0
-"""Largest standard deviation, grey levels, of 3 x 3 pixels of sky."""
+"""Largest standard deviation of 3 x 3 pixels of sky, grey levels."""
 _LEAST_SHARE = 0.002
-"""Share of the image; smaller areas are ignored."""
+"""Smallest area of sky as a share of the image."""
 _FAR_QUANTILE = 0.4
-"""Quantile of all disparities: what surrounds the sky is farther than this."""
+"""Quantile of all disparities that the surroundings of sky must not exceed."""
 _RIM = 7
 _REDDER = 6.0
-"""Levels by which the mean red of the sky may exceed its mean blue."""
+"""Largest difference of the mean red and the mean blue of sky, levels."""
 
 
 def sky_mask(image: NDArray[Any], disparity: NDArray[np.float32]) -> Mask:
@@ -534,7 +532,7 @@ def sky_mask(image: NDArray[Any], disparity: NDArray[np.float32]) -> Mask:
         area = labels == label
         if float(np.mean(grey[area])) >= brightness and _is_blue(image, area) and _is_far(area, disparity, far):
             sky |= area
-    # The 3 x 3 windows that touch an edge were not smooth: one pixel of the sky along it is missing.
+    # Windows of 3 x 3 pixels at an edge are not smooth, so add the missing pixel along the sky's border.
     return cv2.dilate(sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
@@ -547,7 +545,7 @@ def _is_blue(image: NDArray[Any], area: Mask) -> bool:
 
 
 def _is_far(area: Mask, disparity: NDArray[np.float32], far: float) -> bool:
-    """Whether most of what surrounds the area is far; an area with no known rim may be sky."""
+    """Whether most surroundings of the area are far; an area with unknown surroundings may be sky."""
     grown = cv2.dilate(area.astype(np.uint8), np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)) > 0
     rim = disparity[grown & ~area]
     rim = rim[np.isfinite(rim)]
@@ -557,16 +555,16 @@ def _is_far(area: Mask, disparity: NDArray[np.float32], far: float) -> bool:
 def timed_depth(
     depth: F32, rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int
 ) -> F32:
-    """Depth (H, W), metres, in each line's own camera, from that which a rig at rest would mean by its disparity.
+    """Convert depth (H, W), metres, of a rig at rest to depth of a moving rig at each line's time.
 
-    A pixel and its disparity say where the other camera saw the point; with a lens that is on another line, read
-    at another time. The depth is that at which the other camera, where it was then, sees the point in that column.
-    What is unknown (0) and infinitely far (inf) stays so; a point behind either camera becomes infinitely far.
+    A pixel and its disparity give the point's pixel in the other camera; with a lens, that is on another line,
+    which is read at another time. The result is the depth at which the other camera, at its pose of that time,
+    shows the point in that column. Unknown (0) and infinite depth stays; points behind a camera become infinite.
     """
     pair = _pair({each: _eye(rig, shutter, motion, each, frame) for each in SIDES}, rig.ideal, side)
     own = np.ones(depth.shape, np.float32) if rig.aligned else own_depths(rig, side)
     out, other = depth.copy(), "right" if side == "left" else "left"
-    # The line of the other camera that is read with one of this camera, by both lines' times.
+    # Linear map from a line of this camera to the line of the other camera that is read at the same time.
     (a, b), (c, d) = (shutter.line_time(np.array([0.0, 1.0]), frame, each) for each in (side, other))
     same = (0.0, 0.0) if c == d else (float((a - c) / (d - c)), float((b - a) / (d - c)))
     _fill_timed(depth, own, pixel_rays(rig, side), pair, same, out)
@@ -574,19 +572,19 @@ def timed_depth(
 
 
 _ROUNDS, _SETTLED, _STILL_PX = 4, 0.02, 0.5
-"""Most rounds of matching at a fraction of the size; they end earlier where less than this share of the pixels is
-resampled from a place that changed by more than so many px. Late cameras take two or three, opposite scans all."""
+"""Most rounds of matching at reduced size; they end if the resampling of less than this share of the pixels
+changed by more than the third value, px. Delayed cameras take two or three rounds, opposite scans all."""
 _SMALL, _LEAST_SIDE = 4, 60
-"""That fraction, and the least side, px, of an image at it. The last round is at full size."""
+"""Reduction of the size, and smallest side of a reduced image, px. The last round is at full size."""
 _STEPS, _SAME_LINE = 6, 1e-3
-"""Most steps of the search for the line that sees a point, each of which scales the error by the motion, px, in
-one line; and the step, lines, after which it ends."""
+"""Most iterations for the line of a point, each of which multiplies the error by the motion, px, during one line;
+change of the line at which they end."""
 _ONE_SURFACE_PX = 1.0
-"""Neighbours that the motion moves more unlike are not interpolated between."""
+"""Results are not interpolated between neighbours whose displacement differs by more than this, px."""
 _ORDINARY = 1 / 32
-"""Disparity of ordinary things, widths of the level image."""
+"""Typical disparity, as a share of the width of the level image."""
 _SMOOTH = 5
-"""Window, px, of the median filter on known inverse depth before images are resampled by it."""
+"""Window of the median filter on inverse depth, px, before images are resampled by it."""
 
 
 class _Eye(NamedTuple):
@@ -595,7 +593,7 @@ class _Eye(NamedTuple):
     turn: FloatArray
     """(3, 3) from rays to homogeneous pixels of the camera itself without its lens."""
     lens: FloatArray
-    """(14,) ``Optics.lens``; of a camera without a lens one that bends nothing."""
+    """(14,) ``Optics.lens``; for a camera without a lens, one without distortion."""
     lines: FloatArray
     """(lines, 12) rotation and translation of each line."""
     columns: bool
@@ -604,16 +602,16 @@ class _Eye(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """The camera whose disparities are wanted, the other one, and their level images."""
+    """The camera whose disparities are estimated, the other one, and their level (rectified) images."""
 
     eye: _Eye
     other: _Eye
     level: tuple[float, float, float, float]
     """fx, fy, cx, cy."""
     shift: float
-    """px from a place of the other level image to its partner in the own one, of inverse depth 1 / m."""
+    """Disparity, px, from the other level image to the camera's own, for an inverse depth of 1 / m."""
     tilt: tuple[float, float] = (0.0, 0.0)
-    """Slope of the level images' row 0 in the body's axes, and by how much more that of each further row is."""
+    """Slope of the level images' row 0 in the body's axes, and the increase of the slope per row."""
 
 
 def moving_disparities(
@@ -626,12 +624,12 @@ def moving_disparities(
 ) -> tuple[F32, F32]:
     """Disparities (H, W) on the pixels of both cameras, ideal px, NaN where unknown; by any matcher and scan.
 
-    A disparity is that which the other camera would have shown at the time of the pixel: ``rig.depth`` makes it
-    the depth, along the body's z, from the camera of the pixel's own line. ``images`` (H, W[, 3]) by side.
+    A disparity is the one that the other camera would have shown at the time of the pixel: ``rig.depth`` converts
+    it to depth along the body's z from the camera at the time of the pixel's line. ``images`` are (H, W[, 3]).
 
-    The rig moves between both times, so that epipolar lines are those of another baseline: level images are tilted
-    along them. What is left of where the other camera saw a point depends on its depth. The left image's is found
-    in rounds at a quarter of the size, then at full size; the right one's begins with the left one's.
+    As the rig moves between both times, epipolar lines have the direction of another baseline, and the level
+    images are tilted accordingly. The remaining displacement depends on depth: that of the left image is estimated
+    in rounds at a quarter of the size and then at full size; the estimate for the right image starts from it.
 
     Raises:
         RsbenchError: see ``find_disparities``.
@@ -658,7 +656,7 @@ def moving_disparities(
 
 
 def _tilt(pair: _Pair, level: StereoRig) -> tuple[float, float]:
-    """``_Pair.tilt`` along which the other camera sees points of a ray from infinity to an ordinary disparity."""
+    """``_Pair.tilt``: slopes of epipolar lines between infinity and a typical disparity."""
     camera = level.camera.resized(level.camera.width // _SMALL, level.camera.height // _SMALL)
     small = pair._replace(level=(camera.fx, camera.fy, camera.cx, camera.cy), shift=camera.fx * level.baseline)
     step = max(round(camera.width * _ORDINARY), 1)
@@ -676,7 +674,7 @@ def _tilt(pair: _Pair, level: StereoRig) -> tuple[float, float]:
 
 
 def _heightened(level: StereoRig, tilt: tuple[float, float]) -> tuple[StereoRig, tuple[float, float], int]:
-    """The level images with so many more rows above and below that the tilt cuts nothing off, and their tilt."""
+    """The level images with rows added above and below, so that nothing is cut off; their tilt; the number."""
     camera = level.camera
     x = max(camera.cx, camera.width - 1 - camera.cx) / camera.fx
     steepest = max(abs(tilt[0]), abs(tilt[0] + tilt[1] * (camera.height - 1)))
@@ -686,7 +684,7 @@ def _heightened(level: StereoRig, tilt: tuple[float, float]) -> tuple[StereoRig,
 
 
 def _untilted(places: FloatArray, pair: _Pair, pad: int) -> FloatArray:
-    """Places (H, W, 2) of the tilted level image, of those of the one that is not and has ``pad`` rows less."""
+    """Pixels (H, W, 2) of the tilted level image for those of the image without tilt and without ``pad`` rows."""
     (fx, fy, cx, _), (first, steeper) = pair.level, pair.tilt
     x, out = (places[..., 0] - cx) / fx, places.copy()
     out[..., 1] = (places[..., 1] + pad - fy * first * x) / (1.0 + fy * steeper * x)
@@ -712,7 +710,7 @@ def _pair(
 
 
 def _first_guess(entry: MatcherEntry, own: U8, there: U8, level: StereoRig, pair: _Pair) -> F32:
-    """Inverse depth (H, W), 1 / m, on the right level image, in rounds at a fraction of its size.
+    """Estimate inverse depth (H, W), 1 / m, on the right level image in rounds at a reduced size.
 
     Args:
         own: left level image (H, W[, 3]).
@@ -745,7 +743,7 @@ def _first_guess(entry: MatcherEntry, own: U8, there: U8, level: StereoRig, pair
 
 
 def _of_one(entry: MatcherEntry, own: U8, seen: U8, level: StereoRig, side: Side) -> F32:
-    """Disparity (H, W) on one level image alone: our matcher is sooner done with one."""
+    """Disparity (H, W) on one level image; the built-in matcher computes only this one, to save time."""
     left, right = (own, seen) if side == "left" else (seen, own)
     if isinstance(entry.component, SgmMatcher):
         return stereo_disparity(left, right, level, side, entry.component)
@@ -753,10 +751,10 @@ def _of_one(entry: MatcherEntry, own: U8, seen: U8, level: StereoRig, side: Side
 
 
 def _ends(pair: _Pair, rho: F32) -> tuple[F32, F32]:
-    """Where the other camera, at its own times, sees what its level image shows, at those of the own one.
+    """For each pixel of the other level image: its pixel in the other image at the time when that is read.
 
-    (H, W, 2) px of the other image, NaN where it does not, and x / z, y / z (H, W, 2) of the rays. ``rho`` (H, W),
-    1 / m, is the inverse depth there, and that of the partner in the own camera, whose line's time is meant.
+    Returns pixels (H, W, 2) of the other image, NaN outside it, and x / z, y / z (H, W, 2) of the rays. The level
+    image is that at the times of the partner pixels in the own camera; ``rho`` is (H, W), 1 / m.
     """
     ends, rays = (np.full((*rho.shape, 2), np.nan, np.float32) for _ in range(2))
     _fill_ends(rho, pair, ends, rays)
@@ -764,7 +762,7 @@ def _ends(pair: _Pair, rho: F32) -> tuple[F32, F32]:
 
 
 def _without_holes(rho: F32) -> F32:
-    """Inverse depth (H, W) without holes: there that of the farther neighbour in the row; and without specks."""
+    """Inverse depth (H, W) with holes filled by the farther neighbour in the row, and median-filtered."""
     filled = fill_holes(rho)
     anywhere = np.nanmedian(filled) if np.any(np.isfinite(filled)) else 0.0
     filled = np.where(np.isfinite(filled), filled, np.float32(anywhere)).astype(np.float32)
@@ -773,7 +771,7 @@ def _without_holes(rho: F32) -> F32:
 
 @compiled(error_model="numpy", inline="always")
 def _seen_at(eye: _Eye, x: float, y: float, z: float) -> tuple[float, float]:
-    """Pixel at which a camera sees a point in the body's axes; NaN where it does not."""
+    """Pixel of a point in the body's axes in a camera; NaN if it is not visible."""
     m = eye.turn
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
     s = 1.0 / depth if depth > 0.0 else np.nan
@@ -784,14 +782,14 @@ def _seen_at(eye: _Eye, x: float, y: float, z: float) -> tuple[float, float]:
 
 @compiled(error_model="numpy", inline="always")
 def _level_ray(pair: _Pair, column: float, row: int) -> tuple[float, float]:
-    """x / z, y / z of a place of the level images."""
+    """x / z, y / z of a pixel of the level images."""
     x = (column - pair.level[2]) / pair.level[0]
     return x, (row - pair.level[3]) / pair.level[1] + (pair.tilt[0] + pair.tilt[1] * row) * x
 
 
 @compiled(error_model="numpy")
 def _fill_places(pair: _Pair, places: F32) -> None:
-    """Pixels (H, W, 2) of the own camera at which it sees what its level image shows; NaN beside it."""
+    """Fill the pixels (H, W, 2) of the own camera for those of its level image; NaN outside the image."""
     eye = pair.eye
     for row in range(places.shape[0]):
         for column in range(places.shape[1]):
@@ -803,9 +801,9 @@ def _fill_places(pair: _Pair, places: F32) -> None:
 
 @compiled(error_model="numpy", inline="always")
 def _line(eye: _Eye, along: float) -> tuple[int, float]:
-    """The line before a place, and the share of the next one: poses between lines are interpolated straight.
+    """The line before a position, and the weight of the next one for linear interpolation of poses.
 
-    That errs by an eighth of the square of the turn between two lines, 1e-10 of a fast one.
+    Its error is an eighth of the squared rotation between two lines, 1e-10 for a fast one.
     """
     last = len(eye.lines) - 1
     at = min(max(along, -last), 2.0 * last) if along == along else 0.0
@@ -815,7 +813,7 @@ def _line(eye: _Eye, along: float) -> tuple[int, float]:
 
 @compiled(error_model="numpy", inline="always")
 def _pose(lines: FloatArray, below: int, s: float, k: int) -> Vector:
-    """Numbers 3 k to 3 k + 2 of a pose between lines."""
+    """Components 3 k to 3 k + 2 of a pose between lines."""
     a, b, c = lines[below, 3 * k], lines[below, 3 * k + 1], lines[below, 3 * k + 2]
     return (
         a + s * (lines[below + 1, 3 * k] - a),
@@ -864,7 +862,7 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
 
 @compiled(error_model="numpy", inline="always")
 def _inverse_depth(pair: _Pair, x: float, y: float, p: float, q: float) -> float:
-    """``_rho`` where both cameras show these rays; NaN elsewhere."""
+    """``_rho`` if both cameras show these rays, else NaN."""
     eye, other = pair.eye, pair.other
     u, v = _seen_at(other, p, q, 1.0)
     if not (-0.5 <= u <= other.size[0] - 0.5 and -0.5 <= v <= other.size[1] - 0.5):
@@ -878,9 +876,9 @@ def _inverse_depth(pair: _Pair, x: float, y: float, p: float, q: float) -> float
 
 @compiled(error_model="numpy", inline="always")
 def _rho(pair: _Pair, x: float, y: float, p: float, here_line: float, there_line: float) -> float:
-    """Inverse depth, 1 / m, of the ray (x, y, 1) whose point the other camera sees in column p; NaN: none.
+    """Inverse depth, 1 / m, on the ray (x, y, 1) of the point with x / z = p in the other camera; NaN: none.
 
-    By the column, x / z, alone, as disparities are; the row holds the guess that the image was resampled by.
+    Only the column is used, as for disparities, since the row depends on the guess by which images were resampled.
     """
     eye, other = pair.eye, pair.other
     below, s = _line(other, there_line)
@@ -889,7 +887,7 @@ def _rho(pair: _Pair, x: float, y: float, p: float, here_line: float, there_line
     below, s = _line(eye, here_line)
     a, b = _pose(eye.lines, below, s, 0), _pose(eye.lines, below, s, 1)
     c, t = _pose(eye.lines, below, s, 2), _pose(eye.lines, below, s, 3)
-    # In the world's axes: the ray, and the way from the own camera's centre to it.
+    # In the world's axes: the ray and the vector from the own camera's centre.
     X, far_x = a[0] * x + b[0] * y + c[0], a[0] * t[0] + b[0] * t[1] + c[0] * t[2]
     Y, far_y = a[1] * x + b[1] * y + c[1], a[1] * t[0] + b[1] * t[1] + c[1] * t[2]
     Z, far_z = a[2] * x + b[2] * y + c[2], a[2] * t[0] + b[2] * t[1] + c[2] * t[2]
@@ -913,14 +911,14 @@ def _fill_timed(depth: F32, own: F32, rays: FloatArray, pair: _Pair, same: tuple
             u, v = _seen_at(other, p, y, 1.0)
             line, there = float(column if eye.columns else row), u if other.columns else v
             if not abs(there) < np.inf:
-                there = same[0] + same[1] * line  # the lens does not show it: as if read with the pixel itself
+                there = same[0] + same[1] * line  # the lens does not show it: use the time of the pixel itself
             rho = _rho(pair, x, y, p, line, there)
             out[row, column] = own[row, column] / rho if rho > 0.0 else np.inf
 
 
 @compiled(error_model="numpy")
 def _fill_inverse_depths(disparity: F32, rays: F32, pair: _Pair, rho: F32) -> None:
-    """On the other level image, whose disparities (H, W) these are."""
+    """Fill inverse depths (H, W) on the other level image from its disparities."""
     sign = 1.0 if pair.shift > 0.0 else -1.0
     for row in range(rho.shape[0]):
         for column in range(rho.shape[1]):
@@ -930,7 +928,7 @@ def _fill_inverse_depths(disparity: F32, rays: F32, pair: _Pair, rho: F32) -> No
 
 @compiled(error_model="numpy")
 def _fill_disparities(matched: F32, rays: F32, pair: _Pair, disparity: F32) -> None:
-    """On the own level image, from those that were ``matched`` with the other one as it was resampled."""
+    """Fill disparities on the own level image from those ``matched`` with the resampled other image."""
     fx, fy = pair.level[0], pair.level[1]
     sign, gain, last = (1.0 if pair.shift > 0.0 else -1.0), abs(pair.shift), matched.shape[1] - 1
     for row in range(matched.shape[0]):
@@ -940,7 +938,7 @@ def _fill_disparities(matched: F32, rays: F32, pair: _Pair, disparity: F32) -> N
                 continue
             i = min(max(int(np.floor(at)), 0), last - 1)
             s = at - i
-            # What the motion adds to the level ray is alike in neighbours of one surface.
+            # The displacement of the level ray by the motion varies little within one surface.
             (x, y), (x2, y2) = _level_ray(pair, i, row), _level_ray(pair, i + 1, row)
             p, q = rays[row, i, 0] - x, rays[row, i, 1] - y
             along, across = rays[row, i + 1, 0] - x2 - p, rays[row, i + 1, 1] - y2 - q

@@ -1,37 +1,36 @@
-"""Rotation of one rolling-shutter frame from its curves: straight lines in space, bent as the camera turned.
+"""Estimate the rotation during one rolling-shutter frame from images of straight lines, which it bends to curves.
 
-Curves are edges of the image: chains of sub-pixel places. A place is the maximum of the gradient's length along a
-row, by a parabola through its logarithm: exact where a step was blurred by a Gaussian (C. Steger, An unbiased
-detector of curvilinear structures, PAMI 1998, has the same of its profile). Places of neighbouring rows are one
-curve where the edge's own direction leads from one to the other. A curve that no parabola follows is cut where it
-is farthest from it. Flat edges are found likewise in the columns.
+Curves are edges of the image, i.e. chains of sub-pixel points. A point is the maximum of the gradient's length
+along a row, by a parabola through its logarithm, which is exact for a step blurred by a Gaussian (compare C.
+Steger, An unbiased detector of curvilinear structures, PAMI 1998). Points in neighbouring rows are linked if the
+direction of the edge leads from one to the other. A chain that deviates from a parabola is cut at the largest
+deviation. Nearly horizontal edges are found likewise in the columns.
 
-A camera that turns by exp(s w) in the time s sees the points of a line in space, whose plane through the centre
+A camera that rotates by exp(s w) in the time s sees the points of a line in space, whose plane through the centre
 has the normal l at s = 0, on rays r with
 
     l . q = 0,   q = exp(-s w) r.
 
-A curve is l's two degrees of freedom and what the rotation bends. To first order, l . (r - s w x r) = 0, the
-model of Y. Lao, O. Ait-Aider, A Robust Method for Strong Rolling Shutter Effects Correction Using Lines with
-Automatic Feature Selection, CVPR 2018. An upright line that is not slanted determines roll, and off the middle
-pitch; yaw shears it, which leaves it straight: only slanted lines off the middle determine yaw.
+The curve depends on the two degrees of freedom of l and on the rotation. To first order, l . (r - s w x r) = 0,
+the model of Y. Lao, O. Ait-Aider, A Robust Method for Strong Rolling Shutter Effects Correction Using Lines with
+Automatic Feature Selection, CVPR 2018. A vertical line determines roll and, away from the middle, pitch; yaw
+shears it, which leaves it straight, so only slanted lines away from the middle determine yaw.
 
-One rotation makes everything straight: the pitch that turns all rows' rays into one plane (height / (focal
+One rotation makes all curves straight: the pitch that turns the rays of all rows into one plane (height / (focal
 length x readout ratio), tens of degrees in a frame period; C. Albl, A. Sugimoto, T. Pajdla, Degeneracies in
-Rolling Shutter SfM, ECCV 2016, have it of points). Errors are therefore px in the frame as it was, a flat
-curve's at the time that an error of its row changes too: as l . q, or in the corrected image, they would shrink
-towards that rotation and draw every estimate there. Nothing is searched beyond ``FARTHEST`` expected sizes of
-a component.
+Rolling Shutter SfM, ECCV 2016, describe it for points). Errors are therefore in px of the original frame (for
+horizontal curves including the change of time with the row): as l . q, or in the corrected image, they would
+vanish for that rotation and bias all estimates towards it. The search ends at ``FARTHEST`` prior deviations.
 
 ``rotation_of_lines`` (Lao, Ait-Aider) draws samples of four curves, solves the linear model, and fits all curves
-that become straight with it. ``rotation_of_directions`` estimates three orthogonal directions and the rotation
-together, from short pieces of lines (P. Purkait, C. Zach, A. Leonardis, Rolling Shutter Correction in Manhattan
-World, ICCV 2017): a piece whose line runs along the direction v has a normal l with l . v = 0 once its rows are
-turned back, so a piece too short to be bent counts too, and a line that yaw sheared is off its direction. The
-directions are searched by those of three pieces as if nothing had turned (two for the first direction, one for the
-second), and then fitted with the rotation to the pieces that agree, ever more strictly.
+that it makes straight. ``rotation_of_directions`` estimates three orthogonal directions and the rotation jointly
+from short segments (P. Purkait, C. Zach, A. Leonardis, Rolling Shutter Correction in Manhattan World, ICCV 2017):
+a segment along direction v has a normal l with l . v = 0 when its rows are rotated back. So segments that are too
+short to be bent contribute, and a line that is sheared by yaw deviates from its direction. Directions are first
+searched without rotation from samples of three segments (two for the first direction, one for the second), and
+then fitted with the rotation to the segments that agree, with decreasing thresholds.
 
-All curves' points lie one after another, (N,); ``curve`` (N,) is the number of each one's curve, from 0 to K - 1.
+The points of all curves are concatenated, (N,); ``curve`` (N,) is the index of each point's curve, 0 to K - 1.
 """
 
 from __future__ import annotations
@@ -54,21 +53,21 @@ from rsbench.vision.images import grey_u8
 
 F32 = NDArray[np.float32]
 Curves = list[FloatArray]
-"""Each (n, 2) places x, y, px, in the order in which it runs."""
+"""Points (n, 2) x, y, px, of each curve in order."""
 
 _BLUR_PX = 1.0
 _LEAST_GRADIENT = 6.0
-"""Grey levels per px at an edge: three deviations of the gradient of 8-bit noise of 3 levels so blurred."""
+"""Least gradient of an edge, grey levels per px: three standard deviations for blurred 8-bit noise of 3 levels."""
 _BESIDE_PX, _SAME_DIRECTION, _SAME_STRENGTH = 0.6, 0.94, 0.6
-"""Places of one curve: how far the second is from where the first leads, the cosine of the angle between
-their directions (20 degrees), and the least ratio of their gradients."""
+"""Conditions to link two points: largest distance from the extrapolated edge, px, least cosine of the angle
+between their directions (20 degrees), and least ratio of their gradients."""
 _BENT_PX = 0.35
-"""Greatest distance of a curve's smoothed places from a parabola."""
+"""Largest distance of a curve's smoothed points from a parabola, px."""
 _SMOOTHED = 7
 
 
 def image_curves(image: NDArray[Any], least_length: float) -> Curves:
-    """Curves of at least ``least_length`` px, longest first, of an image (H, W[, 3]), uint8 or uint16."""
+    """Curves of at least ``least_length`` px in an image (H, W[, 3]), uint8 or uint16, sorted from the longest."""
     grey = grey_u8(image).astype(np.float32)
     upright = _curves_down(grey, least_length)
     flat = [each[:, ::-1] for each in _curves_down(np.ascontiguousarray(grey.T), least_length)]
@@ -101,7 +100,7 @@ def _curves_down(grey: F32, least_length: float) -> Curves:
 
 
 def _places(grey: F32) -> list[FloatArray]:
-    """Edges (n, 4) of each row: x, gradient along x and y, its length; those more upright than flat."""
+    """Edge points (n, 4) of each row: x, gradient along x and y, its length; only edges nearer to vertical."""
     blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
     gx, gy = (cv2.Scharr(blurred, cv2.CV_32F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1)))
     strength = np.maximum(np.hypot(gx, gy), np.float32(1e-3))
@@ -119,7 +118,7 @@ def _places(grey: F32) -> list[FloatArray]:
 
 
 def _followers(here: FloatArray, there: FloatArray) -> NDArray[np.intp]:
-    """For each place (n, 4) of a row that of the next one which goes on from it; -1 where there is none."""
+    """For each point (n, 4) of a row, the index of the point of the next row that continues it; -1: none."""
     none = np.full(len(here), -1, dtype=np.intp)
     if len(here) == 0 or len(there) == 0:
         return none
@@ -138,7 +137,7 @@ def _followers(here: FloatArray, there: FloatArray) -> NDArray[np.intp]:
 
 
 def _parabolas(chain: FloatArray, least_length: float) -> Curves:
-    """The parts of a chain (n, 2) that parabolas x(y) follow."""
+    """Split a chain (n, 2) into parts that parabolas x(y) fit."""
     if len(chain) < _SMOOTHED or extent(chain) < least_length:
         return []
     y = chain[:, 1] - chain[:, 1].mean()
@@ -155,15 +154,15 @@ def _parabolas(chain: FloatArray, least_length: float) -> Curves:
 
 
 FARTHEST = 4.0
-"""Standard deviations of a component of the rotation within which it is searched."""
+"""Largest component of the rotation in the search, in standard deviations of the prior."""
 _ALIKE_PX = 8.0
-"""Length along a curve over which the errors of its places are one: the surface beside it makes them."""
+"""Length along a curve over which errors of its points are correlated, px, as the adjacent surface causes them."""
 _STEPS, _DONE = 30, 1e-3
-"""The last step is this share of the standard deviations."""
+"""Most steps; length of the last step relative to the standard deviations."""
 _FLATTEST = 1e-9
-"""Slope, 1 / px, of a curve along its row."""
+"""Least absolute slope of ``Turned.slopes``, 1 / px, to avoid division by 0."""
 _PARTS = (1.0, 0.3, 0.1, 0.03)
-"""Shares of a step, tried in turn."""
+"""Shares of a step that are tried in turn."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,13 +170,13 @@ class Points:
     """The points of K curves."""
 
     rays: FloatArray
-    """(N, 3) z = 1."""
+    """(N, 3) rays with z = 1."""
     time: FloatArray
     """(N,) frame periods since the middle of the frame's readout."""
     curve: NDArray[np.intp]
-    """(N,) grows."""
+    """(N,) index of the curve, ascending."""
     upright: NDArray[np.bool_]
-    """(N,) whether a point was found in its row, with an error along it; else in its column."""
+    """(N,) whether the point was found in its row and its error is along the row; otherwise along its column."""
     focal: FloatArray
     """(2,) px."""
     row_time: float
@@ -187,7 +186,7 @@ class Points:
     def of(
         cls, curves: Sequence[FloatArray], camera: PinholeCamera, shutter: RollingShutter, view: View
     ) -> Points:
-        """The points of curves (n, 2), px, one or more, of a frame without a lens with rows read from the top."""
+        """The points of one or more curves (n, 2), px, of a frame without a lens with rows read from the top."""
         side, frame = view
         pixels = np.concatenate(curves)
         lines = shutter.line_times(frame, side)
@@ -204,35 +203,35 @@ class Points:
 
     @property
     def count(self) -> int:
-        """K, of curves."""
+        """Number of curves, K."""
         return int(self.curve[-1]) + 1
 
     def chosen(self, curves: NDArray[np.bool_]) -> Points:
-        """The points of the curves in a mask (K,)."""
+        """The points of the curves selected by a mask (K,)."""
         keep, number = curves[self.curve], np.cumsum(curves) - 1
         parts = {name: getattr(self, name)[keep] for name in ("rays", "time", "upright")}
         return Points(**parts, curve=number[self.curve[keep]], focal=self.focal, row_time=self.row_time)
 
     def sums(self, values: FloatArray) -> FloatArray:
-        """(K, ...) of values (N, ...) over each curve."""
+        """(K, ...) sums of values (N, ...) over each curve."""
         starts = np.flatnonzero(np.diff(self.curve, prepend=-1))
         return np.asarray(np.add.reduceat(values, starts, axis=0))
 
     def means(self, values: FloatArray) -> FloatArray:
-        """(K,) of values (N,) over each curve."""
+        """(K,) means of values (N,) over each curve."""
         return self.sums(values) / self.sums(np.ones_like(values))
 
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """Points at a rotation w, and their errors from lines of normals (K, 3)."""
+    """Points for a rotation w, and their errors for lines with given normals (K, 3)."""
 
     points: Points
     w: FloatArray
     R: FloatArray
     """(N, 3, 3) exp(s w)."""
     q: FloatArray
-    """(N, 3) the rays as the camera would see them in the middle of the readout."""
+    """(N, 3) the rays rotated to the middle of the readout."""
 
     @classmethod
     def by(cls, points: Points, w: FloatArray) -> Turned:
@@ -240,17 +239,17 @@ class Turned:
         return cls(points, w, R, (points.rays[:, None] @ R)[:, 0])
 
     def own(self, vectors: FloatArray) -> FloatArray:
-        """(N, 3) vectors (K, 3) as the camera sees them at the points' times."""
+        """(N, 3) vectors (K, 3) in the camera's axes at the points' times."""
         return np.asarray((self.R @ vectors[self.points.curve][..., None])[..., 0])
 
     def slopes(self, own: FloatArray) -> FloatArray:
-        """(N,) what l . q changes by when a point moves by 1 px along its row or column, 1 / px; linear in l."""
+        """(N,) change of l . q if a point moves by 1 px along its row or column, 1 / px; linear in l."""
         p = self.points
         later = p.row_time * np.sum(so3.cross(self.w, p.rays) * own, axis=1)
         return np.where(p.upright, own[:, 0] / p.focal[0], own[:, 1] / p.focal[1] - later)
 
     def errors(self, normals: FloatArray) -> FloatArray:
-        """(N,) px by which points are off their lines."""
+        """(N,) distances of points from their lines, px."""
         return np.sum(self.q * normals[self.points.curve], axis=1) / _safe(self.slopes(self.own(normals)))
 
     def by_turn(self, normals: FloatArray) -> FloatArray:
@@ -258,7 +257,7 @@ class Turned:
         p, own = self.points, self.own(normals)
         J = so3.left_jacobian(p.time[:, None] * self.w)
         above = (J @ so3.cross(normals[p.curve], self.q)[..., None])[..., 0]
-        # Own turns by s (J dw) x own; each slope's direction, crossed with own, is the derivative by J dw.
+        # ``own`` changes by s (J dw) x own; the cross product of own and the slope's direction is its derivative.
         direction = np.where(
             p.upright[:, None],
             np.array([1.0 / p.focal[0], 0.0, 0.0]),
@@ -287,20 +286,20 @@ def _safe(slopes: FloatArray) -> FloatArray:
 
 
 class Step(NamedTuple):
-    """Errors of each curve as a quadratic form of the p global unknowns, its own m ones at their best."""
+    """Squared errors of each curve as a quadratic form of the p global unknowns, with its own m eliminated."""
 
     A: FloatArray
     """(K, p, p)"""
     b: FloatArray
     """(K, p)"""
     c: FloatArray
-    """(K,) px^2: squared errors at no step; at a step x, c + 2 b . x + x . A x."""
+    """(K,) px^2; after a global step x, the squared error is c + 2 b . x + x . A x."""
     own: FloatArray
-    """(K, m, p + 1): the own unknowns' best step is -own (x, 1)."""
+    """(K, m, p + 1): the step of a curve's own unknowns is -own (x, 1)."""
 
 
 def reduced(points: Points, errors: FloatArray, by_all: FloatArray, by_own: FloatArray) -> Step:
-    """Schur's complement of the unknowns (N, m) of the single curves, from errors (N,) and derivatives (N, p)."""
+    """Schur complement of the curves' own unknowns (N, m), from errors (N,) and derivatives (N, p)."""
     S = points.sums(by_own[:, :, None] * by_own[:, None])
     C = points.sums(by_own[:, :, None] * by_all[:, None])
     g = points.sums(by_own * errors[:, None])
@@ -316,26 +315,26 @@ def across(normals: FloatArray) -> FloatArray:
 
 
 def step_of(turned: Turned, normals: FloatArray) -> Step:
-    """Gauss and Newton's of w; at w = 0 the paper's model, linear in w and in the change of the lines."""
+    """Gauss-Newton step of w; at w = 0 it is the paper's model, linear in w and in the change of the lines."""
     by_normals = turned.by_normals(normals, across(normals))
     return reduced(turned.points, turned.errors(normals), turned.by_turn(normals), by_normals)
 
 
 def moved(normals: FloatArray, directions: FloatArray, step: Step, x: FloatArray) -> FloatArray:
-    """(K, 3) the normals after the own unknowns' best step beside the global step x (p,)."""
+    """(K, 3) the normals after the own unknowns' step that belongs to the global step x (p,)."""
     t = -step.own @ np.append(x, 1.0)
     there = normals + np.einsum("km,kmi->ki", t, directions)
     return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True))
 
 
 def lines_at(turned: Turned) -> FloatArray:
-    """(K, 3) normals of the lines nearest to each curve."""
+    """(K, 3) normals of the best line for each curve."""
     normals = turned.nearest_normals()
     return moved(normals, across(normals), step_of(turned, normals), np.zeros(3))
 
 
 def noise_variance(points: Points, squares: float, unknowns: int) -> float:
-    """px^2 of a point whose neighbours err alike: from the sum of squares and the number of unknowns."""
+    """Variance of a point's error, px^2, from the sum of squares; errors of neighbours are correlated."""
     return squares / max(len(points.time) / _ALIKE_PX - unknowns, 1.0)
 
 
@@ -345,14 +344,14 @@ class Turn(NamedTuple):
     w: FloatArray
     """(3,) rad per frame period."""
     normals: FloatArray
-    """(K, 3)"""
+    """(K, 3) normals of the lines."""
     covariance: FloatArray
-    """(3, 3) rad^2 of w, from the errors and the prior."""
+    """(3, 3) covariance of w, rad^2, from the errors and the prior."""
 
     def determined(self, prior: float) -> FloatArray | None:
-        """w (3,) in the directions that the curves determine, 0 in the others; None where they determine none.
+        """w (3,) projected to the directions that the curves determine; None if they determine none.
 
-        A direction is determined where its standard deviation is at most half of ``prior``, rad.
+        A direction is determined if its standard deviation is at most half of ``prior``, rad.
         """
         variances, axes = np.linalg.eigh(self.covariance)
         known = axes[:, variances <= 0.25 * prior**2]
@@ -360,10 +359,10 @@ class Turn(NamedTuple):
 
 
 def straightened(points: Points, start: FloatArray, prior: float) -> Turn:
-    """Rotation of least squared distance of all curves from lines, Gauss and Newton's steps from ``start`` (3,).
+    """The rotation with the least squared distances of curves from lines, by Gauss-Newton from ``start`` (3,).
 
-    ``prior`` is what a component of w is expected to be, rad: a standard deviation. It is weighed by the noise
-    that the errors show, so that it holds what the lines leave open, and exact curves have their exact rotation.
+    ``prior`` is the standard deviation of a component of w, rad. It is weighted by the noise estimated from the
+    errors, so that it determines what the lines do not, and exact curves give the exact rotation.
     """
     at, unknowns = Turned.by(points, np.asarray(start, dtype=np.float64)), 3 + 2 * points.count
     normals, covariance = lines_at(at), np.zeros((3, 3))
@@ -386,7 +385,7 @@ def straightened(points: Points, start: FloatArray, prior: float) -> Turn:
 def _descended(
     at: Turned, normals: FloatArray, step: Step, x: FloatArray, hold: float, most: float
 ) -> tuple[Turned, FloatArray] | None:
-    """Where the step x, or a part of it, lowers the errors; None where none does."""
+    """The state after the step x, or the first part of it that lowers the errors; None if none does."""
 
     def cost(at: Turned, normals: FloatArray) -> float:
         return float(np.sum(at.errors(normals) ** 2)) + hold * float(at.w @ at.w)
@@ -403,20 +402,20 @@ def _descended(
 
 
 FEWEST_LINES = 4
-"""Curves of a sample, and below which there is no rotation."""
+"""Number of curves in a sample, and fewest curves for a rotation."""
 _ROUNDS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineOptions:
-    """Search for the rotation from lines."""
+    """Options of the search for the rotation from lines."""
 
     threshold_px: float = 0.2
-    """Root mean square by which the points of a curve may miss a line."""
+    """Largest root mean square distance of a curve's points from a line, px."""
     samples: int = 500
-    """Random samples of the search."""
+    """Number of random samples of the search."""
     prior_deg: float = 3.0
-    """Expected size of a component of the rotation in a frame period, a standard deviation."""
+    """Prior standard deviation of a component of the rotation in a frame period, degrees."""
 
     @property
     def prior(self) -> float:
@@ -424,7 +423,7 @@ class LineOptions:
 
 
 def rotation_of_lines(points: Points | None, options: LineOptions, rng: np.random.Generator) -> Turn | str:
-    """The rotation that makes most curves straight, or why there is none; None are the points of no curve."""
+    """The rotation that makes most curves straight, or why there is none; ``points`` is None without curves."""
     count = 0 if points is None else points.count
     if points is None or count < FEWEST_LINES:
         return f"{count} curves that may be lines; {FEWEST} are needed"
@@ -445,7 +444,7 @@ def rotation_of_lines(points: Points | None, options: LineOptions, rng: np.rando
 
 
 def _best_sample(system: Step, points: Points, options: LineOptions, rng: np.random.Generator) -> FloatArray:
-    """w (3,) of the sample whose motion leaves the least truncated squared errors; that of none among them."""
+    """w (3,) with the least truncated squared errors among those of random samples and 0."""
     chosen = np.argsort(rng.random((options.samples, points.count)), axis=1)[:, :FEWEST_LINES]
     hold = (options.threshold_px / options.prior) ** 2
     A = system.A[chosen].sum(axis=1) + hold * np.eye(3)
@@ -457,27 +456,27 @@ def _best_sample(system: Step, points: Points, options: LineOptions, rng: np.ran
 
 
 FEWEST = 8
-"""Curves that agree, below which there is no rotation: six unknowns, and two that could contradict."""
+"""Fewest inlier curves for a rotation: as many as there are unknowns, six, and two more."""
 _SIN = 0.1
-"""Sine of the angle within which a piece of a search agrees with a direction: a fast turn shears by so much."""
+"""Sine of the largest angle between a segment and its direction in the search: fast rotations shear by it."""
 _COARSER = (8.0, 4.0, 2.0, 1.0)
-"""Thresholds of the rounds, in units of the last."""
+"""Thresholds of the rounds, relative to the last one."""
 _STARTS, _ROUND_STEPS, _LAST_STEPS = 3, 3, 30
 _CONVERGED = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ManhattanOptions:
-    """Search for the rotation from three directions."""
+    """Options of the search for the rotation from three orthogonal directions."""
 
     threshold_px: float = 0.3
-    """Root mean square by which the points of a curve may miss a line along its direction."""
+    """Largest root mean square distance of a curve's points from a line along its direction, px."""
     least_share: float = 0.3
-    """Share of all points that must lie on lines along the directions."""
+    """Least share of all points that lie on lines along the directions."""
     samples: int = 500
-    """Random samples of the search."""
+    """Number of random samples of the search."""
     prior_deg: float = 3.0
-    """Expected size of a component of the rotation in a frame period, a standard deviation."""
+    """Prior standard deviation of a component of the rotation in a frame period, degrees."""
 
     @property
     def prior(self) -> float:
@@ -485,15 +484,15 @@ class ManhattanOptions:
 
 
 class _World(NamedTuple):
-    """Curves at a rotation, the directions, and each curve's."""
+    """Curves for a rotation, three orthogonal directions, and the direction of each curve."""
 
     at: Turned
     axes: FloatArray
-    """(3, 3) columns are the directions in the middle of the readout."""
+    """(3, 3) directions in the middle of the readout, as columns."""
     normals: FloatArray
-    """(K, 3)"""
+    """(K, 3) normals of the lines."""
     own: NDArray[np.intp]
-    """(K,) number of a curve's direction."""
+    """(K,) index of each curve's direction."""
 
     def along(self) -> FloatArray:
         """(K, 3) the direction of each curve."""
@@ -507,7 +506,7 @@ class _World(NamedTuple):
 def rotation_of_directions(
     points: Points | None, options: ManhattanOptions, rng: np.random.Generator
 ) -> Turn | str:
-    """The rotation with which most curves run along three directions, or why there is none; None: no curves."""
+    """The rotation for which most curves follow three directions, or why not; ``points`` None: no curves."""
     count = 0 if points is None else points.count
     if points is None or count < FEWEST:
         return f"{count} curves that may be lines; {FEWEST} are needed"
@@ -523,7 +522,7 @@ def rotation_of_directions(
 
 
 def _directions(points: Points, options: ManhattanOptions, rng: np.random.Generator) -> list[FloatArray]:
-    """Triples of directions (3, 3), columns, that most points agree with as if nothing had turned, apart."""
+    """Distinct triples of directions (3, 3), as columns, with which most points agree without a rotation."""
     n, weights = Turned.by(points, np.zeros(3)).nearest_normals(), points.sums(np.ones(len(points.time)))
     i, j, k = np.argsort(rng.random((options.samples, points.count)), axis=1)[:, :3].T
     first = so3.cross(n[i], n[j])
@@ -545,7 +544,7 @@ def _directions(points: Points, options: ManhattanOptions, rng: np.random.Genera
 
 
 def _fitted(points: Points, axes: FloatArray, options: ManhattanOptions) -> tuple[float, Turn] | str:
-    """Truncated squared errors of all curves, and the rotation; or why there is none."""
+    """Fit rotation and directions; returns truncated squared errors of all curves and the rotation, or why not."""
     world = _assigned(Turned.by(points, np.zeros(3)), axes)
     turn, kept = None, np.zeros(points.count, dtype=np.bool_)
     for coarser in _COARSER:
@@ -568,7 +567,7 @@ def _fitted(points: Points, axes: FloatArray, options: ManhattanOptions) -> tupl
 
 
 def _assigned(at: Turned, axes: FloatArray) -> _World:
-    """Each curve with the direction that it misses least, and the line nearest to it along that direction."""
+    """Assign to each curve the direction with the smallest error, and the best line along it."""
     products = at.points.sums(at.q[:, :, None] * at.q[:, None])
     normals = np.zeros((3, at.points.count, 3))
     for k in range(3):
@@ -580,7 +579,7 @@ def _assigned(at: Turned, axes: FloatArray) -> _World:
 
 
 def _least_squares(world: _World, prior: float, steps: int) -> tuple[Turn, FloatArray]:
-    """Gauss and Newton's steps of rotation and directions; ``prior`` as in ``straightness.straightened``."""
+    """Gauss-Newton steps of rotation and directions; ``prior`` is explained at ``straightened``."""
     points, covariance = world.at.points, np.zeros((3, 3))
     for _ in range(steps):
         step, directions = _step(world)
@@ -600,9 +599,9 @@ def _least_squares(world: _World, prior: float, steps: int) -> tuple[Turn, Float
 
 
 def _step(world: _World) -> tuple[Step, FloatArray]:
-    """The step (6,) of rotation and turn of the directions; how lines (K, 1, 3) move about their directions."""
+    """The equations by the rotation and a rotation of the directions (6,); tangents (K, 1, 3) of normals."""
     directions = so3.cross(world.along(), world.normals)[:, None]
-    turns = so3.cross(np.eye(3), world.normals[:, None])  # of the normals with the directions, about x, y, z
+    turns = so3.cross(np.eye(3), world.normals[:, None])  # change of the normals with the directions, by x, y, z
     by_all = np.hstack([world.at.by_turn(world.normals), world.at.by_normals(world.normals, turns)])
     errors, by_own = world.at.errors(world.normals), world.at.by_normals(world.normals, directions)
     return reduced(world.at.points, errors, by_all, by_own), directions
@@ -611,7 +610,7 @@ def _step(world: _World) -> tuple[Step, FloatArray]:
 def _descended_world(
     world: _World, step: Step, directions: FloatArray, x: FloatArray, hold: float, most: float
 ) -> _World | None:
-    """Where the step x, or a part of it, lowers the errors; None where none does."""
+    """The state after the step x, or the first part of it that lowers the errors; None if none does."""
 
     def cost(each: _World) -> float:
         return float(np.sum(each.at.errors(each.normals) ** 2)) + hold * float(each.at.w @ each.at.w)
@@ -624,7 +623,7 @@ def _descended_world(
         turn = so3.exp(part * x[3:])
         axes = turn @ world.axes
         normals = moved(world.normals, directions, step, part * x) @ turn.T
-        along = axes.T[world.own]  # what the finite steps moved off the directions goes back
+        along = axes.T[world.own]  # project the normals back to the directions after the finite step
         normals = normals - np.sum(normals * along, axis=1, keepdims=True) * along
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         after = _World(Turned.by(world.at.points, w), axes, normals, world.own)

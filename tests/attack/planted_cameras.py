@@ -239,7 +239,7 @@ def _others() -> Iterator[Fault]:
     """
     for fault in (*depth_faults(), *image_faults()):
         if fault.name == "all left and right images exchanged":
-            yield replace(fault, words=(ONE.image, "rendered again"), rendered=True)
+            yield replace(fault, words=(ONE.image, "new rendering"), rendered=True)
         elif "another sequence" not in fault.name:
             yield fault
 
@@ -670,7 +670,7 @@ def _thin_faults() -> Iterator[Fault]:
             for side, frame in VIEWS
         )
     )
-    yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "rendered again"), rendered=True)
+    yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "new rendering"), rendered=True)
     late = swapped(("gs_depth/left_0.exr", "gs_depth/left_1.exr"))
     yield Fault("frames exchanged", late, ("gs_depth/left_0.exr", "looks like gs_depth/left_1.exr"))
 

@@ -15,7 +15,7 @@ from rsbench.benchmark.statistics import (
     average_interval,
     bootstrap_interval,
     decimals,
-    in_words,
+    format_interval,
     mean,
     median,
     median_interval,
@@ -153,7 +153,7 @@ def test_failures_without_end_leave_an_interval() -> None:
     ],
 )
 def test_digits_follow_the_interval(numbers: tuple[float, float, float], words: str) -> None:
-    assert in_words(*numbers) == words
+    assert format_interval(*numbers) == words
 
 
 @given(st.floats(-1e3, 1e3), st.floats(1e-6, 1e3))

@@ -16,9 +16,9 @@ from rsbench.capture.calibration import (
     ROWS,
     TERMS,
     RefusedFramesError,
-    in_words,
+    describe_errors,
     judge_stereo,
-    of_offset,
+    offset_error,
     ray_shifts,
     recalibrated,
     row_pattern,
@@ -119,8 +119,11 @@ def test_errors_are_told_by_what_they_do_to_the_images() -> None:
     x, y = -600.0 / 700.0, -200.0 / 700.0
     rows = abs(-0.2 + 0.45 * x - 0.5 * y - 7.2 * x * y)
     errors = tuple(REAL.get(name, 0.0) for name in TERMS)
-    assert in_words(errors, RIG) == f"disparities -1.00 px in the middle; rows by up to {rows:.1f} px; k1 +0.015"
-    assert in_words(NO_ERRORS, RIG) == ""
+    assert (
+        describe_errors(errors, RIG)
+        == f"disparities -1.00 px in the middle; rows by up to {rows:.1f} px; k1 +0.015"
+    )
+    assert describe_errors(NO_ERRORS, RIG) == ""
 
 
 def test_a_good_calibration_is_left_alone() -> None:
@@ -168,7 +171,7 @@ def test_a_tilt_of_the_rows_is_measured() -> None:
 def test_good_pairs_pass_and_bad_ones_are_told_apart() -> None:
     judge_stereo(_matches(), RIG, 1.5)
     judge_stereo(_matches() + np.array([0.0, 0.0, 0.8, 0.0]), RIG, 1.5)  # an offset of real calibrations
-    bad = {"exchanged": _matches()[:, [2, 3, 0, 1]], "undistorted": _matches(-0.33), "late": _matches(forward=2.0)}
+    bad = {"exchanged": _matches()[:, [2, 3, 0, 1]], "distortion": _matches(-0.33), "late": _matches(forward=2.0)}
     for word, stereo in bad.items():
         with pytest.raises(RefusedFramesError, match=word):
             judge_stereo(stereo, RIG, 1.5)
@@ -177,7 +180,7 @@ def test_good_pairs_pass_and_bad_ones_are_told_apart() -> None:
 def test_an_offset_is_taken_from_the_disparity_alone() -> None:
     stereo = _matches()
     c = Correspondences(left=stereo, right=stereo, tracks=np.concatenate([stereo, stereo], axis=1))
-    moved = recalibrated(c, RIG, of_offset(0.6))
+    moved = recalibrated(c, RIG, offset_error(0.6))
     np.testing.assert_allclose(moved.tracks[:, 0] - moved.tracks[:, 2], stereo[:, 0] - stereo[:, 2] - 0.6)
     np.testing.assert_allclose(moved.tracks[:, 0] + moved.tracks[:, 2], stereo[:, 0] + stereo[:, 2])
     np.testing.assert_allclose(moved.tracks[:, 0], moved.left[:, 0])

@@ -19,7 +19,14 @@ from rsbench.capture.hypotheses import (
     Scans,
     TimedMatches,
 )
-from rsbench.capture.self_calibration import PRIOR, PairFocal, _mended, conclude_focal, find_camera, focal_of_pair
+from rsbench.capture.self_calibration import (
+    PRIOR,
+    PairFocal,
+    _corrected,
+    conclude_focal,
+    find_camera,
+    focal_of_pair,
+)
 from rsbench.components.motion_models import InertialMotion, make_motion
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import Correspondences
@@ -152,14 +159,14 @@ def test_a_rig_that_does_not_turn_keeps_its_card() -> None:
     wrong, sigma = with_card(rig, 1.05), CardSigma(focal=52.0, k1=0.02)
     found = find_camera([matches], wrong, sigma, AT_TOP)
     assert found.determined == (False, False) and found.rig == wrong and found.sigma == sigma
-    assert found.words(wrong, sigma).count("cannot tell") == 2
+    assert found.words(wrong, sigma).count("do not determine it") == 2
 
 
 def test_a_lens_that_would_fold_is_not_taken() -> None:
     """k1 = -0.9 folds at a radius of 0.61; the corner is at 0.77."""
     _, rig = matches_of(CAMERA)
-    assert _mended(rig, np.array([0.0, -0.9])) is None
-    assert _mended(rig, np.array([0.0, -0.1])) is not None
+    assert _corrected(rig, np.array([0.0, -0.9])) is None
+    assert _corrected(rig, np.array([0.0, -0.1])) is not None
 
 
 def test_where_rows_differ_k1_is_one_of_the_errors() -> None:
@@ -168,7 +175,7 @@ def test_where_rows_differ_k1_is_one_of_the_errors() -> None:
     given, sigma = replace(rig, camera=CAMERA), CardSigma(k1=0.05)
     found = find_camera([matches], given, sigma, AT_TOP)
     assert found.determined == (False, False) and found.rig == given
-    assert "with the errors of the calibration" in found.words(given, sigma)
+    assert "with the calibration errors" in found.words(given, sigma)
 
 
 WIDTH, HEIGHT = 640, 480

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, of_offset, recalibrated
+from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, offset_error, recalibrated
 from rsbench.capture.hypotheses import (
     ACCELERATION,
     GLOBAL,
@@ -174,13 +174,15 @@ def test_frames_in_the_wrong_order_are_noticed() -> None:
 def test_a_disparity_offset_is_found_with_the_ratio() -> None:
     """Rows tilted by 0.5 px allow an offset; without it the ratio of a global shutter comes out wrong."""
     data, offset = simulated(9, 0.0, 1.0, 1500, noise=0.1), 0.7
-    c = recalibrated(data.correspondences, RIG, of_offset(-offset))
+    c = recalibrated(data.correspondences, RIG, offset_error(-offset))
     tracks = c.tracks.copy()
     tracks[:, [3, 7]] += 0.5 * (tracks[:, [2, 6]] / 450.0 - 1.0)
     c = Correspondences(left=c.left, right=c.right, tracks=tracks)
     known = known_of(c, RIG, KnownInputs(scanning=TOP, models=("linear",)))
     assert known.calibration_sigma[OFFSET] > 0.1
-    assert known_of(c, RIG, KnownInputs(scanning=TOP, calibration=of_offset(0.0))).calibration_sigma == NO_ERRORS
+    assert (
+        known_of(c, RIG, KnownInputs(scanning=TOP, calibration=offset_error(0.0))).calibration_sigma == NO_ERRORS
+    )
     capture = conclude([examine(c, RIG, known)])
     assert abs(capture.offset - offset) < 4.0 * capture.offset_sigma < 0.6
 
@@ -290,7 +292,7 @@ def candidate(scans: Scans, probability: float, ratio: float, sigma: float, offs
         sigma=sigma,
         delay=0.0,
         delay_sigma=0.0,
-        calibration=of_offset(offset),
+        calibration=offset_error(offset),
     )
 
 

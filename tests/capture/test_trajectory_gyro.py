@@ -154,7 +154,7 @@ def test_windows_that_leave_and_those_that_stay_say_together_what_all_said() -> 
         return dense(anchored(here, curve, some, ANCHORED), here.border), here.slope
 
     H, slope = equations(found.curve, tracks, found.trust)
-    state.leave(found, tracks, 3)
+    state.marginalise(found, tracks, 3)
     assert state.curve is not None and found.drift is not None and tracks.gyro is not None
     m = 6 * (len(found.curve.p) - len(state.curve.p))
     solved = scipy.linalg.solve(H[:m, :m], np.column_stack([H[:m, m:], slope[:m]]), assume_a="pos")

@@ -30,7 +30,7 @@ def test_few_frames_say_that_they_are_few() -> None:
     capture = capture_of_sequence(NOTHING, windows, RIG, [Scanning()])
     best = capture.likeliest
     assert best is not None and abs(best.ratio - RATIO) < 3.0 * best.sigma
-    assert not capture.determined and "4 frames in a row do not determine" in capture.reason
+    assert not capture.determined and "4 successive frames do not determine" in capture.reason
 
 
 def test_nothing_is_told_where_nothing_is_seen() -> None:

@@ -250,7 +250,7 @@ def test_a_spline_needs_depth_and_a_trace_of_time() -> None:
     asked = []
     for motion, rig in ((shaken, OF_ROOM), (even, OF_ROOM), (shaken, narrow)):
         data = simulate(rig, READ, motion, SimulationOptions(tracks=300, noise_px=0.2), np.random.default_rng(3))
-        asked.append(two_frame_spline_module._asks_for_one(data.correspondences, rig, READ, even))
+        asked.append(two_frame_spline_module._needs_spline(data.correspondences, rig, READ, even))
     assert asked == [True, False, False]
 
 

@@ -17,7 +17,7 @@ import pytest
 from commands import assert_refused, bytes_below, run_here
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
-from rsbench.capture.calibration import of_offset
+from rsbench.capture.calibration import offset_error
 from rsbench.capture.hypotheses import Known, Scans
 from rsbench.capture.two_frame_estimate import conclude, examine
 from rsbench.cli.correct_output import readout_words, say_calibration
@@ -137,8 +137,8 @@ def test_a_camera_that_is_not_sure_is_looked_for_and_told(
     assert result.stdout.count(note) == 1 and record["calibration_note"] != note
     assert f"(card: {fx:.1f} +- {0.1 * fx:.1f})" in note
     focal, k1 = note.split("; k1 ")
-    assert ("cannot tell" in focal) == (record["camera"]["fx"] == fx)
-    assert ("cannot tell" in k1) == (record["lens"] is None) and "(card: 0.000 +- 0.020)" in k1
+    assert ("do not determine it" in focal) == (record["camera"]["fx"] == fx)
+    assert ("do not determine it" in k1) == (record["lens"] is None) and "(card: 0.000 +- 0.020)" in k1
     looked = run_here("inspect", *frames, "--rig", rig)
     assert looked.returncode in (0, 1) and note in looked.stderr
     rig.write_text(rig.read_text().replace(f"focal_sigma = {0.1 * fx}", "focal_sigma = -1"))
@@ -385,7 +385,7 @@ def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
     motion = LinearMotion(w=np.radians([1.2, -0.7, 1.5]), d=[0.1, -0.15, 0.1])
     matches = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
     known = Known(scans=(Scans("top", "top"),), delay=0.0, models=("linear",))
-    window = examine(matches, rig, replace(known, calibration_sigma=of_offset(0.5)))
+    window = examine(matches, rig, replace(known, calibration_sigma=offset_error(0.5)))
     assert "may err" in readout_words(shutter, conclude([window]), rig)
     assert "may err" not in readout_words(shutter, conclude([window, window]), rig)
     assert "may err" not in readout_words(shutter, conclude([examine(matches, rig, known)]), rig)

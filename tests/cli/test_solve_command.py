@@ -187,5 +187,6 @@ def test_the_motion_model_is_chosen_and_printed() -> None:
     assert json.loads(run_here("solve", EXAMPLE, "--solver", "gs-8pt", "--json").stdout)["model_choice"] is None
     assert_refused(run_here("solve", EXAMPLE, "--motion-model", "twsit"), "did you mean 'twist'")
     assert_refused(
-        run_here("solve", EXAMPLE, "--motion-model", "auto", "--solver", "gs-8pt"), "take rs-stereo-refined"
+        run_here("solve", EXAMPLE, "--motion-model", "auto", "--solver", "gs-8pt"),
+        "use --solver rs-stereo-refined",
     )

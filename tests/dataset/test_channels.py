@@ -343,7 +343,7 @@ def test_planted_faults_are_named(yard: Path, tmp_path: Path, names: list[str]) 
     for name in names:
         FAULTS[name][0](tmp_path / "data/yard")
     rehash(tmp_path / "data")
-    again: Rerender = "all" if any("made again" in FAULTS[name][1] for name in names) else "no"
+    again: Rerender = "all" if any("new computation" in FAULTS[name][1] for name in names) else "no"
     (report,) = verify_dataset(tmp_path / "data", rerender=again, scenes=[yard.parent / "yard.toml"])
     missed = [
         name
@@ -372,7 +372,7 @@ def test_a_map_that_others_contradict_is_acquitted_when_it_is_what_rays_meet(yar
     assert not [
         fault for fault in compared.faults(lambda view: iter(()), lambda view: True) if "_depth/" in str(fault)
     ]
-    assert any("rendered again, all of it" in note for note in compared.notes)
+    assert any("it equals a new rendering" in note for note in compared.notes)
 
 
 def test_channels_that_depth_contradicts_are_cleared_when_they_are_what_rays_make(

@@ -282,7 +282,7 @@ def test_full_frames_keep_the_stack_that_the_frame_is_stitched_from(small: Small
         "a/sequence.json: files does not list gs_stack/left_0/0003.png",
         "gs_stack/right_0: row 5: 1 images differ in their own row from rs/right_0.png",
         "gs_stack/right_1/0000.png: differs from gs/right_1.png",
-        "gs_stack/left_1: row 9: the image differs from what is rendered again",
+        "gs_stack/left_1: row 9: the image differs from a new rendering",
     ):
         assert any(fault.startswith(words) for fault in report.faults), (words, report.faults)
 

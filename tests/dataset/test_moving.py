@@ -342,7 +342,7 @@ def test_labels_that_depth_does_not_tell_are_made_again(lot: Path, tmp_path: Pat
 
 
 def test_what_knows_nothing_of_moving_objects_is_refused(lot: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="'tracks' does not know of moving objects"):
+    with pytest.raises(ValueError, match="'tracks' does not support moving objects"):
         lot_card(lot.parent, channels=("flow", "tracks"))
     with pytest.raises(RsbenchError, match="moving objects are not for the integrator 'path'"):
         generate_dataset(lot_card(lot.parent, renderer="path"), tmp_path)

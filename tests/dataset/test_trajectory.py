@@ -121,7 +121,7 @@ LINE = "{} 0 0 0 0 0 0 1"
         ([LINE.format(0), "1 0 0 inf 0 0 0 1"], "line 2: not 8 finite numbers"),
         (["0 0 0 0 0.5 0 0 0.5"], "line 1: its quaternion has the length 0.707"),
         ([LINE.format(0.5), "", LINE.format(0.5)], "line 3: its timestamp is not later"),
-        ([LINE.format(0), LINE.format(10**9)], r"line 2: is 1e\+09 s after the pose before"),
+        ([LINE.format(0), LINE.format(10**9)], r"line 2: is 1e\+09 s after the previous pose"),
         ([LINE.format(0), "0.1 0 0 0 1 0 0 0"], "line 2: turns by 180 degrees"),
         ([LINE.format(0), LINE.format(0.1)], "lasts 0.1 s; a pair of frames from start_s = 0 on needs 0.18 s"),
     ],
@@ -163,4 +163,4 @@ def test_it_is_rendered_verified_and_refused_when_moved(tmp_path: Path, walk: Pa
     write_json(manifest, content)
     (report,) = verify_dataset(out, 8, rerender="auto", scenes=scenes)
     assert any("scene.start" in fault for fault in report.faults)
-    assert any("rendered again" in fault for fault in report.faults)
+    assert any("new rendering" in fault for fault in report.faults)

@@ -276,7 +276,7 @@ def test_a_gyroscope_s_samples_are_those_of_the_frames_own_times(monkeypatch: py
         taken[len(taken)] = (gyro, turn.shutter.readout_ratio)
         return None, "not asked for"
 
-    monkeypatch.setattr(mono_sequence, "_found", found)
+    monkeypatch.setattr(mono_sequence, "_first_motion", found)
     tau = np.linspace(-1.0, 6.0, 71)
     samples = np.column_stack([tau, 0.01 * tau, 0.0 * tau, 0.0 * tau])
     frames = [_seen(np.full(SIZE[0], float(k))) for k in range(3)]

@@ -108,7 +108,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RsbenchError, match="is UTF-16 text"):
         read_problem(tmp_path / "binary.json")
     for name in ("frame.png", "Film.MP4"):
-        with pytest.raises(RsbenchError, match="is an image or a video, and not matches"):
+        with pytest.raises(RsbenchError, match="is an image or a video, but matches are needed"):
             read_problem(tmp_path / name)
 
 

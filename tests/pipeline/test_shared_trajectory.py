@@ -13,7 +13,7 @@ from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline import mono_correction as mono_ways
+from rsbench.pipeline import mono_correction
 from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, with_shared_trajectory
 from rsbench.pipeline.mono_sequence import correct_frames
 from rsbench.pipeline.sequence_capture import CorrectedMoment
@@ -93,8 +93,8 @@ def test_pairs_are_told_in_order_with_those_beside_them(monkeypatch: pytest.Monk
         runs.append([number for number, _ in run])
         return {}
 
-    monkeypatch.setattr(mono_ways, "_along", noted)
-    monkeypatch.setattr(mono_ways, "_shows", lambda pair: pair.found is not None)
+    monkeypatch.setattr(mono_correction, "_trajectory_motions", noted)
+    monkeypatch.setattr(mono_correction, "_is_usable", lambda pair: pair.found is not None)
     marks = [FoundOwnMotion(own=OWN, robust=None, reason=str(k)) for k in range(25)]
     pairs = [SeenPair(found=None if k == 14 else mark, matches=np.zeros((0, 4))) for k, mark in enumerate(marks)]
     told = list(with_shared_trajectory(pairs))
@@ -122,9 +122,9 @@ def test_a_pair_that_a_way_does_not_explain_keeps_its_own_motion(monkeypatch: py
         matches=np.concatenate([here, here + np.array([6.0, 0.0])], axis=1),
     )
     along, across = InertialMotion([0.0] * 3, [-1.0, 0.0, 0.0]), InertialMotion([0.0] * 3, [0.0, 1.0, 0.0])
-    monkeypatch.setattr(mono_ways, "camera_trajectory", lambda *rest: [along, across, along])
+    monkeypatch.setattr(mono_correction, "camera_trajectory", lambda *rest: [along, across, along])
     told = list(with_shared_trajectory([pair] * 3))
     assert [each is pair.found for each in told] == [False, True, False]
     assert all(each is pair.found for each in with_shared_trajectory([pair] * 2))
-    monkeypatch.setattr(mono_ways, "camera_trajectory", lambda *rest: None)
+    monkeypatch.setattr(mono_correction, "camera_trajectory", lambda *rest: None)
     assert all(each is pair.found for each in with_shared_trajectory([pair] * 3))

@@ -78,7 +78,7 @@ def test_a_blur_is_found(sound: Path, tmp_path: Path) -> None:
         write_png(path, blurred)
 
     (fault,) = verified(sound, spoilt(sound, tmp_path, change)).faults
-    assert "gs/left_1.png" in fault and "rendered again" in fault
+    assert "gs/left_1.png" in fault and "new rendering" in fault
 
 
 def test_a_picture_of_other_light_is_one_finding(sound: Path, tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_a_picture_of_other_light_is_one_finding(sound: Path, tmp_path: Path) ->
         path.write_text(json.dumps(manifest))
 
     faults = verified(sound, spoilt(sound, tmp_path, change)).faults
-    images = [fault for fault in faults if "the image differs from what is rendered again" in fault]
+    images = [fault for fault in faults if "the image differs from a new rendering" in fault]
     assert len(images) == 8
 
 

@@ -32,7 +32,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
-from rsbench.pipeline.isolated_components import Caller, Isolation, SolverRunner, entrys_own
+from rsbench.pipeline.isolated_components import Caller, Isolation, SolverRunner, as_entry_failure
 from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
 from rsbench.storage.work_folder import work_folder
 
@@ -54,11 +54,11 @@ class _Isolated(Metric):
 
 
 def _serve_metric(place: str) -> Callable[..., object]:
-    with entrys_own():
+    with as_entry_failure():
         (entry,) = load_metrics([place])
 
     def answer(case: Case) -> dict[str, float]:
-        with entrys_own():
+        with as_entry_failure():
             return score(entry, case)
 
     return answer

@@ -23,7 +23,7 @@ from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.deviations import Calibration, calibration, named_numbers
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Track
 from rsbench.benchmark.leaderboard.tracks import track_of_id
-from rsbench.benchmark.statistics import COVERAGE, in_words, scene_means, score_interval
+from rsbench.benchmark.statistics import COVERAGE, format_interval, scene_means, score_interval
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 
@@ -141,9 +141,9 @@ class Standing:
     def stated_words(self) -> dict[str, str]:
         """How often its ellipsoids of 95 % hold the truth, its log score, and its rank by that, by column."""
         found = self.calibration
-        words = {"in 95 %": in_words(*found.covers[-1]) if found else "-"}
+        words = {"in 95 %": format_interval(*found.covers[-1]) if found else "-"}
         if "log_score" in self.scored.scores:
-            words["log score"] = in_words(*found.log_score) if found and found.log_score else "-"
+            words["log score"] = format_interval(*found.log_score) if found and found.log_score else "-"
             words["log rank"] = _rank_words(self.log_rank, self.log_peers) if self.log_rank else "-"
         return words
 

@@ -1,7 +1,7 @@
-"""Verdicts on the claims of the paper about simulated points, by rule from stored summaries.
+"""Verdicts on the paper's claims about simulated points, computed by rules from stored summaries.
 
-The paper leaves open how its solver is meant in places (see ``readings``), so a claim has a verdict under each
-reading; it is refuted only where the most favourable one fails.
+The paper's description of its solver is ambiguous in places, so each claim has a verdict for each reading
+(``Reading``); it is refuted only if the most favourable reading fails.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from typing import Any, Literal, NamedTuple
 import pandas as pd
 
 from rsbench.benchmark.simulated.sweep_card import SweepCard, Variant
-from rsbench.benchmark.statistics import in_words, share_interval
+from rsbench.benchmark.statistics import format_interval, share_interval
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import write_bytes
 
 MEASURES = ("e_R", "e_T")
 Centre = Literal["mean", "median"]
 TINY = 0.25
-"""Margin of an increase, as a share of what the eight-point algorithm errs without noise."""
+"""Largest small increase, as a share of the eight-point algorithm's error without noise."""
 UNCHANGED = 1.5
-"""Margin of no change, as the quotient of the largest error and the smallest."""
+"""Largest quotient of two errors that count as unchanged."""
 SUFFICIENT_SHARE, UNIQUE_SHARE = 0.9, 0.95
 SCALE_MARGIN = 0.1
-"""Margin of a known scale: the median of abs(log(estimated / true length of d))."""
+"""Largest median of abs(log(estimated / true length of d)) for a known scale."""
 
 
 class Figure(NamedTuple):
-    """A statistic with its 95 % interval, of no width where it is exact; NaN where the matches do not tell it."""
+    """A statistic with its 95 % interval, of width 0 if it is exact; NaN if it is not observable."""
 
     value: float
     low: float
@@ -42,49 +42,49 @@ class Figure(NamedTuple):
     def __str__(self) -> str:
         if math.isnan(self.value):
             return "not observable"
-        return f"{self.value:.3g}" if self.low == self.high else in_words(*self)
+        return f"{self.value:.3g}" if self.low == self.high else format_interval(*self)
 
 
 class Check(NamedTuple):
-    """Whether a claim holds at one value of the axis, or for one quantity; None: the intervals leave it open."""
+    """Whether a claim holds at one value of the axis, or for one quantity; None: undecided."""
 
     label: str
     holds: bool | None
     value: float | None = None
-    """Value of the axis, where the checks go over values."""
+    """Value of the axis, if there is one check per value."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Figures over the values of a sweep, in order of the values."""
+    """Figures for the values of a sweep, sorted by value."""
 
     values: tuple[float, ...]
     figures: Mapping[str, tuple[Figure, ...]]
-    """``e_R`` and ``e_T`` in degrees, their root mean squares ``rms_R`` and ``rms_T`` with the bounds ``bound_R``
-    and ``bound_T`` of these, the median ``e_s``, and the shares of the trials ``solved`` and ``answered``."""
+    """``e_R`` and ``e_T`` in degrees; their root mean squares ``rms_R`` and ``rms_T`` and the bounds ``bound_R``
+    and ``bound_T`` of these; the median ``e_s``; the shares of trials ``solved`` and ``answered``."""
     labels: tuple[str, ...] = ()
-    """Names of the values where these are no numbers."""
+    """Names of the values if they are not numbers."""
 
     def __getitem__(self, measure: str) -> tuple[Figure, ...]:
         return self.figures[measure]
 
     def at(self, k: int, measures: Sequence[str]) -> str:
-        """The figures at the k-th value in words."""
+        """Text with the figures at the k-th value."""
         where = self.labels[k] if self.labels else f"{self.values[k]:g}"
         return f"{where}: " + ", ".join(f"{name} {self.figures[name][k]}" for name in measures)
 
     def checks(self, holds: Sequence[bool | None], first: int = 0) -> list[Check]:
-        """One check per value from the first on."""
+        """One check per value, starting with number ``first``."""
         if self.labels:
             return [Check(label, good) for label, good in zip(self.labels[first:], holds, strict=True)]
         return [Check(f"{v:g}", good, v) for v, good in zip(self.values[first:], holds, strict=True)]
 
 
 def series(table: pd.DataFrame, solver: str, variant: str, centre: Centre) -> Series:
-    """Figures of a solver in one variant of a summary.
+    """The figures of a solver in one variant of a summary.
 
     Raises:
-        RsbenchError: the summary does not have them.
+        RsbenchError: the summary lacks them.
     """
     rows = table[(table.solver == solver) & (table.variant == variant)].sort_values("value")
     if rows.empty:
@@ -111,7 +111,7 @@ def series(table: pd.DataFrame, solver: str, variant: str, centre: Centre) -> Se
 
 
 def verdict(checks: Sequence[Check], axis: str) -> str:
-    """ "holds", "fails", "undecided" or where which of them: at values of the axis, or for quantities."""
+    """ "holds", "fails", "undecided", or the values of the axis or quantities for which each is true."""
     parts = {
         word: [check for check in checks if check.holds is holds]
         for word, holds in (("holds", True), ("undecided", None), ("fails", False))
@@ -137,24 +137,24 @@ def _where(good: Sequence[Check], checks: Sequence[Check], axis: str) -> str:
 
 
 def better(a: Figure, b: Figure) -> bool | None:
-    """Smaller or not; None when the intervals overlap. What can be observed is better than what cannot."""
+    """Whether a is smaller than b; None if the intervals overlap. NaN (not observable) counts as larger."""
     if math.isnan(a.value) or math.isnan(b.value):
         return None if math.isnan(a.value) and math.isnan(b.value) else math.isnan(b.value)
     return True if a.high < b.low else False if b.high < a.low else None
 
 
 def within(low: float, high: float, margin: float) -> bool | None:
-    """Whether an interval lies below a margin; None when it lies across."""
+    """Whether an interval lies below a margin; None if it contains the margin."""
     return True if high <= margin else False if low > margin else None
 
 
 def all_of(parts: Sequence[bool | None]) -> bool | None:
-    """False if one fails, None if one is undecided."""
+    """False if any part is False, else None if any is None, else True."""
     return False if False in parts else None if None in parts else True
 
 
 def small_increase(ours: Series, other: Series) -> list[Check]:
-    """At each value but the smallest, errors have risen by less than ``TINY`` of the other's at the smallest."""
+    """At each value, errors exceed those at the smallest one by less than ``TINY`` of the other's error there."""
     later = range(1, len(ours.values))
     rises = [[_rise(ours[m], k, TINY * other[m][0].value) for m in MEASURES] for k in later]
     return ours.checks([all_of(rise) for rise in rises], 1)
@@ -176,7 +176,7 @@ def more_stable(ours: Series, other: Series) -> list[Check]:
 
 
 def both_grow(ours: Series, other: Series) -> list[Check]:
-    """Per solver and error: larger at the last value than at the first, and nowhere falling."""
+    """Per solver and error: it is larger at the last value than at the first, and decreases nowhere."""
     sides = (("RS", ours), ("GS", other))
     return [Check(f"{m} of {who}", _grows(s[m])) for who, s in sides for m in MEASURES]
 
@@ -227,7 +227,7 @@ def scale_known(ours: Series, other: Series) -> list[Check]:
 
 
 def beats_one_camera(ours: Series, other: Series) -> list[Check]:
-    """Per error at the first value: root mean square below the bound of the other's matches, of one camera."""
+    """Per error at the first value: its root mean square is below the bound for the matches of one camera."""
     return [Check(f"e_{m}", better(ours[f"rms_{m}"][0], other[f"bound_{m}"][0])) for m in "RT"]
 
 
@@ -250,7 +250,7 @@ SETTINGS: dict[str, tuple[Any, Any]] = {
     "baseline": (0.2, 0.6),
     "points": (9, 100),
 }
-"""Settings that the paper leaves open; a sweep's own axis is left out of its grid."""
+"""Two values for each setting that the paper does not give; the grid of a sweep excludes the sweep's axis."""
 GRID_NOISE_PX, GRID_TRIALS = 1e-3, 100
 
 
@@ -267,7 +267,7 @@ class Reading:
     terms: str = "second"
 
     def __str__(self) -> str:
-        """What differs from the literal reading."""
+        """The parameters that differ from the literal reading."""
         literal = asdict(LITERAL)
         words = [f"{name} by {v}" if name in ("scale", "sign") else v for name, v in asdict(self).items()]
         changed = [word for word, (name, v) in zip(words, asdict(self).items(), strict=True) if v != literal[name]]
@@ -280,27 +280,27 @@ class Reading:
 
     @property
     def complete(self) -> Reading:
-        """The same with all 27 unknowns."""
+        """The same reading with all 27 unknowns."""
         return replace(self, terms="third")
 
 
 LITERAL = Reading()
 _A_AND_UNIT = (("none", "metre"), ("none", "half-baseline"), ("unit-columns", "metre"))
-"""Columns of unit length undo the unit of the baseline."""
+"""Combinations of scaling and unit; columns of unit length make the unit of the baseline irrelevant."""
 _EXTRACTIONS = ("full", "symmetric")
 SOLVER_READINGS = (
     *(Reading(scaling=a, baseline_unit=unit, extraction=e) for (a, unit), e in product(_A_AND_UNIT, _EXTRACTIONS)),
     *(Reading(extraction=extraction, sign="scale") for extraction in _EXTRACTIONS),
 )
-"""What e_R and e_T feel, given more matches than unknowns; the literal one first."""
+"""Readings that affect e_R and e_T if there are more matches than unknowns; the literal one is first."""
 NINE_READINGS = tuple(r for r in SOLVER_READINGS if (r.scaling, r.baseline_unit) == _A_AND_UNIT[0])
-"""With nine matches per camera A X = 0 has an exact solution, which no scaling changes."""
+"""Readings for nine matches per camera: A X = 0 then has an exact solution, which scaling does not change."""
 APART = tuple(Reading(extraction=extraction, sampling="nine-apart") for extraction in _EXTRACTIONS)
-"""Nine of a hundred matches, as far apart as can be."""
+"""Readings that use nine of a hundred matches, chosen as far apart as possible."""
 
 
 def readings_of(sweep: str, points: int | None) -> tuple[Reading, ...]:
-    """The readings that a sweep is run with; ``points`` per camera, None where the sweep varies them."""
+    """The readings for a sweep; ``points`` is the number per camera, None if the sweep varies it."""
     found = NINE_READINGS if points == 9 else SOLVER_READINGS
     cheirality = [reading for reading in found if reading.sign == "cheirality"]
     if sweep == "noise":
@@ -311,7 +311,7 @@ def readings_of(sweep: str, points: int | None) -> tuple[Reading, ...]:
 
 
 def write_cards(folder: Path, readings: tuple[Reading, ...]) -> tuple[str, ...]:
-    """Paths of solver cards below ``folder``, one per reading."""
+    """Write a solver card below ``folder`` for each reading; returns the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for reading in readings:
@@ -324,9 +324,9 @@ def write_cards(folder: Path, readings: tuple[Reading, ...]) -> tuple[str, ...]:
 
 
 def settings_card(card: SweepCard, solvers: tuple[str, ...]) -> SweepCard:
-    """A sweep once per setting of the grid, at the paper's noise in pixels.
+    """The card of a sweep with one variant per setting of the grid, at the paper's noise in pixels.
 
-    The grid is half of all corners, such that each two choices meet equally often (a half fraction).
+    The grid is a half fraction of all corners, in which any two choices occur together equally often.
     """
     fields = {name: values for name, values in SETTINGS.items() if name != card.axis}
     variants = []
@@ -344,14 +344,14 @@ def settings_card(card: SweepCard, solvers: tuple[str, ...]) -> SweepCard:
 
 OURS, GLOBAL = "rs-stereo-refined-pairs", "gs-8pt"
 READINGS = {"1e-3 px": 1e-3, "0.81 px": 0.81}
-"""Variants of the sweeps that read the paper's noise of 10^-3 in pixels, and on the normalised image plane."""
+"""Readings of the paper's noise of 10^-3, in pixels or on the normalised image plane, with the noise in pixels."""
 ALL, NINE, MORE = "100 + 100", "9 + 9", "9 + 9 and more"
-"""Matches that solvers are given."""
+"""Number of matches that solvers get."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """A claim, where it is tested, and the rule."""
+    """A claim of the paper, the sweep that tests it, and the rule of the test."""
 
     key: str
     text: str
@@ -361,23 +361,23 @@ class Claim:
     rule: str
     """The rule in words."""
     check: Callable[[Series, Series], list[Check]]
-    """What judges the solver's figures beside those of ``other``."""
+    """The test, from the figures of the solver and of the one that it is compared with."""
     measures: tuple[str, ...] = MEASURES
     """Figures that tables show."""
     beside: tuple[str, ...] = ()
-    """Figures of what it is compared with; empty: the same figures."""
+    """Figures that tables show of the other solver; empty: the same."""
     matches: tuple[str, ...] = (ALL, NINE)
-    """How many of them it is judged with."""
+    """Numbers of matches for which it is tested."""
     against_complete: bool = False
     """Whether the solver is compared with itself with all 27 unknowns, instead of the eight-point algorithm."""
     at_reading: bool = False
-    """Whether only the noise of the reading counts, of a sweep over noise."""
+    """Whether a sweep over noise is tested only at the noise of the reading."""
     any_scale: bool = False
-    """Whether the readings of the scale matter to it."""
+    """Whether readings of the scale are tested."""
     exact: bool = False
-    """Whether it is judged without noise, by the variants of the sweep."""
+    """Whether it is tested without noise, by the variants of the sweep."""
     papers_alone: bool = False
-    """Whether it says nothing of other solvers than the paper's."""
+    """Whether it applies only to the paper's solver."""
 
     @property
     def shares(self) -> bool:
@@ -385,7 +385,7 @@ class Claim:
         return bool({"solved", "answered"} & set(self.measures))
 
     def statistic(self, centre: Centre) -> str:
-        """What is shown of the trials; ``centre`` is that of e_R and e_T."""
+        """Name of the statistic over the trials; ``centre`` is that of e_R and e_T."""
         if self.measures == MEASURES:
             return centre
         return "share" if self.shares else "RMS" if self.measures[0].startswith("rms") else "median"
@@ -537,9 +537,9 @@ def judge_claims(
     """One row per claim, number of matches, reading of the noise, statistic and contender.
 
     Args:
-        tables: summaries of sweeps, by the matches that solvers were given ("9 + 9") and the name of the sweep,
-            with rows of ``OURS``, ``GLOBAL`` and readings of the paper's solver.
-        readings: of the paper's solver, by the names that they have in the tables.
+        tables: summaries of sweeps, by the number of matches ("9 + 9") and the name of the sweep, with rows of
+            ``OURS``, ``GLOBAL`` and readings of the paper's solver.
+        readings: readings of the paper's solver by their names in the tables.
 
     Raises:
         RsbenchError: a summary lacks a solver or a variant.
@@ -555,7 +555,7 @@ def judge_claims(
 
 
 def _cases(claim: Claim, table: pd.DataFrame) -> list[tuple[str, pd.DataFrame, str]]:
-    """Reading of the noise, the rows of a summary that it is judged by, and their variant."""
+    """For each reading of the noise: its name, the rows of a summary for it, and their variant."""
     if claim.exact:
         exact = table[table.value == 0.0]
         names = exact.variant.unique()
@@ -569,7 +569,7 @@ def _cases(claim: Claim, table: pd.DataFrame) -> list[tuple[str, pd.DataFrame, s
 
 
 def contenders(claim: Claim, table: pd.DataFrame, readings: Mapping[str, Reading]) -> dict[str, str]:
-    """Names in a summary that a claim is judged for, with that of what each is compared with."""
+    """Names of the solvers in a summary to which a claim applies, each with that of the solver to compare with."""
     present = [name for name in table.solver.unique() if name in readings]
     by_reading = {readings[name]: name for name in present}
     chosen = {}
@@ -609,9 +609,9 @@ def _judge(
 
 
 def best_readings(judged: pd.DataFrame) -> pd.DataFrame:
-    """Per claim, matches and noise: the literal verdict in the paper's statistic, the best one, and ours.
+    """Per claim, matches and noise: the literal reading's verdict in the paper's statistic, the best one, ours.
 
-    The best is over readings, and over mean and median: what holds in most checks, then what fails in least.
+    The best reading and statistic (mean or median) holds in most checks, and among these fails in fewest.
     """
     rows = []
     for keys, group in judged.groupby(["claim", "matches", "noise"], sort=False):
@@ -635,11 +635,11 @@ def best_readings(judged: pd.DataFrame) -> pd.DataFrame:
 
 
 def judge_settings(tables: Mapping[str, pd.DataFrame], readings: Mapping[str, Reading]) -> pd.DataFrame:
-    """One row per claim, setting of the grid and reading: verdict on the paper's statistic, the mean.
+    """One row per claim, setting of the grid and reading: the verdict by the paper's statistic, the mean.
 
     Args:
-        tables: summaries of ``readings.settings_card`` sweeps by the name of the sweep.
-        readings: by the names that they have in the tables.
+        tables: summaries of ``settings_card`` sweeps by the name of the sweep.
+        readings: readings by their names in the tables.
 
     Raises:
         RsbenchError: a summary lacks a solver or a variant.
@@ -660,8 +660,7 @@ def judge_settings(tables: Mapping[str, pd.DataFrame], readings: Mapping[str, Re
 
 
 def holding_settings(judged: pd.DataFrame) -> pd.DataFrame:
-    """Per claim and reading: in how many settings of the grid the claim holds throughout, in how many it fails
-    throughout, and how many there are."""
+    """Per claim and reading: the number of settings in which all checks hold, in which all fail, and of all."""
     groups = judged.groupby(["claim", "reading"], sort=False)
     counts = groups.agg(
         holding=("held", lambda held: int((held == 1.0).sum())),

@@ -143,8 +143,8 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
     """One recording of each rig of two cameras and of each other camera, images in the order of their names.
 
     Args:
-        folder: holds cameras.txt and images.txt. images: folder to which image names are relative; None:
-        ``images`` in the folder, or one or two levels above.
+        folder: holds cameras.txt and images.txt.
+        images: folder to which image names are relative; None: ``images`` in folder, or one or two levels above.
 
     Raises:
         RsbenchError: a file is missing or wrong, or a camera model has no counterpart.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt: on six parameters (w, v), and on any problem that makes its own damped steps."""
+"""Levenberg-Marquardt for six parameters (w, v), and for any problem that computes its own damped steps."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ Place = TypeVar("Place")
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
 _LARGEST_DAMPING = 1e10
 _FLAT = 1e-10
-"""Relative decrease of the cost at which to stop: sqrt(n 1e-10) standard deviations from the end."""
+"""Relative decrease of the cost at which to stop: the distance to the minimum is then sqrt(n 1e-10) deviations."""
 
 
 class Minimum(NamedTuple):
-    """Where a descent ended."""
+    """The result of a minimisation."""
 
     theta: FloatArray
     cost: float
     H: FloatArray
-    """Gauss-Newton Hessian at the end, by theta."""
+    """Gauss-Newton Hessian by theta at the minimum."""
 
 
 def levenberg_marquardt(
@@ -37,11 +37,10 @@ def levenberg_marquardt(
 
     Args:
         theta: (6,) start.
-        iterations: most evaluations.
-        limit: largest length of v: without it, an unobservable scale runs to infinity.
-        inverse_length: take the steps in the direction of v and in 1 / |v|, which cannot pass zero. Pairs feel
-            the length of v as baseline / |v| only, and the cost is nearly quadratic in that, while in v it is a
-            valley that flattens out.
+        iterations: largest number of evaluations.
+        limit: largest length of v; without it, an unobservable scale would diverge.
+        inverse_length: parametrise v by its direction and 1 / |v|, which stays positive. Pairs depend on the
+            length of v only through baseline / |v|, in which the cost is nearly quadratic.
         tolerance: relative change of the parameters at which to stop.
     """
     theta = _clamped(theta, limit)
@@ -71,7 +70,7 @@ def levenberg_marquardt(
 def _trial(
     theta: FloatArray, gradient: FloatArray, H: FloatArray, damping: float, limit: float, inverse_length: bool
 ) -> FloatArray:
-    """Where a damped step leads."""
+    """The parameters after a damped step."""
     length = float(np.linalg.norm(theta[3:]))
     if not inverse_length or length == 0.0:
         return _clamped(theta + _damped_step(H, gradient, damping), limit)
@@ -95,8 +94,8 @@ def _damped_step(H: FloatArray, gradient: FloatArray, damping: float) -> FloatAr
 
 
 def _chart(v: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
-    """Axes (3, 3) along and across v; derivative (6, 6) of (w, v) by w, 1 / |v| and the direction's two angles."""
-    # The Householder reflection that takes the first axis to v / |v|, up to sign.
+    """Axes (3, 3) along and across v; derivatives (6, 6) of (w, v) by w, 1 / |v| and two angles."""
+    # The Householder reflection that maps the first axis to v / |v|, up to sign.
     sign = 1.0 if v[0] >= 0.0 else -1.0
     h = v / length
     h[0] += sign
@@ -114,29 +113,29 @@ def _clamped(theta: FloatArray, limit: float) -> FloatArray:
 
 
 class Problem(Protocol[Place]):
-    """A cost whose minimum is sought; a place holds parameters, and the cost and its derivatives there."""
+    """A cost to minimise; a place has parameters, and the cost and its derivatives there."""
 
     def stepped(self, here: Place, damping: float, /) -> Place | None:
-        """Where a damped step leads; None where that is no better."""
+        """The place after a damped step; None if its cost is not lower."""
 
     def settled(self, before: Place, after: Place, /) -> bool:
-        """Whether a step was so small that it is the last."""
+        """Whether the descent has converged with this step."""
 
 
 class Damping(NamedTuple):
-    """How damping grows where a step is no better, and shrinks after one that is: tenfold, within limits."""
+    """Limits of the damping, which is multiplied by ten after a rejected step and divided by ten after others."""
 
     least: float
     first: float
-    """The least one after a step that is no better."""
+    """Least damping after a rejected step."""
     largest: float
-    """The descent ends where no step below it is better."""
+    """The descent ends if no step with a smaller damping is accepted."""
     dropped: float = 0.0
-    """Up to here damping shrinks to ``least`` at once."""
+    """A damping up to this becomes ``least`` after an accepted step."""
 
 
 def descend(problem: Problem[Place], here: Place, steps: int, damping: Damping) -> Place:
-    """At most so many damped steps from a place, each to a better one."""
+    """Take at most ``steps`` accepted damped steps from a place."""
     now = damping.least
     for _ in range(steps):
         there = None

@@ -450,32 +450,32 @@ _ONE_SIGMA = 0.5 * (1.0 + math.erf(1.0 / math.sqrt(2.0)))
 _LEAST_SLOPE = 0.1
 _LEAST_SCALE_PX = 1e-9
 _TRACK_FREEDOM, _PAIR_FREEDOM, _PARAMETERS = 5, 1, 6
-_PARTS, _OF_A_PART = 6, 10
-"""Parts of the rows, at most, and tracks in one, at least, whose motions are compared."""
+_PARTS, _PART_TRACKS = 6, 10
+"""Most groups of rows whose motions are compared, and fewest tracks in each."""
 _SHARED, _CHANCE, _PER_EXCESS = 1.5, 1e-3, 2.0
-"""Dispersion by common errors of neighbours, and the probability, under a law, that rows contradict it; and how
-often the excess of their scatter counts, chosen on draws like those of the track points-2 (seeds 4000 to 4239)."""
+"""Dispersion due to correlated errors of neighbours, level at which rows contradict a motion model, and weight of
+their excess scatter, chosen on draws like those of the track points-2 (seeds 4000 to 4239)."""
 
 
 class Rows(NamedTuple):
-    """How far tracks of parts of the rows disagree about the motion, see ``HeavyTailed.by_rows``."""
+    """The test whether one motion fits all groups of rows, see ``HeavyTailed.by_rows``."""
 
     square: float
+    """Chi-squared statistic."""
     freedom: int
 
     def dispersion(self, shared: float) -> float:
-        """Factor, at least 1, on a covariance that has a factor ``shared`` for common errors of neighbours.
+        """Factor, at least 1, on a covariance that has a factor ``shared`` for correlated errors of neighbours.
 
-        Either errors that all rows of a part share cause the scatter: then it counts once. Or the motion leaves
-        its law: then what is beyond those errors counts ``_PER_EXCESS`` times, because the law's motion has the
-        information of all parts but errs from frame to frame like one of them.
+        Scatter due to errors common to a group of rows counts once. Where the camera leaves the motion model, the
+        excess counts ``_PER_EXCESS`` times: the estimate has the information of all groups, but the error of one.
         """
         scatter = self.square / self.freedom
         return max(1.0, scatter, 1.0 + _PER_EXCESS * (scatter / shared - 1.0))
 
     @property
     def contradict(self) -> bool:
-        """Whether no motion under this law is that of all rows, not even with errors that neighbours share."""
+        """Whether no motion of the model fits all rows, even with correlated errors of neighbours."""
         return self.square > _SHARED * float(scipy.special.chdtri(self.freedom, _CHANCE))
 
 
@@ -550,17 +550,17 @@ class HeavyTailed(Packed):
         return self._stated(theta, each, weights, inverse, variance * information, self.noise_variance(0.0))
 
     def by_rows(self, theta: FloatArray) -> Rows | None:
-        """Whether what a law leaves of the tracks depends on when their rows were read; None for few tracks.
+        """Test whether the residuals of a motion model depend on the readout time of the rows; None: few tracks.
 
-        Tracks of a part of the rows would each like another motion. The squared steps to it, over the information,
-        are chi-squared of six for each part but one under the law (score test, C. Rao, Proc. Cambridge
-        Philosophical Society 1948).
+        If the model is right, the step to the best motion of each group of rows, squared and normalised by its
+        information, is chi-squared with six degrees of freedom, for all groups but one (score test, C. Rao, Proc.
+        Cambridge Philosophical Society 1948).
         """
         times = self.tracks[:, 0, 2] if self.tracks.ndim == 3 else self.tracks[:, 6]
         if len(times) < _FEWEST:
             return None
         each, pairs = each_term(self, theta), len(self.pairs)
-        count = min(_PARTS, len(times) // _OF_A_PART)
+        count = min(_PARTS, len(times) // _PART_TRACKS)
         parts = np.argsort(np.argsort(times, kind="stable"), kind="stable") * count // len(times)
         slopes = (self.weights(each.squares)[:, None] * each.gradients)[pairs:]
         expected = self.trust * (self.nu + self.freedom) / (self.nu + self.freedom + 2.0)

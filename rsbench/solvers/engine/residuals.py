@@ -443,7 +443,7 @@ _VARIANCE = (0.5, 0.5, 2.0)
 
 @compiled
 def _invert_symmetric(S: FloatArray, out: FloatArray) -> bool:
-    """Inverse of a positive definite (3, 3) matrix by cofactors; False when floats show it singular."""
+    """Inverse of a symmetric positive definite (3, 3) matrix; False where it is singular to rounding."""
     c00 = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
     c01 = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
     c02 = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]

@@ -110,7 +110,7 @@ GOOD = _poses(np.arange(float(FRAMES)))
         ({"poses": GOOD[:1]}, "poses: a success needs two rows"),
         ({"poses": [row[:7] for row in GOOD]}, "poses"),
         ({"poses": [[*row[:7], 2.0] for row in GOOD]}, "a quaternion is not of length 1"),
-        ({"poses": [*GOOD[:2], *GOOD[:2]]}, "later than the one before"),
+        ({"poses": [*GOOD[:2], *GOOD[:2]]}, "later than the previous one"),
         ({"poses": [[row[0], 1e12, *row[2:]] for row in GOOD]}, "within 1e\\+09"),
         ({"poses": [[*row[:4], 0.0, 0.0, float(k % 2), 1.0 - k % 2] for k, row in enumerate(GOOD)]}, "90 degrees"),
         ({"poses": [GOOD[0], [1e-30, *GOOD[1][1:]], *GOOD[1:]]}, "1e-30 frame periods apart"),
