@@ -36,7 +36,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import FEWEST_PER_PARAMETER
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.levenberg_marquardt import Minimum, levenberg_marquardt
-from rsbench.solvers.engine.packed import Packed, heavy_tailed, pack, pack_pairs, solve_triples
+from rsbench.solvers.engine.packed import Packed, each_term, heavy_tailed, pack, pack_pairs, solve_triples
 from rsbench.solvers.essential_matrix import decompose_essential, eight_point
 from rsbench.solvers.linear import scaled_translation, solve_reduced
 
@@ -531,5 +531,6 @@ def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
         packed = pack(matches, rig, shutter, model)
         packed.normal_equations(theta)
         packed.in_front(theta)
+        each_term(packed, theta)
         solve_triples(packed, np.arange(6).reshape(2, 3))
     five_point(pack_pairs(pairs, "left", rig, shutter)[:5])

@@ -72,7 +72,7 @@ def test_a_phone_s_video_becomes_an_upright_one_with_sound_and_a_page(
         "taken as one camera's",
         "turned by 90 degrees",
         "1 of 6 frames repeat",
-        "as their time stamps say",
+        "the time stamps are used",
     ):
         assert words in result.stdout
     frames = [frame.to_ndarray(format="rgb24") for frame in av.open("film-corrected.mp4").decode(video=0)]
