@@ -37,8 +37,11 @@ from foreign_rig import card as rig_card
 from foreign_world import read_photographs
 from numpy.typing import NDArray
 from rectify_study import errors, psnr, rectified
+from scipy.stats import chi2
 
 from rsbench.components.motion_models import LinearMotion
+from rsbench.core import so3
+from rsbench.pipeline.footage import read_rig_card
 
 _NAN = float("nan")
 _LIMIT = 3.0
@@ -83,6 +86,10 @@ class Outcome:
     """Of one frame."""
     lost: float = _NAN
     """dB below the correction that is fed with the truth, mean over the frames."""
+    inside: float = _NAN
+    """1 if the ellipsoid of 95 % of the stated motion contains the true one, otherwise 0."""
+    off: tuple[float, ...] = ()
+    """Errors of the calibration that was found, in stated deviations."""
     seconds: float = _NAN
 
     @property
@@ -218,6 +225,7 @@ def outcome(row: str, seed: int, folder: Path, way: str, again: bool, model: str
     fair = row in RIGS and way != "rectified" and (folder / "near.npz").is_file()
     lost = _lost(folder, corrected, correct_by_truth(row, seed, folder)) if fair else _NAN
     estimated = found["readout_ratio_estimated"]
+    inside = _inside(found["motion"], truth["motions"][0]) if truth["frames"] == 2 and new is None else _NAN
     return Outcome(
         **known,
         message=_remark(found, message, code),
@@ -229,8 +237,31 @@ def outcome(row: str, seed: int, folder: Path, way: str, again: bool, model: str
         gain=float(np.mean(gains)),
         worst_gain=float(np.min(gains)),
         lost=lost,
+        inside=inside,
+        off=_calibration_errors(folder, found.get("rig_errors", {})) if way == "loose" else (),
         seconds=seconds,
     )
+
+
+def _inside(motion: dict[str, Any], truth: dict[str, Any]) -> float:
+    """1 if the true motion lies in the ellipsoid of 95 % of the stated one, otherwise 0; NaN where none is stated."""
+    if not motion.get("covariance_w_d"):
+        return _NAN
+    off = np.concatenate(_vectors(motion)) - np.concatenate(_vectors(truth))
+    return float(off @ np.linalg.solve(np.array(motion["covariance_w_d"]), off) <= chi2.ppf(0.95, 6))
+
+
+def _calibration_errors(folder: Path, found: dict[str, dict[str, float]]) -> tuple[float, ...]:
+    """Errors, in stated deviations, of the right camera's angles and both focal lengths; empty: none were found."""
+    sizes = {side: _read(picture(folder, 2, side, 0)) for side in SIDES}
+    loose, true = (
+        read_rig_card(folder / f"{name}.toml").rig_of(sizes["left"], sizes["right"]) for name in ("loose", "told")
+    )
+    turns = {side: so3.log(loose.own(side).R.T @ true.own(side).R) for side in SIDES}
+    longer = {side: np.log(true.own(side).camera.fx / loose.own(side).camera.fx) for side in SIDES}
+    expected = dict(zip(("right_x", "right_y", "right_z"), turns["right"] - turns["left"], strict=True))
+    expected |= {f"focal_{side}": longer[side] for side in SIDES}
+    return tuple((found[k]["value"] - value) / found[k]["sigma"] for k, value in expected.items() if k in found)
 
 
 def _remark(found: dict[str, Any], message: str, code: int) -> str:
@@ -321,6 +352,8 @@ def _of_rigs(outcomes: Sequence[Outcome]) -> list[str]:
         "more than ideal",
         "worst",
         "median s",
+        "in 95 %",
+        "calibration within 3 deviations",
         "",
     )
     lines = [f"| {' | '.join(head)} |", "|---|---|" + "---:|" * (len(head) - 3) + "---|"]
@@ -334,6 +367,10 @@ def _of_rigs(outcomes: Sequence[Outcome]) -> list[str]:
             cells += [f"{np.median(e_R):.4f}", f"{np.max(e_R):.4f}", f"{np.median(e_T):.3f}", f"{np.max(e_T):.3f}"]
             cells += [_median([one.psnr for one in done], 2), _median([one.lost for one in done], 2)]
             cells += [_median(more, 2), _number(max(more, default=_NAN), 2), _median([o.seconds for o in done], 1)]
+            stated = [one.inside for one in done if np.isfinite(one.inside)]
+            off = np.array([each for one in done for each in one.off])
+            cells.append(f"{sum(stated):.0f} of {len(stated)}" if stated else "-")
+            cells.append(f"{np.count_nonzero(np.abs(off) <= 3.0)} of {len(off)}" if len(off) else "-")
             found = {"e_R": np.median(e_R), "e_T": np.median(e_T), "worst e_T": np.max(e_T)}
             beyond = [name for name, value in found.items() if value > LIMITS[name]]
             beyond += ["dB"] if more and np.median(more) > LIMITS["dB"] else []

@@ -75,10 +75,15 @@ class FoundRig:
     shutter: RollingShutter
     errors: FloatArray
     """(8,) values of ``ERRORS`` that were added to the calibration."""
-    sigma: FloatArray
-    """(8,) their standard deviations; 0: not estimated."""
+    covariance: FloatArray
+    """(8, 8) of the errors; 0: not estimated."""
     tracks: int
     """Number of tracks that were used."""
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(8,) standard deviations of the errors; 0: not estimated."""
+        return np.sqrt(np.diagonal(self.covariance))
 
     @property
     def record(self) -> dict[str, Any]:
@@ -214,17 +219,44 @@ def refine_rig(
         return None
     problem = _Problem(found, search, prior)
     end = descend(problem, problem.place(start, thetas), _ITERATIONS, _DAMPING)
-    errors, sigma = end.errors, problem.sigma(end.H, problem.window_gradients(end.errors, end.thetas))
-    if sigma is None:
+    errors = end.errors
+    covariance = problem.covariance(end.H, problem.window_gradients(errors, end.thetas))
+    if covariance is None:
         return None
     count = sum(len(each.tracks) for each in found)
     return FoundRig(
         rig=with_errors(rig, errors),
         shutter=_delayed(shutter, errors),
         errors=errors,
-        sigma=sigma,
+        covariance=covariance,
         tracks=count,
     )
+
+
+def spread_of_motion(
+    found: FoundRig, matches: Correspondences, w: FloatArray, d: FloatArray, noise_px: float, motion_model: str
+) -> FloatArray:
+    """Covariance (6, 6) of a motion (w, d) between two times that comes from the errors of a corrected rig.
+
+    The motion minimises the cost of the tracks for the corrected rig; the second derivatives of that cost show how
+    it moves with each error. Zero if there are too few tracks.
+
+    Args:
+        matches: those from which the motion was estimated, with tracks, in pixels of the images.
+        noise_px: standard deviation of their errors.
+        motion_model: its model.
+    """
+    search = _Search([matches], found.rig, found.shutter, RobustOptions(), 0, motion_model)
+    tracks = Correspondences(tracks=matches.tracks)
+    packed = pack(tracks, found.rig, found.shutter, motion_model)
+    theta = packed.theta(w, d)
+    window = search.window(matches.tracks, found.rig, found.shutter, theta, noise_px)
+    if window is None:
+        return np.zeros((6, 6))
+    problem = _Problem([window], search, found.sigma)
+    (_, by_errors), free = problem.place(np.zeros(len(ERRORS)), [theta]).backs[0], problem.free
+    by_errors = packed.motion_jacobian(theta) @ by_errors
+    return by_errors @ found.covariance[np.ix_(free, free)] @ by_errors.T
 
 
 def agrees(
@@ -248,10 +280,11 @@ def agrees(
         return False
     problem = _Problem(found, search, prior)
     here = problem.place(np.zeros(len(ERRORS)), thetas)
-    sigma = problem.sigma(here.H)
-    if sigma is None:
+    covariance = problem.covariance(here.H)
+    if covariance is None:
         return False
-    return bool(np.all(np.abs(np.linalg.solve(here.H, here.g)) <= deviations * sigma[problem.free]))
+    sigma = np.sqrt(np.diagonal(covariance)[problem.free])
+    return bool(np.all(np.abs(np.linalg.solve(here.H, here.g)) <= deviations * sigma))
 
 
 def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
@@ -286,15 +319,24 @@ class _Search(NamedTuple):
             packed = pack(tracks, first, read, self.motion_model)
             theta = packed.theta(result.estimate.w, result.estimate.d)
             chosen = matches.tracks[result.inliers["tracks"]]
-            some = Correspondences(tracks=chosen[:: max(len(chosen) // _MOST_TRACKS, 1)])
-            noise = max(result.estimate.noise_px or 0.0, _LEAST_NOISE_PX)
-            tailed = heavy_tailed(pack(some, first, read, self.motion_model), theta, noise)
-            if tailed is None:
+            window = self.window(chosen, first, read, theta, result.estimate.noise_px or 0.0)
+            if window is None:
                 continue
-            found.append(_Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale))
+            found.append(window)
             thetas.append(theta)
             agreeing += len(chosen)
         return found, thetas, agreeing
+
+    def window(
+        self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, theta: FloatArray, noise_px: float
+    ) -> _Window | None:
+        """Some of the tracks (n, 8), and the distribution of their errors about a motion; None: too few agree."""
+        some = Correspondences(tracks=tracks[:: max(len(tracks) // _MOST_TRACKS, 1)])
+        packed = pack(some, rig, shutter, self.motion_model)
+        tailed = heavy_tailed(packed, theta, max(noise_px, _LEAST_NOISE_PX))
+        if tailed is None:
+            return None
+        return _Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale)
 
 
 def _delayed(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
@@ -331,19 +373,19 @@ class _Problem:
             out.append(alone.place(errors, [theta]).g - weight * errors[self.free])
         return np.array(out)
 
-    def sigma(self, H: FloatArray, window_gradients: FloatArray | None = None) -> FloatArray | None:
-        """(8,) standard deviations of the errors from the Hessian of the free ones; None if it is singular."""
-        inverse, sigma = inverse_definite(H), np.zeros(len(ERRORS))
+    def covariance(self, H: FloatArray, window_gradients: FloatArray | None = None) -> FloatArray | None:
+        """(8, 8) of the errors from the Hessian of the free ones, 0 of the others; None if it is singular."""
+        inverse, covariance = inverse_definite(H), np.zeros((len(ERRORS), len(ERRORS)))
         if inverse is None:
             return None
         if window_gradients is not None and len(window_gradients) > 1:
             scatter = clustered(window_gradients @ inverse, np.arange(len(window_gradients)))
             inverse = larger(scatter * variance_factor(len(window_gradients) - 1.0, 1), inverse)
         # Errors that all matches have in common do not average out, however many matches there are.
-        shared = _SHARED_PX / self.rig.camera.fx
-        each = np.hypot(np.sqrt(np.diagonal(inverse)), shared)
-        sigma[self.free] = np.minimum(each, self.prior[self.free])
-        return sigma
+        inverse = inverse + (_SHARED_PX / self.rig.camera.fx) ** 2 * np.eye(len(inverse))
+        known_before = np.minimum(self.prior[self.free] / np.sqrt(np.diagonal(inverse)), 1.0)
+        covariance[np.ix_(self.free, self.free)] = inverse * np.outer(known_before, known_before)
+        return covariance
 
     def _packed(self, window: _Window, errors: FloatArray) -> Packed:
         matches = Correspondences(tracks=window.tracks)

@@ -99,7 +99,7 @@ def know_four(
         return matches, replace(capture, rig_found=found)
 
     forget_matches()
-    check, found, doubt = matches is None and rig.rows_together(inputs.reading, inputs.readout_ratio), None, None
+    check, found, doubt = matches is None, None, None
     try:
         if matches is None:
             matches, doubt = match_given(images, rig, options, inputs)
@@ -108,7 +108,7 @@ def know_four(
             found = rig_of_matches(matches, rig, inputs, options)
         return known(matches, found, doubt)
     except RefusedFramesError as refusal:
-        if refusal.stereo is None or not check:
+        if refusal.stereo is None or not check or not rig.rows_together(inputs.reading, inputs.readout_ratio):
             raise
         found, matches = find_rig(images, rig, inputs, options, refusal)
     return known(matches, found)
@@ -286,6 +286,8 @@ def find_rig(
 
 _CLEAR = 3.0
 """Standard deviations above which a calibration error is corrected: needless corrections cost accuracy."""
+_WIDE = 4.0
+"""Factor of the threshold for outliers while the calibration may be off by a few pixels."""
 _LIKELY_ROWS_PX = 0.3
 """Largest row difference, px, for which the given calibration is tested before an estimation."""
 
@@ -295,21 +297,42 @@ def rig_of_matches(
 ) -> FoundRig | None:
     """Correct a rig by matches along its epipolar lines; None if they agree with its calibration.
 
+    If both cameras read the ends of a match at different times, rows differ by the motion too. Errors are then
+    estimated from the tracks alone, if the readout ratio is given.
+
     Raises:
         NoMotionError: the matches do not determine a readout ratio.
     """
-    if not any(known_of(matches, rig, inputs).calibration_sigma):
-        return None
-    ideal = without_lens(matches, rig)
-    rows = rotation_of_rows(np.concatenate([ideal.stereo_0, ideal.stereo_1]), rig, options.seed)
-    if rows is None or (
-        rows_moved(rows[0], rig) < _LIKELY_ROWS_PX and _as_calibrated(matches, rig, inputs, options)
-    ):
-        return None
-    found = _refined_rig(matches, rig, rows[0], inputs, options)
-    # If both cameras read a point at different times, rows differ by the motion too, without any error.
+    if not rig.rows_together(inputs.reading, inputs.readout_ratio):
+        unknown = inputs.readout_ratio is None or _as_calibrated(matches, rig, inputs, options)
+        found = None if unknown else _rig_of_tracks(matches, rig, inputs, options)
+    else:
+        if not any(known_of(matches, rig, inputs).calibration_sigma):
+            return None
+        ideal = without_lens(matches, rig)
+        rows = rotation_of_rows(np.concatenate([ideal.stereo_0, ideal.stereo_1]), rig, options.seed)
+        if rows is None or (
+            rows_moved(rows[0], rig) < _LIKELY_ROWS_PX and _as_calibrated(matches, rig, inputs, options)
+        ):
+            return None
+        found = _refined_rig(matches, rig, rows[0], inputs, options)
+    # A correction that is not clear would cost accuracy.
     agrees = found is None or bool(np.all(np.abs(found.errors) <= _CLEAR * found.sigma))
     return None if agrees else found
+
+
+def _rig_of_tracks(
+    matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+) -> FoundRig | None:
+    """``refine_rig`` without a start from rows: with a wide threshold for outliers, then with the usual one."""
+    shutter, prior, found = inputs.shutter_of(rig), prior_of(np.zeros(len(ERRORS))), None
+    wide = replace(options.robust, threshold_px=_WIDE * options.robust.threshold_px)
+    for robust in (wide, options.robust):
+        start = np.zeros(len(ERRORS)) if found is None else found.errors
+        found = refine_rig([matches], rig, shutter, start, prior, robust, options.seed, _model_name(options))
+        if found is None:
+            return None
+    return found
 
 
 def _as_calibrated(

@@ -12,14 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
-from rsbench.capture.hypotheses import Known, scans_of
+from rsbench.capture.hypotheses import MODELS, Known, scans_of
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
+from rsbench.capture.rig_calibration import spread_of_motion
 from rsbench.capture.shutter_decision import LEAST_BACKWARDS, NoMotionError, reversed_scans, scans_by_laws
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
 from rsbench.capture.two_frame_spline import dispersion_of_rows, log_odds_of_opposite, two_frame_spline
-from rsbench.components.motion_models import load_kernel, make_motion
+from rsbench.components.motion_models import load_kernel, make_motion, model_name
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -354,6 +355,13 @@ def solve_frames(
         raise RefusedFramesError(BACKWARDS)
     if known.capture is not None and not in_order and isinstance(found.motion, ContinuousMotion):
         raise NoMotionError(SHAKES)
+    if known.rig_found is not None and found.robust.estimate.covariance is not None:
+        estimate = found.robust.estimate
+        model = model_name(type(found.motion))
+        model = model if model in MODELS else "linear"  # of a spline
+        noise = estimate.noise_px or 0.0
+        spread = spread_of_motion(known.rig_found, corrected, estimate.w, estimate.d, noise, model)
+        found = replace(found, robust=widened(found.robust, spread))
     return replace(found, calibration=errors)
 
 

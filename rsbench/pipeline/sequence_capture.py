@@ -422,7 +422,8 @@ def with_found_rig(
 ) -> FoundRig | None:
     """Correct the rig's calibration by the first frames; None if their rows agree with it or are inconclusive."""
     images = next(iter(window_images(left, right)), None)
-    if images is None or not rig.rows_together(inputs.reading, inputs.readout_ratio):
+    together = rig.rows_together(inputs.reading, inputs.readout_ratio)
+    if images is None or (rig.aligned and not together):
         return None
     inputs = replace(inputs, calibration=None)
     try:
@@ -431,6 +432,8 @@ def with_found_rig(
             return None
         return rig_of_matches(match_frames(images, rig, options, inputs.scanning), rig, inputs, options)
     except RefusedFramesError as refusal:
+        if not together:
+            return None  # the correction reports refused windows
         try:
             return find_rig(images, rig, inputs, options, refusal)[0]
         except (RefusedFramesError, NoMotionError):

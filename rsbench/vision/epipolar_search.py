@@ -55,6 +55,10 @@ _BAND = 32
 """Rows whose costs of all depths are kept at a time."""
 _ALIKE = 14.0
 """Largest mean cost in the window of a depth that counts; unlike places cost about 20."""
+_CHORD = 16
+"""Steps along the curve between places that are computed, if there is a lens."""
+_BETTER = 6.0
+"""Least difference of mean costs at which a found depth replaces a known one."""
 _AGREE_PX = 1.5
 """Largest difference of parallax between a pixel and the place where the other frame sees it."""
 
@@ -67,6 +71,7 @@ def depth_from_motion(
     motion: Motion,
     side: Side,
     wanted: tuple[int, ...] = (0, 1),
+    replace_unlike: bool = False,
 ) -> tuple[F32, F32]:
     """Depth (H, W), metres, of the pixels of both frames of one camera whose depth is 0; 0 where it stays unknown.
 
@@ -76,6 +81,9 @@ def depth_from_motion(
 
     Args:
         wanted: frames whose depth is needed; that of the others stays unknown.
+        replace_unlike: also search the depth of pixels whose known depth leads to a place of the other frame that
+            looks different, and return it if it leads to one that looks much more alike. Stereo errs so on texture
+            that runs along the baseline.
     """
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
@@ -84,21 +92,67 @@ def depth_from_motion(
     gain = parallax_gain(rig.sensor(side), *maps)
     count = int(_REACH * max(depths[0].shape))
     unknown = [depth == 0.0 for depth in depths]
-    if gain == 0.0 or not any(np.any(mask) for mask in unknown):
+    if gain == 0.0 or not (replace_unlike or any(np.any(mask) for mask in unknown)):
         return found
     greys = [grey_u8(image) for image in images]
     censuses = [census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
+    pairs = [(greys[k], greys[1 - k], censuses[k], censuses[1 - k]) for k in FRAMES]
+    most = [np.full(depth.shape, _ALIKE, dtype=np.float32) for depth in depths]
+    if replace_unlike:
+        for k in FRAMES:
+            cost = _known_costs(rhos[k], pairs[k], maps[k])
+            unknown[k] |= cost > _ALIKE
+            most[k] = np.where(depths[k] == 0.0, most[k], np.minimum(cost - np.float32(_BETTER), most[k]))
     for frame in (*wanted, *({0, 1} - set(wanted))):
         searched = unknown[frame]
         if frame not in wanted:  # only to confirm the other one
             searched = searched & _landed(rhos[1 - frame], unknown[1 - frame], maps[1 - frame])
         y, x = np.nonzero(searched)
-        both = (greys[frame], greys[1 - frame], censuses[frame], censuses[1 - frame])
-        rhos[frame][y, x] = _search(y, x, both, maps[frame], count, 1.0 / gain)
+        result = _search(y, x, pairs[frame], maps[frame], count, 1.0 / gain, most[frame][y, x])
+        rhos[frame][y, x] = np.where(np.isnan(result), rhos[frame][y, x], result)
     for frame in wanted:
         _keep_agreeing(rhos[frame], rhos[1 - frame], unknown[frame], maps[frame], _AGREE_PX / gain, found[frame])
     return found
+
+
+def _known_costs(
+    rho: F32,
+    both: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32], NDArray[np.uint32]],
+    maps: Reprojection,
+) -> F32:
+    """(H, W) mean cost, in the window, of known inverse depths ``rho`` (H, W); 0 outside the other frame."""
+    costs = np.zeros(rho.shape, dtype=np.float32)
+    seen = np.zeros(rho.shape, dtype=np.float32)
+    _fill_known_costs(rho, *both, maps, costs, seen)
+    window = (_WINDOW, _WINDOW)
+    mean = cv2.blur(costs, window) / np.maximum(cv2.blur(seen, window), np.float32(1e-6))
+    return np.where(seen > 0.0, mean, np.float32(0.0))
+
+
+@compiled(error_model="numpy")
+def _fill_known_costs(
+    rho: F32,
+    grey: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    code: NDArray[np.uint32],
+    other_code: NDArray[np.uint32],
+    maps: Reprojection,
+    costs: F32,
+    seen: F32,
+) -> None:
+    """Fill the cost (H, W) of known inverse depths, and whether (H, W) their places lie inside the other frame."""
+    height, width = rho.shape
+    for y in range(height):
+        for x in range(width):
+            if not rho[y, x] >= 0.0:
+                continue
+            u, v, _ = _seen_at(x, y, rho[y, x], maps)
+            if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+                ty, tx = int(v + 0.5), int(u + 0.5)
+                unlike = min(abs(np.int64(grey[y, x]) - np.int64(other[ty, tx])), _LEVELS)
+                costs[y, x] = _PLAIN[0] * ones(code[y, x] ^ other_code[ty, tx]) + _PLAIN[1] * unlike
+                seen[y, x] = 1.0
 
 
 def _landed(rho: F32, wanted: Mask, maps: Reprojection) -> Mask:
@@ -115,9 +169,10 @@ def _search(
     maps: Reprojection,
     count: int,
     step: float,
+    most: F32,
 ) -> F32:
     """Inverse depth (n,) at which pixels (n,), in order of rows, look most alike, of multiples of ``step``; NaN:
-    none does."""
+    none costs at most ``most`` (n,)."""
     numbers = np.full(both[0].shape, -1, dtype=np.int64)
     numbers[y, x] = np.arange(len(y))
     best, costs = np.zeros(len(y), dtype=np.int64), np.zeros((len(y), 3), dtype=np.float32)
@@ -128,7 +183,7 @@ def _search(
         bend = before - 2.0 * least + after
         offset = np.where(np.isfinite(bend) & (bend > 0.0), 0.5 * (before - after) / bend, 0.0)
     rho = np.maximum(best + np.clip(offset, -0.5, 0.5), 0.0) * step
-    return np.where((least <= _ALIKE) & (best < count - 1), rho, np.nan).astype(np.float32)
+    return np.where((least <= most) & (best < count - 1), rho, np.nan).astype(np.float32)
 
 
 def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
@@ -240,19 +295,46 @@ def _fill_costs(
     last = len(maps.A) - 1
     line = min(line_of(maps.columns, x, y), last)
     M, b = homography(x, y, line, maps)
+    u, v, u_0, v_0, u_1, v_1, ahead = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, line
     for k in range(len(cost)):
-        # One step along the curve changes the line by one at most: its pose is that of the last landing.
-        u, v, _ = land(M, b, k * step, maps.lens)
-        along = across_lines(maps.there, u, v)
-        seen_by = min(max(int(along + 0.5), 0), last) if -far < along < 2 * far else line
-        if seen_by != line:
-            line = seen_by
-            M, b = homography(x, y, line, maps)
+        if maps.lens is None:
+            u, v, _ = land(M, b, k * step, maps.lens)
+            # One step along the curve changes the line by one at most: its pose is that of the last landing.
+            along = across_lines(maps.there, u, v)
+            seen_by = min(max(int(along + 0.5), 0), last) if -far < along < 2 * far else line
+            if seen_by != line:
+                line = seen_by
+                M, b = homography(x, y, line, maps)
+        else:
+            # A lens takes most of the time. Between places _CHORD steps apart the curve is straight to 0.1 px.
+            share = (k % _CHORD) / _CHORD
+            if share == 0.0:
+                if k == 0:
+                    u_1, v_1, line = _land_on_line(x, y, 0.0, line, far, maps)
+                    ahead = line
+                u_0, v_0 = u_1, v_1
+                u_1, v_1, seen_by = _land_on_line(x, y, (k + _CHORD) * step, ahead, far, maps)
+                line, ahead = seen_by, min(max(2 * seen_by - line, 0), last)  # the next chord passes as many lines
+            u, v = u_0 + share * (u_1 - u_0), v_0 + share * (v_1 - v_0)
         cost[k] = prices[2]
         if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
             ty, tx = int(v + 0.5), int(u + 0.5)
             unlike = min(abs(np.int64(level) - np.int64(other[ty, tx])), _LEVELS)
             cost[k] = prices[0] * ones(bits ^ other_census[ty, tx]) + prices[1] * unlike
+
+
+@compiled(error_model="numpy")
+def _land_on_line(x: int, y: int, rho: float, line: int, far: int, maps: Reprojection) -> tuple[float, float, int]:
+    """Where the other frame sees a pixel, by the pose of a line near ``line`` that sees it; and that line."""
+    last, u, v = len(maps.A) - 1, np.nan, np.nan
+    for _ in range(3):
+        u, v, _ = reproject(x, y, rho, line, maps)
+        along = across_lines(maps.there, u, v)
+        seen_by = min(max(int(along + 0.5), 0), last) if -far < along < 2 * far else line
+        if abs(seen_by - line) <= 1:
+            return u, v, seen_by
+        line = seen_by
+    return u, v, line
 
 
 @compiled(error_model="numpy")
@@ -291,7 +373,10 @@ def _seen_at(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, flo
         along = across_lines(maps.there, u, v)
         if not -lines < along < 2 * lines:
             break
-        line = min(max(int(along + 0.5), 0), lines - 1)
+        seen_by = min(max(int(along + 0.5), 0), lines - 1)
+        if seen_by == line:
+            break
+        line = seen_by
     return u, v, s
 
 
