@@ -26,7 +26,7 @@ from rsbench.dataset.sequence import files_of
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.scenes.model import Viewpoint
-from rsbench.vision.lines import beside
+from rsbench.storage.files import background_writer
 
 Times = tuple[float, float]
 
@@ -38,7 +38,7 @@ def seconds(card: DatasetCard, options: RendererOptions, scene: MitsubaScene, vi
         for parent in {Path(name).parent for name in files_of(card.manifest_of(sequence))}:
             (Path(folder) / parent).mkdir(parents=True, exist_ok=True)
         begun, used = time.perf_counter(), time.process_time()
-        with beside() as later:
+        with background_writer() as later:
             for view in VIEWS:
                 for _ in render_camera(card, sequence, options, scene, *view, Path(folder), later):
                     pass

@@ -92,7 +92,8 @@ def rays(camera: Camera, samples: int) -> Rays:
     if not any(camera.coefficients):
         return Rays(x.astype(np.float32), y.astype(np.float32))
     undistort = _undistort_brown if camera.lens == BROWN else _undistort_kannala
-    x, y = undistort(*np.broadcast_arrays(x, y), padded(camera))
+    x, y = np.broadcast_arrays(x, y)
+    x, y = undistort(x, y, padded(camera))
     (x_by_row, x_by_column), (y_by_row, y_by_column) = np.gradient(x), np.gradient(y)
     area = np.abs(x_by_column * y_by_row - x_by_row * y_by_column) * camera.fx * camera.fy * samples**2
     blur = 0.5 * np.log2(np.maximum(area, 1e-12))

@@ -244,7 +244,7 @@ def outcome(row: str, seed: int, folder: Path, way: str, again: bool, model: str
 
 
 def _inside(motion: dict[str, Any], truth: dict[str, Any]) -> float:
-    """1 if the true motion lies in the ellipsoid of 95 % of the stated one, otherwise 0; NaN where none is stated."""
+    """1 if the 95 % ellipsoid of the stated motion contains the true one, 0 if not; NaN: none is stated."""
     if not motion.get("covariance_w_d"):
         return _NAN
     off = np.concatenate(_vectors(motion)) - np.concatenate(_vectors(truth))
@@ -252,7 +252,7 @@ def _inside(motion: dict[str, Any], truth: dict[str, Any]) -> float:
 
 
 def _calibration_errors(folder: Path, found: dict[str, dict[str, float]]) -> tuple[float, ...]:
-    """Errors, in stated deviations, of the right camera's angles and both focal lengths; empty: none were found."""
+    """Errors, in stated deviations, of the right camera's angles and both focal lengths; empty: none found."""
     sizes = {side: _read(picture(folder, 2, side, 0)) for side in SIDES}
     loose, true = (
         read_rig_card(folder / f"{name}.toml").rig_of(sizes["left"], sizes["right"]) for name in ("loose", "told")

@@ -28,6 +28,7 @@ def correct(
     rig: StereoRig,
     readout_ratio: float | None = None,
     *,
+    scanning: Scanning | None = None,
     solver: str | Path | Solver = "rs-stereo-refined",
     motion_model: str | None = None,
     matcher: str | Path = "sgm",

@@ -20,7 +20,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.corrector import CorrectorEntry, load_corrector
-from rsbench.vision.epipolar_search import depth_from_motion
+from rsbench.vision.epipolar_search import depth_from_motion, stereo_contradicts
 from rsbench.vision.feature_matcher import FeatureEntry, load_features
 from rsbench.vision.images import eight_bit
 from rsbench.vision.stereo_depth import SgmMatcher, fill_holes, moving_disparities, sky_mask, timed_depth
@@ -279,16 +279,26 @@ def complete_depth(
 ) -> Pairs:
     """The frames with depth from the motion where the other camera gives none, for the given frame indices.
 
-    If the cameras differ, it also replaces depth that the other frame contradicts. With two equal cameras in
-    alignment that changes a frame by -0.1 to 0.1 dB on average, with one above the other it gains up to 0.8 dB.
+    If the cameras differ, it also replaces depth that the other frame contradicts, unless the other camera
+    contradicts the new one. With two equal cameras in alignment that changes a frame by -0.1 to 0.1 dB on average,
+    with one above the other it gains up to 0.8 dB.
     """
 
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])
         known = pairs[0].depth[side], pairs[1].depth[side]
-        return depth_from_motion(
+        found = depth_from_motion(
             (first, second), known, rig, shutter, motion, side, frames, replace_unlike=not rig.aligned
         )
+        if rig.aligned:
+            return found
+        for frame in frames:
+            pair = eight_bit([pairs[frame].images[each] for each in (side, *(s for s in SIDES if s != side))])
+            wrong = stereo_contradicts(
+                (pair[0], pair[1]), known[frame], found[frame], rig, shutter, motion, side, frame
+            )
+            found[frame][wrong] = 0.0
+        return found
 
     with ThreadPoolExecutor(len(SIDES)) as pool:
         found = dict(zip(SIDES, pool.map(side_depths, SIDES), strict=True))

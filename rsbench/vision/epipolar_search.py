@@ -59,6 +59,8 @@ _CHORD = 16
 """Steps along the curve between places that are computed, if there is a lens."""
 _BETTER = 6.0
 """Least difference of mean costs at which a found depth replaces a known one."""
+_WORSE = 0.5
+"""Difference of mean costs above which a depth fits the other camera's image clearly worse."""
 _AGREE_PX = 1.5
 """Largest difference of parallax between a pixel and the place where the other frame sees it."""
 
@@ -116,6 +118,37 @@ def depth_from_motion(
     return found
 
 
+def stereo_contradicts(
+    images: tuple[NDArray[Any], NDArray[Any]],
+    known: F32,
+    found: F32,
+    rig: StereoRig,
+    shutter: RollingShutter,
+    motion: Motion,
+    side: Side,
+    frame: int,
+) -> Mask:
+    """(H, W) whether a pixel fits the other camera's image clearly worse at the depth ``found`` than at ``known``.
+
+    So it is with things that move by themselves, whose depth stereo shows and the motion of the rig does not.
+
+    Args:
+        images: (H, W[, 3]) of that camera and of the other one, at one frame time; sizes may differ.
+        known, found: (H, W) metres along that camera's axis; 0 where it is unknown.
+    """
+    other_side: Side = "right" if side == "left" else "left"
+    here, there = (
+        reprojection_of(rig.sensor(each), poses, poses, (shutter.axis(each),) * 2)
+        for each in (side, other_side)
+        for poses in (row_poses(rig, shutter, motion, each, frame),)
+    )
+    maps = here._replace(A=there.A, B=there.B, lens=there.lens, there=there.there)
+    greys = [grey_u8(image) for image in images]
+    both = (greys[0], greys[1], census(greys[0]), census(greys[1]))
+    costs = [_known_costs(inverse_depth(depth), both, maps) for depth in (known, found)]
+    return np.asarray((known > 0.0) & (found > 0.0) & (costs[1] > costs[0] + _WORSE))
+
+
 def _known_costs(
     rho: F32,
     both: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint32], NDArray[np.uint32]],
@@ -148,7 +181,7 @@ def _fill_known_costs(
             if not rho[y, x] >= 0.0:
                 continue
             u, v, _ = _seen_at(x, y, rho[y, x], maps)
-            if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+            if -0.5 < u < other.shape[1] - 0.5 and -0.5 < v < other.shape[0] - 0.5:
                 ty, tx = int(v + 0.5), int(u + 0.5)
                 unlike = min(abs(np.int64(grey[y, x]) - np.int64(other[ty, tx])), _LEVELS)
                 costs[y, x] = _PLAIN[0] * ones(code[y, x] ^ other_code[ty, tx]) + _PLAIN[1] * unlike

@@ -64,7 +64,7 @@ def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
     lens = camera.lens
     if lens is None:
         return Optics(None, None, columns)
-    return Optics(_ideal_pixels(camera), lens_table(camera, lens), columns)
+    return Optics(ideal_pixels_of(camera), lens_table(camera, lens), columns)
 
 
 def lens_table(camera: PinholeCamera, lens: Lens) -> FloatArray:
@@ -77,7 +77,8 @@ def lens_table(camera: PinholeCamera, lens: Lens) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def _ideal_pixels(camera: PinholeCamera) -> FloatArray:
+def ideal_pixels_of(camera: PinholeCamera) -> FloatArray:
+    """(H, W, 2) ideal pixels of all pixels of a camera; not to be written to."""
     return np.ascontiguousarray(camera.ideal_pixels(camera.pixel_grid()))
 
 

@@ -26,6 +26,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import resample
+from rsbench.vision.reprojection import ideal_pixels_of
 
 _WIDEST = 2.0
 """Times the size of the image: what a lens shows beyond has no depth from the other camera."""
@@ -242,7 +243,12 @@ def _widened(rig: StereoRig) -> PinholeCamera:
 @lru_cache(maxsize=2 * len(SIDES))
 def pixel_rays(rig: StereoRig, side: Side) -> FloatArray:
     """(H, W, 3) rays of all pixels of a camera, in the body's axes; not to be written to."""
-    rays = rig.eye(side).unproject(rig.eye(side).pixel_grid())
+    camera = rig.sensor(side)
+    if camera.lens is None:
+        rays = rig.eye(side).unproject(camera.pixel_grid())
+    else:  # the inverse of the lens is kept
+        rays = camera.ideal.unproject(ideal_pixels_of(camera)) @ rig.own(side).R
+        rays = rays / np.where(rays[..., 2:] > 0.0, rays[..., 2:], np.nan)
     rays.setflags(write=False)
     return rays
 

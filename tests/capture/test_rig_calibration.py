@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.rig_calibration import agrees, prior_of, refine_rig, rotation_of_rows, rows_moved, with_errors
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.motion import Motion
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.frame_capture import KnownCapture, rig_of_matches
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_motion import solve_frames
 
 TRUE = StereoRig.of_cameras(
     PinholeCamera.centred(640, 480, 520.0),
@@ -26,13 +31,25 @@ LOOSE = np.array([*np.deg2rad([0.2, 0.2, 0.2, 0.1, 0.1]), 0.005, 0.005, 0.0])
 """Standard deviations of a loose calibration, in the order of ``ERRORS``."""
 
 
-def tracks_of(rng: np.random.Generator, noise_px: float, count: int) -> FloatArray:
-    """Tracks (n, 8) of 2 deg and 0.25 m a frame period."""
+def motion_of(rng: np.random.Generator) -> Motion:
+    """2 deg and 0.25 m a frame period."""
     w, d = rng.normal(size=(2, 3))
-    motion = make_motion("linear", w * np.deg2rad(2.0) / np.linalg.norm(w), d * 0.25 / np.linalg.norm(d))
+    return make_motion("linear", w * np.deg2rad(2.0) / np.linalg.norm(w), d * 0.25 / np.linalg.norm(d))
+
+
+def tracks_of(
+    rng: np.random.Generator,
+    noise_px: float,
+    count: int,
+    rig: StereoRig = TRUE,
+    shutter: RollingShutter = SHUTTER,
+    motion: Motion | None = None,
+) -> FloatArray:
+    """Tracks (n, 8) of a given motion, or of one by ``motion_of``."""
+    motion = motion or motion_of(rng)
     X = rng.uniform([-6.0, -4.0, 2.0], [6.0, 4.0, 14.0], (6 * count, 3))
     X[:, :2] *= X[:, 2:] / 8.0
-    ends = [rs_project(TRUE, SHUTTER, motion, side, frame, X).pixels for frame in (0, 1) for side in SIDES]
+    ends = [rs_project(rig, shutter, motion, side, frame, X).pixels for frame in (0, 1) for side in SIDES]
     tracks = np.concatenate(ends, axis=1)
     tracks = tracks[np.all(np.isfinite(tracks), axis=1)][:count]
     return np.asarray(tracks + rng.normal(0.0, noise_px, tracks.shape))
@@ -92,6 +109,60 @@ def test_a_loose_calibration_is_found_within_the_stated_deviations() -> None:
     assert np.mean(squares < 9.0) >= 0.95
     # Chi-squared of 84: the mean lies between 0.6 and 1.6 in all but one of ten thousand.
     assert 0.4 < np.mean(squares) < 1.6
+
+
+VERTICAL = StereoRig.of_cameras(
+    PinholeCamera.centred(640, 480, 520.0),
+    PinholeCamera.centred(640, 480, 520.0),
+    so3.exp(np.deg2rad([0.3, -0.2, 0.4])),
+    (0.0, -0.2, 0.0),
+)
+GIVEN = KnownInputs(readout_ratio=0.8, scanning=Scanning())
+OPTIONS = CorrectionOptions(motion_model="linear")
+
+
+def _vertical_window(seed: int) -> tuple[Motion, Correspondences, StereoRig]:
+    """A motion, its matches, a tenth of them wrong, and a loose calibration of the rig that took them."""
+    rng = np.random.default_rng(seed)
+    motion, errors = motion_of(rng), LOOSE * rng.normal(size=8)
+    tracks = tracks_of(rng, 0.1, 300, VERTICAL, VERTICAL.shutter_of(Scanning(), 0.8), motion)
+    tracks[::10, 4:] += rng.normal(0.0, 20.0, (len(tracks[::10]), 4))
+    return motion, Correspondences(tracks=tracks), with_errors(VERTICAL, errors)
+
+
+def test_cameras_one_above_the_other_correct_their_calibration_by_tracks() -> None:
+    """Both read a point at different times, so that rows show no rotation; the true calibration stays as it is."""
+    assert not VERTICAL.rows_together(Scanning(), 0.8)
+    for seed in range(3):
+        _, matches, given = _vertical_window(300 + seed)
+        found = rig_of_matches(matches, given, GIVEN, OPTIONS)
+        assert found is not None
+        turn = found.rig.right_from_left.R @ VERTICAL.right_from_left.R.T
+        # Shared errors of 0.03 px of 520 are 0.003 deg an axis; 300 tracks of 0.1 px add as much.
+        assert (
+            np.rad2deg(so3.angle(turn))
+            < 0.02
+            < np.rad2deg(so3.angle(given.right_from_left.R @ VERTICAL.right_from_left.R.T))
+        )
+        assert rig_of_matches(matches, VERTICAL, GIVEN, OPTIONS) is None
+
+
+@pytest.mark.slow
+def test_a_motion_is_stated_with_the_errors_of_the_calibration_that_was_found() -> None:
+    inside = {True: 0, False: 0}
+    for seed in range(20):
+        motion, matches, given = _vertical_window(400 + seed)
+        found = rig_of_matches(matches, given, GIVEN, OPTIONS)
+        assert found is not None
+        for counted in inside:
+            known = KnownCapture(rig=found.rig, shutter=found.shutter, rig_found=found if counted else None)
+            estimate = solve_frames(matches, known, OPTIONS, in_order=True).robust.estimate
+            assert estimate.covariance is not None
+            off = np.concatenate([estimate.w - motion.w, estimate.d - motion.d])
+            inside[counted] += bool(off @ np.linalg.solve(estimate.covariance, off) < 12.59)  # chi-squared of 6
+    # Of 20 ellipsoids of 95 %, fewer than 16 hold the truth once in 390.
+    assert inside[True] >= 16
+    assert inside[False] <= 10
 
 
 def test_one_step_decides_whether_a_calibration_agrees() -> None:

@@ -47,6 +47,24 @@ def test_a_thin_post_before_a_wall_gets_its_depth(world: Build, shapes: Any, u8:
         assert np.mean(np.abs(got[got > 0.0] / truth[frame][posts[frame]][got > 0.0] - 1.0) < 0.05) > 0.95
 
 
+def test_a_depth_that_the_other_frame_contradicts_is_replaced(world: Build, shapes: Any, u8: Any) -> None:
+    """Stereo saw the wall in place of a post before it, as it does where texture runs along the baseline."""
+    plane = shapes[0]
+    scene = world((plane((0.05, 0.1, 1.0), 7.0), plane((0.0, 0.0, 1.0), 3.0, _post)), d=(0.25, -0.1, 0.1))
+    seen = [scene.rolling("left", frame) for frame in (0, 1)]
+    images, truth = [u8(image) for image, _ in seen], [depth for _, depth in seen]
+    posts = [depth < 4.0 for depth in truth]
+    known = [np.where(post, 7.0, depth).astype(np.float32) for post, depth in zip(posts, truth, strict=True)]
+    given: Any = tuple(images), tuple(known), scene.rig, scene.shutter, scene.motion, "left"
+    assert not any(np.any(depth) for depth in depth_from_motion(*given))
+    for frame, found in enumerate(depth_from_motion(*given, replace_unlike=True)):
+        post, wall = found[posts[frame]], found[~posts[frame]]
+        assert np.mean(post > 0.0) > 0.6
+        assert np.mean(np.abs(post[post > 0.0] / truth[frame][posts[frame]][post > 0.0] - 1.0) < 0.05) > 0.9
+        # Only what the post hides of the wall in the other frame is searched; hardly any is found nearer.
+        assert np.mean((wall > 0.0) & (wall < 6.0)) < 0.01
+
+
 def test_what_the_other_frame_does_not_confirm_has_no_depth(world: Build, shapes: Any) -> None:
     """Noise in the second frame: nothing there looks like the first."""
     scene = world((shapes[0]((0.0, 0.0, 1.0), 5.0),), d=(0.3, 0.0, 0.0))
