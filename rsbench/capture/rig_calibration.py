@@ -23,7 +23,7 @@ import numpy as np
 
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
-from rsbench.core.rig import RigCamera, StereoRig
+from rsbench.core.rig import SIDES, RigCamera, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import clustered, larger, variance_factor
@@ -104,15 +104,16 @@ class FoundRig:
 
 
 def with_errors(rig: StereoRig, errors: FloatArray) -> StereoRig:
-    """The rig after ``ERRORS`` (8,) are added to its calibration; its body's axes stay on the baseline."""
+    """The rig after ``ERRORS`` (8,) are added to its calibration, with the axes of its body as of ``of_cameras``."""
     both = np.array([0.0, errors[3], errors[4]])
-    turns = both, both + errors[:3]
+    turned = [rig.own(side).R @ so3.exp(turn) for side, turn in zip(SIDES, (both, both + errors[:3]), strict=True)]
+    _, y, z = turned[0][2] + turned[1][2]
+    level = so3.exp(np.array([np.arctan2(y, z), 0.0, 0.0]))  # the mean viewing direction has no y
     cameras = []
-    for side, turn, log_focal in zip(("left", "right"), turns, errors[5:7], strict=True):
-        own = rig.own(side)  # pyrefly: ignore[bad-argument-type]
-        longer = float(np.exp(log_focal))
+    for side, R, log_focal in zip(SIDES, turned, errors[5:7], strict=True):
+        own, longer = rig.own(side), float(np.exp(log_focal))
         camera = replace(own.camera, fx=own.camera.fx * longer, fy=own.camera.fy * longer)
-        cameras.append(RigCamera(camera=camera, rotation=tuple(so3.log(own.R @ so3.exp(turn)))))
+        cameras.append(RigCamera(camera=camera, rotation=tuple(so3.log(R @ level.T))))
     return replace(rig, camera=rig.camera.ideal, left=cameras[0], right=cameras[1])
 
 

@@ -68,6 +68,10 @@ def test_errors_added_and_taken_away_leave_the_rig() -> None:
         back = with_errors(with_errors(TRUE, np.eye(8)[6] * 0.01), np.eye(8)[6] * -0.01)
         np.testing.assert_allclose(back.own(side).R, TRUE.own(side).R, atol=1e-12)
         assert back.sensor(side).fx == pytest.approx(TRUE.sensor(side).fx)
+    left, right = (there.sensor(side) for side in SIDES)
+    again = StereoRig.of_cameras(left, right, *there.right_from_left)
+    for side in SIDES:  # the axes of the body are those of a calibration that prints the same cameras
+        np.testing.assert_allclose(there.own(side).R, again.own(side).R, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
