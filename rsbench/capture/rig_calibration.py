@@ -104,7 +104,7 @@ class FoundRig:
 
 
 def with_errors(rig: StereoRig, errors: FloatArray) -> StereoRig:
-    """The rig after ``ERRORS`` (8,) are added to its calibration, with the axes of its body as of ``of_cameras``."""
+    """The rig after ``ERRORS`` (8,) are added to its calibration; the body has the axes of ``of_cameras``."""
     both = np.array([0.0, errors[3], errors[4]])
     turned = [rig.own(side).R @ so3.exp(turn) for side, turn in zip(SIDES, (both, both + errors[:3]), strict=True)]
     _, y, z = turned[0][2] + turned[1][2]

@@ -248,7 +248,13 @@ def _write_page(
         read_corrected,
         read_fused,
     )
-    from rsbench.report.corrected_page import card_of, comparison, draw_trajectory, most_changed
+    from rsbench.report.corrected_page import (
+        card_of,
+        comparison,
+        draw_own_motion,
+        draw_trajectory,
+        most_changed,
+    )
     from rsbench.storage.videos import write_frames
 
     one, changed, frames = not known.rig.metric, list[float](), record["frames"]
@@ -280,7 +286,7 @@ def _write_page(
     ]
     trajectory = folder / "trajectory.csv"
     poses = np.loadtxt(trajectory, ndmin=2) if trajectory.is_file() else np.zeros((0, 8))
-    drawn = draw_trajectory(poses, frames) if not one else None
+    drawn = draw_own_motion(frames) if one else draw_trajectory(poses, frames)
     page = folder / (page_of_video(out).name if is_video(out) else "report.html")
     write_page_of(folder, out, facts, None, cards, drawn, page=page, record=record, video=video)
     return [each for each in (video, page) if is_video(out) and each.is_file()]

@@ -34,7 +34,7 @@ The shutter that a card or problem gives is not used; it is printed beside the e
 Exit codes: 0 every rig was estimated, 1 one cannot be determined from its matches, 2 one input is wrong.
 More: [bold]rsbench docs inspect[/bold]"""
 
-_MODEL = "Motion model to try; repeatable. Default: linear and twist"
+_MODEL = "Motion model to try; repeatable. Default: all four of rsbench"
 
 
 class _Case(NamedTuple):

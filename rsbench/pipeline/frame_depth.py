@@ -315,6 +315,6 @@ def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> Frame
 def metres(disparity: NDArray[np.float32], rig: StereoRig, side: Side) -> NDArray[np.float32]:
     """Depth (H, W), metres along the camera's axis: inf where the disparity is 0, 0 where it is unknown."""
     depth = np.where(np.isnan(disparity), 0.0, rig.depth(disparity))
-    if True:
+    if not rig.aligned:
         depth = depth * own_depths(rig, side)
     return np.nan_to_num(depth, nan=np.inf, posinf=np.inf).astype(np.float32)

@@ -43,11 +43,40 @@ def draw_trajectory(poses: FloatArray, frames: Sequence[Mapping[str, Any]]) -> d
     turns = so3.log(np.swapaxes(R, 1, 2) @ R[0])
     bridged = [int(frame["number"]) for frame in frames if "skipped" in frame]
     return {
+        "whole": True,
         "drawings": [
             _drawing(numbers, np.rad2deg(turns), bridged, "rotation since the first frame (deg)"),
             _drawing(numbers, places, bridged, "position (m)"),
         ],
         "caption": _caption(frames, bridged),
+    }
+
+
+def draw_own_motion(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Drawings (SVG) of one camera's rotation and direction of translation, and their caption.
+
+    Args:
+        frames: what motion.json says of each.
+
+    Returns:
+        As ``draw_trajectory``; None where fewer than two frames have a motion.
+    """
+    moving = [frame for frame in frames if "w" in (frame.get("motion") or {})]
+    if len(moving) < 2:
+        return None
+    numbers = np.array([float(frame["number"]) for frame in moving])
+    w, d = (np.array([frame["motion"][name] for frame in moving]) for name in "wd")
+    length = np.linalg.norm(d, axis=1, keepdims=True)
+    without = sorted({int(frame["number"]) for frame in frames} - {int(frame["number"]) for frame in moving})
+    caption = "Red x, green y, blue z, in the axes of the frames as they are stored: right, down, forward. "
+    caption += "One camera shows the direction in which it moves, not how far."
+    return {
+        "whole": False,
+        "drawings": [
+            _drawing(numbers, np.rad2deg(w), without, "rotation over a frame period (deg)"),
+            _drawing(numbers, d / np.where(length > 0.0, length, 1.0), without, "direction of translation"),
+        ],
+        "caption": caption + (" Grey: frames without an estimated motion." if without else ""),
     }
 
 
@@ -186,9 +215,10 @@ def write_page(
     record: Mapping[str, Any] | None = None,
     video: str = "",
 ) -> None:
-    """report.html: opens from disk, needs no other file; ``trajectory`` is of ``draw_trajectory``.
+    """report.html: opens from disk, needs no other file.
 
     Args:
+        trajectory: of ``draw_trajectory`` or ``draw_own_motion``.
         page: another place for it.
         record: what motion.json says, where it is not in ``folder``.
         video: name of a video beside it that shows the frames before and after.

@@ -12,7 +12,7 @@ from rsbench.components.motion_models import make_motion
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray, exp
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.report.corrected_page import draw_trajectory
+from rsbench.report.corrected_page import draw_own_motion, draw_trajectory
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import RobustEstimate
 
@@ -63,3 +63,18 @@ def test_the_page_names_what_the_deviations_tell(moved: float, uneven: float, sa
     poses = np.array([[k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] for k in range(4)])
     drawn = draw_trajectory(poses, [{"number": k, "motion": motion} for k in range(4)])
     assert drawn is not None and f"The rig {said}" in drawn["caption"]
+
+
+def test_the_page_draws_how_one_camera_turns_and_where_it_moves() -> None:
+    """Frame 2 has no motion and is grey; a translation has a direction alone."""
+    frames: list[dict[str, Any]] = [
+        {"number": k, "motion": {"w": [0.0, np.deg2rad(0.5 * k), 0.0], "d": [0.0, 0.0, 3.0]}} for k in range(5)
+    ]
+    assert draw_own_motion(frames[:1]) is None and draw_own_motion([{"number": 0, "reason": "still"}] * 3) is None
+    frames[2] = {"number": 2, "reason": "too dark"}
+    drawn = draw_own_motion(frames)
+    assert drawn is not None and "not how far" in drawn["caption"] and "Grey" in drawn["caption"]
+    rotation, direction = drawn["drawings"]
+    assert rotation.count("<rect") == 1 and rotation.count("<polyline") == 3
+    assert ">2</text>" in rotation  # deg, the largest; directions end at 1
+    assert ">1</text>" in direction and ">3</text>" not in direction
