@@ -285,7 +285,7 @@ def find_rig(
 
 
 _CLEAR = 3.0
-"""Standard deviations above which a calibration error is corrected: needless corrections cost accuracy."""
+"""Standard deviations above which a calibration error is estimated."""
 _WIDE = 4.0
 """Factor of the threshold for outliers while the calibration may be off by a few pixels."""
 _LIKELY_ROWS_PX = 0.3
@@ -316,9 +316,7 @@ def rig_of_matches(
         ):
             return None
         found = _refined_rig(matches, rig, rows[0], inputs, options)
-    # A correction that is not clear would cost accuracy.
-    agrees = found is None or bool(np.all(np.abs(found.errors) <= _CLEAR * found.sigma))
-    return None if agrees else found
+    return found if found is not None and found.significant else None
 
 
 def _rig_of_tracks(
