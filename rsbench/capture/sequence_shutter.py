@@ -71,6 +71,8 @@ _STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS, _ROUNDS = 0.05, 0.1, 5, 2, 4
 """First difference steps of ratio and log focal length; Newton steps, fine and rough; rounds of the tails."""
 _NO_FIT = -1e12
 """Logarithm of the evidence if there is no fit."""
+_BESIDE = 0.005
+"""Step of the ratio to where a fit is tried if there is none at the start of a search."""
 
 
 def shakes(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> bool:
@@ -337,9 +339,12 @@ class _Profile:
         """Move in steps of ``_COARSE`` to a place whose neighbours all have less evidence.
 
         Raises:
-            NotDefiniteError: there is no fit at the start.
+            NotDefiniteError: there is no fit at the start or just beside it, where rounding may allow one.
         """
         best = start
+        if self.at(best) == _NO_FIT:
+            ratios = np.clip(start.ratio + np.array([-_BESIDE, _BESIDE]), _LEAST, 1.0)
+            best = max((_Place(float(ratio), start.log_focal) for ratio in ratios), key=self.at)
         if self.at(best) == _NO_FIT:
             raise NotDefiniteError("no trajectory explains the tracks")
         strides = [(-_COARSE, 0.0), (_COARSE, 0.0)]
