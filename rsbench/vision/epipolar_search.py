@@ -182,9 +182,7 @@ def _fill_known_costs(
                 continue
             u, v, _ = _seen_at(x, y, rho[y, x], maps)
             if -0.5 < u < other.shape[1] - 0.5 and -0.5 < v < other.shape[0] - 0.5:
-                ty, tx = int(v + 0.5), int(u + 0.5)
-                unlike = min(abs(np.int64(grey[y, x]) - np.int64(other[ty, tx])), _LEVELS)
-                costs[y, x] = _PLAIN[0] * ones(code[y, x] ^ other_code[ty, tx]) + _PLAIN[1] * unlike
+                costs[y, x] = _cost(grey[y, x], code[y, x], other, other_code, u, v, _PLAIN)
                 seen[y, x] = 1.0
 
 
@@ -238,6 +236,22 @@ def ones(bits: np.uint32) -> np.int64:
     n = (n & np.uint64(0x3333333333333333)) + ((n >> np.uint64(2)) & np.uint64(0x3333333333333333))
     n = (n + (n >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
     return np.int64((n * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@compiled(error_model="numpy", inline="always")
+def _cost(
+    level: np.uint8,
+    bits: np.uint32,
+    other: NDArray[np.uint8],
+    other_census: NDArray[np.uint32],
+    u: float,
+    v: float,
+    prices: tuple[int, int, int],
+) -> np.int64:
+    """Cost of a pixel of grey ``level`` and census ``bits`` at a place in the other frame; see ``_fill_costs``."""
+    ty, tx = int(v + 0.5), int(u + 0.5)
+    unlike = min(abs(np.int64(level) - np.int64(other[ty, tx])), _LEVELS)
+    return prices[0] * ones(bits ^ other_census[ty, tx]) + prices[1] * unlike
 
 
 @compiled(error_model="numpy")
@@ -351,9 +365,7 @@ def _fill_costs(
             u, v = u_0 + share * (u_1 - u_0), v_0 + share * (v_1 - v_0)
         cost[k] = prices[2]
         if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
-            ty, tx = int(v + 0.5), int(u + 0.5)
-            unlike = min(abs(np.int64(level) - np.int64(other[ty, tx])), _LEVELS)
-            cost[k] = prices[0] * ones(bits ^ other_census[ty, tx]) + prices[1] * unlike
+            cost[k] = _cost(level, bits, other, other_census, u, v, prices)
 
 
 @compiled(error_model="numpy")
