@@ -90,6 +90,7 @@ def sweep_steps(card: SweepCard) -> int:
 
 
 def _firsts(card: SweepCard) -> range:
+    """Numbers of the first trials of chunks."""
     return range(0, card.trials, CHUNK)
 
 
@@ -130,12 +131,12 @@ def run_sweep(
         RsbenchError: no such solver, or two of one name; ``out`` holds another sweep; a motion leaves too few
             points in view; a worker was killed each time over the same trials.
     """
-    step, plan = progress or (lambda word: None), _plan(card, entrants(card))
+    step, solvers = progress or (lambda word: None), entrants(card)
     with work_folder(out) as hidden:
         chunks = hidden / "chunks"
         if force:
             remove(chunks)
-        _open_folder(plan, out, force)
+        _open_folder(_plan(card, solvers), out, force)
         chunks.mkdir(exist_ok=True)
         todo = []
         for part in _parts(card):
@@ -146,7 +147,7 @@ def run_sweep(
                 else:
                     todo.append(_Job(card, part, first, min(CHUNK, card.trials - first), path))
         if todo:
-            _compile(card)
+            warm_up(_motions(card, solvers))  # once, so that the workers need not
         for part in _run_all(todo, workers, time_limit_s):
             step(part.cell.variant)
         for part in _parts(card):
@@ -325,11 +326,6 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
     return words or (["differs in cells"] if stored.get("cells") != plan["cells"] else [])
 
 
-def _compile(card: SweepCard) -> None:
-    """Compile once, so that the workers need not."""
-    warm_up(_motions(card, entrants(card)))
-
-
 def _run_all(todo: list[_Job], workers: Workers, time_limit_s: float | None) -> Iterator[_Part]:
     """Run jobs in child processes, in which BLAS has one thread and therefore a fixed order of summation."""
     with closing(finished_jobs(_serve_jobs, todo, workers, ONE_THREAD, time_limit_s)) as found:
@@ -413,22 +409,17 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
         for number, solver in enumerate(solvers):
             scores = score_trials(trials, number, solver["reference_point"], cell)
             limit = {key: _scaled(values[:, number], cell.setting.noise_px) for key, values in bounds.items()}
-            identity = {
+            row: dict[str, Any] = {
                 "sweep": card.name,
                 "variant": cell.variant,
                 "axis": card.axis,
                 "value": cell.value,
-                "solver": solver["name"],
-                "shutter": solver["shutter"],
-                "information": solver["information"],
-                "ransac": card.robust,
-                "seed": card.seed,
             }
-            row = identity | summary_row(scores, trials["success"][:, number], limit, card.seed)
-            row["motion_model"] = cell.setting.motion_model
-            row["assumed_motion"] = solver["motion_model"]
-            row["failure_reasons"] = failure_reasons(trials, number)
-            rows.append(row)
+            row |= {"solver": solver["name"], "shutter": solver["shutter"], "information": solver["information"]}
+            row |= {"ransac": card.robust, "seed": card.seed}
+            row |= summary_row(scores, trials["success"][:, number], limit, card.seed)
+            row |= {"motion_model": cell.setting.motion_model, "assumed_motion": solver["motion_model"]}
+            rows.append(row | {"failure_reasons": failure_reasons(trials, number)})
     table = pd.DataFrame(rows)
     write_table(folder / "summary.csv", table)
     return table
@@ -530,17 +521,13 @@ def over_bound(values: FloatArray, sigmas: FloatArray, seed: int) -> dict[str, f
 
     None where they do not exist.
     """
-    if len(values) == 0 or np.any(np.isnan(values)):
-        return dict.fromkeys(("rms", "bound", "over_bound", "over_bound_low", "over_bound_high"))
-    rms, bound = float(_rms(values)), float(_rms(sigmas))
-    if bound == 0.0:
-        return {"rms": rms, "bound": bound, "over_bound": None, "over_bound_low": None, "over_bound_high": None}
-    low, high = average_interval(np.stack([values**2, sigmas**2], axis=-1), seed, _rms_quotient)
-    return {"rms": rms, "bound": bound, "over_bound": rms / bound, "over_bound_low": low, "over_bound_high": high}
-
-
-def _rms_quotient(means: FloatArray) -> FloatArray:
-    return np.sqrt(means[..., 0] / means[..., 1])
+    rms = bound = over = low = high = None
+    if len(values) and not np.any(np.isnan(values)):
+        rms, bound = float(_rms(values)), float(_rms(sigmas))
+    if rms is not None and bound:
+        squares, over = np.stack([values**2, sigmas**2], axis=-1), rms / bound
+        low, high = average_interval(squares, seed, lambda means: np.sqrt(means[..., 0] / means[..., 1]))
+    return {"rms": rms, "bound": bound, "over_bound": over, "over_bound_low": low, "over_bound_high": high}
 
 
 def _rms(values: FloatArray) -> FloatArray:

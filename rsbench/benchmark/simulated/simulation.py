@@ -166,10 +166,11 @@ def simulate(
     scenes, noises, wrongs = rng.spawn(3), rng.spawn(3), rng.spawn(3)
     counts = {"left": options.pairs, "right": options.pairs, "tracks": options.tracks}
     views: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "tracks": ("left", "right")}
+    world = MovingRig(rig, shutter, motion, options)
     noisy, outliers = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
     patches = np.zeros((0, 2, 2)), np.zeros((0, 3))
     for (name, count), scene, noise, wrong in zip(counts.items(), scenes, noises, wrongs, strict=True):
-        exact, points = _exact(rig, shutter, motion, options, scene, count, views[name])
+        exact, points = world.matches(scene, count, views[name])
         if name == "left":
             patches = exact[:, 0], points
         # (n, views, frames, 2) -> xl0, yl0, xr0, yr0, xl1, ...
@@ -180,17 +181,12 @@ def simulate(
     noisy["gravity"] = _gravity(motion, options, rng.spawn(1)[0])
     if options.lines:
         scene, noise, wrong = rng.spawn(3)
-        exact = _exact_lines(rig, shutter, motion, options, scene)
+        exact = world.lines(scene)
         noisy["lines"] = exact + options.noise_px * noise.standard_normal(exact.shape)
         outliers["lines"] = _displace(noisy["lines"], options, wrong)
-    noisy["affine"] = _affine(rig, shutter, motion, options, *patches, rng.spawn(1)[0])
-    return Simulation(
-        correspondences=Correspondences(**noisy),
-        rig=rig,
-        shutter=shutter,
-        motion=motion,
-        outliers=outliers,
-    )
+    noisy["affine"] = world.affine(*patches, rng.spawn(1)[0])
+    correspondences = Correspondences(**noisy)
+    return Simulation(correspondences=correspondences, rig=rig, shutter=shutter, motion=motion, outliers=outliers)
 
 
 def _gyro(motion: Motion, options: SimulationOptions, rng: np.random.Generator) -> FloatArray:
@@ -214,37 +210,6 @@ def _gravity(motion: Motion, options: SimulationOptions, rng: np.random.Generato
     return np.column_stack([tau, (so3.exp(across) @ down[..., None])[..., 0]])
 
 
-def _affine(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    options: SimulationOptions,
-    pixels: FloatArray,
-    points: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Affine frames (n, 4) of patches at points (n, 3) that the left camera sees at (n, 2 frames, 2).
-
-    An outlier's is that of the point which it was.
-    """
-    if not options.affine or len(points) == 0:
-        return np.zeros((0, 4))
-    tau = [shutter.pixel_time(pixels[:, frame], frame, "left") for frame in (0, 1)]
-    R, t = rig.cam_from_world(motion, tau[0], "left")
-    back = np.swapaxes(R, -1, -2)
-    if options.shape == "plane":
-        normals = back @ [*_TILT, 1.0]
-        normals /= np.sqrt(np.sum(normals**2, axis=1, keepdims=True))
-    else:
-        rays = points + (back @ t[..., None])[..., 0]
-        normals = _slanted(rays / np.sqrt(np.sum(rays**2, axis=1, keepdims=True)), rng)
-    along = plane_basis(normals)
-    moves = [pixel_moves(rig, shutter, motion, "left", each, points, along) for each in tau]
-    A = (moves[1] @ inverse_2x2(moves[0])).reshape(-1, 4)
-    size = np.sqrt(0.5 * np.sum(A * A, axis=1, keepdims=True))
-    return A + options.affine_noise * size * rng.standard_normal(A.shape)
-
-
 def _slanted(rays: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Unit normals (n, 3) of patches that unit rays (n, 3) meet, slanted in all directions."""
     slant, turn = rng.uniform(size=(2, len(rays))) * [[_MOST_SLANT], [2.0 * np.pi]]
@@ -266,142 +231,148 @@ def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Ge
     return mask
 
 
-def _exact(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    options: SimulationOptions,
-    rng: np.random.Generator,
-    count: int,
-    sides: tuple[Side, ...],
-) -> tuple[FloatArray, FloatArray]:
-    """Noise-free pixels (count, views, 2 frames, 2) of points (count, 3) that every view sees once."""
-    camera = rig.sensor(sides[0])
-    found, places = [np.zeros((0, len(sides), 2, 2))], [np.zeros((0, 3))]
-    total = 0
-    for _ in range(60):
-        if total >= count:
-            break
-        draws = rng.uniform(size=(count - total + count // 4 + 8, 3))
-        pixels = draws[:, :2] * (camera.width - 1, camera.height - 1)
-        depth = _depths(options, draws[:, 2], camera.unproject(pixels))
-        points = back_project(rig, shutter, motion, sides[0], 0, pixels, depth)
-        views = [
-            [_seen_once(rig, shutter, motion, side, frame, points, pixels[:, 1]) for frame in (0, 1)]
-            for side in sides
-        ]
-        stacked = np.stack([np.stack(row, axis=1) for row in views], axis=1)
-        seen = np.all(np.isfinite(stacked), axis=(1, 2, 3))
-        found.append(stacked[seen])
-        places.append(points[seen])
-        total += int(np.count_nonzero(seen))
-    if total < count:
-        wide = camera.fx * rig.baseline / options.depth[1]
-        if len(sides) > 1 and wide >= camera.width:
-            raise ValueError(
-                f"depth = {options.depth}: cameras {rig.baseline:g} m apart see no point together that is nearer "
-                f"than {options.depth[1] * wide / camera.width:.3g} m; use larger depths"
-            )
-        raise ValueError(
-            f"the motion leaves only {total} of {count} points in view, {options.depth[0]:g} to "
-            f"{options.depth[1]:g} m away; use a slower one or larger depths"
-        )
-    return np.concatenate(found)[:count], np.concatenate(places)[:count]
-
-
 _SLIDE = 0.2
 """Share of a line's length by which its ends differ between images, at most."""
-
-
-def _exact_lines(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    options: SimulationOptions,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Noise-free ends (lines, 16) of lines that all four images see."""
-    camera, count = rig.sensor("left"), options.lines
-    found = [np.zeros((0, 16))]
-    for _ in range(60):
-        total = sum(len(each) for each in found)
-        if total >= count:
-            return np.concatenate(found)[:count]
-        draws = rng.uniform(size=(2 * (count - total) + 8, 14))
-        places = draws[:, :6].reshape(-1, 3)
-        pixels = places[:, :2] * (camera.width - 1, camera.height - 1)
-        depth = _depths(options, places[:, 2], camera.unproject(pixels))
-        ends = back_project(rig, shutter, motion, "left", 0, pixels, depth).reshape(-1, 2, 3)
-        rows = pixels[:, 1].reshape(-1, 2)
-        seen = list[FloatArray]()
-        for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
-            share = _SLIDE * draws[:, 6 + 2 * k : 8 + 2 * k]
-            # From either end towards the other.
-            points = ends + share[..., None] * (ends[:, ::-1] - ends)
-            seen += [_seen_once(rig, shutter, motion, side, frame, points[:, e], rows[:, e]) for e in (0, 1)]
-        stacked = np.concatenate(seen, axis=1)
-        found.append(stacked[np.all(np.isfinite(stacked), axis=1)])
-    raise ValueError(f"the motion leaves fewer than {count} lines in view; use a slower one")
-
-
 _SECANT_STEPS = 12
 
 
-def _seen_once(
-    rig: StereoRig,
-    shutter: RollingShutter,
-    motion: Motion,
-    side: Side,
-    frame: int,
-    points: FloatArray,
-    guess: FloatArray,
-) -> FloatArray:
-    """Pixels (n, 2) of points (n, 3) that one frame sees exactly once; NaN for the others.
+@dataclass(frozen=True, eq=False)
+class MovingRig:
+    """What the images of a simulation depend on, and what they show without noise."""
 
-    The same as ``rs_project``, which searches all rows, but many times as fast for slow motion: where image
-    points are slower than the readout none can be seen twice, and secant steps from a near row suffice.
-    """
-    pixels = np.full((len(points), 2), np.nan)
-    slow = _slower_than_readout(rig, shutter, motion, side, frame, points)
-    X, y0 = points[slow], guess[slow]
-    seen = project_at(rig, motion, side, shutter.line_time(y0, frame, side), X)
-    f0, y = seen[:, 1] - y0, seen[:, 1]
-    for _ in range(_SECANT_STEPS if np.any(np.abs(f0) > ROW_TOLERANCE_PX) else 0):
-        seen = project_at(rig, motion, side, shutter.line_time(y, frame, side), X)
-        f = seen[:, 1] - y
-        if np.all(np.abs(f) <= ROW_TOLERANCE_PX):
-            break
-        slope = np.where(f != f0, (f - f0) / np.where(y != y0, y - y0, 1.0), -1.0)
-        y0, f0, y = y, f, np.where(np.abs(f) <= ROW_TOLERANCE_PX, y, y - f / slope)
-    converged = np.abs(seen[:, 1] - y) <= ROW_TOLERANCE_PX
-    pixels[slow] = np.where((converged & rig.sensor(side).contains(seen[:, :2]))[:, None], seen[:, :2], np.nan)
-    if not np.all(slow):
-        rest = rs_project(rig, shutter, motion, side, frame, points[~slow])
-        pixels[~slow] = np.where((rest.status == ProjectionStatus.SEEN)[:, None], rest.pixels, np.nan)
-    return pixels
+    rig: StereoRig
+    shutter: RollingShutter
+    motion: Motion
+    options: SimulationOptions
 
+    def matches(
+        self, rng: np.random.Generator, count: int, sides: tuple[Side, ...]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (count, views, 2 frames, 2) of points (count, 3) that every view sees once."""
+        rig, options = self.rig, self.options
+        camera = rig.sensor(sides[0])
+        found, places = [np.zeros((0, len(sides), 2, 2))], [np.zeros((0, 3))]
+        total = 0
+        for _ in range(60):
+            if total >= count:
+                break
+            pixels, points = self._points(sides[0], rng.uniform(size=(count - total + count // 4 + 8, 3)))
+            views = [[self.seen_once(side, frame, points, pixels[:, 1]) for frame in FRAMES] for side in sides]
+            stacked = np.stack([np.stack(row, axis=1) for row in views], axis=1)
+            seen = np.all(np.isfinite(stacked), axis=(1, 2, 3))
+            found.append(stacked[seen])
+            places.append(points[seen])
+            total += int(np.count_nonzero(seen))
+        if total < count:
+            wide = camera.fx * rig.baseline / options.depth[1]
+            if len(sides) > 1 and wide >= camera.width:
+                raise ValueError(
+                    f"depth = {options.depth}: cameras {rig.baseline:g} m apart see no point together that is "
+                    f"nearer than {options.depth[1] * wide / camera.width:.3g} m; use larger depths"
+                )
+            raise ValueError(
+                f"the motion leaves only {total} of {count} points in view, {options.depth[0]:g} to "
+                f"{options.depth[1]:g} m away; use a slower one or larger depths"
+            )
+        return np.concatenate(found)[:count], np.concatenate(places)[:count]
 
-def _slower_than_readout(
-    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, points: FloatArray
-) -> np.ndarray:
-    """Mask (n,) of points whose image provably never moves as fast as half the speed of the readout.
+    def lines(self, rng: np.random.Generator) -> FloatArray:
+        """Ends (lines, 16) of lines that all four images see."""
+        count = self.options.lines
+        found = [np.zeros((0, 16))]
+        for _ in range(60):
+            total = sum(len(each) for each in found)
+            if total >= count:
+                return np.concatenate(found)[:count]
+            draws = rng.uniform(size=(2 * (count - total) + 8, 14))
+            pixels, points = self._points("left", draws[:, :6].reshape(-1, 3))
+            ends, rows = points.reshape(-1, 2, 3), pixels[:, 1].reshape(-1, 2)
+            seen = list[FloatArray]()
+            for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
+                share = _SLIDE * draws[:, 6 + 2 * k : 8 + 2 * k]
+                # From either end towards the other.
+                moved = ends + share[..., None] * (ends[:, ::-1] - ends)
+                seen += [self.seen_once(side, frame, moved[:, e], rows[:, e]) for e in (0, 1)]
+            stacked = np.concatenate(seen, axis=1)
+            found.append(stacked[np.all(np.isfinite(stacked), axis=1)])
+        raise ValueError(f"the motion leaves fewer than {count} lines in view; use a slower one")
 
-    Then the row equation falls at every crossing, so it has at most one. Of a motion that knows no bound of its
-    speed over the frame, none is.
-    """
-    camera = rig.camera
-    if not (rig.rectified and shutter.plain):
-        return np.zeros(len(points), dtype=np.bool_)
-    rows = (-0.5, 0.5 * shutter.height, shutter.height - 0.5)
-    first, middle, last = (float(shutter.row_time(row, frame)) for row in rows)
-    fastest = motion.fastest(first, last)
-    if fastest is None:
-        return np.zeros(len(points), dtype=np.bool_)
-    speed = fastest[0] * np.linalg.norm(points, axis=-1) + fastest[1]
-    depth = project_at(rig, motion, side, middle, points)[:, 2]
-    nearest = depth - 0.5 * speed * shutter.readout_ratio
-    steepest = np.hypot(1.0, max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy)
-    return (nearest > 0.0) & (shutter.h * camera.fy * speed * steepest < 0.5 * nearest)
+    def _points(self, side: Side, draws: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (n, 2) of a camera's frame 0 and points (n, 3) that it sees there, from uniform draws (n, 3)."""
+        camera = self.rig.sensor(side)
+        pixels = draws[:, :2] * (camera.width - 1, camera.height - 1)
+        depth = _depths(self.options, draws[:, 2], camera.unproject(pixels))
+        return pixels, back_project(self.rig, self.shutter, self.motion, side, 0, pixels, depth)
+
+    def affine(self, pixels: FloatArray, points: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Affine frames (n, 4), noisy, of patches at points (n, 3) that the left camera sees at (n, 2 frames, 2).
+
+        An outlier's is that of the point which it was.
+        """
+        rig, shutter, motion, options = self.rig, self.shutter, self.motion, self.options
+        if not options.affine or len(points) == 0:
+            return np.zeros((0, 4))
+        tau = [shutter.pixel_time(pixels[:, frame], frame, "left") for frame in FRAMES]
+        R, t = rig.cam_from_world(motion, tau[0], "left")
+        back = np.swapaxes(R, -1, -2)
+        if options.shape == "plane":
+            normals = back @ [*_TILT, 1.0]
+            normals /= np.sqrt(np.sum(normals**2, axis=1, keepdims=True))
+        else:
+            rays = points + (back @ t[..., None])[..., 0]
+            normals = _slanted(rays / np.sqrt(np.sum(rays**2, axis=1, keepdims=True)), rng)
+        along = plane_basis(normals)
+        moves = [pixel_moves(rig, shutter, motion, "left", each, points, along) for each in tau]
+        A = (moves[1] @ inverse_2x2(moves[0])).reshape(-1, 4)
+        size = np.sqrt(0.5 * np.sum(A * A, axis=1, keepdims=True))
+        return A + options.affine_noise * size * rng.standard_normal(A.shape)
+
+    def seen_once(self, side: Side, frame: int, points: FloatArray, guess: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3) that one frame sees exactly once; NaN for the others.
+
+        The same as ``rs_project``, which searches all rows, but many times as fast for slow motion: where image
+        points are slower than the readout none can be seen twice, and secant steps from a near row suffice.
+        """
+        rig, shutter, motion = self.rig, self.shutter, self.motion
+        pixels = np.full((len(points), 2), np.nan)
+        slow = self._slower_than_readout(side, frame, points)
+        X, y0 = points[slow], guess[slow]
+        seen = project_at(rig, motion, side, shutter.line_time(y0, frame, side), X)
+        f0, y = seen[:, 1] - y0, seen[:, 1]
+        for _ in range(_SECANT_STEPS if np.any(np.abs(f0) > ROW_TOLERANCE_PX) else 0):
+            seen = project_at(rig, motion, side, shutter.line_time(y, frame, side), X)
+            f = seen[:, 1] - y
+            if np.all(np.abs(f) <= ROW_TOLERANCE_PX):
+                break
+            slope = np.where(f != f0, (f - f0) / np.where(y != y0, y - y0, 1.0), -1.0)
+            y0, f0, y = y, f, np.where(np.abs(f) <= ROW_TOLERANCE_PX, y, y - f / slope)
+        converged = np.abs(seen[:, 1] - y) <= ROW_TOLERANCE_PX
+        inside = converged & rig.sensor(side).contains(seen[:, :2])
+        pixels[slow] = np.where(inside[:, None], seen[:, :2], np.nan)
+        if not np.all(slow):
+            rest = rs_project(rig, shutter, motion, side, frame, points[~slow])
+            pixels[~slow] = np.where((rest.status == ProjectionStatus.SEEN)[:, None], rest.pixels, np.nan)
+        return pixels
+
+    def _slower_than_readout(self, side: Side, frame: int, points: FloatArray) -> NDArray[np.bool_]:
+        """Mask (n,) of points whose image provably never moves as fast as half the speed of the readout.
+
+        Then the row equation falls at every crossing, so it has at most one. Of a motion that knows no bound of
+        its speed over the frame, none is.
+        """
+        rig, shutter, camera = self.rig, self.shutter, self.rig.camera
+        none = np.zeros(len(points), dtype=np.bool_)
+        if not (rig.rectified and shutter.plain):
+            return none
+        rows = (-0.5, 0.5 * shutter.height, shutter.height - 0.5)
+        first, middle, last = (float(shutter.row_time(row, frame)) for row in rows)
+        if (fastest := self.motion.fastest(first, last)) is None:
+            return none
+        speed = fastest[0] * np.linalg.norm(points, axis=-1) + fastest[1]
+        depth = project_at(rig, self.motion, side, middle, points)[:, 2]
+        nearest = depth - 0.5 * speed * shutter.readout_ratio
+        steepest = np.hypot(1.0, max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy)
+        return (nearest > 0.0) & (shutter.h * camera.fy * speed * steepest < 0.5 * nearest)
 
 
 def _depths(options: SimulationOptions, draws: FloatArray, rays: FloatArray) -> FloatArray:

@@ -40,6 +40,8 @@ Axis = Literal[
 Vector = tuple[float, float, float]
 _IDEAL = ("width", "height", "focal")
 """What ``rig_card`` stands in place of."""
+_NOISE = ("noise_px", "gyro_noise_deg", "gyro_bias_deg", "gyro_delay", "gravity_noise_deg", "affine_noise")
+"""Errors of what is given, which are options of ``simulate`` of the same names."""
 
 
 @lru_cache(maxsize=64)
@@ -174,37 +176,20 @@ class Setting:
         return make_motion(self.motion_model, w, d, parameters)
 
     def options(self, tracks: bool) -> SimulationOptions:
-        """What ``simulate`` needs; ``tracks`` asks for points in all four images besides the pairs."""
+        """What ``simulate`` needs; ``tracks`` requests points in all four images besides the pairs."""
+        same = (*_NOISE, "outlier_ratio", "outlier_px", "depth", "shape")
         return SimulationOptions(
             pairs=self.points,
             tracks=self.points if tracks else 0,
-            noise_px=self.noise_px,
-            outlier_ratio=self.outlier_ratio,
-            outlier_px=self.outlier_px,
-            depth=self.depth,
-            shape=self.shape,
             gyro_rate=GYRO_RATE,
-            gyro_noise_deg=self.gyro_noise_deg,
-            gyro_bias_deg=self.gyro_bias_deg,
-            gyro_delay=self.gyro_delay,
             gravity=True,
-            gravity_noise_deg=self.gravity_noise_deg,
             affine=True,
-            affine_noise=self.affine_noise,
+            **{name: getattr(self, name) for name in same},
         )
 
     def exact(self) -> Setting:
         """The setting of the same matches without noise and with the truth for the solver."""
-        return replace(
-            self,
-            noise_px=0.0,
-            readout_ratio_error=0.0,
-            affine_noise=0.0,
-            gyro_noise_deg=0.0,
-            gyro_bias_deg=0.0,
-            gyro_delay=0.0,
-            gravity_noise_deg=0.0,
-        )
+        return replace(self, **dict.fromkeys((*_NOISE, "readout_ratio_error"), 0.0))
 
     def changed(self, changes: Mapping[str, Any], where: str) -> Setting:
         """The setting with some fields replaced.
@@ -305,12 +290,8 @@ def with_options(
     Raises:
         RsbenchError: a value that a card could not have either.
     """
+    given: dict[str, Any] = {"solvers": tuple(solvers) if solvers else None, "trials": trials, "seed": seed}
     try:
-        return replace(
-            card,
-            solvers=tuple(solvers) if solvers else card.solvers,
-            trials=card.trials if trials is None else trials,
-            seed=card.seed if seed is None else seed,
-        )
+        return replace(card, **{name: value for name, value in given.items() if value is not None})
     except ValueError as error:
         raise RsbenchError(f"sweep {card.name}: {error}") from error

@@ -50,10 +50,11 @@ def test_fast_projection_agrees_with_the_search_over_all_rows(motion: Motion) ->
     rng = np.random.default_rng(3)
     pixels = rng.uniform(0.0, 899.0, (300, 2))
     points = back_project(RIG, SHUTTER, motion, "left", 0, pixels, rng.uniform(2.0, 10.0, 300))
+    world = simulation.MovingRig(RIG, SHUTTER, motion, OPTIONS)
     for side in SIDES:
         for frame in (0, 1):
             expected = rs_project(RIG, SHUTTER, motion, side, frame, points)
-            found = simulation._seen_once(RIG, SHUTTER, motion, side, frame, points, pixels[:, 1])
+            found = world.seen_once(side, frame, points, pixels[:, 1])
             once = expected.status == ProjectionStatus.SEEN
             assert np.array_equal(np.isfinite(found[:, 0]), once)
             # Both solve the row equation to 1e-9 px; its slope is at least 0.5 where the fast way is taken.
