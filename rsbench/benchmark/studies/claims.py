@@ -357,7 +357,6 @@ class Claim:
     text: str
     """The paper's words."""
     sweep: str
-    axis: str
     rule: str
     """The rule in words."""
     check: Callable[[Series, Series], list[Check]]
@@ -380,6 +379,11 @@ class Claim:
     """Whether it applies only to the paper's solver."""
 
     @property
+    def axis(self) -> str:
+        """What its sweep varies."""
+        return _AXES[self.sweep]
+
+    @property
     def shares(self) -> bool:
         """Whether its figures are shares of trials."""
         return bool({"solved", "answered"} & set(self.measures))
@@ -396,58 +400,53 @@ class Claim:
         return ("mean", "median") if self.measures == MEASURES else ("mean",)
 
 
-_VELOCITY = "Section 3.1: at every velocity the RS solver beats the GS one, in rotation as in translation"
-_STABLE = "Section 3.1: as velocity grows, the errors of the RS solver stay steadier than those of the GS one"
+_AXES = {
+    "noise": "noise_px",
+    "rotation": "rotation_deg",
+    "translation": "translation",
+    "readout": "readout_ratio",
+    "baseline": "baseline",
+    "points": "points",
+    "degenerate": "motion or scene",
+}
+"""What each sweep varies."""
 _BETTER = "e_R and e_T both below those of gs-8pt, 95 % intervals apart, at each value"
-_RANGE = "largest minus smallest error over the sweep (deg) below that of gs-8pt, intervals apart, for e_R and e_T"
 CLAIMS = (
     Claim(
         key="noise: tiny increase",
         text="Section 3.1: errors grow with the noise, but only a little",
         sweep="noise",
-        axis="noise_px",
         rule=f"from the smallest noise to each level up to the reading, e_R and e_T rise by at most "
         f"{100 * TINY:g} % of the error that gs-8pt has at the smallest noise, which is what ignoring the rolling "
         "shutter costs; by the ends of both intervals",
         check=small_increase,
     ),
-    Claim(
-        key="rotation velocity: better than GS",
-        text=_VELOCITY,
-        sweep="rotation",
-        axis="rotation_deg",
-        rule=_BETTER,
-        check=always_better,
+    *(
+        Claim(
+            key=f"{sweep} velocity: better than GS",
+            text="Section 3.1: at every velocity the RS solver beats the GS one, in rotation as in translation",
+            sweep=sweep,
+            rule=_BETTER,
+            check=always_better,
+        )
+        for sweep in ("rotation", "translation")
     ),
-    Claim(
-        key="translation velocity: better than GS",
-        text=_VELOCITY,
-        sweep="translation",
-        axis="translation",
-        rule=_BETTER,
-        check=always_better,
-    ),
-    Claim(
-        key="rotation velocity: more stable",
-        text=_STABLE,
-        sweep="rotation",
-        axis="rotation_deg",
-        rule=_RANGE,
-        check=more_stable,
-    ),
-    Claim(
-        key="translation velocity: more stable",
-        text=_STABLE,
-        sweep="translation",
-        axis="translation",
-        rule=_RANGE,
-        check=more_stable,
+    *(
+        Claim(
+            key=f"{sweep} velocity: more stable",
+            text="Section 3.1: as velocity grows, the errors of the RS solver stay steadier than those of the GS "
+            "one",
+            sweep=sweep,
+            rule="largest minus smallest error over the sweep (deg) below that of gs-8pt, intervals apart, for "
+            "e_R and e_T",
+            check=more_stable,
+        )
+        for sweep in ("rotation", "translation")
     ),
     Claim(
         key="readout ratio: both grow",
         text="Section 3.1: the errors of both solvers grow with the readout ratio",
         sweep="readout",
-        axis="readout_ratio",
         rule="e_R and e_T of both at phi = 1 above those at phi = 0.2, 95 % intervals apart, and nowhere falling",
         check=both_grow,
     ),
@@ -455,7 +454,6 @@ CLAIMS = (
         key="readout ratio: GS gets higher errors",
         text="Section 3.1: at every readout ratio the GS solver errs more",
         sweep="readout",
-        axis="readout_ratio",
         rule=_BETTER,
         check=always_better,
     ),
@@ -463,7 +461,6 @@ CLAIMS = (
         key="baseline: no impact",
         text="Section 3.1: the length of the baseline hardly matters",
         sweep="baseline",
-        axis="baseline",
         rule=f"largest error over the sweep at most {UNCHANGED:g} times the smallest, by the ends of their 95 % "
         "intervals, for e_R and e_T",
         check=hardly_changes,
@@ -472,7 +469,6 @@ CLAIMS = (
         key="nine matches per camera suffice",
         text="Abstract and section 2.2: nine matches of each camera over time are enough",
         sweep="points",
-        axis="points",
         rule=f"at least {100 * SUFFICIENT_SHARE:g} % of the trials solved (e_R < 1 deg and e_T < 5 deg), by the "
         "ends of the 95 % interval",
         check=enough_solved,
@@ -483,7 +479,6 @@ CLAIMS = (
         key="omitted terms do not matter",
         text="Section 2.2: the terms of third order do not affect the results, so they are omitted",
         sweep="rotation",
-        axis="rotation_deg",
         rule=f"e_R and e_T at most {UNCHANGED:g} times those of the same solver with all 27 unknowns, by the ends "
         "of the 95 % intervals, at each value (the terms grow with the motion)",
         check=no_worse,
@@ -495,7 +490,6 @@ CLAIMS = (
         key="eighteen equations have one solution",
         text="Section 2.2: 19 parameters, thus a linear 18-point solver must exist",
         sweep="degenerate",
-        axis="motion or scene",
         rule=f"exact matches: A has rank 18 in at least {100 * UNIQUE_SHARE:g} % of the trials, by the ends of "
         "the 95 % interval",
         check=one_solution,
@@ -508,7 +502,6 @@ CLAIMS = (
         key="the scale is metric",
         text="Section 1: stereo cameras give the global scale",
         sweep="noise",
-        axis="noise_px",
         rule=f"median of abs(log(estimated / true length of d)) at most {SCALE_MARGIN:g} at the noise of the "
         "reading, by the ends of the 95 % interval",
         check=scale_known,
@@ -520,7 +513,6 @@ CLAIMS = (
         key="stereo estimates motion better than one camera",
         text="Section 1: stereo cameras estimate motion more accurately than a monocular camera",
         sweep="noise",
-        axis="noise_px",
         rule="root mean square of e_R and of e_T at the noise of the reading below the Cramer-Rao bound of the "
         "left camera's matches alone, which no unbiased solver of that camera can beat, 95 % interval apart",
         check=beats_one_camera,
