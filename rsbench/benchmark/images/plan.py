@@ -158,6 +158,14 @@ def reference_of(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> str:
     return os.fspath(entry.path.resolve())
 
 
+_PARTS: dict[str, tuple[Kind[Any, Any], Callable[[str], Any]]] = {
+    "corrector": (CORRECTORS, load_corrector),
+    "solver": (SOLVERS, load_solver_entry),
+    "matcher": (STEREO_MATCHERS, load_matcher),
+}
+"""Kinds of the components of a correction, and how they are loaded."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recipe:
     """The components of a correction, and which of its inputs are the true ones."""
@@ -177,6 +185,11 @@ class Recipe:
             "solver": solver if "motion" in needs else NONE,
             "matcher": matcher if "depth" in needs else NONE,
         }
+
+    @property
+    def references(self) -> dict[str, str]:
+        """Names or paths by which its components are loaded again."""
+        return {name: reference_of(kind, getattr(self.chain, name)) for name, (kind, _) in _PARTS.items()}
 
     def variants(self) -> list[Recipe]:
         """This recipe and its oracles, in which the true motion, the true depth or both replace the estimates."""
@@ -294,15 +307,9 @@ def stored_corrections(places: Places) -> Iterator[Stored]:
 
 
 def _recipe(chain: CorrectionOptions, record: Mapping[str, Any]) -> Recipe:
-    entries = record["entries"]
-    corrector, solver, matcher = chain.corrector, chain.solver, chain.matcher
-    if entries["corrector"] != reference_of(CORRECTORS, corrector):
-        corrector = _named(load_corrector, entries["corrector"])
-    if entries["solver"] != reference_of(SOLVERS, solver):
-        solver = _named(load_solver_entry, entries["solver"])
-    if entries["matcher"] != reference_of(STEREO_MATCHERS, matcher):
-        matcher = _named(load_matcher, entries["matcher"])
-    loaded = replace(chain, corrector=corrector, solver=solver, matcher=matcher)
+    own, entries = Recipe(chain=chain).references, record["entries"]
+    others = {part: load for part, (_, load) in _PARTS.items() if entries[part] != own[part]}
+    loaded = replace(chain, **{part: _named(load, entries[part]) for part, load in others.items()})
     return Recipe(chain=loaded, true_motion=record["solver"] == TRUE, true_depth=record["matcher"] == TRUE)
 
 

@@ -29,6 +29,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import (
+    FramePair,
     Images,
     Pairs,
     depth_of_pair,
@@ -50,7 +51,6 @@ from rsbench.storage.files import (
     sha256,
     write_png,
 )
-from rsbench.vision.corrector import CORRECTORS
 from rsbench.vision.stereo_depth import timed_depth
 from rsbench.vision.stereo_matcher import STEREO_MATCHERS, MatcherEntry, needs_motion, sensor_disparities
 
@@ -209,7 +209,7 @@ class Bench:
         if self.stands(artefact):
             return
         artefact.start()
-        record = {**recipe.names, "entries": _references(recipe), "success": True, "reason": ""}
+        record = {**recipe.names, "entries": recipe.references, "success": True, "reason": ""}
         given = self._given(recipe)
         if isinstance(given, str):
             artefact.finish(record | {"success": False, "reason": given})
@@ -260,30 +260,17 @@ class Bench:
         record = artefact.record()
         if record is None or not record["success"]:
             return str(record["reason"]) if record else "not made"
-        stored = load_disparities(artefact.file(".npz"), self.sequence.rig)
-        if moved:
-            first, second = (
-                pair_with_motion(
-                    self.images,
-                    [stored[f"{side}_{frame}"] for side in SIDES],
-                    frame,
-                    self.sequence.rig,
-                    find_sky=recipe.chain.find_sky,
-                )
-                for frame in FRAMES
-            )
-            return first, second
-        first, second = (
-            depth_of_pair(
-                self.images["left", frame],
-                self.images["right", frame],
-                [stored[f"{side}_{frame}"] for side in SIDES],
-                self.sequence.rig,
-                find_sky=recipe.chain.find_sky,
-            )
-            for frame in FRAMES
-        )
-        return first, second
+        rig, find_sky = self.sequence.rig, recipe.chain.find_sky
+        stored = load_disparities(artefact.file(".npz"), rig)
+
+        def pair(frame: int) -> FramePair:
+            disparities = [stored[f"{side}_{frame}"] for side in SIDES]
+            if moved:
+                return pair_with_motion(self.images, disparities, frame, rig, find_sky=find_sky)
+            left, right = (self.images[side, frame] for side in SIDES)
+            return depth_of_pair(left, right, disparities, rig, find_sky=find_sky)
+
+        return pair(0), pair(1)
 
 
 def _motion_record(entry: SolverEntry, robust: RobustEstimate) -> dict[str, Any]:
@@ -305,15 +292,6 @@ def _motion_record(entry: SolverEntry, robust: RobustEstimate) -> dict[str, Any]
         "inliers": {str(name): count.inliers for name, count in robust.counts.items()},
         "matches": {str(name): count.matches for name, count in robust.counts.items()},
         "iterations": robust.iterations,
-    }
-
-
-def _references(recipe: Recipe) -> dict[str, str]:
-    chain = recipe.chain
-    return {
-        "corrector": reference_of(CORRECTORS, chain.corrector),
-        "solver": reference_of(SOLVERS, chain.solver),
-        "matcher": reference_of(STEREO_MATCHERS, chain.matcher),
     }
 
 
