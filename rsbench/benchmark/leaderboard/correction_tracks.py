@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -26,16 +26,16 @@ from rsbench.benchmark.leaderboard.pictures import (
     VIEW,
     Parts,
     RequestedPicture,
-    SquareErrors,
     TruePictures,
     frame_png,
     parts_within,
     read_answer_frame,
+    rms_by_part,
     texture,
 )
 from rsbench.benchmark.leaderboard.pictures import columns as parting_columns
 from rsbench.benchmark.leaderboard.splits import Frames
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Track
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Submission, Track
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, VIEWS, View
@@ -152,30 +152,37 @@ class CorrectionTrack(PictureTrack):
             for name, row in rows.items()
         )
 
-    def hints(
-        self, folder: Path, pictures: TruePictures, png_unit_m: float | None, split: Split, wanted: bool
-    ) -> Iterable[str]:
+    def read(self, submission: Submission, pictures: TruePictures) -> list[Frame]:
+        return [read_answer_frame(submission.folder / PICTURES, pictures, each) for each in pictures.requested]
+
+    def hints(self, drawn: Sequence[Frame], pictures: TruePictures, public: bool) -> Iterable[str]:
+        truths = {each.stem: pictures.frame(each.row) for each in pictures.requested} if public else {}
         found: set[str] = set()
-        for each in pictures.requested:
-            image, _ = read_answer_frame(folder, pictures, each)
-            if wanted and split.public:
-                others = {k.stem: pictures.frame(k.row) for k in pictures.requested if k != each}
-                found |= set(_mistakes(image, pictures.frame(each.row), others))
+        for (stem, truth), (image, _) in zip(truths.items(), drawn, strict=False):
+            others = {name: other for name, other in truths.items() if name != stem}
+            found |= set(_mistakes(image, truth, others))
         return found
 
-    def scorer(self, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
-        true = TrueFrame.all_of(pictures)
+    def truth_of(self, pictures: TruePictures) -> list[TrueFrame]:
+        found, commons = list[TrueFrame](), pictures.commons()
+        for each, common in zip(pictures.requested, commons, strict=True):
+            image, name = pictures.frame(each.row), each.stem.rpartition("_")[2]
+            parts = parts_within(self.part_score, image, each.row, common)
+            found.append(TrueFrame(name=name, picture=Picture(image), common=common, parts=parts))
+        return found
 
-        def scores_of(submission: Submission, success: bool) -> Numbers:
-            folder = submission.folder / PICTURES
-            drawn = [read_answer_frame(folder, pictures, each) for each in pictures.requested] if success else None
-            return self.scores_within(true, drawn)
-
-        return scores_of
-
-    def scores_within(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
-        """Scores of the frames of a problem; None: a failure."""
-        return frame_scores(true, drawn, self.rows, flips=self.flips)
+    def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
+        """Means over the requested frames, of dB too; FLIP takes most of the time."""
+        answers = [None] * len(true) if drawn is None else drawn
+        both = list(zip(answers, true, strict=True))
+        scores = [_WORST_FRAME if frame is None else _frame(*frame, one, self.flips) for frame, one in both]
+        images = ((frame and frame[0], one.picture.image, one.parts) for frame, one in both)
+        keys = [key for key in _WORST_FRAME if self.flips or not key.startswith("flip_")]
+        found = {key: float(np.mean([each[key] for each in scores])) for key in keys}
+        by_row = {f"psnr_{name}": math.nan for name in self.rows}
+        by_row |= {f"psnr_{one.name}": each["psnr"] for one, each in zip(true, scores, strict=True)}
+        squares = rms_by_part(self.part_score, images)
+        return {**found, **by_row, **squares, "error": 1.0 - found["ssim"]}
 
     def draw(self, pictures: TruePictures, place: Path) -> None:
         _uncorrected(pictures, place)
@@ -255,39 +262,6 @@ class TrueFrame:
     """(H, W) see ``TruePictures.common``."""
     parts: Parts
     """Parts of the common pixels."""
-
-    @classmethod
-    def all_of(cls, pictures: TruePictures) -> list[TrueFrame]:
-        """Read those of a problem."""
-        found, commons = list[TrueFrame](), pictures.commons()
-        for each, common in zip(pictures.requested, commons, strict=True):
-            image = pictures.frame(each.row)
-            parts = parts_within(CorrectionTrack.part_score, image, each.row, common)
-            name = each.stem.rpartition("_")[2]
-            found.append(cls(name=name, picture=Picture(image), common=common, parts=parts))
-        return found
-
-
-def frame_scores(
-    truths: Sequence[TrueFrame],
-    frames: Sequence[Frame] | None,
-    rows: Sequence[str] = ("first", "middle"),
-    *,
-    flips: bool = True,
-) -> Numbers:
-    """Scores of the requested corrected frames; None: a failure. Means over these, of dB too.
-
-    ``rows`` are those whose times may be requested; ``flips``: FLIP too, which takes most of the time.
-    """
-    scores, squares = list[Numbers](), SquareErrors(CorrectionTrack.part_score)
-    for number, true in enumerate(truths):
-        squares.add(None if frames is None else frames[number][0], true.picture.image, true.parts)
-        scores.append(_WORST_FRAME if frames is None else _frame(*frames[number], true, flips))
-    keys = [key for key in _WORST_FRAME if flips or not key.startswith("flip_")]
-    found = {key: float(np.mean([each[key] for each in scores])) for key in keys}
-    by_row = {f"psnr_{name}": math.nan for name in rows}
-    by_row |= {f"psnr_{true.name}": each["psnr"] for true, each in zip(truths, scores, strict=True)}
-    return {**found, **by_row, **squares.scores(), "error": 1.0 - found["ssim"]}
 
 
 def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, flips: bool) -> Numbers:
@@ -380,9 +354,9 @@ class PlacedTrack(CorrectionTrack):
     def chain(self, card: str) -> CardChain:
         return super().chain(card).choosing()
 
-    def scores_within(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
+    def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
         share = 0.0 if drawn is None else placed(true, drawn)
-        return {**super().scores_within(true, drawn), "placed": share, "misplaced": 1.0 - share}
+        return {**super().scores_of(true, drawn), "placed": share, "misplaced": 1.0 - share}
 
 
 class SensorTrack(PlacedTrack):
@@ -407,8 +381,8 @@ class SensorTrack(PlacedTrack):
             each._replace(file=exposed_file(side, frame + sequence.first, each.row)) for each in requested
         )
 
-    def scores_within(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
-        found = super().scores_within(true, drawn)
+    def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
+        found = super().scores_of(true, drawn)
         looks = 0.0 if drawn is None else seen_alike(true, drawn)
         both = found["placed"] * looks
         return {**found, "picture": looks, "corrected": both, "shortfall": 1.0 - both}

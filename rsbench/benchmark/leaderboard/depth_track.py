@@ -28,7 +28,7 @@ from rsbench.benchmark.leaderboard.pictures import (
     shares,
 )
 from rsbench.benchmark.leaderboard.splits import Frames
-from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Split, Submission, Track
+from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Submission, Track
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
@@ -98,25 +98,31 @@ class DepthTrack(PictureTrack):
         file = picture_file("rs", VIEW[0], VIEW[1] + sequence.first, depth=True)
         return (RequestedPicture(f"{VIEW[0]}_{VIEW[1]}", 0, file, (".exr", ".png")),)
 
-    def hints(
-        self, folder: Path, pictures: TruePictures, png_unit_m: float | None, split: Split, wanted: bool
-    ) -> Iterable[str]:
-        depth = read_answer_depth(folder, pictures, png_unit_m)
-        if not wanted:
-            return ()
-        if split.public:
-            return _mistakes(depth, pictures)
-        far = np.any(depth > 0.0) and np.median(depth[depth > 0.0]) > _FAR_M
+    def read(self, submission: Submission, pictures: TruePictures) -> NDArray[np.float32]:
+        return read_answer_depth(submission.folder / PICTURES, pictures, submission.header.png_unit_m)
+
+    def hints(self, drawn: NDArray[np.float32], pictures: TruePictures, public: bool) -> Iterable[str]:
+        if public:
+            return _mistakes(drawn, pictures)
+        far = np.any(drawn > 0.0) and np.median(drawn[drawn > 0.0]) > _FAR_M
         return (f"half of it is above {_FAR_M:g} m; depth is in metres, not millimetres",) if far else ()
 
-    def scorer(self, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
-        true = TrueDepth.of(pictures)
+    def truth_of(self, pictures: TruePictures) -> TrueDepth:
+        depth, rig = pictures.depth(), pictures.sequence.rig
+        parts = parts_within(self.part_score, pictures.rolling(), 0, depth > 0.0)
+        return TrueDepth(rig=rig, depth=depth, seen=pictures.seen_by_both(depth), parts=parts)
 
-        def scores_of(submission: Submission, success: bool) -> Numbers:
-            folder, unit = submission.folder / PICTURES, submission.header.png_unit_m
-            return depth_scores(true, read_answer_depth(folder, pictures, unit) if success else None)
-
-        return scores_of
+    def scores_of(self, true: TrueDepth, drawn: NDArray[np.float32] | None) -> Numbers:
+        truth, rig, seen = true.depth, true.rig, true.seen
+        found = part_scores(drawn, truth, rig, np.ones_like(seen))
+        for name, part in (("visible", seen), ("occluded", ~seen)):
+            scores = part_scores(drawn, truth, rig, part)
+            found |= {f"{key}_{name}": scores[key] for key in ("bad_1", "abs_rel", "rmse_m")}
+        wrong = np.ones_like(seen) if drawn is None else _wrong(drawn, truth, rig)
+        found |= shares(true.parts, wrong)
+        sky = truth == 0.0
+        invented = 1.0 if drawn is None else float(np.mean(drawn[sky] > 0.0)) if np.any(sky) else 0.0
+        return {**found, "on_sky": invented}
 
     def draw(self, pictures: TruePictures, place: Path) -> None:
         _flat(pictures, place, 10.0)
@@ -181,27 +187,6 @@ class TrueDepth:
     """(H, W) by both cameras."""
     parts: Parts
     """Parts of the surface."""
-
-    @classmethod
-    def of(cls, pictures: TruePictures) -> TrueDepth:
-        """Read it."""
-        depth, rig = pictures.depth(), pictures.sequence.rig
-        parts = parts_within(DepthTrack.part_score, pictures.rolling(), 0, depth > 0.0)
-        return cls(rig=rig, depth=depth, seen=pictures.seen_by_both(depth), parts=parts)
-
-
-def depth_scores(true: TrueDepth, depth: NDArray[np.float32] | None) -> Numbers:
-    """Scores of a depth map (H, W), m, 0 unknown; None: a failure."""
-    truth, rig, seen = true.depth, true.rig, true.seen
-    found = part_scores(depth, truth, rig, np.ones_like(seen))
-    for name, part in (("visible", seen), ("occluded", ~seen)):
-        scores = part_scores(depth, truth, rig, part)
-        found |= {f"{key}_{name}": scores[key] for key in ("bad_1", "abs_rel", "rmse_m")}
-    wrong = np.ones_like(seen) if depth is None else _wrong(depth, truth, rig)
-    found |= shares(true.parts, wrong)
-    sky = truth == 0.0
-    invented = 1.0 if depth is None else float(np.mean(depth[sky] > 0.0)) if np.any(sky) else 0.0
-    return {**found, "on_sky": invented}
 
 
 def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRig) -> NDArray[np.bool_]:

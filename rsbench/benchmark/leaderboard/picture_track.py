@@ -112,14 +112,20 @@ class PictureTrack(Track):
     # Of each kind of picture
 
     @abstractmethod
-    def hints(
-        self, folder: Path, pictures: TruePictures, png_unit_m: float | None, split: Split, wanted: bool
-    ) -> Iterable[str]:
-        """Likely mistakes in the pictures of an answer, where ``wanted``.
+    def read(self, submission: Submission, pictures: TruePictures) -> Any:
+        """The pictures of an answer. Raises RsbenchError when one cannot be read."""
 
-        Raises:
-            RsbenchError: a picture cannot be read.
-        """
+    @abstractmethod
+    def hints(self, drawn: Any, pictures: TruePictures, public: bool) -> Iterable[str]:
+        """Likely mistakes in what ``read`` returned; the truth is compared where it is public."""
+
+    @abstractmethod
+    def truth_of(self, pictures: TruePictures) -> Any:
+        """What ``scores_of`` needs of the truth of a problem."""
+
+    @abstractmethod
+    def scores_of(self, true: Any, drawn: Any | None) -> Numbers:
+        """Scores of what ``read`` returned, by what ``truth_of`` returned; None: a failure."""
 
     @abstractmethod
     def draw(self, pictures: TruePictures, place: Path) -> None:
@@ -132,10 +138,6 @@ class PictureTrack(Track):
     @abstractmethod
     def make(self, work: SharedWork, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
         """Write the pictures of a chain into a new folder; the answer without its name."""
-
-    @abstractmethod
-    def scorer(self, pictures: TruePictures) -> Callable[[Submission, bool], Numbers]:
-        """What scores the pictures of a submission to one problem, by whether it has an answer."""
 
     # Predictions
 
@@ -164,7 +166,7 @@ class PictureTrack(Track):
     ) -> tuple[list[str], list[str]]:
         """Each picture is read once; a secret truth is not looked at."""
         answered = [answer.name for answer in submission.answers.values() if answer.success]
-        folder, unit = submission.folder / PICTURES, submission.header.png_unit_m
+        folder = submission.folder / PICTURES
         faults, found = list(islice(_strange_files(folder, split, answered), most)), Counter[str]()
         for name in answered:
             if len(faults) >= most:
@@ -172,7 +174,8 @@ class PictureTrack(Track):
             pictures = split.by_name[name].pictures
             assert pictures is not None
             try:
-                found.update(self.hints(folder, pictures, unit, split, hints))
+                drawn = self.read(submission, pictures)
+                found.update(self.hints(drawn, pictures, split.public) if hints else ())
             except RsbenchError as error:
                 faults.append(str(error))
         notes = [
@@ -263,13 +266,13 @@ def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> 
     truth, track = split.by_name[name], split.track
     assert isinstance(track, PictureTrack) and truth.pictures is not None
     truth.pictures.check()
-    scores_of = track.scorer(truth.pictures)
+    true = track.truth_of(truth.pictures)
     rows = list[Row | str]()
     for submission in submissions:
         answer = submission.answers.get(truth.name)
         success = answer is not None and answer.success
         try:
-            scores = scores_of(submission, success)
+            scores = track.scores_of(true, track.read(submission, truth.pictures) if success else None)
             rows.append(score_row(truth, answer, success, scores) | track.part_of(truth))
         except RsbenchError as error:
             rows.append(str(error))

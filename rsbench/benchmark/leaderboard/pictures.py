@@ -322,24 +322,21 @@ def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolAr
     return found
 
 
-class SquareErrors:
-    """Root mean squares of frames by part; what was not drawn is black."""
+def rms_by_part(
+    score: str, frames: Iterable[tuple[NDArray[np.uint8] | None, NDArray[np.uint8], Parts]]
+) -> dict[str, float]:
+    """Root mean squared errors of frames, by the columns of a ``score``; NaN for a part without pixels.
 
-    def __init__(self, score: str) -> None:
-        self._sums = {name: np.zeros(2) for parting in PARTINGS for name in columns(score, parting)}
-        """Sum of squared errors, and their number."""
-
-    def add(self, image: NDArray[np.uint8] | None, truth: NDArray[np.uint8], parts: Parts) -> None:
-        """A frame (H, W, 3) and its ``parts_within``; None: a failure, which errs by all levels."""
+    ``frames``: for each the image (H, W, 3), None for a failure, which errs by all levels; its truth; and its
+    ``parts_within``.
+    """
+    sums = {name: np.zeros(2) for parting in PARTINGS for name in columns(score, parting)}
+    for image, truth, parts in frames:
         off = np.full(truth.shape, _MOST) if image is None else image.astype(np.float64) - truth
         squares = _mean(off * off)
         for name, part in parts.items():
-            inside = squares[part]
-            self._sums[name] += np.array([np.sum(inside), inside.size])
-
-    def scores(self) -> dict[str, float]:
-        """Scores by column; NaN for a part without pixels."""
-        return {name: math.sqrt(s / n) if n else math.nan for name, (s, n) in self._sums.items()}
+            sums[name] += np.array([np.sum(squares[part]), np.count_nonzero(part)])
+    return {name: math.sqrt(total / count) if count else math.nan for name, (total, count) in sums.items()}
 
 
 def shares(parts: Parts, wrong: BoolArray) -> dict[str, float]:
