@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from commands import run_here
 
-from rsbench.benchmark.leaderboard.submissions import truth_text
-from rsbench.benchmark.leaderboard.track import Split
+from rsbench.benchmark.leaderboard.board import Scored, entries_of
+from rsbench.benchmark.leaderboard.submissions import read_submission, truth_text, write_oracles
+from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
@@ -40,6 +43,34 @@ def write(path: Path, lines: Iterable[Mapping[str, Any]]) -> Path:
 def named(lines: list[Line], method: str, uses: tuple[str, ...] = ("left",)) -> list[Line]:
     """The same predictions by another method."""
     return [{**lines[0], "method": method, "uses": uses}, *lines[1:]]
+
+
+def scores_of(split: Split, predictions: Path | Iterable[Line], folder: Path = Path()) -> pd.DataFrame:
+    """Scores of a file of predictions, or of lines, which are written into ``folder``."""
+    path = predictions if isinstance(predictions, Path) else write(folder / "scored.jsonl", predictions)
+    return mark(read_submission(path, split), split)
+
+
+def oracle_scores(split: Split, folder: Path) -> dict[str, pd.DataFrame]:
+    """Scores of the oracles of a split, whose predictions are written into ``folder``."""
+    return {path.parent.name: scores_of(split, path) for path in write_oracles(split, folder)}
+
+
+def leaderboard(*words: object) -> str:
+    """What ``rsbench leaderboard`` prints where it succeeds."""
+    ran = run_here("leaderboard", *words)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return ran.stdout
+
+
+def run_entries(track: str, entries: Iterable[object], *where: object) -> str:
+    """``rsbench leaderboard run`` of some entries."""
+    return leaderboard("run", track, *where, *(word for entry in entries for word in ("--entry", entry)))
+
+
+def entered(board: Path, split: Split) -> dict[str, Scored]:
+    """The entries of a board by the names of their methods."""
+    return {entry.header.method: entry for entry in entries_of(board, split.track.id, split.name)}
 
 
 def erring(lines: Iterable[Line], w: float, d: float, seed: int = 0) -> list[Line]:

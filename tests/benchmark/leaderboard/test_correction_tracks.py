@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,13 @@ import cv2
 import numpy as np
 import pytest
 from analytic_dataset import write_analytic_dataset
-from commands import run_here
-from leaderboards import PLANES, jobs_here, lines_of
+from leaderboards import PLANES, entered, jobs_here, leaderboard, lines_of, oracle_scores, run_entries
 
 from rsbench.benchmark.leaderboard import running
-from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.correction_tracks import TrueFrame, placed, seen_alike
 from rsbench.benchmark.leaderboard.picture_track import SharedWork
 from rsbench.benchmark.leaderboard.pictures import parts_within
 from rsbench.benchmark.leaderboard.splits import with_gyro
-from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
-from rsbench.benchmark.leaderboard.track import mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
@@ -55,9 +52,15 @@ def _u8(image: np.ndarray[Any, Any]) -> Image:
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
+@cache
 def _true() -> TrueFrame:
     image = _u8(_seen(0.0))
     return TrueFrame(name="first", picture=Picture(image), common=ALL, parts=parts_within("rms", image, 0, ALL))
+
+
+def _one(score: Callable[..., float], image: np.ndarray[Any, Any], drawn: Any = ALL) -> float:
+    """``placed`` or ``seen_alike`` of one frame of the scene."""
+    return score([_true()], [(_u8(image), drawn)])
 
 
 def _sharpened(image: Image) -> Image:
@@ -77,13 +80,13 @@ FILTERS: dict[str, Callable[[Image], Any]] = {
 def test_a_known_distance_has_its_score(off: float) -> None:
     # The tops of correlations of blurred windows are parabolas to some hundredths of a pixel.
     expected = max(0.0, 1.0 - off / 2.0)
-    assert placed([_true()], [(_u8(_seen(off)), ALL)]) == pytest.approx(expected, abs=0.05)
+    assert _one(placed, _seen(off)) == pytest.approx(expected, abs=0.05)
 
 
 def test_what_is_not_drawn_counts_nothing() -> None:
     drawn = ALL.copy()
     drawn[:, ::2] = False
-    assert placed([_true()], [(_u8(_seen(0.0)), drawn)]) == pytest.approx(0.5, abs=0.02)
+    assert _one(placed, _seen(0.0), drawn) == pytest.approx(0.5, abs=0.02)
     flat = np.full((*SHAPE, 3), 90, dtype=np.uint8)
     plain = TrueFrame(name="first", picture=Picture(flat), common=ALL, parts={})
     assert placed([plain], [(flat, ALL)]) == 1.0  # nothing there tells where it stands
@@ -97,19 +100,16 @@ def test_filters_gain_nothing(shear: float) -> None:
     frame = cv2.GaussianBlur(_seen(shear * np.arange(height) / height), (0, 0), 0.8)
     corner = np.hypot(*np.meshgrid(np.linspace(-1, 1, SHAPE[1]), np.linspace(-1, 1, height)))[..., None]
     frame = _u8(frame * (1.0 - 0.1 * corner**2) + 10.0 * rng.standard_normal(frame.shape))
-    before, seen = placed([true], [(frame, ALL)]), ssim(frame, true.picture)
-    after = {name: placed([true], [(made(frame), ALL)]) for name, made in FILTERS.items()}
+    before, seen = _one(placed, frame), ssim(frame, true.picture)
+    after = {name: _one(placed, made(frame)) for name, made in FILTERS.items()}
     assert max(after.values()) < before + 0.01, (before, after)
     assert max(ssim(made(frame), true.picture) for made in FILTERS.values()) > seen + 0.05
-    straight = placed([true], [(_u8(_seen(0.0)), ALL)])
-    assert straight > before + (0.3 if shear else -0.01)
+    assert _one(placed, _seen(0.0)) > before + (0.3 if shear else -0.01)
 
 
 def test_oracles_have_their_places(planes: Path, tmp_path: Path) -> None:
     split = TRACKS["correction-2"].split(planes)
-    found = {
-        path.parent.name: mark(read_submission(path, split), split) for path in write_oracles(split, tmp_path)
-    }
+    found = oracle_scores(split, tmp_path)
     # A picture on itself: the top of an uneven correlation is no more than 0.01 px from the middle.
     assert np.all(found["truth"]["placed"] > 0.995) and np.all(found["truth"]["misplaced"] < 0.005)
     assert np.all(found["fusion-true"]["placed"] > found["uncorrected"]["placed"])
@@ -141,14 +141,14 @@ def _holes(image: Image) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 def test_what_is_no_picture_has_no_score() -> None:
     """What keeps its place and not its looks: each loses most of what ``placed`` alone would leave it."""
-    true, right = _true(), _u8(_seen(0.0))
+    right = _u8(_seen(0.0))
     holes, mean = _holes(right), np.mean(right, axis=(0, 1))
     pale = _u8(mean + 0.1 * (right - mean))
     filled = right.copy()
     filled[holes] = _u8(mean)
     black = right.copy()
     black[holes] = 0
-    assert seen_alike([true], [(right, ALL)]) == pytest.approx(1.0, abs=1e-12)
+    assert _one(seen_alike, right) == pytest.approx(1.0, abs=1e-12)
     grey = np.repeat(np.mean(right, axis=-1, keepdims=True), 3, axis=-1).astype(np.uint8)
     for name, image, drawn, place, most in (
         ("contrast of a tenth", pale, ALL, 0.95, 0.3),
@@ -159,7 +159,7 @@ def test_what_is_no_picture_has_no_score() -> None:
         ("without colours", grey, ALL, 0.6, 0.35),
         ("red and blue exchanged", right[..., ::-1].copy(), ALL, 0.7, 0.3),
     ):
-        where, looks = (score([true], [(image, drawn)]) for score in (placed, seen_alike))
+        where, looks = (_one(score, image, drawn) for score in (placed, seen_alike))
         assert where >= place and where * looks < most, name
 
 
@@ -167,17 +167,15 @@ def test_filters_gain_next_to_nothing_in_looks() -> None:
     """On the noise of a real sensor, some 10 of 255 levels."""
     true = _true()
     frame = _noise(cv2.GaussianBlur(_u8(_seen(0.0)), (0, 0), 1.0), 10.0)
-    before = seen_alike([true], [(frame, ALL)])
-    after = {name: seen_alike([true], [(made(frame), ALL)]) for name, made in FILTERS.items()}
+    before = _one(seen_alike, frame)
+    after = {name: _one(seen_alike, made(frame)) for name, made in FILTERS.items()}
     assert before > 0.97 and max(after.values()) < before + 0.02, (before, after)
     assert max(ssim(made(frame), true.picture) for made in FILTERS.values()) > ssim(frame, true.picture) + 0.02
 
 
 def test_the_score_is_the_product_and_the_truth_has_it_all(planes: Path, tmp_path: Path) -> None:
     split = TRACKS["correction-3"].split(planes)
-    found = {
-        path.parent.name: mark(read_submission(path, split), split) for path in write_oracles(split, tmp_path)
-    }
+    found = oracle_scores(split, tmp_path)
     for scores in found.values():
         np.testing.assert_allclose(scores["corrected"], scores["placed"] * scores["picture"], rtol=1e-12)
         np.testing.assert_allclose(scores["shortfall"], 1.0 - scores["corrected"], atol=1e-12)
@@ -228,12 +226,9 @@ def test_methods_are_ranked_by_the_cameras_that_they_see(
     monkeypatch.setattr(running, "finished_jobs", jobs_here)
     where = ("--data", rendered, "--board", tmp_path / "board")
     names = ("mono-fusion", "rotation-only", "gyro", "zhuang", "lao-lines", "fusion")
-    cards = [word for name in names for word in ("--entry", name)]
-    ran = run_here("leaderboard", "run", TRACK.name, *where, *cards)
-    assert ran.returncode == 0, ran.stderr
-    assert run_here("leaderboard", "oracles", TRACK.name, *where).returncode == 0
-    split = TRACK.split(rendered)
-    found = {e.header.method: e for e in entries_of(tmp_path / "board", TRACK.id, split.name)}
+    run_entries(TRACK.name, names, *where)
+    leaderboard("oracles", TRACK.name, *where)
+    found = entered(tmp_path / "board", TRACK.split(rendered))
     uses = {name: found[name].header.uses[2:] for name in names}
     assert uses == {
         "mono-fusion": ("time",),
@@ -255,7 +250,7 @@ def test_methods_are_ranked_by_the_cameras_that_they_see(
 
 
 def test_a_gyroscope_is_given_where_there_is_one(rendered: Path, tmp_path: Path) -> None:
-    assert run_here("leaderboard", "export", TRACK.name, "--data", rendered, "--out", tmp_path).returncode == 0
+    leaderboard("export", TRACK.name, "--data", rendered, "--out", tmp_path)
     (problem,) = lines_of(tmp_path / "problems.jsonl")
     truth = TRACK.split(rendered).truths[0]
     tau, w = np.split(np.array(problem["gyro"]), [1], axis=1)

@@ -17,7 +17,17 @@ import pytest
 from commands import assert_refused, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from leaderboards import lines_of, named, truth_lines, write
+from leaderboards import (
+    entered,
+    leaderboard,
+    lines_of,
+    named,
+    oracle_scores,
+    run_entries,
+    scores_of,
+    truth_lines,
+    write,
+)
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -35,8 +45,7 @@ from rsbench.benchmark.leaderboard.splits import (
     truth_of,
 )
 from rsbench.benchmark.leaderboard.standings import standings, table
-from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
-from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_name
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.cli.reproduce_leaderboard import SAME_METHOD, entries_of_laws
@@ -44,7 +53,7 @@ from rsbench.components.motion_models import TwistMotion
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import rotation_error, translation_error
-from rsbench.dataset.card import DatasetCard, load_dataset_card
+from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.secret_split import Secret
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
@@ -53,6 +62,7 @@ ROOT = Path(__file__).parents[3]
 LAWS_FOLDER = ROOT / "results" / "laws"
 TRACK = TRACKS["points-2"]
 RIVALS = ("rs-stereo-refined-twist", "gs-stereo-tracks-scaled")
+needs_results = pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +127,7 @@ def test_the_score_is_that_of_the_protocol(split: Split, tmp_path: Path) -> None
     for line in lines[1:]:
         line["w"][0] += turn
     lines[-1] = {"name": few.truths[-1].name, "success": False}
-    scores = mark(read_submission(write(tmp_path / "a.jsonl", lines), few), few)
+    scores = scores_of(few, lines, tmp_path)
     rng = np.random.default_rng(0)
     for k, truth in enumerate(few.truths[:-1]):
         problem, noise = exact_problem(1, k, POINTS_2)
@@ -201,12 +211,15 @@ def test_nothing_that_is_stated_of_all_ratios_alike_beats_a_refusal(
 
 
 def _read_out(split: Split, answers: Mapping[str, Mapping[str, Any]], folder: Path) -> pd.DataFrame:
-    lines = [{"name": truth.name, **answers[truth.name]} for truth in split.truths]
-    header = {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
-    return mark(read_submission(write(folder / "a.jsonl", [header, *lines]), split), split)
+    lines = ({"name": truth.name, **answers[truth.name]} for truth in split.truths)
+    return scores_of(split, [_header(split), *lines], folder)
 
 
-@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+def _header(split: Split) -> dict[str, Any]:
+    return {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
+
+
+@needs_results
 def test_a_guess_in_place_of_a_refusal_gains_nothing(tmp_path: Path) -> None:
     """What raised every entry of ``readout-2`` lowers each of them on ``readout-3``."""
     old, new = _without_frames("readout-2"), _without_frames("readout-3")
@@ -260,11 +273,10 @@ def test_a_deviation_beside_which_errors_overflow_is_scored_as_certain(sigma: fl
 def test_a_score_that_is_no_number_is_damage(tmp_path: Path) -> None:
     split = _without_frames("readout-3")
     lines = [{"name": truth.name, "readout_ratio": 0.5} for truth in split.truths]
-    header = {"protocol": split.track.id, "split": split.name, "method": "mine", "uses": ["left"]}
-    file = add(tmp_path / "board", write(tmp_path / "a.jsonl", [header, *lines]), split, {}).folder / "scores.csv"
+    path = write(tmp_path / "a.jsonl", [_header(split), *lines])
+    file = add(tmp_path / "board", path, split, {}).folder / "scores.csv"
     table = pd.read_csv(file)
-    bad = [table.assign(skill=-np.inf), table.assign(skill=np.nan), table.assign(nees="a"), table[:0]]
-    for each in bad:
+    for each in (table.assign(skill=-np.inf), table.assign(skill=np.nan), table.assign(nees="a"), table[:0]):
         each.to_csv(file, index=False)
         with pytest.raises(RsbenchError, match=r"scores\.csv: is damaged"):
             entries_of(tmp_path / "board", split.track.id, split.name)
@@ -281,7 +293,7 @@ def _without_frames(protocol: str) -> Split:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+@needs_results
 @pytest.mark.parametrize("protocol", ["points-2", "pose-2", "readout-2", "readout-3"])
 def test_stored_predictions_give_the_committed_table(protocol: str, split: Split, tmp_path: Path) -> None:
     split = split if protocol == TRACK.id else _without_frames(protocol)
@@ -301,12 +313,17 @@ def test_stored_predictions_give_the_committed_table(protocol: str, split: Split
     assert names == set(found["method"])
 
 
-@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
-def test_results_tell_what_laws_cost() -> None:
-    """The sentences below the table of the page of results are those of its numbers."""
-    (path,) = (LAWS_FOLDER / "site").glob("points-2--*.csv")
-    ranked = pd.read_csv(path, index_col="method").dropna(subset="rank")
+def _published(protocol: str) -> tuple[pd.DataFrame, str]:
+    """The committed table of a protocol, by method, and the page of results, whose sentences quote its numbers."""
+    (path,) = (LAWS_FOLDER / "site").glob(f"{protocol}--*.csv")
     words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    return pd.read_csv(path, index_col="method"), words
+
+
+@needs_results
+def test_results_tell_what_laws_cost() -> None:
+    ranked, words = _published("points-2")
+    ranked = ranked.dropna(subset="rank")
     by_law = {law: ranked[f"near_bound_{law}"] for law in MODELS_DRAWN}
     for law, where in (("accelerated", "accelerated motion"), ("spline", "shaking hands")):
         auto, others = by_law[law][CHOOSES], by_law[law].drop(CHOOSES)
@@ -322,12 +339,11 @@ def test_results_tell_what_laws_cost() -> None:
     assert set(RIVALS) <= set(str(ranked.loc["rs-stereo-refined", "ties"]).split())
 
 
-@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+@needs_results
 def test_results_tell_what_laws_cost_on_frames() -> None:
-    """The sentences below the table of frames are those of its numbers; each bold claim holds."""
-    (path,) = (LAWS_FOLDER / "site").glob("pose-2--*.csv")
-    ranked = pd.read_csv(path, index_col="method").dropna(subset="rank")
-    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    """Each bold claim holds."""
+    ranked, words = _published("pose-2")
+    ranked = ranked.dropna(subset="rank")
     auto, others = ranked.loc[CHOOSES], ranked.drop(CHOOSES)
     first = f"**, with {auto['auc_apart']:.2f}, the next {others['auc_apart'].max():.2f}. It gains most"
     assert first in words and np.all(ranked.loc[CHOOSES, ["rank", "rank_low", "rank_high"]].astype(int) == 1)
@@ -342,35 +358,28 @@ def test_results_tell_what_laws_cost_on_frames() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+@needs_results
 def test_results_tell_what_laws_cost_readers_of_the_ratio(tmp_path: Path) -> None:
-    """The sentences below the table of ``readout-3``, those about sensors from the stored answers."""
-    (path,) = (LAWS_FOLDER / "site").glob("readout-3--*.csv")
-    table_of = pd.read_csv(path, index_col="method")
-    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    """The sentences about sensors are from the stored answers."""
+    table_of, words = _published("readout-3")
     skill = table_of["skill"]
     laws = sorted((skill["rs-stereo-refined-twist"], skill["rs-stereo-refined"]), reverse=True)
     assert f"with {skill[CHOOSES]:.2f}; solvers that assume a model have {laws[0]:.2f} and {laws[1]:.2f}:" in words
     assert table_of["skill_spline"].to_dict()[CHOOSES] == 0.0, "all refused"
-    assert (
-        f"95 % intervals contain the ratio in {100.0 * float(table_of['covers_95'].to_dict()[CHOOSES]):.0f} %"
-        in words
-    )
+    covered = 100.0 * float(table_of["covers_95"].to_dict()[CHOOSES])
+    assert f"95 % intervals contain the ratio in {covered:.0f} %" in words
     split = _without_frames("readout-3")
     restore(LAWS_FOLDER / "predictions" / "readout-3", split, tmp_path / "board")
-    (entry,) = (e for e in entries_of(tmp_path / "board", "readout-3", split.name) if e.header.method == CHOOSES)
-    scores = entry.scores.set_index("problem")
+    scores = entered(tmp_path / "board", split)[CHOOSES].scores.set_index("problem")
     silent = ~scores["success"].astype(bool)
     assert f"It refuses {100.0 * silent.mean():.0f} %, among them all hand-held motion" in words
     assert np.all(silent[scores.index.str.contains("-spline-")])
 
 
-@pytest.mark.skipif(not LAWS_FOLDER.is_dir(), reason="needs the committed results")
+@needs_results
 def test_results_tell_what_a_second_camera_is_worth() -> None:
-    """The sentences below the table of ``correction-3`` that its numbers hold, and no rank that they do not."""
-    (path,) = (LAWS_FOLDER / "site").glob("correction-3--*.csv")
-    ranked = pd.read_csv(path, index_col="method")
-    words = " ".join((ROOT / "docs" / "results-leaderboard.md").read_text("utf-8").split())
+    """And no rank that its numbers do not hold."""
+    ranked, words = _published("correction-3")
     score = ranked["corrected"]
     assert f"`fusion` has {score['fusion']:.2f}, and `mono-fusion`, with one camera," in words
     assert f"camera, {score['mono-fusion']:.2f}, which is not significant" in words
@@ -388,17 +397,13 @@ def test_damaged_predictions_are_named(split: Split, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def card() -> DatasetCard:
-    return load_dataset_card("laws")
-
-
-@pytest.fixture(scope="module")
 def readouts() -> Split:
     """Of the card, from a secret: nothing is rendered."""
     return drawn_split(TRACKS["readout-2"], "laws", Secret("a text that nobody can guess"))
 
 
-def test_the_card_draws_laws_and_ratios(card: DatasetCard) -> None:
+def test_the_card_draws_laws_and_ratios() -> None:
+    card = load_dataset_card("laws")
     motions = [card.motion_of(each) for each in card.sequence]
     assert set(Counter(motion.name for motion in motions).values()) == {36} and len(motions) == 180
     assert len({tuple(motion.w) for motion in motions}) == 90  # both sensors see the same
@@ -411,7 +416,7 @@ def test_the_card_draws_laws_and_ratios(card: DatasetCard) -> None:
 
 @pytest.mark.parametrize("limits", ["[0.9, 0.1]", "[0.1, 1.2]", "[0.5, 0.5]"])
 def test_ranges_of_ratios_that_are_none_are_refused(limits: str, tmp_path: Path) -> None:
-    text = (Path(__file__).parents[3] / "cards" / "datasets" / "laws.toml").read_text("utf-8")
+    text = (ROOT / "cards" / "datasets" / "laws.toml").read_text("utf-8")
     path = tmp_path / "wrong.toml"
     path.write_text(text.replace("[0.1, 0.95]", limits), "utf-8")
     assert_refused(run_here("generate", path, "--out", tmp_path / "out"), "readout_range")
@@ -419,15 +424,15 @@ def test_ranges_of_ratios_that_are_none_are_refused(limits: str, tmp_path: Path)
 
 def test_no_constant_wins_the_ratio(readouts: Split, tmp_path: Path) -> None:
     """The best of all constants, found by trying a thousand, has what the oracle has, and that is little."""
-    paths = {path.parent.name: path for path in write_oracles(readouts, tmp_path)}
-    assert list(paths) == ["truth", "constant"]
-    scores = {name: mark(read_submission(path, readouts), readouts)["auc_r10"] for name, path in paths.items()}
+    found = oracle_scores(readouts, tmp_path)
+    assert list(found) == ["truth", "constant"]
+    scores = {name: each["auc_r10"] for name, each in found.items()}
     ratios = np.array([truth.shutter.readout_ratio for truth in readouts.truths])
     tried = [np.mean(np.clip(1.0 - np.abs(ratios - c) / 0.1, 0.0, None)) for c in np.linspace(0.0, 1.0, 1001)]
     assert scores["truth"].mean() == 1.0
     assert max(tried) - 1e-3 <= scores["constant"].mean() + 1e-12 and scores["constant"].mean() < 0.2
     assert best_constant([0.2, 0.21, 0.9]) in (0.2, 0.21)
-    header, *answers = lines_of(paths["constant"])
+    header, *answers = lines_of(tmp_path / "constant" / "predictions.jsonl")
     assert header["uses"] == ["truth"] and len({line["readout_ratio"] for line in answers}) == 1
 
 
@@ -445,7 +450,7 @@ def test_rotation_counts_apart(readouts: Split, tmp_path: Path) -> None:
     for line in lines[1:]:
         turned = so3.exp(np.deg2rad([0.05, 0.0, 0.0])) @ so3.exp(np.array(line["w"]))
         line["w"] = so3.log(turned).tolist()
-    scores = mark(read_submission(write(tmp_path / "a.jsonl", lines), split), split)
+    scores = scores_of(split, lines, tmp_path)
     np.testing.assert_allclose(scores["auc_R"], 0.5, atol=1e-9)
     np.testing.assert_allclose(scores["auc_T"], 1.0, atol=1e-6)  # an angle from its sine and cosine
     np.testing.assert_allclose(scores["auc_apart"], 0.75, atol=1e-6)
@@ -454,12 +459,10 @@ def test_rotation_counts_apart(readouts: Split, tmp_path: Path) -> None:
 
 def test_who_chooses_a_law_runs_on_frames(smoke_dataset: Path, tmp_path: Path) -> None:
     board = ("--board", tmp_path / "board", "--data", smoke_dataset)
-    ran = run_here("leaderboard", "run", "pose-2", "--entry", "rs-stereo-auto", *board)
-    assert ran.returncode == 0, ran.stderr
+    run_entries("pose-2", ["rs-stereo-auto"], *board)
     split = TRACKS["pose-2"].split(smoke_dataset)
-    (entry,) = entries_of(tmp_path / "board", "pose-2", split.name)
+    (entry,) = entered(tmp_path / "board", split).values()
     assert entry.header.motion_model == "chosen" and entry.scores["success"].all()
     assert np.all(entry.scores["e_R_deg"] < [float(truth.facts["rotation_deg"]) for truth in split.truths])
-    site = run_here("leaderboard", "build", "--board", tmp_path / "board", "--out", tmp_path / "site")
-    assert site.returncode == 0, site.stderr
+    leaderboard("build", *board[:2], "--out", tmp_path / "site")
     assert '<td class="text">chosen</td>' in (tmp_path / "site" / "index.html").read_text("utf-8")

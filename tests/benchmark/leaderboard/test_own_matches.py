@@ -10,25 +10,20 @@ import numpy as np
 import pandas as pd
 import pytest
 from analytic_dataset import PLANES, write_analytic_dataset
-from commands import run_here
-from leaderboards import truth_lines, write
+from leaderboards import PLANES as RIG_OF_PLANES
+from leaderboards import entered, leaderboard, run_entries, scores_of, truth_lines, write
 
 from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore
 from rsbench.benchmark.leaderboard.motion_tracks import match_scores
-from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission
-from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.submissions import check_submission
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
-from rsbench.components.motion_models import LinearMotion
-from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.projection import rs_project
-from rsbench.core.rig import VIEWS, StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.rig import VIEWS
 from rsbench.pipeline.problem import COLUMNS
 
-RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
-SHUTTER = RollingShutter(height=80, readout_ratio=0.9)
-MOTION = LinearMotion(np.array([0.01, 0.02, -0.01]), np.array([0.1, -0.05, 0.08]))
+RIG, SHUTTER, MOTION = RIG_OF_PLANES
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +71,7 @@ def test_right_matches_are_counted(split: Split, tmp_path: Path) -> None:
     off[::3, 3] = 2.0
     noise = 0.1 * np.random.default_rng(1).standard_normal(left.shape)
     path = _handed_in(tmp_path, split, {"left": left + off + noise, "stereo_0": stereo})
-    (row,) = mark(read_submission(path, split), split).to_dict("records")
+    (row,) = scores_of(split, path).to_dict("records")
     assert row["matches"] == 2 * len(tracks)
     assert abs(row["matches_1px"] - (1.0 - len(tracks[::3]) / (2 * len(tracks)))) < 0.02
     # Tracks are matches of all four pairs, each once, also where they are repeated.
@@ -88,9 +83,7 @@ def test_right_matches_are_counted(split: Split, tmp_path: Path) -> None:
 
 
 def test_motions_without_matches_have_none(split: Split, tmp_path: Path) -> None:
-    (row,) = mark(read_submission(write(tmp_path / "x.jsonl", truth_lines(split)), split), split).to_dict(
-        "records"
-    )
+    (row,) = scores_of(split, truth_lines(split), tmp_path).to_dict("records")
     assert np.isnan(row["matches"]) and np.isnan(row["matches_1px"]) and row["auc_1"] > 1.0 - 1e-6
     (truth,) = split.truths
     assert truth.sequence is not None
@@ -108,53 +101,34 @@ def test_matches_are_kept_with_the_entry(split: Split, tmp_path: Path) -> None:
 
 def test_what_comes_with_rsbench_finds_its_own_matches(smoke_dataset: Path, tmp_path: Path) -> None:
     """The matches of ``rsbench correct``, which are handed in, and the law that they ask for."""
-    board = ["--board", tmp_path / "board", "--data", smoke_dataset]
-    entries = ["--entry", "rs-stereo-auto", "--entry", "gs-8pt"]
-    ran = run_here("leaderboard", "run", "pose-own", *entries, *board)
-    assert ran.returncode == 0, ran.stderr
-    split = TRACKS["pose-own"].split(smoke_dataset)
-    baseline, ours = entries_of(tmp_path / "board", "pose-own-1", split.name)
-    assert (ours.header.method, baseline.header.method) == ("rs-stereo-auto", "gs-8pt")
+    board = ("--board", tmp_path / "board", "--data", smoke_dataset)
+    run_entries("pose-own", ["rs-stereo-auto", "gs-8pt"], *board)
+    found = entered(tmp_path / "board", TRACKS["pose-own"].split(smoke_dataset))
+    ours, baseline = found["rs-stereo-auto"], found["gs-8pt"]
     assert "images" in ours.header.uses and "matches/tracks.csv" in ours.files
     assert ours.scores["matches"].min() > 50 and ours.scores["matches_1px"].min() > 0.7
     assert ours.scores["e_R_deg"].median() < 0.5 * baseline.scores["e_R_deg"].median()
 
 
+def _table(*rows: str, head: str = "name,x0,y0,x1,y1") -> Callable[[Path], object]:
+    """Of left matches, by lines below a head."""
+    return lambda folder: (folder / "left.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "another file": (
-        lambda p: (p / "evil.csv").write_text("x"),
-        "evil.csv: does not belong here; there are: left.csv",
-    ),
+    "another file": (lambda p: (p / "evil.csv").touch(), "evil.csv: does not belong here; there are: left.csv"),
     "a link": (lambda p: (p / "right.csv").symlink_to(p / "left.csv"), "right.csv: must be a file of its own"),
     "nothing": (lambda p: (p / "left.csv").unlink(), "matches: must be a folder with some of"),
-    "no columns": (lambda p: (p / "left.csv").write_text("name,x\nplanes,1\n"), "lacks the column 'x0'"),
-    "text": (lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,a\n"), "must hold numbers"),
-    "NaN": (
-        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,nan\n"),
-        "left.csv:2: must hold",
-    ),
-    "infinity": (lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,inf\n"), "finite pixels"),
-    "another problem": (
-        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\n../x,1,2,3,4\n"),
-        "name = '../x': is no problem",
-    ),
-    "truth values": (
-        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,True,False,True,True\n"),
-        "must hold numbers",
-    ),
-    "a column twice": (
-        lambda p: (p / "left.csv").write_text("name,x0,x0,y0,x1,y1\n"),
-        "'x0.1' does not belong here",
-    ),
-    "an open quote": (lambda p: (p / "left.csv").write_text('name,x0,y0,x1,y1\n"planes'), "not a table"),
-    "rows that are too long": (
-        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\nplanes,1,2,3,4,5,6\n"),
-        "name =",
-    ),
-    "more than pixels": (
-        lambda p: (p / "left.csv").write_text("name,x0,y0,x1,y1\n" + "planes,1,2,3,4\n" * 7681),
-        "7681 matches of planes: more than pixels, 7680",
-    ),
+    "no columns": (_table("planes,1", head="name,x"), "lacks the column 'x0'"),
+    "text": (_table("planes,1,2,3,a"), "must hold numbers"),
+    "NaN": (_table("planes,1,2,3,nan"), "left.csv:2: must hold"),
+    "infinity": (_table("planes,1,2,3,inf"), "finite pixels"),
+    "another problem": (_table("../x,1,2,3,4"), "name = '../x': is no problem"),
+    "truth values": (_table("planes,True,False,True,True"), "must hold numbers"),
+    "a column twice": (_table(head="name,x0,x0,y0,x1,y1"), "'x0.1' does not belong here"),
+    "an open quote": (_table('"planes'), "not a table"),
+    "rows that are too long": (_table("planes,1,2,3,4,5,6"), "name ="),
+    "more than pixels": (_table(*7681 * ["planes,1,2,3,4"]), "7681 matches of planes: more than pixels, 7680"),
     "other bytes": (lambda p: (p / "left.csv").write_bytes(b"\xff\xfe\x00"), "is UTF-16 text"),
 }
 
@@ -172,11 +146,11 @@ def test_given_matches_are_in_the_form_of_own_ones(smoke_dataset: Path, tmp_path
     """What ``export pose`` writes may be handed in as it is: most of rsbench's matches are right."""
     split = TRACKS["pose-own"].split(smoke_dataset)
     out = tmp_path / "inputs"
-    assert run_here("leaderboard", "export", "pose", "--data", smoke_dataset, "--out", out).returncode == 0
+    leaderboard("export", "pose", "--data", smoke_dataset, "--out", out)
     (tmp_path / "matches").mkdir()
     for key in COLUMNS:
         if (out / f"{key}.csv").exists():
             (out / f"{key}.csv").rename(tmp_path / "matches" / f"{key}.csv")
     path = write(tmp_path / "predictions.jsonl", truth_lines(split))
-    scores = mark(read_submission(path, split), split)
+    scores = scores_of(split, path)
     assert np.all(scores["matches"] > 50) and np.all(scores["matches_1px"] > 0.7), json.dumps(scores.to_dict())

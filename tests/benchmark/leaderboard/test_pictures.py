@@ -20,7 +20,19 @@ import numpy as np
 import pandas as pd
 import pytest
 from analytic_dataset import write_analytic_dataset
-from leaderboards import ASK_PICTURES, PLANES, Line, files_below, lines_of, named, pictures_of, write
+from leaderboards import (
+    ASK_PICTURES,
+    PLANES,
+    Line,
+    entered,
+    files_below,
+    lines_of,
+    named,
+    pictures_of,
+    scores_of,
+    small_split,
+    write,
+)
 
 from rsbench.benchmark.leaderboard.board import add, entries_of, merge, place, rescore
 from rsbench.benchmark.leaderboard.picture_track import PictureTrack
@@ -28,12 +40,11 @@ from rsbench.benchmark.leaderboard.pictures import PARTINGS, WINDOW, columns, te
 from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import (
     check_submission,
-    read_submission,
     write_oracles,
     write_template,
     write_truth,
 )
-from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
@@ -41,10 +52,6 @@ from rsbench.report.board_page import albums, entry_context, read_split
 from rsbench.storage.files import read_depth, read_png, read_table, write_depth, write_exr, write_png
 
 RIG, SHUTTER, MOTION = PLANES
-
-
-def _scores(path: Path, split: Split) -> pd.DataFrame:
-    return mark(read_submission(path, split), split)
 
 
 def _each_depth(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
@@ -62,30 +69,27 @@ def _each_frame(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
 # Scores
 
 
-@pytest.mark.parametrize("track", ASK_PICTURES)
+@pytest.mark.parametrize("track", [*ASK_PICTURES, "points"])
 def test_the_truth_is_best_and_nothing_is_worst(track: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """No score of any other lies outside; the order of answers does not matter."""
-    split = splits[track]
+    split = splits[track] if track in splits else small_split()
     two = islice(write_oracles(split, tmp_path), 2)  # the third takes seconds, and is scored below
-    found = {path.parent.name: _scores(path, split) for path in two}
+    found = {path.parent.name: scores_of(split, path) for path in two}
     path = tmp_path / "truth" / "predictions.jsonl"
     head, *answers = lines_of(path)
     write(path, [head, *random.Random(1).sample(answers, len(answers))])
-    pd.testing.assert_frame_equal(_scores(path, split), found["truth"])
-    empty = _scores(write(tmp_path / "empty.jsonl", [head]), split)
-    failed = [{**answer, "success": False} for answer in answers]
-    pd.testing.assert_frame_equal(_scores(write(tmp_path / "failed.jsonl", [head, *failed]), split), empty)
+    pd.testing.assert_frame_equal(scores_of(split, path), found["truth"])
+    empty = scores_of(split, [head], tmp_path)
+    failed = [head, *({"name": answer["name"], "success": False, "reason": "no"} for answer in answers)]
+    pd.testing.assert_frame_equal(scores_of(split, failed, tmp_path), empty)
     for score in split.track.scores:
-        best, worst = ((score.sign * found["truth"][score.key]), (score.sign * empty[score.key]))
-        if score.key == "seconds":
-            continue
-        assert np.all(best >= worst)
-        for other in found.values():
+        best, worst = (score.sign * each[score.key] for each in (found["truth"], empty))
+        for other in found.values() if score.key != "seconds" else ():
             value = score.sign * other[score.key]
-            assert np.all((value <= best) & (value >= worst)), score.key
-    primary = split.track.primary
-    assert np.all(found["truth"][primary.key] == (1.0 if primary.better == "higher" else 0.0))
-    assert found["truth"][split.track.error].max() == 0.0 and empty[split.track.error].min() == 1.0
+            assert np.all((value <= best + 1e-9) & (value >= worst)) and np.all(best >= worst), score.key
+    primary, error = split.track.primary, split.track.error
+    np.testing.assert_allclose(found["truth"][primary.key], float(primary.better == "higher"), atol=1e-6)
+    assert found["truth"][error].max() < 1e-5 and empty[error].min() == (180.0 if track == "points" else 1.0)
 
 
 def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: Path) -> None:
@@ -97,7 +101,7 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
     known = rng.random((80, 96)) > 0.2
     product = RIG.camera.fx * RIG.baseline
     _each_depth(path, lambda z: np.where(known, product / np.maximum(product / z + off, 0.1), 0.0))
-    scores = _scores(path, split)
+    scores = scores_of(split, path)
     for number, truth in enumerate(split.truths):
         assert truth.pictures is not None
         z = truth.pictures.depth().astype(np.float64)
@@ -123,11 +127,13 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
 def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: Path) -> None:
     """Ten steps of grey everywhere, a picture that is moved by two pixels, and one that is half drawn."""
     split = splits["correction"]
-    brighter = _scores(_each_frame(write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10)), split)
+    brighter = scores_of(
+        split, _each_frame(write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10))
+    )
     for name in ("psnr", "psnr_all", "psnr_covered", "psnr_first", "psnr_middle"):
         np.testing.assert_allclose(brighter[name], 20.0 * np.log10(25.5), rtol=1e-9)
-    moved = _scores(
-        _each_frame(write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1)), split
+    moved = scores_of(
+        split, _each_frame(write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1))
     )
     assert np.all(np.abs(moved["epe_px"] - 2.0) < 0.3)  # dense flow is some tenths of a pixel wrong
     assert np.all(moved["ssim"] < brighter["ssim"])
@@ -137,7 +143,7 @@ def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: 
         alpha = np.zeros(image.shape[:2], np.uint8)
         alpha[:40] = 255
         cv2.imwrite(str(picture), np.dstack([image[..., ::-1], alpha]))
-    half = _scores(path, split)
+    half = scores_of(split, path)
     assert np.all(half["ssim_covered"] == 1.0) and np.all(np.isinf(half["psnr_covered"]))
     assert np.all(half["psnr_all"] < 12.0)
     for truth, share in zip(split.truths, half["coverage"], strict=True):
@@ -185,12 +191,10 @@ FRAME_SLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @pytest.mark.parametrize("words", [*DEPTH_SLIPS, *FRAME_SLIPS])
 def test_slips_are_told(words: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """And of a secret truth only what needs no truth."""
-    split = splits["depth" if words in DEPTH_SLIPS else "correction"]
+    is_depth = words in DEPTH_SLIPS
+    split = splits["depth" if is_depth else "correction"]
     path = write_truth(split, tmp_path)
-    if words in DEPTH_SLIPS:
-        _each_depth(path, DEPTH_SLIPS[words])
-    else:
-        _each_frame(path, FRAME_SLIPS[words])
+    (_each_depth if is_depth else _each_frame)(path, (DEPTH_SLIPS | FRAME_SLIPS)[words])
     (note,) = check_submission(path, split).notes
     assert words in note
     blind = check_submission(path, replace(split, public=False)).notes
@@ -240,7 +244,7 @@ def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path)
     write(path, [head, *answers])
     assert "png_unit_m" in check_submission(path, split).faults[0]
     write(path, [{**head, "png_unit_m": 0.001}, *answers])
-    scores = _scores(path, split)
+    scores = scores_of(split, path)
     assert scores["bad_1"].max() == 0.0 and 0.0 < scores["rmse_m"].max() < 0.0005
 
 
@@ -253,18 +257,15 @@ def _submitted(board: Path, split: Split, folder: Path, method: str, factor: flo
     add(board, write(path, [{**head, "method": method, "uses": ["images"]}, *answers]), split, {})
 
 
-def test_entries_stand_alone_copies_tie_and_boards_merge(splits: dict[str, Split], tmp_path: Path) -> None:
+def test_copies_tie_and_boards_merge(splits: dict[str, Split], tmp_path: Path) -> None:
     split, board, other = splits["depth"], tmp_path / "board", tmp_path / "other"
-    _submitted(board, split, tmp_path, "a", 1.2)
-    (alone,) = entries_of(board, "depth-1", split.name)
-    _submitted(board, split, tmp_path, "b", 1.01)
-    _submitted(other, split, tmp_path, "copy", 1.2)
+    for where, name, factor in ((board, "a", 1.2), (board, "b", 1.01), (other, "copy", 1.2)):
+        _submitted(where, split, tmp_path, name, factor)
     assert merge(other, board) == [f"depth-1/{split.name}/copy"]
-    found = {line.scored.header.method: line for line in standings(entries_of(board, "depth-1", split.name))}
-    pd.testing.assert_frame_equal(found["a"].scored.scores, alone.scores)
+    found = {line.scored.header.method: line for line in standings([*entered(board, split).values()])}
     assert next(iter(found)) == "b" and found["a"].rank == found["copy"].rank and "copy" in found["a"].ties
-    assert sorted(alone.files) == ["pictures/planes.0/left_1.exr", "pictures/planes.1/left_1.exr"]
-    assert rescore(board, split) == {}
+    files = ["pictures/planes.0/left_1.exr", "pictures/planes.1/left_1.exr"]
+    assert sorted(found["copy"].scored.files) == files and rescore(board, split) == {}
     with pytest.raises(RsbenchError, match="with other predictions"):
         _submitted(board, split, tmp_path / "again", "a", 1.3)
 
@@ -308,7 +309,7 @@ def test_another_dataset_is_another_split(planes: Path, splits: dict[str, Split]
     true = tmp_path / "planes" / "rs_depth" / "left_2.exr"
     write_depth(true, 1.01 * read_depth(true))
     with pytest.raises(RsbenchError, match=r"left_2\.exr: is not the file that dataset\.json names"):
-        _scores(path, split)
+        scores_of(split, path)
 
 
 def test_cameras_of_other_kinds_are_refused(planes: Path, tmp_path: Path) -> None:
@@ -319,24 +320,17 @@ def test_cameras_of_other_kinds_are_refused(planes: Path, tmp_path: Path) -> Non
         TRACKS["depth"].split(tmp_path / "copy")
 
 
-def _png(
-    width: int, height: int, bits: int, colour: int, body: bytes = b"", more: tuple[tuple[bytes, bytes], ...] = ()
-) -> bytes:
+def _header(width: int = 96, height: int = 80, bits: int = 8, colour: int = 2) -> bytes:
+    return struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+
+
+def _png(*more: tuple[bytes, bytes], header: bytes = _header(), body: bytes = b"") -> bytes:
     """``more``: chunks between the header and the pixels."""
-    chunks = (
-        (b"IHDR", _header(width, height, bits, colour)),
-        *more,
-        (b"IDAT", zlib.compress(body)),
-        (b"IEND", b""),
-    )
+    chunks = ((b"IHDR", header), *more, (b"IDAT", zlib.compress(body)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in chunks
     )
-
-
-def _header(width: int, height: int, bits: int, colour: int) -> bytes:
-    return struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
 
 
 def _with_hole(value: float) -> Callable[[Path], None]:
@@ -367,25 +361,24 @@ def _link(picture: Path) -> None:
     picture.symlink_to(other)
 
 
-def _circle(picture: Path) -> None:
-    picture.unlink()
-    picture.symlink_to(picture)
-
-
 def _linked_folder(picture: Path) -> None:
     other = picture.parents[3] / "secret"
     picture.parent.rename(other)
     picture.parent.symlink_to(other)
 
 
-def _pipe(picture: Path) -> None:
-    picture.unlink()
-    os.mkfifo(picture)
+def _written(data: bytes) -> Callable[[Path], object]:
+    return lambda picture: picture.write_bytes(data)
 
 
-def _fault_folder(picture: Path) -> None:
-    picture.unlink()
-    picture.mkdir()
+def _replaced(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    """By what ``make`` puts in the place of a picture."""
+
+    def damage(picture: Path) -> None:
+        picture.unlink()
+        make(picture)
+
+    return damage
 
 
 DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
@@ -401,9 +394,9 @@ DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a file among folders": (lambda p: (p.parents[1] / "planes.1x").write_text("x"), "planes.1x: is no problem"),
     "a link": (_link, "left_1.exr: must be a file of its own, no link"),
     "a linked folder": (_linked_folder, "planes.0: must be a folder of its own, no link"),
-    "a circle": (_circle, "must be a file of its own, no link"),
-    "a pipe": (_pipe, "must be a file of its own"),
-    "a folder": (_fault_folder, "must be a file of its own"),
+    "a circle": (_replaced(lambda p: p.symlink_to(p)), "must be a file of its own, no link"),
+    "a pipe": (_replaced(lambda p: os.mkfifo(p)), "must be a file of its own"),
+    "a folder": (_replaced(lambda p: p.mkdir()), "must be a file of its own"),
     "1 GB": (lambda p: os.truncate(p, 1 << 30), "bytes: 1073741824 is more than"),
     "no EXR": (lambda p: p.write_bytes(b"PK\x03\x04" + bytes(100)), "damaged or not an EXR file"),
     "half a file": (lambda p: os.truncate(p, 500), "left_1.exr: "),
@@ -424,6 +417,12 @@ DEPTH_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "negative": (_with_hole(-1.0), "1 pixels are negative"),
     "beyond the universe": (_with_hole(1e30), "1 pixels are above 1e+09 m"),
 }
+DAMAGED, UNFOLDS = "is a damaged PNG file", b"x\0\0" + zlib.compress(bytes(1 << 22))
+TOO_LARGE = f"{DAMAGED}: Decompressed data too large"
+FILM = (
+    (b"acTL", struct.pack(">II", 2, 0)),
+    (b"fcTL", struct.pack(">IIIIIHHBB", 0, 60000, 60000, 0, 0, 1, 1, 0, 0)),
+)
 FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a JPEG": (lambda p: p.write_bytes(cv2.imencode(".jpg", np.ones((80, 96, 3)))[1].tobytes()), "is no PNG file"),
     "16 bits": (
@@ -431,49 +430,23 @@ FRAME_FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         "is RGB of 16 bits: must be RGB or",
     ),
     "grey": (lambda p: cv2.imwrite(str(p), np.ones((80, 96), np.uint8)), "is grey of 8 bits: must be RGB or RGBA"),
-    "a palette": (lambda p: p.write_bytes(_png(96, 80, 8, 3)), "is palette of 8 bits"),
-    "no colour type": (lambda p: p.write_bytes(_png(96, 80, 8, 77)), "is unknown of 8 bits"),
+    "a palette": (_written(_png(header=_header(colour=3))), "is palette of 8 bits"),
+    "no colour type": (_written(_png(header=_header(colour=77))), "is unknown of 8 bits"),
     "another size": (lambda p: write_png(p, np.zeros((80, 95, 3), np.uint8)), "is 95 x 80 pixels"),
-    "a huge image": (
-        lambda p: p.write_bytes(_png(2**31 - 1, 2**31 - 1, 8, 2)),
-        "is 2147483647 x 2147483647 pixels",
-    ),
+    "a huge image": (_written(_png(header=_header(2**31 - 1, 2**31 - 1))), "is 2147483647 x 2147483647 pixels"),
     # 64 million pixels pass Pillow's own limit.
-    "a second header": (
-        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"IHDR", _header(8000, 8000, 8, 2)),))),
-        "its headers differ: 8000 x 8000 pixels",
-    ),
+    "a second header": (_written(_png((b"IHDR", _header(8000, 8000)))), "its headers differ: 8000 x 8000 pixels"),
     "a second kind": (
-        lambda p: p.write_bytes(_png(96, 80, 8, 2, bytes(97 * 80), ((b"IHDR", _header(96, 80, 8, 0)),))),
+        _written(_png((b"IHDR", _header(colour=0)), body=bytes(97 * 80))),
         "is RGB of 8 bits, and holds something else",
     ),
-    "a text that unfolds": (
-        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"zTXt", b"x\0\0" + zlib.compress(bytes(1 << 22))),))),
-        "is a damaged PNG file: Decompressed data too large",
-    ),
-    "a profile that unfolds": (
-        lambda p: p.write_bytes(_png(96, 80, 8, 2, more=((b"iCCP", b"x\0\0" + zlib.compress(bytes(1 << 22))),))),
-        "is a damaged PNG file: Decompressed data too large",
-    ),
-    "a film of huge pictures": (
-        lambda p: p.write_bytes(
-            _png(
-                96,
-                80,
-                8,
-                2,
-                more=(
-                    (b"acTL", struct.pack(">II", 2, 0)),
-                    (b"fcTL", struct.pack(">IIIIIHHBB", 0, 60000, 60000, 0, 0, 1, 1, 0, 0)),
-                ),
-            )
-        ),
-        "is a damaged PNG file",
-    ),
+    "a text that unfolds": (_written(_png((b"zTXt", UNFOLDS))), TOO_LARGE),
+    "a profile that unfolds": (_written(_png((b"iCCP", UNFOLDS))), TOO_LARGE),
+    "a film of huge pictures": (_written(_png(*FILM)), DAMAGED),
     "another check sum": (lambda p: p.write_bytes(p.read_bytes()[:29] + b"abcd" + p.read_bytes()[33:]), "damaged"),
-    "no pixels": (lambda p: p.write_bytes(_png(96, 80, 8, 2)), "is a damaged PNG file"),
-    "only a header": (lambda p: p.write_bytes(_png(96, 80, 8, 2)[:30]), "is no PNG file"),
-    "nothing": (lambda p: p.write_bytes(b""), "is no PNG file"),
+    "no pixels": (_written(_png()), DAMAGED),
+    "only a header": (lambda p: p.write_bytes(_png()[:30]), "is no PNG file"),
+    "nothing": (_written(b""), "is no PNG file"),
     "the middle is missing": (
         lambda p: p.with_name("left_1_middle.png").unlink(),
         "left_1_middle.png: is missing",
@@ -552,7 +525,7 @@ def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path
         z[40:] = product / (product / z[40:] + 1.5)
         z[:, 7] = 0.0
         write_depth(picture, z.astype(np.float32))
-    scores = mark(read_submission(path, split), split)
+    scores = scores_of(split, path)
     assert np.all(scores["bad_1_rows_1"] == 1 / 96) and np.all(scores["bad_1_rows_5"] == 1.0)
     for number, truth in enumerate(split.truths):
         assert truth.pictures is not None
@@ -572,7 +545,7 @@ def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path:
     off[50:] *= 9
     for picture in pictures_of(path):
         write_png(picture, ((read_png(picture) + off) % 256).astype(np.uint8))
-    scores = mark(read_submission(path, split), split)
+    scores = scores_of(split, path)
     for number, truth in enumerate(split.truths):
         assert truth.pictures is not None
         parts = dict[str, list[float]]()
@@ -598,8 +571,8 @@ def test_a_failure_is_the_worst_in_the_same_parts(
 ) -> None:
     split = splits[track]
     path = write_truth(split, tmp_path)
-    right = mark(read_submission(path, split), split)
-    failed = mark(read_submission(write(_folder(tmp_path / "none") / "x.jsonl", lines_of(path)[:1]), split), split)
+    right = scores_of(split, path)
+    failed = scores_of(split, lines_of(path)[:1], _folder(tmp_path / "none"))
     for parting in PARTINGS:
         for name in columns(cast(PictureTrack, split.track).part_score, parting):
             assert list(right[name].isna()) == list(failed[name].isna())

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run_here
-from leaderboards import lines_of, truth_lines, write
+from leaderboards import leaderboard, lines_of, oracle_scores, scores_of, truth_lines
 from scipy.spatial.transform import Rotation
 from small_scenes import write_box_scene
 
 from rsbench.benchmark.leaderboard.rig_tracks import LOOSE, left_camera_motion, loose_of
-from rsbench.benchmark.leaderboard.submissions import read_submission, write_oracles
-from rsbench.benchmark.leaderboard.track import mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.cards import list_cards
 from rsbench.components.motion_models import TwistMotion
@@ -84,19 +81,19 @@ def test_the_truth_is_exact_with_both_calibrations_and_no_other_axes(rigs: Path,
     names = [truth.name for truth in split.truths]
     assert names == ["shuttum-vertical", f"shuttum-vertical{LOOSE}", "zed2", f"zed2{LOOSE}"]
     lines = truth_lines(split)
-    found = mark(read_submission(write(tmp_path / "true.jsonl", lines), split), split)
+    found = scores_of(split, lines, tmp_path)
     assert list(found["calibration"]) == ["true", "loose"] * 2
     assert np.all(found["e_R_deg"] < 1e-9) and np.all(found["e_T_deg"] < 1e-9)
     # The true motion in the axes of the true calibration, given for the loose one, is off by what these differ.
     lines[2]["w"], lines[2]["d"] = lines[1]["w"], lines[1]["d"]
-    found = mark(read_submission(write(tmp_path / "mixed.jsonl", lines), split), split)
+    found = scores_of(split, lines, tmp_path)
     assert 0.01 < found["e_T_deg"][1] < 1.0 and found["e_T_deg"][0] < 1e-9
 
 
 def test_methods_are_given_the_loose_calibration_and_never_the_true_one(rigs: Path, tmp_path: Path) -> None:
     for track in ("pose-rigs", "correction-rigs"):
         out = tmp_path / track
-        assert run_here("leaderboard", "export", track, "--data", rigs, "--out", out, "--secret").returncode == 0
+        leaderboard("export", track, "--data", rigs, "--out", out, "--secret")
         given = {line["name"]: line for line in lines_of(out / "problems.jsonl")}
         split = TRACKS[track].split(rigs)
         for truth in split.truths:
@@ -109,9 +106,7 @@ def test_methods_are_given_the_loose_calibration_and_never_the_true_one(rigs: Pa
 def test_frames_are_of_the_sequences_whose_left_camera_rolls(rigs: Path, tmp_path: Path) -> None:
     split = TRACKS["correction-rigs"].split(rigs)
     assert [truth.name for truth in split.truths] == ["zed2", f"zed2{LOOSE}"]
-    found = {
-        path.parent.name: mark(read_submission(path, split), split) for path in write_oracles(split, tmp_path)
-    }
+    found = oracle_scores(split, tmp_path)
     assert list(found["truth"]["calibration"]) == ["true", "loose"]
     assert np.all(found["truth"]["picture"] > 1.0 - 1e-9) and np.all(found["truth"]["corrected"] > 0.99)
     assert np.all(found["fusion-true"]["corrected"] > found["uncorrected"]["corrected"])

@@ -14,7 +14,19 @@ import pandas as pd
 import pytest
 from analytic_dataset import write_analytic_dataset
 from commands import assert_refused, run_here
-from leaderboards import ASK_PICTURES, PLANES, files_below, jobs_here, lines_of, named, pictures_of, write
+from leaderboards import (
+    ASK_PICTURES,
+    PLANES,
+    entered,
+    files_below,
+    jobs_here,
+    leaderboard,
+    lines_of,
+    named,
+    pictures_of,
+    run_entries,
+    write,
+)
 
 from rsbench.benchmark.leaderboard import motion_tracks, running
 from rsbench.benchmark.leaderboard.board import (
@@ -50,19 +62,17 @@ def test_cards_run_and_go_on(
     """Through the command line; what is lost is made again, to the last digit, and a solver is no matcher."""
     monkeypatch.setattr(running, "finished_jobs", jobs_here)
     where = ("--data", smoke_dataset, "--board", tmp_path / "board")
-    cards = [word for entry in entries for word in ("--entry", entry)]
     assert_refused(run_here("leaderboard", "run", track, *where, "--entry", "gs-8pt"), "gs-8pt")
-    ran = run_here("leaderboard", "run", track, *where, *cards)
-    assert ran.returncode == 0, ran.stderr
-    assert run_here("leaderboard", "oracles", track, *where).returncode == 0
+    run_entries(track, entries, *where)
+    leaderboard("oracles", track, *where)
     split = TRACKS[track].split(smoke_dataset)
-    found = {e.header.method: e for e in entries_of(tmp_path / "board", split.track.id, split.name)}
+    found = entered(tmp_path / "board", split)
     assert {*entries, "truth"} < set(found)
     made = tmp_path / "board" / ".rsbench" / "runs" / split.track.id / split.name / entries[0]
     first = {path.name: path.read_bytes() for path in pictures_of(made / "x")}
     (made / "answers" / "castle.json").unlink()
     (made / "pictures" / "castle").rename(tmp_path / "lost")
-    assert run_here("leaderboard", "run", track, *where, *cards).returncode == 0
+    run_entries(track, entries, *where)
     assert {path.name: path.read_bytes() for path in pictures_of(made / "x")} == first
     if track == "depth":
         assert np.all(found["sgm"].scores["bad_1"] < 0.5 * found["constant"].scores["bad_1"])
@@ -101,11 +111,9 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
             f'class = "level_matcher:Level"\nparameters = {{ px = {px} }}\n', "utf-8"
         )
     where = ("--data", planes, "--board", tmp_path / "board")
-    cards = [word for name in ("level", "odd") for word in ("--entry", tmp_path / f"{name}.toml")]
-    ran = run_here("leaderboard", "run", "depth", *where, *cards)
-    assert ran.returncode == 0, ran.stderr
+    run_entries("depth", [tmp_path / "level.toml", tmp_path / "odd.toml"], *where)
     split = TRACKS["depth"].split(planes)
-    found = {e.header.method: e for e in entries_of(tmp_path / "board", "depth-1", split.name)}
+    found = entered(tmp_path / "board", split)
     depth = read_depth(found["level"].folder / "pictures" / "planes.0" / "left_1.exr")
     np.testing.assert_allclose(depth, RIG.camera.fx * RIG.baseline / 5.0, rtol=1e-6)
     assert found["level"].header.code == "" and found["level"].header.uses == ("images", "stereo")
@@ -125,11 +133,11 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
 @pytest.mark.parametrize("track", ASK_PICTURES)
 def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None:
     """Of a public split the truth, which is in order as it stands; of a secret one none of its files."""
-    export = ("leaderboard", "export", track, "--data", planes, "--out")
-    assert run_here(*export, tmp_path / "open").returncode == 0
+    export = ("export", track, "--data", planes, "--out")
+    leaderboard(*export, tmp_path / "open")
     split = TRACKS[track].split(planes)
     assert check_submission(tmp_path / "open" / "truth.jsonl", split).faults == ()
-    assert run_here(*export, tmp_path / "closed", "--secret").returncode == 0
+    leaderboard(*export, tmp_path / "closed", "--secret")
     told = set(files_below(tmp_path / "closed").values())
     for truth in split.truths:
         assert truth.pictures is not None
@@ -207,10 +215,8 @@ def test_a_method_that_takes_too_much_fails_alone(
         f'class = "{module}:{CLASSES[track]}"\ntime_limit_s = 300\nparameters = {{ mood = "{mood}" }}\n', "utf-8"
     )
     where = ("--data", planes, "--board", tmp_path / "board")
-    ran = run_here("leaderboard", "run", track, *where, "--entry", card, *limit)
-    assert ran.returncode == 0, ran.stderr
-    split = TRACKS[track].split(planes)
-    (found,) = entries_of(tmp_path / "board", split.track.id, split.name)
+    run_entries(track, [card], *where, *limit)
+    (found,) = entered(tmp_path / "board", TRACKS[track].split(planes)).values()
     first, second = lines_of(found.folder / "predictions.jsonl")[1:]
     assert words in str(first["reason"]) and mood in str(first["reason"])
     assert "reason" not in second
@@ -228,12 +234,8 @@ def test_two_processes_give_the_bytes_of_one(splits: dict[str, Split], tmp_path:
     path = write(path, named(lines, "noisy", ("images",)))
     for workers in (1, 2):
         add(tmp_path / str(workers), path, split, {}, workers=workers)
-    for name in FILES:
-        one, two = (
-            (tmp_path / str(workers) / split.track.id / split.name / "entries" / "noisy" / name).read_bytes()
-            for workers in (1, 2)
-        )
-        assert one == two
+    one, two = (entered(tmp_path / each, split)["noisy"].folder for each in ("1", "2"))
+    assert all((one / name).read_bytes() == (two / name).read_bytes() for name in FILES)
     assert rescore(tmp_path / "2", split) == {}
 
 
@@ -249,12 +251,10 @@ def test_entries_that_are_scored_together_score_as_alone(
         add(tmp_path / "alone", path, split, {"command": ORACLES})
     for workers in (1, 2):
         add_all(tmp_path / str(workers), paths, split, {"command": ORACLES}, workers=workers)
-        for path in paths:
-            alone, together = (
-                tmp_path / each / split.track.id / split.name / "entries" / path.parent.name / "scores.csv"
-                for each in ("alone", str(workers))
-            )
-            assert alone.read_bytes() == together.read_bytes()
+        alone, together = (entered(tmp_path / each, split) for each in ("alone", str(workers)))
+        for name, entry in alone.items():
+            table = (entry.folder / "scores.csv").read_bytes()
+            assert table == (together[name].folder / "scores.csv").read_bytes()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -294,8 +294,7 @@ def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Spl
     write_depth(pictures_of(paths[0])[0], np.full((80, 96), -1.0, dtype=np.float32))
     with pytest.raises(RsbenchError, match=r"left_1\.exr: 7680 pixels are negative"):
         add_all(tmp_path / "board", paths, split, {"command": ORACLES})
-    (entry,) = entries_of(tmp_path / "board", split.track.id, split.name)
-    assert entry.header.method == "constant"
+    assert [*entered(tmp_path / "board", split)] == ["constant"]
 
 
 def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_path: Path) -> None:
@@ -351,10 +350,7 @@ def test_one_command_makes_all_boards_and_goes_on(tmp_path: Path, monkeypatch: p
     split = TRACKS["pose-2"].split(frames)
     restore(folder / "predictions" / "pose-2", split, tmp_path / "again")
     first, again = (
-        {
-            each.header.method: each.scores["auc_apart"].to_list()
-            for each in entries_of(board, "pose-2", split.name)
-        }
+        {name: each.scores["auc_apart"].to_list() for name, each in entered(board, split).items()}
         for board in (data / "laws", tmp_path / "again")
     )
     assert first == again and len(first) == 3
@@ -379,9 +375,8 @@ def test_the_first_problems_are_a_split_of_their_own_ranked_beside_stored_entrie
     truth = write_truth(split, tmp_path / "truth")
     (stored / "truth.jsonl.xz").write_bytes(lzma.compress(truth.read_bytes()))
     where = ("--entry", "gs-8pt", "--board", board, "--beside", stored, "--workers", "1")
-    ran = run_here("leaderboard", "run", "points", *where, "--problems", "3")
-    assert ran.returncode == 0, ran.stderr
-    assert "oracle" in ran.stdout and "gs-8pt" in ran.stdout
+    shown = leaderboard("run", "points", *where, "--problems", "3")
+    assert "oracle" in shown and "gs-8pt" in shown
     ((protocol, name),) = splits_of(board)
     assert name != split.name
     (entry,) = entries_of(board, protocol, name)  # what is stored is beside the board, not on it

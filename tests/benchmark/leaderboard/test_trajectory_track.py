@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from analytic_dataset import write_analytic_dataset
 from commands import assert_refused, run_here
-from leaderboards import Line, lines_of, named, truth_lines, write
+from leaderboards import Line, entered, leaderboard, lines_of, named, run_entries, scores_of, truth_lines, write
 
-from rsbench.benchmark.leaderboard.board import entries_of
 from rsbench.benchmark.leaderboard.publishing import drawn_split
 from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_truth
-from rsbench.benchmark.leaderboard.track import Split, mark
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.benchmark.trajectory_scores import METHODS
 from rsbench.core import so3
@@ -59,15 +58,14 @@ def _poses(tau: FloatArray, invert: bool = False, turn: FloatArray | None = None
 
 def _scored(split: Split, folder: Path, **answer: Any) -> dict[str, Any]:
     lines = named(truth_lines(split), "mine")
-    path = write(folder / "mine.jsonl", [lines[0], {"name": lines[1]["name"], **answer}])
-    row = mark(read_submission(path, split), split).iloc[0]
+    row = scores_of(split, [lines[0], {"name": lines[1]["name"], **answer}], folder).iloc[0]
     return {str(key): row[key] for key in row.index}
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.6, 1.0])
 def test_the_truth_has_the_best_of_everything(tmp_path: Path, ratio: float) -> None:
     split = TRACK.split(_dataset(tmp_path / "data", ratio=ratio))
-    row = mark(read_submission(write_truth(split, tmp_path), split), split).iloc[0]
+    row = scores_of(split, write_truth(split, tmp_path)).iloc[0]
     assert row["auc_way"] > 1.0 - 1e-6 and row["auc_rows"] > 1.0 - 1e-6 and row["failure"] == 0.0
     assert row["way_95_deg"] < 1e-6 and row["ate_mm"] < 1e-4 and row["rpe_mm"] < 1e-4
     # Of points between the lines that are told: a spline through them.
@@ -93,7 +91,7 @@ def test_one_pose_a_frame_misses_the_shake_within_it(split: Split, tmp_path: Pat
 
 def test_failures_and_what_is_not_answered_score_the_worst(split: Split, tmp_path: Path) -> None:
     (header, _) = named(truth_lines(split), "mine")
-    missing = mark(read_submission(write(tmp_path / "a.jsonl", [header]), split), split).iloc[0]
+    missing = scores_of(split, [header], tmp_path).iloc[0]
     failed = _scored(split, tmp_path, success=False, reason="lost")
     for row in (missing, failed):
         assert row["failure"] == row["error"] == 1.0 and row["auc_way"] == row["auc_rows"] == 0.0
@@ -161,19 +159,17 @@ def test_a_secret_split_needs_its_rendered_truth() -> None:
 @pytest.mark.slow
 def test_methods_run_and_make_a_board(data: Path, split: Split, tmp_path: Path) -> None:
     board = ("--board", tmp_path / "board", "--data", data)
-    entries = [word for name in ("no-motion", "gs-vo", "gyro-integrated") for word in ("--entry", name)]
-    ran = run_here("leaderboard", "run", "trajectory", *entries, *board)
-    assert ran.returncode == 0, ran.stderr
-    found = {each.header.method: each for each in entries_of(tmp_path / "board", TRACK.id, split.name)}
-    assert set(found) == {"no-motion", "gs-vo", "gyro-integrated"}
+    names = ("no-motion", "gs-vo", "gyro-integrated")
+    run_entries("trajectory", names, *board)
+    found = entered(tmp_path / "board", split)
+    assert set(found) == {*names}
     assert not found["gyro-integrated"].scores["success"].any()  # the dataset has none
     # A rig that stands still is off by as far as the true one turns, at nine lines of each frame.
     tau = np.concatenate([frame + 0.6 * np.round(np.linspace(0.0, 79.0, 9)) / 80 for frame in range(FRAMES)])
     turned = np.rad2deg(so3.angle(MOTION.body_from_world(tau).R))
     np.testing.assert_allclose(found["no-motion"].scores["way_median_deg"], np.median(turned), rtol=1e-6)
-    assert run_here("leaderboard", "oracles", "trajectory", *board).returncode == 0
-    site = run_here("leaderboard", "build", *board, "--out", tmp_path / "site")
-    assert site.returncode == 0, site.stderr
+    leaderboard("oracles", "trajectory", *board)
+    leaderboard("build", *board, "--out", tmp_path / "site")
     assert "AUC way" in (tmp_path / "site/index.html").read_text("utf-8")
     assert_refused(run_here("leaderboard", "run", "trajectory", "--entry", "gs-voo", *board), "--entry gs-voo")
     mine = named(truth_lines(split), "rs-trajectory")
@@ -183,7 +179,7 @@ def test_methods_run_and_make_a_board(data: Path, split: Split, tmp_path: Path) 
 
 def test_the_inputs_are_windows_of_sequences(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "inputs"
-    assert run_here("leaderboard", "export", "trajectory", "--data", data, "--out", out).returncode == 0
+    leaderboard("export", "trajectory", "--data", data, "--out", out)
     assert [line["name"] for line in lines_of(out / "problems.jsonl")] == [
         f"planes.{k}" for k in range(FRAMES - 1)
     ]
