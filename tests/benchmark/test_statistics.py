@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations_with_replacement
 from math import comb
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.stats import beta
 
 from rsbench.benchmark.statistics import (
+    Interval,
     average_interval,
     bootstrap_interval,
     decimals,
@@ -23,6 +25,7 @@ from rsbench.benchmark.statistics import (
     share_interval,
     typical_interval,
 )
+from rsbench.core.so3 import FloatArray
 
 
 def test_nine_values_give_the_second_and_the_eighth() -> None:
@@ -56,19 +59,6 @@ def test_the_exact_interval_covers_where_the_bootstrap_does_not(n: int) -> None:
     draws = np.exp(rng.standard_normal((2000, n)))  # the median of a log-normal variable is 1
     exact = np.mean([low <= 1.0 <= high for low, high in map(median_interval, draws)])
     assert exact > 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / 2000)
-
-
-def test_the_bootstrap_covers_for_many_values() -> None:
-    rng = np.random.default_rng(1)
-    draws = rng.exponential(size=(400, 200))
-    hits = {"median": 0, "mean": 0}
-    for values in draws:
-        for name, statistic, truth in (("median", median, np.log(2.0)), ("mean", mean, 1.0)):
-            low, high = bootstrap_interval(values, statistic, 0, resamples=1000)
-            hits[name] += int(low <= truth <= high)
-    for name, count in hits.items():
-        # Three standard deviations of 400 tosses, and percentile intervals of a skewed mean are a little short.
-        assert 0.91 < count / 400 < 0.985, name
 
 
 def test_clusters_widen_the_interval_to_what_they_hold() -> None:
@@ -123,17 +113,21 @@ def test_the_average_of_many_agrees_with_the_normal_interval() -> None:
     np.testing.assert_allclose(twice, 2.0 * np.array(average_interval(values, 0)), rtol=1e-12)
 
 
-def test_intervals_of_trials_cover_the_truth() -> None:
-    rng = np.random.default_rng(5)
-    experiments, hits = 300, {"mean": 0, "median": 0}
-    for _ in range(experiments):
-        values = rng.exponential(1.0, 80)
-        for name, interval, truth in (("mean", average_interval, 1.0), ("median", typical_interval, np.log(2.0))):
-            low, high = interval(values, 0)
-            hits[name] += low <= truth <= high
+INTERVALS: dict[str, tuple[Callable[[FloatArray, int], Interval], float]] = {
+    "mean": (average_interval, 1.0),
+    "median": (typical_interval, np.log(2.0)),
+    "mean, drawn": (lambda values, seed: bootstrap_interval(values, mean, seed, resamples=1000), 1.0),
+    "median, drawn": (lambda values, seed: bootstrap_interval(values, median, seed, resamples=1000), np.log(2.0)),
+}
+"""For many values, with what they shall cover for an exponential distribution."""
+
+
+@pytest.mark.parametrize("name", INTERVALS)
+def test_intervals_of_many_values_cover_the_truth(name: str) -> None:
+    interval, truth = INTERVALS[name]
+    found = [interval(values, 0) for values in np.random.default_rng(5).exponential(1.0, (300, 80))]
     # 95 % within four standard deviations (0.0126) of 300 experiments, less what n = 80 costs such an interval.
-    assert 0.88 < hits["mean"] / experiments < 0.99
-    assert 0.88 < hits["median"] / experiments < 0.99
+    assert 0.88 < np.mean([low <= truth <= high for low, high in found]) < 0.99
 
 
 def test_failures_without_end_leave_an_interval() -> None:

@@ -24,8 +24,8 @@ from rsbench.benchmark.simulated.run_sweep import (
     summarise_sweep,
     sweep_steps,
 )
-from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant
-from rsbench.benchmark.simulated.trials import Arrays, enter, run_bounds, run_trials
+from rsbench.benchmark.simulated.sweep_card import Setting, SweepCard, Variant, load_sweep
+from rsbench.benchmark.simulated.trials import Arrays, _simulation, enter, run_bounds, run_trials
 from rsbench.components.motion_models import LinearMotion
 from rsbench.components.rig_tables import load_rig
 from rsbench.core.epipolar import rs_sampson_error
@@ -37,18 +37,7 @@ from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
 from rsbench.storage.work_folder import work_folder
 
-SETTING = Setting(
-    width=900,
-    height=900,
-    focal=810.0,
-    baseline=0.6,
-    readout_ratio=0.8,
-    points=30,
-    depth=(2.0, 10.0),
-    rotation_deg=2.0,
-    translation=0.3,
-    noise_px=0.1,
-)
+SETTING = load_sweep("noise").setting.changed({"points": 30, "noise_px": 0.1}, "test")
 CARD = SweepCard(
     name="small",
     axis="rotation_deg",
@@ -259,13 +248,6 @@ def test_trials_depend_on_their_number_alone() -> None:
     assert not np.any(other_seed["w"] == whole["w"])
 
 
-def test_solvers_get_what_they_need_and_no_more() -> None:
-    assert enter(load_solver_entry("gs-8pt")).information == "left pairs"
-    assert enter(load_solver_entry("rs-stereo-linear")).information == "left and right pairs"
-    assert enter(load_solver_entry("rs-stereo-refined-pairs")).information == "left and right pairs"
-    assert enter(load_solver_entry("rs-stereo-refined")).information == "tracks"
-
-
 def test_noise_and_told_readout_share_exact_matches(finished: Path) -> None:
     cells = CARD.cells()
     assert [geometry_of(CARD, cell).index for cell in cells] == [0, 1, 0, 1]
@@ -336,8 +318,6 @@ def test_rigs_of_settings_are_those_of_their_cards() -> None:
 def test_bound_of_the_left_camera_agrees_with_finite_differences_of_its_residuals() -> None:
     """Fisher information of a rig of one, whose length is free, by numerical derivatives of the Sampson error."""
     bounds = run_bounds(SETTING, ("gs-8pt",), 0, 0, 1)
-    from rsbench.benchmark.simulated.trials import _simulation
-
     simulation = _simulation(SETTING.exact(), [enter(load_solver_entry("gs-8pt"))], 0, 0)
     rig, shutter, motion = simulation.rig, simulation.shutter, simulation.motion
     left, alone = simulation.correspondences.left, StereoRig.of_one(rig.camera)

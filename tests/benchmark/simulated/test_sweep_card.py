@@ -13,18 +13,7 @@ from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.solvers.engine.base import list_solvers
 
-SETTING: dict[str, Any] = {
-    "width": 900,
-    "height": 900,
-    "focal": 810.0,
-    "baseline": 0.6,
-    "readout_ratio": 0.8,
-    "points": 20,
-    "depth": [2.0, 10.0],
-    "rotation_deg": 2.0,
-    "translation": 0.3,
-    "noise_px": 0.1,
-}
+SETTING: dict[str, Any] = load_sweep("noise").setting.record | {"points": 20, "noise_px": 0.1}
 CARD: dict[str, Any] = {
     "name": "mine",
     "axis": "points",
