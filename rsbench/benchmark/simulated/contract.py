@@ -12,8 +12,9 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from types import TracebackType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import rotation_error, scale_error, translation_error, translation_of_offset
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, one_line
@@ -70,9 +71,7 @@ def _misreadings(
     w: FloatArray, d_body: FloatArray, rig: StereoRig, point: str
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
     """What each mistake makes of the true motion; the empty words are the truth itself."""
-    points = {"body": d_body}
-    for side in ("left", "right"):
-        points[side] = translation_of_offset(w, d_body, rig.offset(side))
+    points = {"body": d_body} | {side: translation_of_offset(w, d_body, rig.offset(side)) for side in SIDES}
     d = points[point]
     found = {
         "": (w, d),
@@ -189,11 +188,7 @@ def _serve(place: str) -> Callable[..., object]:
         solver = load_solver_entry(place).solver
     except BaseException as error:
         raise EntryFailure(one_line(error)) from error
-
-    def answer(*arguments: Any) -> Answer:
-        return _looked_at(solver, *arguments)
-
-    return answer
+    return partial(_looked_at, solver)
 
 
 def _looked_at(
@@ -249,24 +244,16 @@ def check_solver(
     """
     limit = entry.options.time_limit_s if time_limit_s is None else time_limit_s
     findings: list[Finding] = []
-    with Subject(
-        entry, isolated=not entry.built_in if isolated is None else isolated, time_limit_s=limit
-    ) as subject:
+    isolated = not entry.built_in if isolated is None else isolated
+    with Subject(entry, isolated=isolated, time_limit_s=limit) as subject:
         for name, check in CHECKS.items():
-            if subject.hung or (findings and findings[0].verdict == "failed"):
-                finding = Finding(check=name, verdict="skipped", why="it does not answer")
-            else:
-                finding = _found(name, check, subject)
-            findings.append(finding)
+            silent = subject.hung or (findings and findings[0].verdict == "failed")
+            try:
+                verdict, why = ("skipped", "it does not answer") if silent else check(subject)
+            except BrokenContractError as error:
+                verdict, why = "failed", str(error)
+            findings.append(Finding(check=name, verdict=verdict, why=why))
     return findings
-
-
-def _found(name: str, check: Callable[[Subject], tuple[Verdict, str]], subject: Subject) -> Finding:
-    try:
-        verdict, why = check(subject)
-    except BrokenContractError as error:
-        verdict, why = "failed", str(error)
-    return Finding(check=name, verdict=verdict, why=why)
 
 
 # Data
@@ -301,19 +288,14 @@ def given(subject: Subject, simulation: Simulation) -> Correspondences:
 
 def true_translation(subject: Subject, simulation: Simulation) -> FloatArray:
     """True translation of the point whose translation the solver gives."""
-    motion = simulation.motion
-    if subject.spec.reference_point == "body":
-        return motion.d
-    return translation_of_offset(motion.w, motion.d, RIG.offset("left"))
+    w, d = simulation.motion.w, simulation.motion.d
+    return d if subject.spec.reference_point == "body" else translation_of_offset(w, d, RIG.offset("left"))
 
 
-def _solved(
-    subject: Subject, simulation: Simulation, correspondences: Correspondences | None = None
-) -> MotionEstimate:
+def _solved(subject: Subject, simulation: Simulation, matches: Correspondences | None = None) -> MotionEstimate:
     """A success, on data that the solver must be able to solve."""
-    estimate = subject.estimate(
-        given(subject, simulation) if correspondences is None else correspondences, RIG, simulation.shutter
-    )
+    matches = given(subject, simulation) if matches is None else matches
+    estimate = subject.estimate(matches, RIG, simulation.shutter)
     if not estimate.success:
         raise BrokenContractError(f"failed on 60 + 60 matches and 60 tracks: {estimate.reason}")
     return estimate
@@ -517,16 +499,13 @@ CHECKS: Mapping[str, Callable[[Subject], tuple[Verdict, str]]] = {
 def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
     """Matches that determine no motion, or not all of it."""
     rng = np.random.default_rng(2)
+    options = SimulationOptions(pairs=30, tracks=30, gyro_rate=GYRO_RATE, gravity=True, affine=True)
 
     def seen(
-        w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, plane: bool = False
+        w: FloatArray, d: FloatArray, shutter: RollingShutter = ROLLING, shape: SceneShape = "box"
     ) -> Correspondences:
-        shape: SceneShape = "plane" if plane else "box"
-        options = SimulationOptions(
-            pairs=30, tracks=30, shape=shape, gyro_rate=GYRO_RATE, gravity=True, affine=True
-        )
-        motion = make_motion("linear", w, d)
-        return simulate(RIG, shutter, motion, options, np.random.default_rng(2)).correspondences
+        chosen, motion = replace(options, shape=shape), make_motion("linear", w, d)
+        return simulate(RIG, shutter, motion, chosen, np.random.default_rng(2)).correspondences
 
     c = seen(W, D)
     line = np.linspace(100.0, 800.0, 20)
@@ -548,7 +527,7 @@ def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
         "pure translation": (seen(0 * W, D), ROLLING),
         "no motion": (seen(0 * W, 0 * D), ROLLING),
         "a global shutter": (seen(W, D, GLOBAL), GLOBAL),
-        "a plane": (seen(W, D, plane=True), ROLLING),
+        "a plane": (seen(W, D, shape="plane"), ROLLING),
         "points on a line": (Correspondences(left=pair, right=pair, tracks=tracks), ROLLING),
         "one camera": (Correspondences(left=c.left, affine=c.affine), ROLLING),
         "the same match 20 times": (Correspondences(**first), ROLLING),
