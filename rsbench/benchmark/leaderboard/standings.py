@@ -39,6 +39,16 @@ class Rank(NamedTuple):
     high: int
 
 
+class Place(NamedTuple):
+    """An entry's rank among the entries that use no more than it does; none where it is not ranked."""
+
+    rank: Rank | None = None
+    peers: int = 0
+    """Number of these entries, itself included."""
+    ties: tuple[str, ...] = ()
+    """Those of them that the data do not distinguish from it."""
+
+
 def better(means: FloatArray) -> NDArray[np.bool_]:
     """Whether entry i is better than entry j (n, n): of means (n, k) of entries and scenes, higher is better.
 
@@ -187,16 +197,12 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
                 f"{each.folder}: is scored on other problems than {kept[0].folder.name}; rescore the board"
             )
     ranked = [each for each in kept if ORACLE not in each.header.uses and not each.doubt]
-    scenes = list(problems["scene"])
-    primary = track_of_id(kept[0].header.protocol).primary
-    by_log_score = _ranked([each for each in ranked if _states_deviations(each)], "log_score", 1.0, scenes)
-    log_ranks = {each.header.method: (rank, peers) for each, rank, peers, _ in by_log_score}
-    found = [
-        _standing(each, scenes, rank, peers, tied, log_ranks.get(each.header.method, (None, 0)))
-        for each, rank, peers, tied in _ranked(ranked, primary.key, primary.sign, scenes)
-    ]
-    oracles = [_standing(each, scenes, None, 0, (), (None, 0)) for each in kept if each not in ranked]
-    return sorted(found, key=_order) + sorted(oracles, key=_order)
+    stating = [each for each in ranked if _states_deviations(each)]
+    scenes, primary = list(problems["scene"]), track_of_id(kept[0].header.protocol).primary
+    places = _ranked(ranked, primary.key, primary.sign, scenes)
+    log_places = _ranked(stating, "log_score", 1.0, scenes)
+    lines = [_standing(each, scenes, *(by.get(each, Place()) for by in (places, log_places))) for each in kept]
+    return sorted(lines, key=_order)
 
 
 def _states_deviations(scored: Scored) -> bool:
@@ -204,44 +210,34 @@ def _states_deviations(scored: Scored) -> bool:
     return "log_score" in scored.scores and bool(scored.scores["nees"].notna().any())
 
 
-def _ranked(
-    entries: Sequence[Scored], column: str, sign: float, scenes: Sequence[str]
-) -> list[tuple[Scored, Rank, int, tuple[str, ...]]]:
-    """Entries with their ranks by a column, the number of those that they are ranked among, and their ties."""
+def _ranked(entries: Sequence[Scored], column: str, sign: float, scenes: Sequence[str]) -> dict[Scored, Place]:
+    """Places of entries by a column."""
     if not entries:
-        return []
+        return {}
     uses = [frozenset(each.header.uses) for each in entries]
     means = scene_means(sign * np.stack([each.scores[column].to_numpy() for each in entries]), scenes)
-    beats = better(means)
-    found = list[tuple[Scored, Rank, int, tuple[str, ...]]]()
+    beats, names = better(means), [each.header.method for each in entries]
+    found = dict[Scored, Place]()
     for i, rank in enumerate(ranks(means.mean(axis=1), beats, uses)):
         peers = [j for j in range(len(entries)) if uses[j] <= uses[i]]
-        tied = tuple(entries[j].header.method for j in ties(beats, i) if j in peers)
-        found.append((entries[i], rank, len(peers), tied))
+        found[entries[i]] = Place(rank, len(peers), tuple(names[j] for j in ties(beats, i) if j in peers))
     return found
 
 
-def _order(standing: Standing) -> tuple[int, str, float, str]:
+def _order(standing: Standing) -> tuple[bool, int, str, float, str]:
     header = standing.scored.header
     primary = standing.track.primary
     score = primary.sign * standing.means[primary.key][0]
-    return len(set(header.uses)), standing.uses, -score, header.method
+    return standing.rank is None, len(set(header.uses)), standing.uses, -score, header.method
 
 
-def _standing(
-    scored: Scored,
-    scenes: Sequence[str],
-    rank: Rank | None,
-    peers: int,
-    tied: tuple[str, ...],
-    by_log_score: tuple[Rank | None, int],
-) -> Standing:
+def _standing(scored: Scored, scenes: Sequence[str], place: Place, log_place: Place) -> Standing:
     scores, track = scored.scores, track_of_id(scored.header.protocol)
     return Standing(
         scored=scored,
-        rank=rank,
-        peers=peers,
-        ties=tied,
+        rank=place.rank,
+        peers=place.peers,
+        ties=place.ties,
         means={
             score.key: score_interval(scores[score.key].to_numpy(), scenes, score.kind == "share")
             for score in track.scores
@@ -249,8 +245,8 @@ def _standing(
         },
         medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
         calibration=calibration(scores, track.unknowns),
-        log_rank=by_log_score[0],
-        log_peers=by_log_score[1],
+        log_rank=log_place.rank,
+        log_peers=log_place.peers,
         parts={} if not track.parting else _parts(scores, track),
         worst=_worst(scores, track),
     )
