@@ -8,7 +8,7 @@ moves.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 
 from rsbench.benchmark.leaderboard.correction_tracks import OF_SENSORS, SensorTrack
 from rsbench.benchmark.leaderboard.motion_tracks import MotionTrack, add_area_columns, motion_row, pose_fields
-from rsbench.benchmark.leaderboard.splits import FEATURES, Frames, find_problem
+from rsbench.benchmark.leaderboard.splits import Frames
 from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Track, Truth
 from rsbench.benchmark.seeds import generator
 from rsbench.core import so3
@@ -27,9 +27,6 @@ from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_pairs
-from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.problem import Problem
-from rsbench.vision.feature_matcher import load_features
 
 LOOSE = "-loose"
 """End of the name of a problem whose given calibration is not the true one."""
@@ -66,13 +63,10 @@ class RigFrames(Frames):
         split = super().split(track, data, seed_file, secret)
         return replace(split, truths=tuple(each for truth in split.truths for each in _both(truth)))
 
-    def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        assert data is not None
-        options = CorrectionOptions(features=load_features(FEATURES))
-        for sequence in self.pairs(track, data)[: count // 2]:
-            loose = replace(sequence, name=sequence.name + LOOSE, rig=loose_of(sequence.name, sequence.rig))
-            for each in (sequence, loose):
-                yield find_problem(each, None if track.gives_images else options)
+    def given(self, track: Track, folder: Path) -> list[Rendered]:
+        pairs = self.pairs(track, folder)
+        loose = (replace(each, name=each.name + LOOSE, rig=loose_of(each.name, each.rig)) for each in pairs)
+        return [each for both in zip(pairs, loose, strict=True) for each in both]
 
     def pairs(self, track: Track, folder: Path) -> list[Rendered]:
         """Pairs of frames; where pictures of the left camera are scored, only rigs whose left camera rolls."""

@@ -218,15 +218,15 @@ class SimulatedPoints(Inputs):
 
     def _truth(self, seed: int, number: int) -> Truth:
         setting, motion, name = self.draws.setting(seed, number), self.draws.motion(seed, number), _name(number)
+        rig, shutter = setting.rig(), setting.shutter()
         facts = {
-            **_sizes(motion, setting.rig(), setting.shutter()),
+            **_sizes(motion, rig, shutter),
             "noise_px": setting.noise_px,
             "outliers": setting.outlier_ratio,
             "points": setting.points,
             "shape": setting.shape,
             **self.draws.kinds(seed, number),
         }
-        rig, shutter = setting.rig(), setting.shutter()
         return Truth(name=name, rig=rig, shutter=shutter, motion=motion, scene=name, facts=facts)
 
 
@@ -323,14 +323,14 @@ class Frames(Inputs):
 
     def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
         assert data is not None
-        pairs = self.pairs(track, data)[:count]
-        if not track.gives_images:
-            options = CorrectionOptions(features=load_features(FEATURES))
-            yield from (find_problem(sequence, options) for sequence in pairs)
-            return
-        for sequence in pairs:
-            problem = find_problem(sequence, None)
+        options = None if track.gives_images else CorrectionOptions(features=load_features(FEATURES))
+        for sequence in self.given(track, data)[:count]:
+            problem = find_problem(sequence, options)
             yield with_gyro(problem, sequence) if "gyro" in track.allowed else problem
+
+    def given(self, track: Track, folder: Path) -> list[Sequence]:
+        """The sequences of the problems as methods get them."""
+        return self.pairs(track, folder)
 
     def pairs(self, track: Track, folder: Path) -> list[Sequence]:
         """The pairs of frames that are problems of the track."""
