@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -156,6 +157,34 @@ def kept(path: Path, identity: str) -> Any:
     content = record.get("content")
     current = record.get("identity") == identity and record.get("sha256") == _digest(content)
     return content if current else None
+
+
+def resumed(
+    names: Sequence[str],
+    places: Mapping[str, tuple[Path, str]],
+    make: Callable[[list[str]], Generator[tuple[str, Any], None, None]],
+    step: Callable[[str], object],
+) -> dict[str, Any]:
+    """Results by name: those that ``kept`` finds, and the others as ``make`` yields them, which are stored.
+
+    Args:
+        names: of all results.
+        places: file and identity of each, for ``kept``; empty: nothing is stored.
+        make: yields the results of some names as they become ready; it is closed whatever happens.
+        step: called with each name.
+    """
+    found = dict[str, Any]()
+    for name in names:
+        if name in places and (content := kept(*places[name])) is not None:
+            found[name] = content
+            step(name)
+    with closing(make([name for name in names if name not in found])) as made:
+        for name, content in made:
+            if name in places:
+                keep(*places[name], content)
+            found[name] = content
+            step(name)
+    return found
 
 
 def _digest(content: object) -> str:

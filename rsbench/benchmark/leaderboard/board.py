@@ -14,11 +14,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import json
 import lzma
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
 from rsbench.benchmark.leaderboard.inputs import split_record
 from rsbench.benchmark.leaderboard.pictures import copy_files, file_bytes
@@ -414,27 +414,19 @@ def add_all(
                 refuse_another(entries / method, hashlib.sha256(data).hexdigest(), kept)
             taken.append(_Taken(dataclasses.replace(submission, folder=new), data, kept))
         write_split(board, split)
-        kept = _kept(hidden, taken, split)
-        marked = split.track.mark([each.submission for each in taken], split, workers, step, kept)
+        kept, submissions = hidden / "scoring", [each.submission for each in taken]
+        identities = [each.identity for each in taken]
+        identity = identity_of(split=split.fingerprint, code=numeric_version(), files=identities)
+        marked = split.track.mark(submissions, split, workers, step, (kept, identity))
         for each, scores in zip(taken, marked, strict=True):
             if isinstance(scores, RsbenchError):
                 faults.append(scores)
             else:
-                doubt = doubt_about(scores, each.submission.header, split)
-                scored.append(_put(each, scores, _record(each, split, made) | {"doubt": doubt}, entries))
-        remove(kept.parent)
+                scored.append(_put(each, scores, split, made, entries))
+        remove(kept)
     if faults:
         raise faults[0]
     return scored
-
-
-def _kept(hidden: Path, taken: Sequence[_Taken], split: Split) -> Path:
-    """Folder for scores of these predictions by this code; scores of other interrupted runs are removed."""
-    of = [split.fingerprint, numeric_version(), *(each.identity for each in taken)]
-    kept = hidden / "scoring" / hashlib.sha256(json.dumps(of).encode()).hexdigest()
-    if not kept.is_dir():
-        remove(kept.parent)
-    return kept
 
 
 def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submission, bytes]], list[RsbenchError]]:
@@ -448,27 +440,24 @@ def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submissio
     return read, faults
 
 
-def _record(taken: _Taken, split: Split, made: dict[str, Any]) -> dict[str, Any]:
-    """Content of entry.json."""
-    return {
+def _put(taken: _Taken, scores: pd.DataFrame, split: Split, made: dict[str, Any], entries: Path) -> Scored:
+    """Write an entry into a work folder, and rename it to its place."""
+    header, new = taken.submission.header, taken.submission.folder
+    new.mkdir(parents=True, exist_ok=True)
+    write_bytes(new / FILES[0], taken.data)
+    write_table(new / FILES[1], scores)
+    record = {
         "format": FORMAT,
-        "header": asdict(taken.submission.header),
+        "header": asdict(header),
         "predictions_sha256": hashlib.sha256(taken.data).hexdigest(),
         "fingerprint": split.fingerprint,
         **({"files": taken.files} if taken.files else {}),
         "made": made,
+        "doubt": doubt_about(scores, header, split),
     }
-
-
-def _put(taken: _Taken, scores: pd.DataFrame, record: dict[str, Any], entries: Path) -> Scored:
-    """Write an entry into a work folder, and rename it to its place."""
-    new, folder = taken.submission.folder, entries / taken.submission.header.method
-    new.mkdir(parents=True, exist_ok=True)
-    write_bytes(new / FILES[0], taken.data)
-    write_table(new / FILES[1], scores)
     write_json(new / FILES[2], record)
-    move_entry(new, folder)
-    return read_entry(folder)
+    move_entry(new, entries / header.method)
+    return read_entry(entries / header.method)
 
 
 # Merging

@@ -35,7 +35,9 @@ from rsbench.benchmark.leaderboard.track import (
     ORACLE,
     SECONDS,
     Answer,
+    Checked,
     Job,
+    Kept,
     Limits,
     Row,
     Runnable,
@@ -225,7 +227,7 @@ class SolverTrack(Track):
         return rows
 
     def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Kept | None
     ) -> list[pd.DataFrame | RsbenchError]:
         return [pd.DataFrame(self.rows(submission, split)) for submission in submissions]
 
@@ -301,10 +303,8 @@ class MotionTrack(SolverTrack):
         return motion_row(truth, answer)
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
-        rows, vague = (
-            super().rows(submission, split),
-            vague_log_densities([truth.motion for truth in split.truths]),
-        )
+        rows = super().rows(submission, split)
+        vague = vague_log_densities([truth.motion for truth in split.truths])
         for row, at_truth in zip(rows, vague, strict=True):
             row["log_score"] = log_score(row.pop("log_density"), float(at_truth))
         return rows
@@ -501,8 +501,7 @@ def _add_match_columns(rows: list[Row], submission: Submission, split: Split) ->
     """pose-own: how many own matches there are, and how many are right."""
     own = read_own_matches(submission.folder, split.by_name)
     for row, truth in zip(rows, split.truths, strict=True):
-        assert truth.sequence is not None
-        row |= match_scores(truth.sequence, None if own is None else own[truth.name])
+        row |= match_scores(truth.rendered, None if own is None else own[truth.name])
 
 
 # Motions from frames, with matches of the method's own
@@ -538,9 +537,7 @@ class OwnMatchesTrack(MotionTrack):
     def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
         return [f"{MATCHES}/{name}" for name in match_files(submission.folder)]
 
-    def check_files(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
+    def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
         try:
             read_own_matches(submission.folder, split.by_name)
         except RsbenchError as error:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,12 +21,15 @@ from typing import Any, ClassVar, NamedTuple
 
 import pandas as pd
 
+from rsbench.benchmark.images.store import resumed
 from rsbench.benchmark.leaderboard.inputs import read_frames, read_inputs
 from rsbench.benchmark.leaderboard.pictures import PICTURES, RequestedPicture, TruePictures, find_picture
 from rsbench.benchmark.leaderboard.submissions import method_header, submission_text
 from rsbench.benchmark.leaderboard.track import (
     Answer,
+    Checked,
     Job,
+    Kept,
     Limits,
     Numbers,
     Row,
@@ -42,7 +45,7 @@ from rsbench.benchmark.leaderboard.track import (
 from rsbench.capture.model_choice import AUTO
 from rsbench.components.plugins import Entry
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import ONE_THREAD, decode, encode, use_one_thread
+from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, run_jobs
 from rsbench.pipeline.chain import Given
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
@@ -156,14 +159,12 @@ class PictureTrack(Track):
     def files_of(self, submission: Submission, split: Split) -> Iterator[str]:
         for truth in split.truths:
             answer = submission.answers.get(truth.name)
-            if truth.pictures is not None and answer is not None and answer.success:
-                for each in truth.pictures.requested:
+            if answer is not None and answer.success:
+                for each in truth.shown.requested:
                     found = find_picture(submission.folder / PICTURES, truth.name, each)
                     yield f"{PICTURES}/{truth.name}/{found.name}"
 
-    def check_files(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
+    def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
         """Each picture is read once; a secret truth is not looked at."""
         answered = [answer.name for answer in submission.answers.values() if answer.success]
         folder = submission.folder / PICTURES
@@ -171,8 +172,7 @@ class PictureTrack(Track):
         for name in answered:
             if len(faults) >= most:
                 break
-            pictures = split.by_name[name].pictures
-            assert pictures is not None
+            pictures = split.by_name[name].shown
             try:
                 drawn = self.read(submission, pictures)
                 found.update(self.hints(drawn, pictures, split.public) if hints else ())
@@ -218,19 +218,11 @@ class PictureTrack(Track):
     # Scores
 
     def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Kept | None
     ) -> list[pd.DataFrame | RsbenchError]:
-        marked, names = dict[str, list[Row | str]](), list(split.by_name)
-        for name in names:
-            if kept is not None and (path := kept / name).is_file():
-                marked[name] = decode(read_bytes(path), {})
-                step(name)
-        for name, rows in _rows_of(submissions, split, workers, [name for name in names if name not in marked]):
-            if kept is not None:
-                kept.mkdir(parents=True, exist_ok=True)
-                write_bytes(kept / name, encode(rows))
-            marked[name] = rows
-            step(name)
+        names = list(split.by_name)
+        places = {name: (kept[0] / f"{name}.json", kept[1]) for name in names} if kept else {}
+        marked = resumed(names, places, partial(_rows_of, submissions, split, workers), step)
         tables = list[pd.DataFrame | RsbenchError]()
         for rows in zip(*(marked[name] for name in names), strict=True):
             faults = [row for row in rows if isinstance(row, str)]
@@ -240,7 +232,7 @@ class PictureTrack(Track):
 
 def _rows_of(
     submissions: Sequence[Submission], split: Split, workers: Workers, names: list[str]
-) -> Iterator[tuple[str, list[Row | str]]]:
+) -> Generator[tuple[str, list[Row | str]], None, None]:
     """``picture_rows`` of problems by their names, as they become ready; with one worker, in this process."""
     if workers == 1:
         yield from ((name, picture_rows(split, name, submissions)) for name in names)
@@ -264,15 +256,15 @@ def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> 
         RsbenchError: the truth has changed since the split was read.
     """
     truth, track = split.by_name[name], split.track
-    assert isinstance(track, PictureTrack) and truth.pictures is not None
-    truth.pictures.check()
-    true = track.truth_of(truth.pictures)
+    assert isinstance(track, PictureTrack)
+    truth.shown.check()
+    true = track.truth_of(truth.shown)
     rows = list[Row | str]()
     for submission in submissions:
         answer = submission.answers.get(truth.name)
         success = answer is not None and answer.success
         try:
-            scores = track.scores_of(true, track.read(submission, truth.pictures) if success else None)
+            scores = track.scores_of(true, track.read(submission, truth.shown) if success else None)
             rows.append(score_row(truth, answer, success, scores) | track.part_of(truth))
         except RsbenchError as error:
             rows.append(str(error))
@@ -285,7 +277,7 @@ def _strange_files(folder: Path, split: Split, answered: Collection[str]) -> Ite
         return
     for place in sorted(folder.iterdir()):
         truth = split.by_name.get(place.name)
-        if truth is None or truth.pictures is None:
+        if truth is None:
             yield f"{place}: is no problem of {split.name}: folders have the names of problems"
             continue
         if place.is_symlink() or not place.is_dir():
@@ -293,7 +285,7 @@ def _strange_files(folder: Path, split: Split, answered: Collection[str]) -> Ite
             continue
         if place.name not in answered:
             yield f"{place}: has pictures, but no line in the file of answers; add one, or remove them"
-        names = {f"{each.stem}{suffix}" for each in truth.pictures.requested for suffix in each.suffixes}
+        names = {f"{each.stem}{suffix}" for each in truth.shown.requested for suffix in each.suffixes}
         for path in sorted(place.iterdir()):
             if path.name not in names:
                 yield f"{path}: does not belong here; there are: {', '.join(sorted(names))}"
@@ -312,10 +304,9 @@ def _drawn_answers(name: str, uses: str, description: str, draw: Draw, split: Sp
 
 def _draw_all(truths: Sequence[Truth], folder: Path, draw: Draw) -> None:
     for truth in truths:
-        assert truth.pictures is not None
         place = folder / PICTURES / truth.name
         place.mkdir(parents=True, exist_ok=True)
-        draw(truth.pictures, place)
+        draw(truth.shown, place)
 
 
 def _copy_truth(pictures: TruePictures, place: Path) -> None:

@@ -102,8 +102,9 @@ def run_cards(
                 problems=chunk,
                 limits=list(limits),
             )
-            targets[card].append(target := Target(card, work / runnable.name, identity))
-            if _stored(target, chunk) is None:
+            folder = work / runnable.name
+            targets[card].append(target := Target(card, folder, identity, folder / "answers" / f"{chunk[0]}.json"))
+            if kept(target.record, identity) is None:
                 due.append(target)
             else:
                 step(runnable.name)
@@ -119,7 +120,7 @@ def run_cards(
             step(target.folder.name)
     files = list[Path]()
     for card, runnable in runnables.items():
-        parts = [_stored(target, chunk) or [] for target, chunk in zip(targets[card], chunks, strict=True)]
+        parts = [kept(target.record, target.identity) or [] for target in targets[card]]
         files.append(_write(split, runnable, list(chain.from_iterable(parts)), work / runnable.name))
         track.copy_files(inputs, work / runnable.name)
     return files
@@ -137,19 +138,6 @@ def _write(split: Split, runnable: Runnable, answers: Sequence[dict[str, Any]], 
     }
     write_bytes(folder / "predictions.jsonl", submission_text(header, answers).encode())
     return folder / "predictions.jsonl"
-
-
-def _record(target: Target, problems: Sequence[str]) -> Path:
-    return target.folder / "answers" / f"{problems[0]}.json"
-
-
-def _stored(target: Target, problems: Sequence[str]) -> list[dict[str, Any]] | None:
-    """The stored answers to some problems; None if they are not current."""
-    return kept(_record(target, problems), target.identity)
-
-
-def _keep(target: Target, problems: Sequence[str], answers: Sequence[dict[str, Any]]) -> None:
-    keep(_record(target, problems), target.identity, answers)
 
 
 def _done(
@@ -185,7 +173,8 @@ def _done(
             if not outcome.success:
                 (name,), (target,) = job.problems, job.targets
                 remove(target.folder / PICTURES / name)
-                _keep(target, job.problems, [{"name": name, "success": False, "reason": outcome.reason[:300]}])
+                failure = {"name": name, "success": False, "reason": outcome.reason[:300]}
+                keep(target.record, target.identity, [failure])
             yield job
 
 
@@ -197,8 +186,8 @@ def _serve(track: Track, inputs: Path, limits: Limits) -> Any:
 
     def run(job: Job) -> None:
         for target in job.targets:
-            remove(_record(target, job.problems))
+            remove(target.record)
         for target, answers in zip(job.targets, solve(job), strict=True):
-            _keep(target, job.problems, answers)
+            keep(target.record, target.identity, answers)
 
     return run

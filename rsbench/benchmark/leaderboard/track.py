@@ -72,6 +72,10 @@ Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Numbers = dict[str, float]
 Step = Callable[[str], None]
+Checked = tuple[list[str], list[str]]
+"""Faults and likely mistakes, a line each."""
+Kept = tuple[Path, str]
+"""Folder of stored scores, and their identity."""
 Vector = tuple[float, float, float]
 
 
@@ -260,6 +264,18 @@ class Truth:
     given_rig: StereoRig | None = None
     """The rig that methods are given, if it is not the true one."""
 
+    @property
+    def rendered(self) -> Rendered:
+        """The sequence, on tracks of rendered frames."""
+        assert self.sequence is not None
+        return self.sequence
+
+    @property
+    def shown(self) -> TruePictures:
+        """The pictures, on tracks whose answers are pictures."""
+        assert self.pictures is not None
+        return self.pictures
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Split:
@@ -362,6 +378,8 @@ class Target(NamedTuple):
     """Folder of its predictions."""
     identity: str
     """Identity of these answers."""
+    record: Path
+    """File in which they are stored, for ``images.store.kept``."""
 
 
 class Job(NamedTuple):
@@ -477,9 +495,7 @@ class Track(ABC):
         """Paths, below the folder of the file of answers, of the pictures and matches of a submission."""
         return ()
 
-    def check_files(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
+    def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
         """Faults of answers and their files, ``most`` at most, and with ``hints`` likely mistakes."""
         return [], []
 
@@ -516,7 +532,7 @@ class Track(ABC):
 
     @abstractmethod
     def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Kept | None
     ) -> list[pd.DataFrame | RsbenchError]:
         """Scores of submissions, which share what is found of the truth; an error is that of one submission.
 
@@ -528,7 +544,7 @@ class Track(ABC):
             split: the truth.
             workers: processes that score pictures; the rest takes no time.
             step: called with the name of each problem whose pictures are scored.
-            kept: folder where an interrupted run keeps the scores of pictures, and finds them again; None: none.
+            kept: where an interrupted run keeps the scores of pictures, and finds them again; None: nowhere.
 
         Raises:
             RsbenchError: the truth has changed since the split was read.

@@ -25,7 +25,9 @@ from rsbench.benchmark.leaderboard.track import (
     LARGEST,
     SECONDS,
     Answer,
+    Checked,
     Job,
+    Kept,
     Limits,
     Row,
     Runnable,
@@ -162,28 +164,24 @@ class TrajectoryTrack(Track):
     # Predictions
 
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:
-        assert truth.sequence is not None
-        frames = truth.sequence.frames
+        frames = truth.rendered.frames
         return answer_of(along(truth.motion, frames - 1), truth.shutter, frames)
 
     def example(self, split: Split) -> Mapping[str, Any]:
-        sequence = split.truths[0].sequence
-        assert sequence is not None
-        still = [[float(frame), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] for frame in range(sequence.frames)]
+        frames = range(split.truths[0].rendered.frames)
+        still = [[float(frame), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] for frame in frames]
         return {"poses": still, "metric": False}
 
-    def check_files(
-        self, submission: Submission, split: Split, most: int, hints: bool
-    ) -> tuple[list[str], list[str]]:
+    def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
         """Poses must cover the sequence, whose length the split knows."""
         faults, answered = list[str](), list[tuple[TrajectoryAnswer, Truth]]()
         for answer in submission.answers.values():
             truth = split.by_name[answer.name]
-            assert isinstance(answer, TrajectoryAnswer) and truth.sequence is not None
+            assert isinstance(answer, TrajectoryAnswer)
             if not answer.success:
                 continue
             answered.append((answer, truth))
-            first, end, last_start = answer.rows[0, 0], answer.rows[-1, 0], truth.sequence.frames - 1
+            first, end, last_start = answer.rows[0, 0], answer.rows[-1, 0], truth.rendered.frames - 1
             if first > _REACH or end < last_start - _REACH:
                 faults.append(
                     f"{submission.folder}: name = {answer.name!r}: poses reach from {first:g} to {end:g}: must "
@@ -229,12 +227,11 @@ class TrajectoryTrack(Track):
     # Scores
 
     def mark(
-        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Path | None
+        self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Kept | None
     ) -> list[pd.DataFrame | RsbenchError]:
         rows: list[list[Row]] = [[] for _ in submissions]
         for truth in split.truths:
-            assert truth.sequence is not None
-            true = TrueTrajectory.of(truth.sequence)
+            true = TrueTrajectory.of(truth.rendered)
             for mine, submission in zip(rows, submissions, strict=True):
                 mine.append(_row(truth, true, submission.answers.get(truth.name)))
             step(truth.name)
@@ -243,8 +240,7 @@ class TrajectoryTrack(Track):
 
 def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
     """Whether a trajectory is much nearer to the truth when each pose is inverted."""
-    assert truth.sequence is not None
-    tau = np.arange(float(truth.sequence.frames))
+    tau = np.arange(float(truth.rendered.frames))
     found, true = (each.body_from_world(tau).R for each in (answer.motion, truth.motion))
     as_is, turned = (np.max(so3.angle(R @ np.swapaxes(true, 1, 2))) for R in (found, np.swapaxes(found, 1, 2)))
     return bool(_INVERTED * turned < as_is)
@@ -255,8 +251,7 @@ def _row(truth: Truth, true: TrueTrajectory, answer: Answer | None) -> Row:
     success = isinstance(answer, TrajectoryAnswer) and answer.success
     found = dict(_FAILURE)
     if isinstance(answer, TrajectoryAnswer) and success:
-        assert truth.sequence is not None
-        estimate = along(answer.motion, truth.sequence.frames - 1, positions=answer.metric)
+        estimate = along(answer.motion, truth.rendered.frames - 1, positions=answer.metric)
         found = trajectory_scores(true, estimate)
         del found["failed"]
     return score_row(truth, answer, success, {**found, "error": 1.0 - found["auc_way"]})

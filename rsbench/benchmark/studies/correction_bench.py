@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.scoring import motion_errors
@@ -197,10 +198,7 @@ class Bench:
         rng = generator(seed, "study", sequence.name, "gs")
         self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
         self.sgm = frame_pairs(self.images, self.rig, self.options)
-        true = {view: sequence.depth("rs", *view) for view in VIEWS}
-        self.true = known_depth(
-            self.images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in true.items()}
-        )
+        self.true = true_pairs(sequence, self.images)
 
     def _own_law(self, solver: str) -> CorrectionOptions:
         """Options with a solver that keeps its own motion model, whichever model fits the matches best."""

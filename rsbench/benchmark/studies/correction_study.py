@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rsbench.benchmark.images.store import keep
-from rsbench.benchmark.images.store import kept as kept_rows
+from rsbench.benchmark.images.store import resumed
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
 from rsbench.benchmark.statistics import median_interval
 from rsbench.benchmark.studies.correction_bench import (
@@ -183,44 +181,22 @@ def study_dataset(
         RsbenchError: the dataset cannot be read, or there is no such solver.
         LostJobsError: see ``finished_jobs``.
     """
-    sequences = [sequence for sequence in read_dataset(dataset) if among(sequence.name)]
-    found: dict[str, Rows] = {}
-    stored: dict[str, tuple[Path, str]] = {}
+    sequences = {each.name: each for each in read_dataset(dataset) if among(each.name)}
+    places = dict[str, tuple[Path, str]]()
     if kept is not None:
         options = {"seed": seed, "solver": solver, "others": others}
-        for each in sequences:
-            stored[each.name] = kept / f"{each.name}.json", rows_identity(dataset, each.name, **options)
-            if (rows := kept_rows(*stored[each.name])) is not None:
-                found[each.name] = rows
-                step(each.name)
-    missing = [sequence for sequence in sequences if sequence.name not in found]
-    with closing(_studied(missing, dataset, seed, solver, workers, others)) as outcomes:
-        for name, rows in outcomes:
-            found[name] = rows
-            if kept is not None:
-                keep(*stored[name], rows)
-            step(name)
-    images, bands, motions = (
-        [row for sequence in sequences for row in found[sequence.name][table]] for table in range(3)
-    )
+        places = {name: (kept / f"{name}.json", rows_identity(dataset, name, **options)) for name in sequences}
+
+    def study(missing: list[str]) -> Generator[tuple[str, Rows], None, None]:
+        if workers == 1:
+            yield from ((name, study_sequence(sequences[name], seed, solver, others)) for name in missing)
+        else:
+            count = workers or os.cpu_count() or 1
+            yield from finished_jobs(_serve, missing, count, {}, dataset, seed, solver, others)
+
+    found: dict[str, Rows] = resumed(list(sequences), places, study, step)
+    images, bands, motions = ([row for name in sequences for row in found[name][table]] for table in range(3))
     return images, bands, motions
-
-
-def _studied(
-    sequences: list[Sequence],
-    dataset: Path,
-    seed: int,
-    solver: str,
-    workers: int | None,
-    others: tuple[str, ...],
-) -> Generator[tuple[str, Rows], None, None]:
-    """Names of sequences with their rows, as they become ready."""
-    if workers == 1:
-        for sequence in sequences:
-            yield sequence.name, study_sequence(sequence, seed, solver, others)
-    else:
-        names, count = [sequence.name for sequence in sequences], workers or os.cpu_count() or 1
-        yield from finished_jobs(_serve, names, count, {}, dataset, seed, solver, others)
 
 
 def _serve(dataset: Path, seed: int, solver: str, others: tuple[str, ...]) -> Callable[[str], Rows]:
@@ -245,14 +221,16 @@ def study_sequence(
 
 
 def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt | None]) -> list[Row]:
-    truth, found = sequence.image("gs", *view), _found(attempts)
-    common = np.logical_and.reduce([attempt.covered for key, attempt in found.items() if key in _PUBLISHED])
+    truth, true = sequence.image("gs", *view), attempts["truth"]
+    assert true is not None
+    published = [attempts[key] for key in attempts if key in _PUBLISHED]
+    common = np.logical_and.reduce([attempt.covered for attempt in published if attempt is not None])
     rows = []
     for key, attempt in attempts.items():
         if attempt is None:
             scores = _worst_scores(truth, view == VIEWS[0] and key in _SLOW)
         else:
-            error = flow_error(attempt.flow, found["truth"].flow)
+            error = flow_error(attempt.flow, true.flow)
             known = np.isfinite(error)
             ssim_covered, ssim_all = ssim_within(attempt.image, truth, (common, None))
             scores = {
@@ -268,11 +246,6 @@ def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt | No
             }
         rows.append({"method": key, "success": attempt is not None, **scores, "common": float(np.mean(common))})
     return rows
-
-
-def _found(attempts: dict[str, Attempt | None]) -> dict[str, Attempt]:
-    """The attempts that did not fail."""
-    return {key: attempt for key, attempt in attempts.items() if attempt is not None}
 
 
 def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
@@ -302,7 +275,8 @@ def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted
 
 
 def _band_rows(attempts: dict[str, Attempt | None]) -> list[Row]:
-    truth, rows = _found(attempts)["truth"], list[Row]()
+    truth, rows = attempts["truth"], list[Row]()
+    assert truth is not None
     for key, attempt in attempts.items():
         error = np.full(truth.covered.shape, worst_flow(truth.image))
         if attempt is not None:

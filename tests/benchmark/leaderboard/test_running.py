@@ -28,6 +28,7 @@ from leaderboards import (
     write,
 )
 
+from rsbench.benchmark.images.store import keep
 from rsbench.benchmark.leaderboard import motion_tracks, running
 from rsbench.benchmark.leaderboard.board import (
     FILES,
@@ -46,8 +47,8 @@ from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.cli import reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.isolation import Outcome, decode, encode
-from rsbench.storage.files import read_depth, read_png, write_depth, write_png
+from rsbench.jobs.isolation import Outcome
+from rsbench.storage.files import read_depth, read_json, read_png, write_depth, write_png
 
 RIG, _, _ = PLANES
 
@@ -268,12 +269,13 @@ def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], 
 
     with pytest.raises(KeyboardInterrupt):
         add(tmp_path / "cut", path, split, {"command": ORACLES}, workers=workers, step=stop)
-    (kept,) = (tmp_path / "cut" / ".rsbench" / "scoring").glob("*/*")
-    (row,) = decode(kept.read_bytes(), {})
-    kept.write_bytes(encode([{**row, "scene": "marble"}]))  # seen only if it is taken
+    (kept,) = (tmp_path / "cut" / ".rsbench" / "scoring").iterdir()
+    record = read_json(kept)
+    (row,) = record["content"]
+    keep(kept, record["identity"], [{**row, "scene": "marble"}])  # seen only if it is taken
     add(tmp_path / "cut", path, split, {"command": ORACLES}, workers=workers)
     table = pd.read_csv(next((tmp_path / "cut").rglob("scores.csv")))
-    assert kept.name == scored[0] and list(table["scene"]).count("marble") == 1
+    assert kept.stem == scored[0] and list(table["scene"]).count("marble") == 1
     assert not (tmp_path / "cut" / ".rsbench" / "scoring").exists()
 
 
