@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rsbench.benchmark.images.plan import NONE, Places, Plan, stored_corrections, stored_depths, stored_motions
 from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pairs
 from rsbench.benchmark.images.store import Artefact, identity_of, keep, kept, read_seconds
-from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, MetricEntry, PoseCase
+from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import numeric_version, package_version
 from rsbench.benchmark.scoring import answered, score
 from rsbench.components.imports import hash_of_files
@@ -144,15 +144,12 @@ class Scorer:
         row: dict[str, float] = {}
         for metric in self.plan.metrics:
             if metric.component.case is kind:
-                row |= self._values(metric, case)
+                try:
+                    row |= score(metric, case)
+                except RsbenchError as error:
+                    self._fail("metric", metric.name, str(error))
+                    row |= {column.name: np.nan for column in metric.component.columns}
         return row
-
-    def _values(self, metric: MetricEntry, case: Case | None) -> dict[str, float]:
-        try:
-            return score(metric, case)
-        except RsbenchError as error:
-            self._fail("metric", metric.name, str(error))
-            return {column.name: np.nan for column in metric.component.columns}
 
     def _score_matches(self) -> None:
         record = self.places.matches().record()

@@ -487,11 +487,8 @@ class OneCameraTrack(CorrectionTrack):
             known = work.left
         gyro = problem.correspondences.gyro
         known = replace(known, gyro=gyro if len(gyro) > 0 else None)
-        rig, rows, start = (
-            problem.rig.about(_SIDE),
-            [float(each.row) for each in work.requested],
-            time.perf_counter(),
-        )
+        rig, rows = problem.rig.about(_SIDE), [float(each.row) for each in work.requested]
+        start = time.perf_counter()
         frames = correct_known_rows(images, known, rig, problem.shutter, chain, (VIEW,), 0.0, rows)
         spent = work.spent.get("left", 0.0) if spec.needs & {"motion", "matches"} else 0.0
         return frames, time.perf_counter() - start + spent

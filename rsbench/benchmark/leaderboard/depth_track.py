@@ -227,18 +227,16 @@ def _mistakes(depth: NDArray[np.float32], pictures: TruePictures) -> Iterator[st
     both = (depth > 0.0) & (true > 0.0)
     if not np.any(both):
         return
-    submitted, z, product = (
-        depth[both].astype(np.float64),
-        true[both].astype(np.float64),
-        rig.camera.fx * rig.baseline,
-    )
+    submitted, z = (each[both].astype(np.float64) for each in (depth, true))
     error = _error(submitted, z)
     if error < _RIGHT:
         return
     readings: dict[str, Callable[[], FloatArray]] = {
         "it is in millimetres; depth is in metres": lambda: submitted / 1000.0,
         "it is in centimetres; depth is in metres": lambda: submitted / 100.0,
-        "it is disparity in px; depth is fx * baseline / disparity": lambda: product / submitted,
+        "it is disparity in px; depth is fx * baseline / disparity": lambda: (
+            rig.camera.fx * rig.baseline / submitted
+        ),
         "it is inverse depth, 1 / m, not depth": lambda: 1.0 / submitted,
         "it is the distance along the ray; depth is z of the camera": lambda: submitted / along[both],
     }

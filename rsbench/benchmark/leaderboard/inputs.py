@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,12 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     write_matches(given, out)
     save_arrays(out / "problems.npz", _arrays(given, columns))
     if split.track.at_rows:
-        rows = _requested_rows(split)
+        # Each corrected frame of an answer, with the row whose time it shows, and that time.
+        rows = (
+            (truth.name, each.stem, each.row, float(truth.shutter.time_after(each.row, VIEW[1], VIEW[0])))
+            for truth in split.truths
+            for each in truth.shown.requested
+        )
         write_bytes(out / "pictures.csv", _csv(("name", "picture", "row", "time"), rows))
     if split.public:
         write_truth(split, out, "truth.jsonl")
@@ -107,13 +112,6 @@ def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:
     return tuple(known[key] if key in known else getattr(problem.rig.camera, key) for key in columns)
 
 
-def _requested_rows(split: Split) -> Iterator[tuple[str, str, int, float]]:
-    """Each corrected frame of an answer, with the row whose time it shows, and that time."""
-    for truth in split.truths:
-        for each in truth.pictures.requested if truth.pictures else ():
-            yield truth.name, each.stem, each.row, float(truth.shutter.time_after(each.row, VIEW[1], VIEW[0]))
-
-
 def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
     """A CSV file; numbers have all their digits."""
     text = io.StringIO()
@@ -149,8 +147,7 @@ def write_frames(split: Split, out: Path) -> None:
         if truth.pictures is not None:
             truth.pictures.check()
     for truth in split.truths:
-        sequence, folder = truth.sequence, out / "frames" / truth.name
-        assert sequence is not None
+        sequence, folder = truth.rendered, out / "frames" / truth.name
         folder.mkdir(parents=True, exist_ok=True)
         for side, frame in VIEWS:
             sequence.image("rs", side, frame)  # that it can be read

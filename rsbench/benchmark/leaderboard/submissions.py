@@ -7,14 +7,13 @@ as paths, and numbers must be finite. The format is described in docs/how-to/sub
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rsbench.benchmark.leaderboard.track import ORACLE, Answer, Header, Split, Submission, Vector
+from rsbench.benchmark.leaderboard.track import ORACLE, Answer, Header, Split, Submission
 from rsbench.components.cards import choices, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import write_bytes
@@ -160,7 +159,7 @@ def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:
     if missing:
         yield f"{path}: no answer for {len(missing)} of {_few(missing, len(split.truths))}: they count as failures"
     answers = [answer for answer in submission.answers.values() if answer.success and answer.w is not None]
-    turns = [answer.name for answer in answers if np.linalg.norm(_of(answer.w)) > np.pi]
+    turns = [answer.name for answer in answers if math.hypot(*(answer.w or ())) > math.pi]
     if turns:
         yield (
             f"{path}: norm(w) is more than half a turn in {len(turns)} of {_few(turns, len(answers))}: w is in "
@@ -172,10 +171,6 @@ def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:
 
 def _few(names: list[str], total: int) -> str:
     return f"{total} ({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
-
-
-def _of(vector: Vector | None) -> np.ndarray:
-    return np.array(vector, dtype=np.float64)
 
 
 # Writing
