@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from commands import run_here
 
-from rsbench.benchmark.leaderboard.board import Scored, entries_of
+from rsbench.benchmark.leaderboard.board import Scored, add, entries_of
 from rsbench.benchmark.leaderboard.submissions import read_submission, truth_text, write_oracles
 from rsbench.benchmark.leaderboard.track import Split, mark
 from rsbench.benchmark.leaderboard.tracks import TRACKS
@@ -66,6 +66,11 @@ def leaderboard(*words: object) -> str:
 def run_entries(track: str, entries: Iterable[object], *where: object) -> str:
     """``rsbench leaderboard run`` of some entries."""
     return leaderboard("run", track, *where, *(word for entry in entries for word in ("--entry", entry)))
+
+
+def handed_in(board: Path, lines: Iterable[Line], split: Split, command: str = "", **options: Any) -> Scored:
+    """The entry that lines become on a board."""
+    return add(board, write(board.with_suffix(".jsonl"), lines), split, {"command": command}, **options)
 
 
 def entered(board: Path, split: Split) -> dict[str, Scored]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rsbench.benchmark.images.evaluation import columns_of, open_evaluation, rea
 from rsbench.benchmark.images.score import TABLES
 from rsbench.core.errors import RsbenchError
 from rsbench.storage import files
+from rsbench.storage.files import load_matches
 from rsbench.storage.work_folder import work_folder
 
 
@@ -55,14 +57,11 @@ def test_one_more_solver_redoes_and_deletes_nothing(smoke_dataset: Path, copy: P
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(smoke_dataset: Path, evaluated: Path, tmp_path: Path) -> None:
-    class InterruptedByTestError(Exception):
-        pass
-
     def stop(word: str) -> None:
         if word == "room-twist: gs-8pt":
-            raise InterruptedByTestError
+            raise KeyboardInterrupt
 
-    with pytest.raises(InterruptedByTestError):
+    with pytest.raises(KeyboardInterrupt):
         evaluate(smoke_dataset, tmp_path, stop)
     before = times(tmp_path)
     assert "predictions/room-twist/motion/gs-8pt.json" in before
@@ -82,8 +81,6 @@ def test_half_an_artefact_is_made_again(smoke_dataset: Path, evaluated: Path, co
 
 
 def test_other_images_make_everything_stale(smoke_dataset: Path, copy: Path, tmp_path: Path) -> None:
-    import shutil
-
     data = Path(shutil.copytree(smoke_dataset, tmp_path / "data"))
     image = data / "castle" / "rs" / "left_0.png"
     image.write_bytes((data / "castle" / "gs" / "left_0.png").read_bytes())
@@ -189,8 +186,6 @@ def test_columns_are_the_planned_ones(smoke_dataset: Path, evaluated: Path) -> N
 
 
 def test_each_match_is_counted_once(evaluated: Path) -> None:
-    from rsbench.storage.files import load_matches
-
     pose = read_scores(evaluated, "pose")
     for sequence in ("castle", "room-twist"):
         matches = load_matches(evaluated / "predictions" / sequence / "matches.npz")

@@ -109,6 +109,13 @@ class OddMetric(PoseMetric):
         return {"other": 1.0}
 
 
+class Twin(ImageMetric):
+    columns = (Column(name="psnr", better="higher", worst=0.0),)
+
+    def compute(self, case):
+        return {"psnr": 1.0}
+
+
 class Darkness(ImageMetric):
     columns = (Column(name="darkness", better="lower", worst=1.0, title="dark"),)
 
@@ -124,11 +131,14 @@ def strangers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def odd(strangers: Path, name: str, cls: str, how: str, limit: float = 30.0) -> str:
-    text = f'class = "evaluation_strangers:{cls}"\ntime_limit_s = {limit}\n[parameters]\nhow = "{how}"\n'
+def card(strangers: Path, name: str, cls: str, more: str = "") -> str:
     path = strangers / f"{name}.toml"
-    path.write_text(text)
+    path.write_text(f'class = "evaluation_strangers:{cls}"\n{more}')
     return str(path)
+
+
+def odd(strangers: Path, name: str, cls: str, how: str, limit: float = 30.0) -> str:
+    return card(strangers, name, cls, f'time_limit_s = {limit}\n[parameters]\nhow = "{how}"\n')
 
 
 SOLVER_FAULTS = {
@@ -190,8 +200,7 @@ def test_other_components_that_break_the_contract_fail_alone(
 def test_frames_that_a_corrector_gives_up_by_value_score_the_worst_and_the_others_their_own(
     smoke_dataset: Path, tmp_path: Path, strangers: Path
 ) -> None:
-    (strangers / "left-alone.toml").write_text('class = "evaluation_strangers:LeftAlone"\n')
-    evaluate(smoke_dataset, tmp_path, corrector=str(strangers / "left-alone.toml"), only=("castle",))
+    evaluate(smoke_dataset, tmp_path, corrector=card(strangers, "left-alone", "LeftAlone"), only=("castle",))
     scores = read_scores(tmp_path, "correction")
     own = scores[(scores["corrector"] == "left-alone") & (scores["sequence"] == "castle")].set_index("side")
     assert set(own["solver"]) == set(own["matcher"]) == {"none"}
@@ -240,10 +249,8 @@ def test_an_error_in_our_own_code_stops_the_run(
 
 
 def test_one_file_and_one_card_add_a_metric(smoke_dataset: Path, copy: Path, strangers: Path) -> None:
-    path = strangers / "darkness.toml"
-    path.write_text('class = "evaluation_strangers:Darkness"\n')
     before, was = times(copy), read_scores(copy, "correction")
-    evaluate(smoke_dataset, copy, metrics=(str(path),))
+    evaluate(smoke_dataset, copy, metrics=(card(strangers, "darkness", "Darkness"),))
     assert remade(before, copy) == set()
     scores = read_scores(copy, "correction")
     pd.testing.assert_frame_equal(scores.drop(columns="darkness"), was)
@@ -254,16 +261,8 @@ def test_one_file_and_one_card_add_a_metric(smoke_dataset: Path, copy: Path, str
 
 
 def test_a_metric_whose_column_is_taken_is_refused(smoke_dataset: Path, tmp_path: Path, strangers: Path) -> None:
-    (strangers / "evaluation_twin.py").write_text(
-        "from rsbench.benchmark.metric_plugins import Column, ImageMetric\n"
-        "class Twin(ImageMetric):\n"
-        "    columns = (Column(name='psnr', better='higher', worst=0.0),)\n"
-        "    def compute(self, case):\n"
-        "        return {'psnr': 1.0}\n"
-    )
-    (strangers / "twin.toml").write_text('class = "evaluation_twin:Twin"\n')
     with pytest.raises(RsbenchError, match="metric 'twin': column 'psnr' is one of metric 'psnr' too"):
-        evaluate(smoke_dataset, tmp_path, metrics=(str(strangers / "twin.toml"),))
+        evaluate(smoke_dataset, tmp_path, metrics=(card(strangers, "twin", "Twin"),))
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from leaderboards import (
     Line,
     entered,
     erring,
+    handed_in,
     jobs_here,
     leaderboard,
     lines_of,
@@ -125,11 +126,11 @@ def test_stated_covariances_are_judged(tmp_path: Path) -> None:
 
 def test_entries_stand_alone_and_copies_tie(tmp_path: Path) -> None:
     board = tmp_path / "board"
-    add(board, write(tmp_path / "a.jsonl", named(_noisy(0.1), "a")), SPLIT, {})
+    handed_in(board, named(_noisy(0.1), "a"), SPLIT)
     (alone,) = entries_of(board, "points-1", SPLIT.name)
     for name, lines in (("copy", _noisy(0.1)), ("better", _noisy(0.03)), ("worse", _noisy(0.6))):
-        add(board, write(tmp_path / "a.jsonl", named(lines, name)), SPLIT, {})
-    add(board, write(tmp_path / "a.jsonl", TRUTH), SPLIT, {"command": ORACLES})
+        handed_in(board, named(lines, name), SPLIT)
+    handed_in(board, TRUTH, SPLIT, ORACLES)
     entries = entered(board, SPLIT)
     pd.testing.assert_frame_equal(entries["a"].scores, alone.scores)
     found = {line.scored.header.method: line for line in standings([*entries.values()])}
@@ -143,7 +144,7 @@ def test_entries_stand_alone_and_copies_tie(tmp_path: Path) -> None:
 def test_boards_merge_and_names_clash(tmp_path: Path) -> None:
     boards = [tmp_path / "one", tmp_path / "two"]
     for board, name, size in ((boards[0], "a", 0.01), (boards[1], "b", 0.02), (boards[1], "a", 0.01)):
-        add(board, write(tmp_path / "x.jsonl", named(_noisy(size), name)), SPLIT, {})
+        handed_in(board, named(_noisy(size), name), SPLIT)
     assert merge(boards[1], boards[0]) == [f"points-1/{SPLIT.name}/b"]
     assert merge(boards[1], boards[0]) == []
     assert [e.header.method for e in entries_of(boards[0], *splits_of(boards[0])[0])] == ["a", "b"]
@@ -158,7 +159,7 @@ def test_boards_merge_and_names_clash(tmp_path: Path) -> None:
 
 def test_scores_that_were_changed_are_named(tmp_path: Path) -> None:
     board = tmp_path / "board"
-    scored = add(board, write(tmp_path / "x.jsonl", named(_noisy(0.01), "a")), SPLIT, {})
+    scored = handed_in(board, named(_noisy(0.01), "a"), SPLIT)
     path = scored.folder / "scores.csv"
     forged = pd.read_csv(path).assign(auc_5=1.0)
     forged.to_csv(path, index=False)
@@ -226,7 +227,7 @@ def test_a_strangers_board_leads_nowhere(tmp_path: Path) -> None:
     """Links and entries under other names than their own are refused, and nothing is copied."""
     theirs, secret = tmp_path / "theirs", tmp_path / "secret"
     secret.write_text("secret", "utf-8")
-    scored = add(theirs, write(tmp_path / "x.jsonl", named(_noisy(0.01), "a")), SPLIT, {})
+    scored = handed_in(theirs, named(_noisy(0.01), "a"), SPLIT)
     (scored.folder / "predictions.jsonl").unlink()
     (scored.folder / "predictions.jsonl").symlink_to(secret)
     with pytest.raises(RsbenchError, match="must be a file of its own"):
@@ -235,7 +236,7 @@ def test_a_strangers_board_leads_nowhere(tmp_path: Path) -> None:
     with pytest.raises(RsbenchError):
         merge(theirs, tmp_path / "mine")
     other = tmp_path / "other"
-    about = add(other, tmp_path / "x.jsonl", SPLIT, {}).folder.parents[1] / "split.json"
+    about = handed_in(other, named(_noisy(0.01), "a"), SPLIT).folder.parents[1] / "split.json"
     about.unlink()
     about.symlink_to(secret)
     with pytest.raises(RsbenchError, match=r"split\.json: must be a file of its own"):

@@ -257,10 +257,10 @@ def test_a_gyroscope_is_given_where_there_is_one(rendered: Path, tmp_path: Path)
     assert tau.min() < 0.0 and tau.max() > 1.8
     # The motion turns evenly; 0.02 rad/s of bias on each axis, at 20 frames a second.
     np.testing.assert_allclose(np.mean(w, axis=0), truth.motion.w, atol=4.0 * 0.02 * 0.05)
-    assert truth.pictures is not None and "imu/measured.csv" in truth.pictures.files
+    assert "imu/measured.csv" in truth.shown.files
     # The tracks that do not give it are as they were.
-    other = TRACKS["correction"].split(rendered).truths[0].pictures
-    assert other is not None and "imu/measured.csv" not in other.files
+    other = TRACKS["correction"].split(rendered).truths[0].shown
+    assert "imu/measured.csv" not in other.files
 
 
 def test_samples_of_a_pair_of_many_frames_have_its_own_times(rendered: Path) -> None:
@@ -282,8 +282,7 @@ def test_nobody_looks_to_the_right(name: str, rendered: Path) -> None:
     """Black images of the right camera give the same frames."""
     split = TRACK.split(rendered)
     (problem,) = TRACK.problems(rendered, None, 1)
-    pictures, made = split.truths[0].pictures, list[np.ndarray]()
-    assert pictures is not None
+    pictures, made = split.truths[0].shown, list[np.ndarray]()
     images = {view: pictures.sequence.image("rs", *view) for view in VIEWS}
     for seen in (images, {view: image * (view[0] == "left") for view, image in images.items()}):
         frames, seconds = TRACK.corrected(  # pyrefly: ignore[missing-attribute]
@@ -300,5 +299,5 @@ def test_rows_are_asked_where_their_truth_is(tmp_path: Path) -> None:
         folder = tmp_path / str(len(twins))
         write_analytic_dataset(folder, *PLANES, twins=twins)
         for track, most in (("correction-mono", 3), ("correction", 2)):
-            pictures = TRACKS[track].split(folder).truths[0].pictures
-            assert pictures is not None and [each.row for each in pictures.requested] == rows[:most]
+            pictures = TRACKS[track].split(folder).truths[0].shown
+            assert [each.row for each in pictures.requested] == rows[:most]

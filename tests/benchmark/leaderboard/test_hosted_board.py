@@ -8,12 +8,12 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
-from leaderboards import Line, erring, files_below, lines_of, named, truth_lines, write
+from commands import bytes_below
+from leaderboards import erring, lines_of, named, truth_lines, write
 
 from rsbench.benchmark.leaderboard.submissions import write_truth
 from rsbench.benchmark.leaderboard.track import Split
@@ -23,55 +23,42 @@ ROOT = Path(__file__).parents[3]
 BOARD = ROOT / "examples" / "board"
 
 
-PATHS: dict[str, tuple[bytes, str]] = {
-    "script": (b"check.py", "100644"),
-    "workflow": (b".github/workflows/board.yml", "100644"),
-    "attributes": (b"submissions/mine/.gitattributes", "100644"),
-    "modules": (b".gitmodules", "100644"),
-    "keeper's word": (b"updates.txt", "100644"),
-    "page": (b"submissions/mine/evil.html", "100644"),
-    "page below": (b"submissions/mine/pictures/p000/a/evil.html", "100644"),
-    "another's": (b"submissions/theirs/pictures/p000/left_1.exr", "100644"),
-    "prefix": (b"submissions/mine.d/predictions.jsonl", "100644"),
-    "folder in other case": (b"Submissions/mine/predictions.jsonl", "100644"),
-    "entry in other case": (b"submissions/Theirs/predictions.jsonl", "100644"),
-    "full-width": ("submissions/\uff4dine/predictions.jsonl".encode(), "100644"),
-    "not UTF-8": (b"submissions/mine/\xff\xfe", "100644"),
-    "terminal": (b"submissions/mine/\x1b[31mred\x07", "100644"),
-    "command of the log": (b"submissions/mine/a\n::error::b", "100644"),
-    "text from right to left": ("submissions/mine/\u202etxt".encode(), "100644"),
-    "link": (b"submissions/mine/pictures/p000/left_1.exr", "120000"),
-    "program": (b"submissions/mine/pictures/p000/left_1.exr", "100755"),
-    "submodule": (b"submissions/mine/matches/left.csv", "160000"),
-    "signature of a new one": (b"submissions/mine/update.sig", "100644"),
-    "key": (b"submissions/mine/owner.pub", "100644"),
+REFUSED = "is no file of one folder submissions/METHOD"
+PATHS: dict[str, tuple[bytes, str, str]] = {
+    "script": (b"check.py", "100644", REFUSED),
+    "workflow": (b".github/workflows/board.yml", "100644", REFUSED),
+    "attributes": (b"submissions/mine/.gitattributes", "100644", REFUSED),
+    "modules": (b".gitmodules", "100644", REFUSED),
+    "keeper's word": (b"updates.txt", "100644", REFUSED),
+    "page": (b"submissions/mine/evil.html", "100644", REFUSED),
+    "page below": (b"submissions/mine/pictures/p000/a/evil.html", "100644", REFUSED),
+    "another's": (b"submissions/theirs/pictures/p000/left_1.exr", "100644", "changes 2 entries"),
+    "prefix": (b"submissions/mine.d/predictions.jsonl", "100644", "changes 2 entries"),
+    "folder in other case": (b"Submissions/mine/predictions.jsonl", "100644", REFUSED),
+    "entry in other case": (b"submissions/Theirs/predictions.jsonl", "100644", "changes 2 entries"),
+    "full-width": ("submissions/\uff4dine/predictions.jsonl".encode(), "100644", REFUSED),
+    "not UTF-8": (b"submissions/mine/\xff\xfe", "100644", REFUSED),
+    "terminal": (b"submissions/mine/\x1b[31mred\x07", "100644", REFUSED),
+    "command of the log": (b"submissions/mine/a\n::error::b", "100644", REFUSED),
+    "text from right to left": ("submissions/mine/\u202etxt".encode(), "100644", REFUSED),
+    "link": (b"submissions/mine/pictures/p000/left_1.exr", "120000", "mode 120000: must be a plain file"),
+    "program": (b"submissions/mine/pictures/p000/left_1.exr", "100755", "mode 100755: must be a plain file"),
+    "submodule": (b"submissions/mine/matches/left.csv", "160000", "mode 160000: must be a plain file"),
+    "signature of a new one": (b"submissions/mine/update.sig", "100644", "is for a change of an entry that is"),
+    "key": (b"submissions/mine/owner.pub", "100644", "owner.pub: must be one public key"),
 }
-"""A path beside an entry in order, and its mode."""
-REFUSED = {
-    "another's": "changes 2 entries",
-    "prefix": "changes 2 entries",
-    "entry in other case": "changes 2 entries",
-    "link": "mode 120000: must be a plain file",
-    "program": "mode 100755: must be a plain file",
-    "submodule": "mode 160000: must be a plain file",
-    "signature of a new one": "is for a change of an entry that is there",
-    "key": "owner.pub: must be one public key",
-}
+"""A path beside an entry in order, its mode, and what is said of it."""
 SECONDS = itertools.count(2_000_000_000)
 """Of commits, so that each is after the last."""
 Files = dict[bytes, bytes | tuple[str, bytes] | None]
 
 
+ME = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
+
+
 def run(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    me = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
-    return subprocess.run(
-        [str(word) for word in words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, **me, "PYTHONPATH": str(ROOT)},
-    )
+    environment = {**os.environ, **ME, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(list(map(str, words)), cwd=cwd, capture_output=True, text=True, env=environment)
 
 
 @pytest.fixture
@@ -88,31 +75,27 @@ def keeper(tmp_path: Path) -> Path:
     return clone
 
 
-def hand_in(tmp_path: Path, branch: str, change: Callable[[Path], object]) -> None:
-    """A stranger's clone, a branch, a push: the pull request."""
+def hand_in(tmp_path: Path, keeper: Path, branch: str, method: str) -> None:
+    """A stranger's clone, a branch, a push: the pull request, which the keeper fetches."""
     clone = tmp_path / branch
     run("git", "clone", "-q", tmp_path / "bare.git", clone, cwd=tmp_path)
     run("git", "checkout", "-q", "-b", branch, cwd=clone)
-    change(clone)
+    put_answers(clone, method)
     run("git", "add", "-A", cwd=clone)
     run("git", "commit", "-qm", "Hand in", cwd=clone)
     assert run("git", "push", "-q", "origin", branch, cwd=clone).returncode == 0
+    run("git", "fetch", "-q", "origin", branch, cwd=keeper)
 
 
-def answers(method: str) -> Callable[[Path], object]:
-    lines: list[Line] = named(truth_lines(TRACKS["points"].split(None)), method)
-    rough = [lines[0], *erring(lines[1:], 0.05, 0.05)]  # errors beyond those of any doubt
-
-    def change(clone: Path) -> None:
-        (clone / "submissions" / method).mkdir(parents=True)
-        write(clone / "submissions" / method / "predictions.jsonl", rough)
-
-    return change
+def put_answers(clone: Path, method: str) -> None:
+    """With errors beyond those of any doubt."""
+    lines = named(truth_lines(TRACKS["points"].split(None)), method)
+    (clone / "submissions" / method).mkdir(parents=True)
+    write(clone / "submissions" / method / "predictions.jsonl", [lines[0], *erring(lines[1:], 0.05, 0.05)])
 
 
 def git(clone: Path, *words: str, given: bytes = b"") -> str:
-    me = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
-    me |= {"GIT_INDEX_FILE": str(clone / ".git" / "hostile"), "GIT_COMMITTER_DATE": f"{next(SECONDS)} +0000"}
+    me = ME | {"GIT_INDEX_FILE": str(clone / ".git" / "hostile"), "GIT_COMMITTER_DATE": f"{next(SECONDS)} +0000"}
     ran = subprocess.run(["git", *words], cwd=clone, input=given, capture_output=True, env=os.environ | me)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout.decode().strip()
@@ -163,9 +146,8 @@ def board(keeper: Path) -> Path:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_only_what_a_track_asks_for_may_change(board: Path, path: str) -> None:
-    name, mode = PATHS[path]
-    head = commit(board, "main", {MINE: b"mine", name: (mode, b"x")})
-    assert_refused(judge(board, head), REFUSED.get(path, "is no file of one folder submissions/METHOD"))
+    name, mode, words = PATHS[path]
+    assert_refused(judge(board, commit(board, "main", {MINE: b"mine", name: (mode, b"x")})), words)
 
 
 def test_what_differs_in_case_alone_is_refused(board: Path) -> None:
@@ -226,29 +208,25 @@ def hand_in_tree(board: Path, entry: str) -> str:
     return git(board, "commit-tree", root, "-p", "main", "-m", "Hand in")
 
 
-@pytest.mark.parametrize(
-    "entries",
-    [
-        [("100644", "predictions.jsonl", "blob"), ("100644", "predictions.jsonl", "blob")],
-        [("40000", "pictures", "empty"), ("100644", "predictions.jsonl", "blob")],
-        [("100644", "pictures/p000/left_1.exr", "blob"), ("100644", "predictions.jsonl", "blob")],
-        [("100664", "predictions.jsonl", "blob")],
-        [("100644", "", "blob"), ("100644", "predictions.jsonl", "blob")],
-        [("100644", "predictions.jsonl", "blob"), ("40000", "..", "folder")],
-        [("100644", "predictions.jsonl", "missing")],
-        [("100644", "predictions.jsonl", "folder")],
-    ],
-    ids=["doubled", "empty folder", "slash", "mode", "no name", "above", "missing", "folder"],
-)
-def test_trees_that_git_does_not_make_are_refused(board: Path, entries: list[tuple[str, str, str]]) -> None:
+WHOLE = ("100644", "predictions.jsonl", "blob")
+TREES: dict[str, list[tuple[str, str, str]]] = {
+    "doubled": [WHOLE, WHOLE],
+    "empty folder": [("40000", "pictures", "empty"), WHOLE],
+    "slash": [("100644", "pictures/p000/left_1.exr", "blob"), WHOLE],
+    "mode": [("100664", "predictions.jsonl", "blob")],
+    "no name": [("100644", "", "blob"), WHOLE],
+    "above": [WHOLE, ("40000", "..", "folder")],
+    "missing": [("100644", "predictions.jsonl", "missing")],
+    "folder": [("100644", "predictions.jsonl", "folder")],
+}
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_trees_that_git_does_not_make_are_refused(board: Path, tree: str) -> None:
     blob = git(board, "hash-object", "-w", "--stdin", given=b"mine")
-    made = {
-        "blob": blob,
-        "missing": "1" * 40,
-        "empty": tree_of(board),
-        "folder": tree_of(board, ("100644", "f", blob)),
-    }
-    head = hand_in_tree(board, tree_of(board, *((mode, name, made[what]) for mode, name, what in entries)))
+    made = {"blob": blob, "missing": "1" * 40, "empty": tree_of(board)}
+    made["folder"] = tree_of(board, ("100644", "f", blob))
+    head = hand_in_tree(board, tree_of(board, *((mode, name, made[what]) for mode, name, what in TREES[tree])))
     assert_refused(judge(board, head), "refused: ")
 
 
@@ -340,21 +318,18 @@ def test_the_key_of_an_entry_signs_its_updates(board: Path, tmp_path: Path) -> N
     line = ran.stderr.strip().rpartition(": ")[2]
     second = signed(board, unsigned, mine, line)
     assert REACHED in judge(board, second).stderr
+    cut, theirs = (
+        commit(board, unsigned, {b"submissions/mine/owner.pub": public})
+        for public in (owner.popitem()[1][:-4], other.with_suffix(".pub").read_bytes())
+    )
     for wrong in (
         signed(board, unsigned, other, line),
         signed(board, unsigned, mine, line, namespace="git"),
         signed(board, unsigned, mine, line[:-1] + ("1" if line.endswith("0") else "0")),
         commit(board, second, {MINE: b"third"}),
         commit(board, unsigned, {b"submissions/mine/update.sig": b"no signature"}),
-        signed(
-            board, commit(board, unsigned, {b"submissions/mine/owner.pub": owner.popitem()[1][:-4]}), mine, line
-        ),
-        signed(
-            board,
-            commit(board, unsigned, {b"submissions/mine/owner.pub": other.with_suffix(".pub").read_bytes()}),
-            other,
-            line,
-        ),
+        signed(board, cut, mine, line),
+        signed(board, theirs, other, line),
     ):
         assert_refused(judge(board, wrong), "update.sig: is not the signature by the key of owner.pub")
     # Merged; what was signed for that change serves for no other: not to come back, not to be done again.
@@ -368,9 +343,8 @@ def test_the_key_of_an_entry_signs_its_updates(board: Path, tmp_path: Path) -> N
     line = judge(board, again).stderr.strip().rpartition(": ")[2]
     assert REACHED in judge(board, signed(board, again, mine, line)).stderr
     push(board, {b"accepted.txt": b"mine: a reason\n"})
-    assert_refused(
-        judge(board, signed(board, again, mine, line)), "it changes where the keeper adds to updates.txt"
-    )
+    accepted = signed(board, again, mine, line)
+    assert_refused(judge(board, accepted), "it changes where the keeper adds to updates.txt")
     push(board, {b"updates.txt": f"{line}\n".encode()})
     assert REACHED in judge(board, again).stderr
 
@@ -380,13 +354,12 @@ def test_the_key_of_an_entry_signs_its_updates(board: Path, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_what_rsbench_finds_is_one_plain_line(board: Path, tmp_path: Path) -> None:
-    answers("mine")(tmp_path)
+    put_answers(tmp_path, "mine")
     text = (tmp_path / MINE.decode()).read_text("utf-8")
     theirs = text.encode()
-    assert_refused(
-        judge(board, commit(board, "main", {b"submissions/another/predictions.jsonl": theirs})),
-        "submissions/another: its header names 'mine'; folder and method must agree",
-    )
+    elsewhere = commit(board, "main", {b"submissions/another/predictions.jsonl": theirs})
+    words = "submissions/another: its header names 'mine'; folder and method must agree"
+    assert_refused(judge(board, elsewhere), words)
     for path in (b"pictures/p000/evil.html", b"pictures/p000/left_1.exr", b"matches/left.csv"):
         head = commit(board, "main", {MINE: theirs, b"submissions/mine/" + path: b"x"})
         ran = judge(board, head)
@@ -411,11 +384,8 @@ def test_pictures_that_a_track_asks_for_are_scored(
 ) -> None:
     path = write_truth(splits["depth"], tmp_path / "in")
     write(path, named(lines_of(path), "mine", ("images",)))
-    below = files_below(tmp_path / "in")
-    change: Files = {
-        f"submissions/mine/{Path(name).relative_to(tmp_path / 'in').as_posix()}".encode(): data
-        for name, data in below.items()
-    }
+    below = bytes_below(tmp_path / "in").items()
+    change: Files = {f"submissions/mine/{name}".encode(): data for name, data in below}
     ran = judge(board, commit(board, "main", change), "--data", planes)
     assert len(change) == 3 and ran.returncode == 0 and "mine" in ran.stdout, ran.stderr
     extra = commit(board, "main", {**change, b"submissions/mine/matches/left.csv": b"name"})
@@ -424,20 +394,18 @@ def test_pictures_that_a_track_asks_for_are_scored(
 
 @pytest.mark.slow
 def test_one_is_scored_published_and_there_when_the_board_is_opened_again(keeper: Path, tmp_path: Path) -> None:
-    hand_in(tmp_path, "mine", answers("mine"))
-    run("git", "fetch", "-q", "origin", "mine", cwd=keeper)
+    hand_in(tmp_path, keeper, "mine", "mine")
     ran = run(sys.executable, "check.py", "main", "FETCH_HEAD", cwd=keeper)
     assert ran.returncode == 0 and "mine" in ran.stdout, ran.stderr
     assert run("git", "merge", "-q", "FETCH_HEAD", cwd=keeper).returncode == 0
     assert run("git", "push", "-q", "origin", "main", cwd=keeper).returncode == 0
-    hand_in(tmp_path, "shouting", answers("MINE"))
-    run("git", "fetch", "-q", "origin", "shouting", cwd=keeper)
+    hand_in(tmp_path, keeper, "shouting", "MINE")
     ran = run(sys.executable, "check.py", "main", "FETCH_HEAD", cwd=keeper)
     assert ran.returncode != 0 and "reads like submissions/mine" in ran.stderr
     tables = []
     for later in (False, True):  # from what the repository holds alone, as after a year
         if later:  # a newer rsbench has a method of an entry's name, and no doubt that the keeper spoke of
-            answers("rs-stereo-refined")(keeper)
+            put_answers(keeper, "rs-stereo-refined")
             (keeper / "accepted.txt").write_text("mine: an oracle of ours\n", "utf-8")
         ran = run(sys.executable, "publish.py", tmp_path / "site", cwd=keeper)
         assert ran.returncode == 0, ran.stderr

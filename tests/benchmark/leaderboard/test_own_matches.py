@@ -76,18 +76,16 @@ def test_right_matches_are_counted(split: Split, tmp_path: Path) -> None:
     assert abs(row["matches_1px"] - (1.0 - len(tracks[::3]) / (2 * len(tracks)))) < 0.02
     # Tracks are matches of all four pairs, each once, also where they are repeated.
     (truth,) = split.truths
-    assert truth.sequence is not None
-    found = match_scores(truth.sequence, Correspondences(tracks=tracks, left=left))
+    found = match_scores(truth.rendered, Correspondences(tracks=tracks, left=left))
     assert found["matches"] == 4 * len(tracks) and found["matches_1px"] > 0.98
-    assert match_scores(truth.sequence, Correspondences(left=np.tile(left[:7], (9, 1))))["matches"] == 7.0
+    assert match_scores(truth.rendered, Correspondences(left=np.tile(left[:7], (9, 1))))["matches"] == 7.0
 
 
 def test_motions_without_matches_have_none(split: Split, tmp_path: Path) -> None:
     (row,) = scores_of(split, truth_lines(split), tmp_path).to_dict("records")
     assert np.isnan(row["matches"]) and np.isnan(row["matches_1px"]) and row["auc_1"] > 1.0 - 1e-6
     (truth,) = split.truths
-    assert truth.sequence is not None
-    assert match_scores(truth.sequence, Correspondences()) == {"matches": 0.0, "matches_1px": 0.0}
+    assert match_scores(truth.rendered, Correspondences()) == {"matches": 0.0, "matches_1px": 0.0}
 
 
 def test_matches_are_kept_with_the_entry(split: Split, tmp_path: Path) -> None:

@@ -103,8 +103,7 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
     _each_depth(path, lambda z: np.where(known, product / np.maximum(product / z + off, 0.1), 0.0))
     scores = scores_of(split, path)
     for number, truth in enumerate(split.truths):
-        assert truth.pictures is not None
-        z = truth.pictures.depth().astype(np.float64)
+        z = truth.shown.depth().astype(np.float64)
         estimate = read_depth(pictures_of(path)[number]).astype(np.float64)
         for limit in (1, 2, 3):
             bad = sum(
@@ -119,7 +118,7 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
         assert abs(scores["rmse_m"][number] - np.sqrt(squares.mean())) < 1e-9
         assert scores["coverage"][number] == known.mean() and scores["on_sky"][number] == 0.0
         # The classes make up the whole: what the right camera sees, and the rest.
-        seen = truth.pictures.seen_by_both(truth.pictures.depth()).mean()
+        seen = truth.shown.seen_by_both(truth.shown.depth()).mean()
         whole = seen * scores["bad_1_visible"][number] + (1.0 - seen) * scores["bad_1_occluded"][number]
         assert abs(whole - scores["bad_1"][number]) < 1e-12
 
@@ -147,8 +146,7 @@ def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: 
     assert np.all(half["ssim_covered"] == 1.0) and np.all(np.isinf(half["psnr_covered"]))
     assert np.all(half["psnr_all"] < 12.0)
     for truth, share in zip(split.truths, half["coverage"], strict=True):
-        assert truth.pictures is not None
-        masks = truth.pictures.commons()
+        masks = truth.shown.commons()
         assert abs(share - np.mean([mask[:40].sum() / mask.sum() for mask in masks])) < 1e-12
 
 
@@ -157,9 +155,8 @@ def test_the_common_pixels_are_those_that_the_frame_saw(splits: dict[str, Split]
     from rsbench.core.projection import rs_project
 
     truth = splits["correction"].truths[1]
-    assert truth.pictures is not None
-    for each, common in zip(truth.pictures.requested, truth.pictures.commons(), strict=True):
-        sequence = truth.pictures.sequence
+    for each, common in zip(truth.shown.requested, truth.shown.commons(), strict=True):
+        sequence = truth.shown.sequence
         pose = RIG.cam_from_world(truth.motion, truth.shutter.time_after(each.row, 1, "left"), "left")
         z = sequence.depth("gs", "left", 1, each.row)[..., None]
         X = (RIG.camera.unproject(RIG.camera.pixel_grid()) * z - pose.t) @ pose.R
@@ -528,10 +525,9 @@ def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path
     scores = scores_of(split, path)
     assert np.all(scores["bad_1_rows_1"] == 1 / 96) and np.all(scores["bad_1_rows_5"] == 1.0)
     for number, truth in enumerate(split.truths):
-        assert truth.pictures is not None
         wrong = np.zeros((80, 96))
         wrong[40:], wrong[:, 7] = 1.0, 1.0
-        parts = _by_hand(wrong, truth.pictures.depth() > 0, truth.pictures.rolling(), 0)
+        parts = _by_hand(wrong, truth.shown.depth() > 0, truth.shown.rolling(), 0)
         for name in (*columns("bad_1", ROWS), *columns("bad_1", TEXTURE)):
             expected = parts.get(name.removeprefix("bad_1_"), [math.nan])
             assert scores[name][number] == pytest.approx(np.mean(expected), nan_ok=True)
@@ -547,10 +543,9 @@ def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path:
         write_png(picture, ((read_png(picture) + off) % 256).astype(np.uint8))
     scores = scores_of(split, path)
     for number, truth in enumerate(split.truths):
-        assert truth.pictures is not None
         parts = dict[str, list[float]]()
-        for each, common in zip(truth.pictures.requested, truth.pictures.commons(), strict=True):
-            frame = truth.pictures.frame(each.row)
+        for each, common in zip(truth.shown.requested, truth.shown.commons(), strict=True):
+            frame = truth.shown.frame(each.row)
             squares = np.mean(((frame + off) % 256 - frame.astype(np.float64)) ** 2, axis=-1)
             for name, values in _by_hand(squares, common, frame, each.row).items():
                 parts.setdefault(name, []).extend(values)

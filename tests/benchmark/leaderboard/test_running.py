@@ -141,8 +141,7 @@ def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None
     leaderboard(*export, tmp_path / "closed", "--secret")
     told = set(files_below(tmp_path / "closed").values())
     for truth in split.truths:
-        assert truth.pictures is not None
-        assert not told & {truth.pictures.path(each).read_bytes() for each in truth.pictures.requested}
+        assert not told & {truth.shown.path(each).read_bytes() for each in truth.shown.requested}
     assert (planes / "planes" / "rs" / "left_2.png").read_bytes() in told
 
 
@@ -303,8 +302,7 @@ def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_p
     """In this process, as a child would."""
     split = splits["depth"]
     first, second = split.truths
-    assert first.pictures is not None
-    changed = replace(first.pictures, files=dict.fromkeys(first.pictures.files, "0" * 64))
+    changed = replace(first.shown, files=dict.fromkeys(first.shown.files, "0" * 64))
     broken = replace(split, truths=(replace(first, pictures=changed), second))
     run = _serve_rows([read_submission(write_truth(split, tmp_path), split)], broken)
     with pytest.raises(RsbenchError, match=r"is not the file that dataset\.json names"):

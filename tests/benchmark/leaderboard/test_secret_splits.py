@@ -8,15 +8,14 @@ import re
 import shutil
 import struct
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import run_here
-from leaderboards import small_split
+from commands import assert_refused, bytes_below, run_here
+from leaderboards import leaderboard, named, scores_of, small_split, truth_lines, write
 
 from rsbench.benchmark.leaderboard import publishing
 from rsbench.benchmark.leaderboard.inputs import check_place, write_inputs
@@ -30,8 +29,7 @@ from rsbench.benchmark.leaderboard.publishing import (
     read_announcement,
 )
 from rsbench.benchmark.leaderboard.splits import exact_problem, simulated_problem
-from rsbench.benchmark.leaderboard.submissions import read_submission, truth_text
-from rsbench.benchmark.leaderboard.track import mark
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import rs_project
@@ -97,43 +95,42 @@ def test_all_inputs_are_the_same_numbers(tmp_path: Path) -> None:
     assert (tmp_path / "truth.jsonl").is_file()
 
 
+def assert_tells_no_motion(folder: Path, split: Split) -> None:
+    """What can be read as text has the fingerprint of a split, and no number of its motions."""
+    files = [path for path in folder.rglob("*") if path.suffix in (".csv", ".json", ".jsonl")]
+    told = b"".join(path.read_bytes() for path in files)
+    assert len(files) >= 3 and split.fingerprint.encode() in told
+    for truth in split.truths:
+        assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
+
+
 def test_a_secret_split_is_exported_without_its_truth(tmp_path: Path) -> None:
     (tmp_path / "seed").write_text("a text that nobody can guess", "utf-8")
     split = TRACKS["points"].split(None, tmp_path / "seed")
     write_inputs(split, iter([simulated_problem(3, 0)]), tmp_path / "out")
-    told = b"".join(path.read_bytes() for path in (tmp_path / "out").iterdir() if path.suffix != ".npz")
     assert not (tmp_path / "out" / "truth.jsonl").exists()
-    for truth in split.truths:
-        assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
+    assert_tells_no_motion(tmp_path / "out", split)
 
 
 def test_motions_at_the_bound_err_as_it_says(tmp_path: Path) -> None:
     """Their squared errors over the bound's covariance are chi-squared with six degrees of freedom: mean 6."""
     split = small_split(40)
-    path = tmp_path / "x.jsonl"
-    path.write_text(bound_text(split, tmp_path), "utf-8")
-    scores = mark(read_submission(path, split), split)
+    scores = scores_of(split, map(json.loads, bound_text(split, tmp_path).splitlines()), tmp_path)
     assert scores["success"].all()
     assert abs(scores["nees"].mean() - 6.0) < 3.0 * np.sqrt(12.0 / 40)  # its variance is 12
     # The bound of tracks without the outliers: no noisy pixel is among the exact ones, and no outlier.
     exact, noise = exact_problem(1, 0)
     given = simulated_problem(1, 0).correspondences.tracks
     near = np.min(np.max(np.abs(exact.correspondences.tracks[:, None] - given[None]), axis=2), axis=1)
-    assert len(exact.correspondences.tracks) == round(
-        (1.0 - float(split.truths[0].facts["outliers"])) * len(given)
-    )
+    good = 1.0 - float(split.truths[0].facts["outliers"])
+    assert len(exact.correspondences.tracks) == round(good * len(given))
     assert np.all(near < 6.0 * noise) and np.all(near > 0.0)
 
 
 def test_a_secret_dataset_is_exported_without_its_truth(smoke_dataset: Path, tmp_path: Path) -> None:
-    where = ("--data", smoke_dataset, "--out", tmp_path / "out", "--secret")
-    assert run_here("leaderboard", "export", "pose-own", *where).returncode == 0
+    leaderboard("export", "pose-own", "--data", smoke_dataset, "--out", tmp_path / "out", "--secret")
     split = TRACKS["pose-own"].split(smoke_dataset)
-    files = [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".csv", ".json", ".jsonl")]
-    told = b"".join(path.read_bytes() for path in files)
-    assert len(files) == 3 and split.fingerprint.encode() in told
-    for truth in split.truths:
-        assert all(repr(float(x)).encode() not in told for x in (*truth.motion.w, *truth.motion.d))
+    assert_tells_no_motion(tmp_path / "out", split)
 
 
 def test_inputs_are_written_beside_nothing_else(tmp_path: Path) -> None:
@@ -216,12 +213,6 @@ def place(tmp_path: Path, card: str) -> Path:
     return tmp_path
 
 
-def public(place: Path) -> Iterator[tuple[str, bytes]]:
-    for path in sorted((place / "out").rglob("*")):
-        if path.is_file():
-            yield path.relative_to(place / "out").as_posix(), path.read_bytes()
-
-
 def test_the_text_alone_makes_the_truth_that_was_rendered(place: Path, card: str) -> None:
     announced = read_announcement(place / "out")
     drawn = announced_split(announced, TRACK, card, SECRET, None)
@@ -229,13 +220,12 @@ def test_the_text_alone_makes_the_truth_that_was_rendered(place: Path, card: str
     assert drawn.fingerprint == kept.fingerprint == announced.fingerprint
     assert [each.facts for each in drawn.truths] == [each.facts for each in kept.truths]
     assert [each.scene for each in drawn.truths] == [each.scene for each in kept.truths]
-    (place / "mine.jsonl").write_text(truth_text(drawn))
-    scores = mark(read_submission(place / "mine.jsonl", kept), kept)
+    scores = scores_of(kept, truth_lines(drawn), place)
     assert np.all(scores["auc_1"] == 1.0) and len(scores) == 4
 
 
 def test_the_public_part_is_frames_cameras_and_what_is_announced(place: Path) -> None:
-    names = {re.sub(r"s\d/(left|right)_[01]", "s0/left_0", name) for name, _ in public(place)}
+    names = {re.sub(r"s\d/(left|right)_[01]", "s0/left_0", name) for name in bytes_below(place / "out")}
     assert names == {
         "frames/s0/left_0.png",
         "problems.csv",
@@ -259,7 +249,7 @@ def test_no_public_file_holds_a_number_or_name_of_the_truth(place: Path, card: s
         hidden |= {str(image_seed(drawn.seed_of(each), each.name, *view)) for view in views_of(2)}
     hidden |= {repr(float(number)) for number in numbers}
     bits = [struct.pack("<d", number) for number in numbers]
-    for name, content in public(place):
+    for name, content in bytes_below(place / "out").items():
         text = content.decode("latin-1")
         assert not [word for word in hidden if word in text], name
         assert not [word for word in bits if word in content], name
@@ -267,7 +257,7 @@ def test_no_public_file_holds_a_number_or_name_of_the_truth(place: Path, card: s
 
 def test_pictures_hold_pixels_alone(place: Path) -> None:
     """No date, no program, no comment: a header, the pixels and an end."""
-    for name, content in public(place):
+    for name, content in bytes_below(place / "out").items():
         if name.endswith(".png"):
             kinds, at = list[bytes](), 8
             while at < len(content):
@@ -278,11 +268,11 @@ def test_pictures_hold_pixels_alone(place: Path) -> None:
 
 
 def test_who_is_told_the_text_finds_the_same(place: Path, card: str) -> None:
-    before = dict(public(place))
+    before = bytes_below(place / "out")
     publish(TRACK, card, SECRET, place / "again", place / "other")
     assert (place / "other" / ANNOUNCEMENT).read_bytes() == before[ANNOUNCEMENT]
     publish(TRACK, card, SECRET, place / "keep", place / "out")
-    assert dict(public(place)) == before
+    assert bytes_below(place / "out") == before
 
 
 def test_another_text_is_not_the_announced_one(place: Path, card: str) -> None:
@@ -315,20 +305,16 @@ def test_the_readout_ratio_is_not_told_by_the_split_of_another_track(card: str) 
 
 def test_commands_score_by_the_text_and_keep_the_truth_apart(place: Path, card: str) -> None:
     (place / "seed").write_text(TEXT)
-    (place / "mine.jsonl").write_text(truth_text(drawn_split(TRACK, card, SECRET)).replace('"truth"', '"mine"', 1))
-    (place / "mine.jsonl").write_text((place / "mine.jsonl").read_text().replace('["truth"]', '["left"]', 1))
+    write(place / "mine.jsonl", named(truth_lines(drawn_split(TRACK, card, SECRET)), "mine"))
     given = ("--seed-file", place / "seed", "--published", place / "out", "--board", place / "board")
-    done = run_here("leaderboard", "score", place / "mine.jsonl", *given, "--card", card)
-    assert done.returncode == 0, done.stderr
-    assert (
-        place / "board/pose-own-1" / read_announcement(place / "out").split / "entries/mine/scores.csv"
-    ).is_file()
+    leaderboard("score", place / "mine.jsonl", *given, "--card", card)
+    split = read_announcement(place / "out").split
+    assert (place / "board/pose-own-1" / split / "entries/mine/scores.csv").is_file()
     inside = ("--seed-file", place / "seed", "--keep", place / "out/keep", "--out", place / "out")
     refused = run_here("leaderboard", "publish", "pose-own", *inside, "--card", card)
-    assert refused.returncode == 2 and "which everybody may see; take another place" in refused.stderr
+    assert_refused(refused, "which everybody may see; take another place")
     apart = ("--seed-file", place / "seed", "--keep", place / "apart", "--out", place / "new")
-    simulated = run_here("leaderboard", "publish", "points", *apart)
-    assert simulated.returncode == 2 and "has no frames" in simulated.stderr
+    assert_refused(run_here("leaderboard", "publish", "points", *apart), "has no frames")
     shutil.rmtree(place / "out")
     lost = run_here("leaderboard", "score", place / "mine.jsonl", *given, "--card", card)
-    assert lost.returncode == 2 and "has no announcement.json" in lost.stderr
+    assert_refused(lost, "has no announcement.json")

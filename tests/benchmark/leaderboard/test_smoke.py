@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import assert_refused, run_here
+from leaderboards import leaderboard
 
 from rsbench.benchmark.leaderboard.smoke import CARD, ENTRIES, differences, read_scores
 from rsbench.benchmark.leaderboard.tracks import TRACKS
@@ -23,9 +24,8 @@ QUICK = ("rs-stereo-refined", "gs-poselib", "gs-stereo-tracks")
 def test_the_stored_scores_are_those_of_this_code() -> None:
     entries = [word for name in QUICK for word in ("--entry", name)]
     where = ("--track", "points", "--stored", STORED, "--workers", 1)
-    ran = run_here("leaderboard", "smoke", *where, "--problems", 2, *entries)
-    assert ran.returncode == 0, ran.stdout
-    assert ran.stdout.startswith("6 answers of 3 entries of 1 tracks, 0 differ from ")
+    shown = leaderboard("smoke", *where, "--problems", 2, *entries)
+    assert shown.startswith("6 answers of 3 entries of 1 tracks, 0 differ from ")
 
 
 def test_each_difference_is_named(tmp_path: Path) -> None:
@@ -74,9 +74,8 @@ def test_the_stored_scores_of_frames_are_those_of_this_code(corridor: Path) -> N
     words = [word for name in entries for word in ("--entry", name)]
     tracks = [word for track in ENTRIES for word in ("--track", track)]
     where = ("--stored", STORED, "--data", corridor, "--workers", 1)
-    ran = run_here("leaderboard", "smoke", *where, *tracks, *words)
-    assert ran.returncode == 0, ran.stdout
-    assert ran.stdout.splitlines()[-1].startswith("16 answers of 16 entries of 6 tracks, 0 differ from ")
+    shown = leaderboard("smoke", *where, *tracks, *words)
+    assert shown.splitlines()[-1].startswith("16 answers of 16 entries of 6 tracks, 0 differ from ")
 
 
 @pytest.mark.skipif(not STORED.is_dir(), reason="needs the committed results")
@@ -96,20 +95,22 @@ def test_the_stored_truth_errs_nowhere(track: str) -> None:
 
 def test_scores_are_stored_by_track(smoke_dataset: Path, tmp_path: Path) -> None:
     """Of another dataset: stored, found again, and named where they are others."""
-    smoke = ("leaderboard", "smoke", "--stored", tmp_path, "--data", smoke_dataset, "--workers", 1)
+    smoke = ("smoke", "--stored", tmp_path, "--data", smoke_dataset, "--workers", 1)
     part = ("--track", "pose", "--entry", "gs-stereo-tracks-scaled", "--entry", "truth")
-    assert run_here(*smoke, *part, "--write").returncode == 0
+    leaderboard(*smoke, *part, "--write")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pose.csv", "pose.json"]
-    ran = run_here(*smoke, *part)
-    assert ran.returncode == 0 and ran.stdout.startswith("4 answers of 2 entries of 1 tracks, 0 differ from ")
+    assert leaderboard(*smoke, *part).startswith("4 answers of 2 entries of 1 tracks, 0 differ from ")
     text = (tmp_path / "pose.csv").read_text("utf-8")
     (tmp_path / "pose.csv").write_text(text.replace("truth,castle,True,0,", "truth,castle,True,9,"), "utf-8")
     record = (tmp_path / "pose.json").read_text("utf-8")
     (tmp_path / "pose.json").write_text(record.replace('"castle": "', '"castle": "0'), "utf-8")
-    ran = run_here(*smoke, *part, "--problems", 1)
+    ran = run_here("leaderboard", *smoke, *part, "--problems", 1)
     assert ran.returncode == 1
     assert "note: pose: other frames than those of the stored scores: castle\n" in ran.stdout
     assert "pose, castle, truth: e_R_deg = 0, stored 9\n" in ran.stdout
-    assert_refused(run_here(*smoke, "--track", "depth"), "depth.csv")
-    assert_refused(run_here(*smoke, "--track", "points", "--entry", "sgm"), "--entry sgm: is not run on points")
-    assert_refused(run_here(*smoke, "--track", "dept"), "dept")
+    for words, fault in (
+        (("--track", "depth"), "depth.csv"),
+        (("--track", "points", "--entry", "sgm"), "--entry sgm: is not run on points"),
+        (("--track", "dept"), "dept"),
+    ):
+        assert_refused(run_here("leaderboard", *smoke, *words), fault)

@@ -11,10 +11,10 @@ import pytest
 from commands import assert_refused, run_here
 from hypothesis import given
 from hypothesis import strategies as st
-from leaderboards import Line, named, small_split, truth_lines, write
+from leaderboards import Line, entered, handed_in, leaderboard, named, small_split, truth_lines, write
 from scipy.stats import binom, chi2, multivariate_normal, multivariate_t, ttest_1samp, ttest_rel
 
-from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, add, entries_of, merge, rescore
+from rsbench.benchmark.leaderboard.board import ORACLES, RUN, accept, merge, rescore
 from rsbench.benchmark.leaderboard.deviations import (
     LEVELS,
     VAGUE,
@@ -25,13 +25,15 @@ from rsbench.benchmark.leaderboard.deviations import (
     vague_log_densities,
 )
 from rsbench.benchmark.leaderboard.motion_tracks import bound_text
-from rsbench.benchmark.leaderboard.standings import better, ranks, standings, table, ties
+from rsbench.benchmark.leaderboard.standings import Standing, better, ranks, standings, table, ties
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.benchmark.statistics import mean_interval, scene_means, score_interval
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.report.board_page import build_site
+from rsbench.storage.files import read_json, write_json
 
 ANY = frozenset({"left"})
 
@@ -259,11 +261,8 @@ def test_entries_that_state_deviations_are_ranked_by_their_log_score(tmp_path: P
             stated_too = line.pop("covariance", None)
             if factor is not None and stated_too is not None:
                 line["covariance"] = (factor * np.array(stated_too)).tolist()
-        add(tmp_path / "board", write(tmp_path / f"{name}.jsonl", lines), SPLIT, {})
-    lines = {
-        line.scored.header.method: line
-        for line in standings(entries_of(tmp_path / "board", "points-1", SPLIT.name))
-    }
+        handed_in(tmp_path / "board", lines, SPLIT)
+    lines = lines_by_name(tmp_path / "board")
     assert {line.rank.place for line in lines.values() if line.rank} == {1}
     assert lines["right"].stated_words["log rank"] == "1 [1, 1] of 2"
     assert lines["halved"].log_rank == (2, 2, 2)
@@ -275,41 +274,44 @@ def test_entries_that_state_deviations_are_ranked_by_their_log_score(tmp_path: P
 SPLIT, SMALL = small_split(60), small_split()
 
 
+def lines_by_name(board: Path, split: Split = SPLIT) -> dict[str, Standing]:
+    return {line.scored.header.method: line for line in standings([*entered(board, split).values()])}
+
+
 @pytest.fixture(scope="module")
 def at_bound() -> list[Line]:
     """Motions that err as the bound of all links allows."""
-    return [json.loads(line) for line in bound_text(SPLIT, Path()).splitlines()]
+    return list(map(json.loads, bound_text(SPLIT, Path()).splitlines()))
 
 
 def test_a_method_at_its_bound_is_believed_and_one_below_it_is_not(tmp_path: Path, at_bound: list[Line]) -> None:
     board = tmp_path / "board"
     honest = named(at_bound, "honest", ("left", "right", "links", "readout"))
-    scored = add(board, write(tmp_path / "a.jsonl", honest), SPLIT, {})
+    scored = handed_in(board, honest, SPLIT)
     assert scored.doubt == ""
     for name, medians in SPLIT.track.medians_at_bound(honest[0]["uses"], SPLIT).items():
         # A draw from the bound is below its median in half of the problems: of 60, in 17 to 43, at 1 in 1000.
         assert 17 <= np.count_nonzero(scored.scores[name].to_numpy() < medians) <= 43
     # The same answers, said to be of less: twice too near where one camera's matches are all that it saw.
-    scored = add(board, write(tmp_path / "b.jsonl", named(at_bound, "boasting", ("left",))), SPLIT, {})
+    scored = handed_in(board, named(at_bound, "boasting", ("left",)), SPLIT)
     assert scored.doubt.startswith("e_R_deg is below the median at the Cramer-Rao bound of left in ")
-    lines = {line.scored.header.method: line for line in standings(entries_of(board, "points-1", SPLIT.name))}
+    lines = lines_by_name(board)
     assert lines["boasting"].rank is None and lines["boasting"].rank_words == "in doubt"
     assert lines["honest"].rank is not None and lines["honest"].rank_words == "alone"
     assert rescore(board, SPLIT) == {}, "doubts are found again"
     page = build_site(board, tmp_path / "site", ()).read_text("utf-8")
     assert page.count('class="entry oracle handed-in doubt"') == 1 and page.count("handed in</span>") == 2
     assert accept(board, "points-1", SPLIT.name, "boasting", "seen by us") == scored.doubt
-    ranked = standings(entries_of(board, "points-1", SPLIT.name))
-    assert all(line.rank is not None for line in ranked)
+    assert all(line.rank is not None for line in lines_by_name(board).values())
     with pytest.raises(RsbenchError, match="nothing speaks against it"):
         accept(board, "points-1", SPLIT.name, "honest", "why not")
 
 
 def test_the_truth_under_another_name_is_in_doubt(tmp_path: Path) -> None:
     lines = named(truth_lines(SMALL), "mine", ("left",))
-    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", lines), SMALL, {})
+    scored = handed_in(tmp_path / "board", lines, SMALL)
     assert scored.doubt.startswith("e_R_deg is below 1e-05, exact but for rounding, in 1.00 ")
-    numbers = table(standings(entries_of(tmp_path / "board", "points-1", SMALL.name)))
+    numbers = table([*lines_by_name(tmp_path / "board", SMALL).values()])
     assert numbers["rank"].isna().all() and numbers["handed_in"].all() and numbers["doubt"].notna().all()
 
 
@@ -320,20 +322,15 @@ def test_the_truth_under_another_name_is_in_doubt(tmp_path: Path) -> None:
 def test_names_of_rsbench_are_its_own(tmp_path: Path, name: str, uses: str) -> None:
     lines = named(truth_lines(SMALL), name, (uses,))
     with pytest.raises(RsbenchError, match=f"method = '{name}': is the name of a method of rsbench"):
-        add(
-            tmp_path / "board",
-            write(tmp_path / "a.jsonl", lines),
-            SMALL,
-            {"command": "rsbench leaderboard submit"},
-        )
-    assert not add(tmp_path / "own", write(tmp_path / "a.jsonl", lines), SMALL, {"command": RUN}).handed_in
+        handed_in(tmp_path / "board", lines, SMALL, "rsbench leaderboard submit")
+    assert not handed_in(tmp_path / "own", lines, SMALL, RUN).handed_in
 
 
 def test_the_truth_is_used_by_no_stranger(tmp_path: Path) -> None:
-    file = write(tmp_path / "a.jsonl", named(truth_lines(SMALL), "mine", ("left", "truth")))
+    lines = named(truth_lines(SMALL), "mine", ("left", "truth"))
     with pytest.raises(RsbenchError, match="uses = 'truth': only oracles of rsbench know the truth"):
-        add(tmp_path / "board", file, SMALL, {"command": "rsbench leaderboard submit"})
-    assert not add(tmp_path / "board", file, SMALL, {"command": ORACLES}).handed_in
+        handed_in(tmp_path / "board", lines, SMALL, "rsbench leaderboard submit")
+    assert not handed_in(tmp_path / "board", lines, SMALL, ORACLES).handed_in
 
 
 def _erring(lines: list[Line], name: str, size: float, share: float = 1.0) -> list[Line]:
@@ -353,11 +350,11 @@ def test_a_true_translation_is_found_beside_a_rotation_that_errs(tmp_path: Path,
             d = translation_of_offset(truth.motion.w, truth.motion.d, truth.rig.offset("left"))
             line |= {"d": d.tolist(), "reference_point": "left", "metric": False}
     exact = _erring(lines, "w", 2e-3)
-    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", exact), SPLIT, {})
+    scored = handed_in(tmp_path / "board", exact, SPLIT)
     assert scored.scores["auc_5"].mean() > 0.9 and scored.doubt.startswith("e_T_deg is below 1e-05")
     # With 1e-5 of noise nothing is exact, but no camera alone is so near.
     nearly = named(_erring(exact, "d", 1e-6), "other", ("left",))
-    scored = add(tmp_path / "board", write(tmp_path / "b.jsonl", nearly), SPLIT, {})
+    scored = handed_in(tmp_path / "board", nearly, SPLIT)
     assert scored.doubt.startswith("e_T_deg is below the median at the Cramer-Rao bound of left in 1.00")
 
 
@@ -368,11 +365,11 @@ def test_every_error_is_judged_and_a_tenth_is_enough(tmp_path: Path) -> None:
     for line, direction in zip(lines[1:], directions, strict=True):
         line["w"] = (np.array(line["w"]) + 0.01 * direction).tolist()
         line["d"] = (np.linalg.norm(line["d"]) * direction / np.linalg.norm(direction)).tolist()
-    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", lines), SPLIT, {})
+    scored = handed_in(tmp_path / "board", lines, SPLIT)
     assert scored.doubt.startswith("e_s is below 1e-07, exact but for rounding, in 1.00")
     few = _erring(named(truth_lines(SPLIT), "few", uses), "w", 0.03, share=0.8)
     few = _erring(few, "d", 0.03)
-    scored = add(tmp_path / "board", write(tmp_path / "b.jsonl", few), SPLIT, {})
+    scored = handed_in(tmp_path / "board", few, SPLIT)
     assert scored.doubt.startswith("e_R_deg is below 1e-05, exact but for rounding, in 0.")
 
 
@@ -381,7 +378,7 @@ def test_the_truth_of_the_last_problems_is_in_doubt_too(tmp_path: Path) -> None:
     split = small_split(250)
     lines = named(truth_lines(split), "mine", ("left", "right", "links", "readout"))
     bad, near = (_erring(_erring(lines, "w", size), "d", size) for size in (0.03, 2e-6))
-    scored = add(tmp_path / "board", write(tmp_path / "a.jsonl", [*bad[:51], *near[51:]]), split, {})
+    scored = handed_in(tmp_path / "board", [*bad[:51], *near[51:]], split)
     assert np.mean(scored.scores["e_R_deg"] < 1e-5) < 0.1 and scored.scores["auc_5"].mean() > 0.8
     assert scored.doubt.startswith("e_R_deg is below the median at the Cramer-Rao bound of left + right + links")
 
@@ -389,33 +386,29 @@ def test_the_truth_of_the_last_problems_is_in_doubt_too(tmp_path: Path) -> None:
 def test_no_other_board_accepts_an_entry(tmp_path: Path) -> None:
     """A stranger's board: the truth, a doubt that was removed, and an acceptance that its author wrote."""
     theirs, ours = tmp_path / "theirs", tmp_path / "ours"
-    scored = add(theirs, write(tmp_path / "a.jsonl", named(truth_lines(SMALL), "mine", ("left",))), SMALL, {})
-    record = json.loads((scored.folder / "entry.json").read_text("utf-8"))
-    (scored.folder / "entry.json").write_text(
-        json.dumps(record | {"doubt": "", "accepted": "believe me"}), "utf-8"
-    )
+    scored = handed_in(theirs, named(truth_lines(SMALL), "mine", ("left",)), SMALL)
+    path = scored.folder / "entry.json"
+    write_json(path, read_json(path) | {"doubt": "", "accepted": "believe me"})
     assert merge(theirs, ours) == [f"points-1/{SMALL.name}/mine"]
     assert rescore(ours, SMALL) == {}
-    (line,) = standings(entries_of(ours, "points-1", SMALL.name))
+    line = lines_by_name(ours, SMALL)["mine"]
     assert line.rank is None and line.rank_words == "in doubt"
     assert merge(theirs, ours) == []
 
 
 def test_links_alone_are_not_all_that_a_method_uses(tmp_path: Path) -> None:
     """As attacked: an entry that names links alone would have no peers, and the loosest of all bounds."""
-    file = write(tmp_path / "a.jsonl", named(truth_lines(SMALL), "mine", ("links", "readout")))
-    with pytest.raises(
-        RsbenchError, match=r"a.jsonl:1: uses = 'links' without 'left' or 'right': .* name the matches"
-    ):
-        add(tmp_path / "board", file, SMALL, {})
+    lines = named(truth_lines(SMALL), "mine", ("links", "readout"))
+    with pytest.raises(RsbenchError, match=r"jsonl:1: uses = 'links' without 'left' or 'right': .* the matches"):
+        handed_in(tmp_path / "board", lines, SMALL)
 
 
 def test_the_commands_say_it(tmp_path: Path) -> None:
     file = write(tmp_path / "a.jsonl", named(truth_lines(TRACKS["points"].split(None)), "mine"))
     board = tmp_path / "board"
-    ran = run_here("leaderboard", "submit", file, "--board", board)
-    assert ran.returncode == 0 and "in doubt, and not ranked: e_R_deg is below 1e-05" in ran.stdout, ran.stderr
+    shown = leaderboard("submit", file, "--board", board)
+    assert "in doubt, and not ranked: e_R_deg is below 1e-05" in shown
     where = ("--board", board, "--protocol", "points-1", "--split", TRACKS["points"].split(None).name)
     assert_refused(run_here("leaderboard", "accept", "mine", *where, "--reason", " "), "--reason")
-    ran = run_here("leaderboard", "accept", "mine", *where, "--reason", "a test of ours")
-    assert ran.returncode == 0 and ran.stdout.startswith("mine: ranked all the same: e_R_deg")
+    shown = leaderboard("accept", "mine", *where, "--reason", "a test of ours")
+    assert shown.startswith("mine: ranked all the same: e_R_deg")
