@@ -223,6 +223,7 @@ def part_scores(
 def _mistakes(depth: NDArray[np.float32], pictures: TruePictures) -> Iterator[str]:
     sequence = pictures.sequence
     rig, true = sequence.rig, pictures.depth()
+    product = rig.camera.fx * rig.baseline
     along = np.linalg.norm(rig.camera.unproject(rig.camera.pixel_grid()), axis=-1)
     both = (depth > 0.0) & (true > 0.0)
     if not np.any(both):
@@ -234,9 +235,7 @@ def _mistakes(depth: NDArray[np.float32], pictures: TruePictures) -> Iterator[st
     readings: dict[str, Callable[[], FloatArray]] = {
         "it is in millimetres; depth is in metres": lambda: submitted / 1000.0,
         "it is in centimetres; depth is in metres": lambda: submitted / 100.0,
-        "it is disparity in px; depth is fx * baseline / disparity": lambda: (
-            rig.camera.fx * rig.baseline / submitted
-        ),
+        "it is disparity in px; depth is fx * baseline / disparity": lambda: product / submitted,
         "it is inverse depth, 1 / m, not depth": lambda: 1.0 / submitted,
         "it is the distance along the ray; depth is z of the camera": lambda: submitted / along[both],
     }

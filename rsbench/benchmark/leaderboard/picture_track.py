@@ -106,7 +106,6 @@ class PictureTrack(Track):
 
     answers = PictureAnswer
     pictures = True
-    shares_work = True
     part_score: ClassVar[str]
     """Beginning of the columns of scores of parts of the pixels, see ``pictures.PARTINGS``."""
     part_title: ClassVar[str]

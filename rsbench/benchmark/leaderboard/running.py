@@ -110,7 +110,7 @@ def run_cards(
                 step(runnable.name)
         pictures = split.by_name[chunk[0]].pictures
         requested = () if pictures is None else pictures.requested
-        together = [due] if due and track.shares_work and limits == Limits() else [[each] for each in due]
+        together = [due] if due and track.pictures and limits == Limits() else [[each] for each in due]
         jobs += [Job(chunk, tuple(part), requested) for part in together]
     if jobs:
         warm_up({runnable.model for runnable in runnables.values()})

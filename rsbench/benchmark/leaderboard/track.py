@@ -439,13 +439,12 @@ class Track(ABC):
     answers: ClassVar[type[Answer]] = Answer
     """What a line of a file of predictions must hold."""
     pictures: ClassVar[bool] = False
-    """Whether an answer is pictures beside the file of answers."""
+    """Whether an answer is pictures beside the file of answers. Cards that make them share intermediate results of
+    a problem, so that one job runs all of them."""
     own_matches: ClassVar[bool] = False
     """Whether methods find matches themselves, and may submit them with motions."""
     at_rows: ClassVar[bool] = False
     """Whether each picture shows the time of one row."""
-    shares_work: ClassVar[bool] = False
-    """Whether cards share intermediate results of a problem, so that one job runs all of them."""
 
     # Inputs
 
