@@ -28,47 +28,32 @@ ROOT = Path(__file__).parents[3]
 
 def test_motion_must_be_better_in_both_errors_in_the_median_of_runs() -> None:
     rows = [
-        {"solver": solver, "sequence": scene, "e_R_deg": e_R, "e_T_deg": e_T}
-        for solver, scene, e_R, e_T in (
-            ("gs-8pt", "a", 1.0, 1.0),
-            ("gs-8pt", "b", 1.0, 1.0),
-            (PUBLISHED[0], "a", 0.5, 0.5),
-            (PUBLISHED[0], "a", 0.6, 0.6),
-            (PUBLISHED[0], "a", 9.0, 9.0),
-            (PUBLISHED[0], "b", 0.5, 2.0),
-            (PUBLISHED[1], "a", 2.0, 2.0),
-            (PUBLISHED[1], "b", 2.0, 2.0),
-        )
+        ("gs-8pt", "a", 1.0, 1.0),
+        ("gs-8pt", "b", 1.0, 1.0),
+        (PUBLISHED[0], "a", 0.5, 0.5),
+        (PUBLISHED[0], "a", 0.6, 0.6),
+        (PUBLISHED[0], "a", 9.0, 9.0),
+        (PUBLISHED[0], "b", 0.5, 2.0),
+        (PUBLISHED[1], "a", 2.0, 2.0),
+        (PUBLISHED[1], "b", 2.0, 2.0),
     ]
-    found = motion_on_images(pd.DataFrame(rows))
+    found = motion_on_images(pd.DataFrame(rows, columns=["solver", "sequence", "e_R_deg", "e_T_deg"]))
     assert [verdict(found[solver][0], "scene") for solver in PUBLISHED] == ["holds only for a", "fails"]
 
 
 def test_depth_counts_only_with_cameras_in_step() -> None:
-    rows = [
-        {
-            "sequence": "a",
-            "stratum": "mild",
-            "delay": d,
-            "opposite": o,
-            "error_px": e,
-            "over_2m": f,
-            "coverage": 0.9,
-        }
-        for d, o, e, f in ((0.0, False, 0.05, 0.01), (0.1, False, 3.0, 0.5), (0.0, True, 3.0, 0.5))
-    ]
-    ((checks, _),) = sgm_is_accurate(pd.DataFrame(rows)).values()
-    assert verdict(checks, "scene") == "holds"
-    far = pd.DataFrame([rows[0] | {"over_2m": 0.06}])
+    columns = ["delay", "opposite", "error_px", "over_2m"]
+    rows = [(0.0, False, 0.05, 0.01), (0.1, False, 3.0, 0.5), (0.0, True, 3.0, 0.5)]
+    table = pd.DataFrame(rows, columns=columns).assign(sequence="a", stratum="mild", coverage=0.9)
+    assert verdict(sgm_is_accurate(table)["SGM"][0], "scene") == "holds"
+    far = table[:1].assign(over_2m=0.06)
     assert verdict(sgm_is_accurate(far)["SGM"][0], "scene") == "fails"
 
 
 def test_corrected_images_are_averaged_over_views() -> None:
-    rows = [
-        {"corrector": "fusion", "solver": s, "matcher": "sgm", "sequence": "a", "pixels": "visible", "psnr": p}
-        for s, p in (("x", 29.0), ("x", 32.0), ("true", 50.0))
-    ]
-    found = almost_coincides(pd.DataFrame([*rows, rows[0] | {"pixels": "all", "psnr": 20.0}]))
+    rows = [("x", "visible", 29.0), ("x", "visible", 32.0), ("true", "visible", 50.0), ("x", "all", 20.0)]
+    table = pd.DataFrame(rows, columns=["solver", "pixels", "psnr"])
+    found = almost_coincides(table.assign(corrector="fusion", matcher="sgm", sequence="a"))
     assert {who: verdict(checks, "scene") for who, (checks, _) in found.items()} == {
         "x, what the frame saw": "holds",
         "x, all pixels": "fails",
@@ -76,16 +61,10 @@ def test_corrected_images_are_averaged_over_views() -> None:
 
 
 def test_the_literal_reading_averages_the_views_of_each_seed() -> None:
-    names = {"solver": "a", "features": "b", "matcher": "c", "corrector": "d"}
-    pixels = ("drawn", "visible", "all")
-    rows = [
-        names
-        | {"ransac_seed": seed}
-        | {f"psnr_rolling_{p}": 22.0 for p in pixels}
-        | {f"psnr_{p}": db for p in pixels}
-        for seed, db in ((0, 29.0), (0, 32.0), (1, 29.0), (1, 30.5))
-    ]
-    found = coincides_literally(pd.DataFrame([row | {"psnr_all": 20.0} for row in rows]))
+    seeds = pd.DataFrame([(0, 29.0), (0, 32.0), (1, 29.0), (1, 30.5)], columns=["ransac_seed", "psnr_drawn"])
+    table = seeds.assign(psnr_visible=seeds["psnr_drawn"], psnr_all=20.0)
+    table = table.assign(**{f"psnr_rolling_{pixels}": 22.0 for pixels in ("drawn", "visible", "all")})
+    found = coincides_literally(table.assign(solver="a", features="b", matcher="c", corrector="d"))
     assert {who: verdict(checks, "seed") for who, (checks, _) in found.items()} == {
         "a, b, c, d: pixels with depth": "holds only for seed 0",
         "a, b, c, d: what the frame saw": "holds only for seed 0",
@@ -95,13 +74,10 @@ def test_the_literal_reading_averages_the_views_of_each_seed() -> None:
 
 
 def test_a_gain_needs_an_interval_above_zero() -> None:
-    gains = (("mild", 0.1, 1.0), ("moderate", -0.1, 1.0), ("aggressive", -2.0, -1.0))
-    rows = [
-        {"method": method, "stratum": s, "gain": (low + high) / 2, "gain_low": low, "gain_high": high}
-        for method in ("mono", "plane")
-        for s, low, high in gains
-    ]
-    checks, _ = stereo_corrects_better(pd.DataFrame(rows))["against one camera"]
+    rows = [("mild", 0.55, 0.1, 1.0), ("moderate", 0.45, -0.1, 1.0), ("aggressive", -1.5, -2.0, -1.0)]
+    table = pd.DataFrame(rows, columns=["stratum", "gain", "gain_low", "gain_high"])
+    both = pd.concat([table.assign(method=method) for method in ("mono", "plane")])
+    checks, _ = stereo_corrects_better(both)["against one camera"]
     assert verdict(checks, "stratum") == "holds only for mild; undecided for moderate"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,17 +24,10 @@ def _motions(sigmas: dict[str, list[float]], camera: str = "real") -> pd.DataFra
     rows = []
     for name, values in sigmas.items():
         for seed, value in enumerate(values):
-            key: dict[str, Any] = {
-                "camera": camera,
-                "scene": name,
-                "stratum": "mild",
-                "sequence": f"{name}-mild-2",
-                "seed": seed,
-            }
-            failed = np.isnan(value)
-            errors = {"e_R_deg": 180.0 if failed else 0.01 * value, "e_T_deg": 180.0 if failed else 0.1 * value}
-            rows.append(key | {"success": not failed, "sigmas": value, **errors})
-    return pd.DataFrame(rows)
+            errors = (180.0, 180.0) if np.isnan(value) else (0.01 * value, 0.1 * value)
+            rows.append((name, f"{name}-mild-2", seed, not np.isnan(value), value, *errors))
+    columns = ["scene", "sequence", "seed", "success", "sigmas", "e_R_deg", "e_T_deg"]
+    return pd.DataFrame(rows, columns=columns).assign(camera=camera, stratum="mild")
 
 
 def test_the_largest_error_is_in_its_own_deviation() -> None:
@@ -49,13 +41,14 @@ def test_a_failure_and_one_seed_beyond_break_a_sequence() -> None:
 
 def test_the_summary_and_the_page_are_of_the_stored_rows() -> None:
     both = pd.concat([_motions({"a": [1.0, 3.0, 2.0]}, camera) for camera in ("ideal", "real")])
-    rows: list[dict[str, Any]] = []
-    for camera in ("ideal", "real"):
-        for seed, value in (("none", 20.0), ("median", 30.0), ("worst", 28.0)):
-            key = {"camera": camera, "scene": "a", "stratum": "mild", "sequence": "a-mild-2", "seed": seed}
-            scores = {"psnr_clean": value + 3.0, "coverage": 0.9}
-            rows += [key | {"side": "left", "frame": frame, "psnr": value + frame} | scores for frame in (0, 1)]
-    views = pd.DataFrame(rows)
+    rows = [
+        (camera, seed, frame, value + frame, value + 3.0)
+        for camera in ("ideal", "real")
+        for seed, value in (("none", 20.0), ("median", 30.0), ("worst", 28.0))
+        for frame in (0, 1)
+    ]
+    views = pd.DataFrame(rows, columns=["camera", "seed", "frame", "psnr", "psnr_clean"])
+    views = views.assign(scene="a", stratum="mild", sequence="a-mild-2", side="left", coverage=0.9)
     summary = summarise(both, views)
     assert summary["e_R_deg"].tolist() == pytest.approx([0.02, 0.02])
     assert summary["e_T_worst_deg"].tolist() == pytest.approx([0.3, 0.3])
