@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -173,19 +174,16 @@ def wide(values: list[float], relative: float) -> Series:
 def summary(errors: dict[str, float], variants: list[str], values: tuple[float, ...] = VALUES) -> pd.DataFrame:
     """A summary in which each solver has one error everywhere."""
     rows = []
-    for variant in variants:
-        for value in values:
-            for solver, error in errors.items():
-                row: dict[str, object] = {"variant": variant, "value": value, "solver": solver}
-                for name in ("e_R_mean", "e_R_median", "e_T_mean", "e_T_median", "e_s_median"):
-                    ends = {"": error, "_low": 0.9 * error, "_high": 1.1 * error}
-                    row |= {f"{name}{end}": number for end, number in ends.items()}
-                for name in ("e_R", "e_T"):
-                    quotients = {"over_bound": 1.0, "over_bound_low": 0.9, "over_bound_high": 1.1}
-                    row |= {f"{name}_bound": error} | {f"{name}_{key}": q for key, q in quotients.items()}
-                share = 1.0 if error < 1 else 0.0
-                row |= {"trials": 300, "failures": 300 - round(300 * share)}
-                rows.append(row | {"success_share": share, "success_low": share, "success_high": share})
+    for variant, value, (solver, error) in product(variants, values, errors.items()):
+        share = 1.0 if error < 1 else 0.0
+        row: dict[str, object] = {"variant": variant, "value": value, "solver": solver}
+        row |= {"trials": 300, "failures": 300 - round(300 * share)}
+        for end, factor in (("", 1.0), ("_low", 0.9), ("_high", 1.1)):
+            names = ("e_R_mean", "e_R_median", "e_T_mean", "e_T_median", "e_s_median")
+            row |= {f"{name}{end}": factor * error for name in names}
+            row |= {f"{name}_over_bound{end}": factor for name in ("e_R", "e_T")}
+            row |= {f"success_{end[1:] or 'share'}": share}
+        rows.append(row | {"e_R_bound": error, "e_T_bound": error})
     return pd.DataFrame(rows)
 
 
@@ -207,12 +205,8 @@ def test_every_claim_is_judged_in_every_reading() -> None:
     assert set(table.claim) == {claim.key for claim in CLAIMS}
     best = {(row.claim, row.matches, row.noise): row for row in best_readings(table).itertuples()}
     faster = best["rotation velocity: better than GS", ALL, "1e-3 px"]
-    assert (faster.literal, faster.best, faster.best_reading, faster.ours) == (
-        "fails",
-        "holds",
-        "symmetric",
-        "holds",
-    )
+    verdicts = (faster.literal, faster.best, faster.best_reading, faster.ours)
+    assert verdicts == ("fails", "holds", "symmetric", "holds")
     assert (faster.holding, faster.readings) == (1, 2)
     enough = best["nine matches per camera suffice", MORE, "0.81 px"]
     assert (enough.literal, enough.best) == ("fails", "holds")

@@ -111,10 +111,8 @@ def test_the_summary_is_the_median_over_sequences_of_the_mean_of_views(tables: T
     castle = images[(images["method"] == "ours") & (images["sequence"] == "castle")]
     assert scenes["sequences"].loc["ours", "castle"] == 1
     np.testing.assert_allclose(scenes["psnr_all"].loc["ours", "castle"], castle["psnr_all"].mean())
-    share = masks(images).iloc[0]
-    np.testing.assert_allclose(
-        [share["median"], share["least"]], [images["common"].median(), images["common"].min()]
-    )
+    share, common = masks(images).iloc[0], images["common"]
+    np.testing.assert_allclose([share["median"], share["least"]], [common.median(), common.min()])
     # The interval of two sequences spans both.
     ours = summary.loc["ours"]
     assert ours["psnr_covered_low"] <= ours["psnr_covered"] <= ours["psnr_covered_high"]
@@ -135,7 +133,7 @@ def _synthetic(ours: list[float], other: list[float]) -> pd.DataFrame:
 
 
 def test_a_study_of_several_laws_is_summed_up_by_law_and_size() -> None:
-    images = _synthetic([30.0, 32.0, 34.0, 40.0, 50.0], [20.0, 20.0, 20.0, 20.0, 20.0])
+    images = _synthetic([30.0, 32.0, 34.0, 40.0, 50.0], 5 * [20.0])
     names = [f"old-town-{law}-moderate-ideal-{seed}" for law in ("linear", "twist") for seed in (1, 2)]
     names.append("castle-spline-aggressive-ideal-1")
     images["sequence"] = images["sequence"].map({f"q{k}": name for k, name in enumerate(names)})
@@ -212,14 +210,13 @@ def test_methods_in_no_published_table_take_part_when_they_are_asked_for(
     smoke_dataset: Path, tables: Tables, tmp_path: Path
 ) -> None:
     """They change no number of the others; what gives a view up scores the worst; the page shows them."""
-    rows, bands, _ = study_sequence(
-        read_sequence(smoke_dataset / "castle"), others=("zhuang", "vasu-layers", "lao-lines")
-    )
+    others, castle = ("zhuang", "vasu-layers", "lao-lines"), read_sequence(smoke_dataset / "castle")
+    rows, bands, _ = study_sequence(castle, others=others)
     images = pd.DataFrame(rows)
-    asked = images["method"].isin(["zhuang", "vasu-layers", "lao-lines"])
+    asked = images["method"].isin(others)
     before = tables[0][tables[0]["sequence"] == "castle"].drop(columns="stratum").reset_index(drop=True)
     pd.testing.assert_frame_equal(images[~asked].reset_index(drop=True), before)
-    assert images[asked].groupby("method").size().to_dict() == {"zhuang": 4, "vasu-layers": 4, "lao-lines": 4}
+    assert images[asked].groupby("method").size().to_dict() == dict.fromkeys(others, 4)
     lost = images[~images["success"]]
     assert np.all(lost["psnr_all"] == 0.0) and np.all(lost["coverage"] == 0.0)
     alone = images.groupby("method")["flow_median_px"].mean()
@@ -229,7 +226,7 @@ def test_methods_in_no_published_table_take_part_when_they_are_asked_for(
     assert set(summary["method"]) == set(images["method"]) and len(bands) == len(images) * ROW_BANDS
     assert "monocular, Zhuang et al." in study_page(images, summary)
     with pytest.raises(RsbenchError, match="imu"):
-        study_sequence(read_sequence(smoke_dataset / "castle"), others=("gyroscope",))
+        study_sequence(castle, others=("gyroscope",))
 
 
 def test_the_page_and_the_figure_come_from_the_stored_tables(tables: Tables, tmp_path: Path) -> None:

@@ -83,27 +83,14 @@ def test_without_delay_the_poses_are_the_rigs_own() -> None:
 
 
 def test_the_page_says_what_the_table_says(tmp_path: Path) -> None:
-    rows = []
-    for timing in TIMINGS:
-        error = 0.03 + timing.delay * 10
-        rows.append(
-            {
-                "stratum": "mild",
-                "sequence": "castle-2",
-                "timing": timing.name,
-                "delay": timing.delay,
-                "opposite": timing.opposite,
-                "coverage": 0.25 if timing.opposite else 0.9 - 4 * timing.delay,
-                "error_px": error,
-                "predicted_px": timing.delay * 10,
-                "unexplained_px": 0.03,
-                "vertical_px": 20 * timing.delay,
-                "bad_1px": 0.0,
-                "depth_error_m": 0.1,
-                "over_2m": 0.0,
-            }
-        )
-    table = pd.DataFrame(rows)
+    rows = [
+        (each.name, each.delay, each.opposite, 0.25 if each.opposite else 0.9 - 4 * each.delay) for each in TIMINGS
+    ]
+    table = pd.DataFrame(rows, columns=["timing", "delay", "opposite", "coverage"])
+    predicted = 10 * table["delay"]
+    table = table.assign(error_px=0.03 + predicted, predicted_px=predicted, vertical_px=2 * predicted)
+    table = table.assign(stratum="mild", sequence="castle-2", unexplained_px=0.03)
+    table = table.assign(bad_1px=0.0, depth_error_m=0.1, over_2m=0.0)
     text = " ".join(sgm_page(table).split())
     assert "0.0100 frame periods (mild, castle-2)" in text  # 0.1 px at 10 px per frame period
     assert "by 2 rows it has lost 44 % of them" in text
