@@ -394,7 +394,7 @@ def _row_angle(w: FloatArray, truth: Truth) -> float:
 
 @lru_cache(maxsize=8)
 def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str, FloatArray]:
-    """As of ``Track.medians_at_bound``, of the first problems: a bound takes as long as a solver.
+    """As of ``Track.medians_at_bound``, of Gaussian errors in the first problems; a bound takes a solver's time.
 
     A method that names less data is compared with the bound of less; the readout ratio counts as known. The
     direction is that of the body, and of a method of the left camera alone that of this camera.
@@ -409,7 +409,11 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
             bounds.append(bound_of_one_camera(track_pairs(tracks, "left"), rig, shutter, motion, noise_px))
         else:
             bounds.append(motion_bound(problem.correspondences, rig, shutter, motion, noise_px, views))
-    return medians_of(bounds)
+    errors = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
+    return {
+        "e_R_deg": np.array([_median(bound.rotation_axes, errors) for bound in bounds]),
+        "e_T_deg": np.array([_median(bound.direction_axes, errors) for bound in bounds]),
+    }
 
 
 def smooth(motion: Motion) -> Motion:
@@ -418,15 +422,6 @@ def smooth(motion: Motion) -> Motion:
     A derivative of a spline by its end takes a hundred times as long.
     """
     return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion) else motion
-
-
-def medians_of(bounds: Sequence[Bound]) -> Mapping[str, FloatArray]:
-    """Medians (n,) of e_R_deg and e_T_deg of Gaussian errors at bounds; infinite where the data say nothing."""
-    draws = np.abs(generator(0, "leaderboard", "doubt").standard_normal((_DRAWS, 3)))
-    return {
-        "e_R_deg": np.array([_median(bound.rotation_axes, draws) for bound in bounds]),
-        "e_T_deg": np.array([_median(bound.direction_axes, draws) for bound in bounds]),
-    }
 
 
 def _median(axes: FloatArray, draws: FloatArray) -> float:

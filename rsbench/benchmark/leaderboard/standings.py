@@ -197,17 +197,13 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
                 f"{each.folder}: is scored on other problems than {kept[0].folder.name}; rescore the board"
             )
     ranked = [each for each in kept if ORACLE not in each.header.uses and not each.doubt]
-    stating = [each for each in ranked if _states_deviations(each)]
+    # Those that state a covariance somewhere have a log score.
+    stating = [each for each in ranked if "log_score" in each.scores and each.scores["nees"].notna().any()]
     scenes, primary = list(problems["scene"]), track_of_id(kept[0].header.protocol).primary
     places = _ranked(ranked, primary.key, primary.sign, scenes)
     log_places = _ranked(stating, "log_score", 1.0, scenes)
     lines = [_standing(each, scenes, *(by.get(each, Place()) for by in (places, log_places))) for each in kept]
     return sorted(lines, key=_order)
-
-
-def _states_deviations(scored: Scored) -> bool:
-    """Whether an entry has a log score: it states a covariance somewhere."""
-    return "log_score" in scored.scores and bool(scored.scores["nees"].notna().any())
 
 
 def _ranked(entries: Sequence[Scored], column: str, sign: float, scenes: Sequence[str]) -> dict[Scored, Place]:

@@ -85,19 +85,43 @@ def test_cards_run_and_go_on(
         assert np.all(psnr["fusion-true"] > psnr["rotation-only"])
 
 
-MATCHER = """
+METHODS = """
+import time
 from dataclasses import dataclass
+from pathlib import Path
 import numpy as np
+from rsbench.vision.corrector import Corrector, CorrectorSpec
+from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import StereoMatcher
+
+def misbehave(mood):
+    "Once: the first problem alone; but for who is odd."
+    if mood == "odd":
+        raise ValueError("not today")
+    done = Path(__file__).with_name(f"{mood}.done")
+    if mood == "sound" or done.exists():
+        return
+    done.touch()
+    held = np.ones((1 << 17, 900 if mood == "hungry" else 1))
+    time.sleep(1000.0)
 
 @dataclass(frozen=True)
 class Level(StereoMatcher):
-    px: float = 5.0
+    mood: str = "sound"
 
     def disparities(self, left, right, rig):
-        if self.px < 0.0:
-            raise ValueError("not today")
-        return (np.full(left.shape[:2], self.px),) * 2
+        misbehave(self.mood)
+        return (np.full(left.shape[:2], 5.0),) * 2
+
+@dataclass(frozen=True)
+class Same(Corrector):
+    mood: str = "sound"
+    spec = CorrectorSpec(needs=set(), reference="this file", assumes="nothing")
+
+    def correct(self, problem, views):
+        misbehave(self.mood)
+        seen = np.ones(problem.images["left", 0].shape[:2], bool)
+        return {view: Fused.seen(problem.images[view], seen) for view in views}
 """
 
 
@@ -106,11 +130,10 @@ def test_a_method_of_somebody_else_runs_and_fails_alone(
 ) -> None:
     """Two cards beside their own module: one level everywhere, and one that raises."""
     monkeypatch.setattr(running, "finished_jobs", jobs_here)
-    (tmp_path / "level_matcher.py").write_text(MATCHER, "utf-8")
-    for name, px in (("level", 5.0), ("odd", -1.0)):
-        (tmp_path / f"{name}.toml").write_text(
-            f'class = "level_matcher:Level"\nparameters = {{ px = {px} }}\n', "utf-8"
-        )
+    (tmp_path / "level_matcher.py").write_text(METHODS, "utf-8")
+    for name, mood in (("level", "sound"), ("odd", "odd")):
+        text = f'class = "level_matcher:Level"\nparameters = {{ mood = "{mood}" }}\n'
+        (tmp_path / f"{name}.toml").write_text(text, "utf-8")
     where = ("--data", planes, "--board", tmp_path / "board")
     run_entries("depth", [tmp_path / "level.toml", tmp_path / "odd.toml"], *where)
     split = TRACKS["depth"].split(planes)
@@ -145,42 +168,6 @@ def test_inputs_hold_no_secret(track: str, planes: Path, tmp_path: Path) -> None
     assert (planes / "planes" / "rs" / "left_2.png").read_bytes() in told
 
 
-METHODS = """
-import time
-from dataclasses import dataclass
-from pathlib import Path
-import numpy as np
-from rsbench.vision.corrector import Corrector, CorrectorSpec
-from rsbench.vision.fusion import Fused
-from rsbench.vision.stereo_matcher import StereoMatcher
-
-def misbehave(mood):
-    "Once: the first problem alone."
-    done = Path(__file__).with_name(f"{mood}.done")
-    if mood == "sound" or done.exists():
-        return
-    done.touch()
-    held = np.ones((1 << 17, 900 if mood == "hungry" else 1))
-    time.sleep(1000.0)
-
-@dataclass(frozen=True)
-class Level(StereoMatcher):
-    mood: str = "sound"
-
-    def disparities(self, left, right, rig):
-        misbehave(self.mood)
-        return (np.full(left.shape[:2], 5.0),) * 2
-
-@dataclass(frozen=True)
-class Same(Corrector):
-    mood: str = "sound"
-    spec = CorrectorSpec(needs=set(), reference="this file", assumes="nothing")
-
-    def correct(self, problem, views):
-        misbehave(self.mood)
-        seen = np.ones(problem.images["left", 0].shape[:2], bool)
-        return {view: Fused.seen(problem.images[view], seen) for view in views}
-"""
 CLASSES = {"depth": "Level", "correction": "Same"}
 MOODS = {
     "hanging": (("--time-limit", 2), "took longer than 2 s"),
