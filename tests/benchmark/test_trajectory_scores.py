@@ -10,6 +10,7 @@ from analytic_dataset import write_analytic_dataset
 from evo.core import metrics
 from evo.core.metrics import PoseRelation, StatisticsType
 from evo.core.trajectory import PoseTrajectory3D
+from solver_trials import matches_of
 
 from rsbench.benchmark.trajectory_scores import (
     METHODS,
@@ -30,8 +31,7 @@ from rsbench.core import se3, so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
-from rsbench.core.projection import project_at, rs_project
-from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -129,27 +129,14 @@ def test_after_a_window_without_a_motion_nobody_knows_where_the_rig_is() -> None
     assert np.isfinite(chain.start(1).R).all()
 
 
-def _tracks(motion: Motion, shutter: RollingShutter | None, rng: np.random.Generator) -> FloatArray:
+def _tracks(motion: Motion, shutter: RollingShutter = SHUTTER, seed: int = 0) -> FloatArray:
     """Exact tracks (n, 8) of points in front of the rig, in all four images."""
-    points = rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 8.0], size=(400, 3))
-    pixels, seen = list[FloatArray](), np.ones(len(points), dtype=bool)
-    for side, frame in VIEWS:
-        if shutter is None:
-            found = project_at(RIG, motion, side, float(frame), points)[..., :2]
-            seen &= np.asarray(RIG.camera.contains(found))
-        else:
-            projection = rs_project(RIG, shutter, motion, side, frame, points)
-            found = projection.pixels
-            seen &= np.isfinite(projection.depth)
-        pixels.append(found)
-    by_view = dict(zip(VIEWS, pixels, strict=True))
-    order = [by_view[side, frame] for frame in (0, 1) for side in ("left", "right")]
-    return np.concatenate(order, axis=1)[seen]
+    return matches_of(motion, seed=seed, rig=RIG, shutter=shutter, tracks=150, depth=(3.0, 8.0)).tracks.copy()
 
 
 def test_a_global_shutter_is_seen_by_pnp_to_rounding(rng: np.random.Generator) -> None:
     motion = LinearMotion([0.02, -0.01, 0.03], [0.1, 0.02, -0.1])
-    tracks = _tracks(motion, None, rng)
+    tracks = _tracks(motion, RollingShutter(height=120, readout_ratio=0.0))
     tracks[:20, 4:6] += rng.uniform(-30.0, 30.0, size=(20, 2))
     found = pnp_motion(tracks, RIG)
     assert found is not None
@@ -169,12 +156,10 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> TrueTrajectory:
 
 
 @pytest.mark.slow
-def test_methods_in_the_order_of_what_they_know(shaken: TrueTrajectory, rng: np.random.Generator) -> None:
+def test_methods_in_the_order_of_what_they_know(shaken: TrueTrajectory) -> None:
     """Exact matches: what fits the shake is near it, what assumes another motion is not."""
     motion = shaken.sequence.motion
-    windows = [
-        Correspondences(tracks=_tracks(motion.from_time(float(k)), SHUTTER, rng)) for k in range(FRAMES - 1)
-    ]
+    windows = [Correspondences(tracks=_tracks(motion.from_time(float(k)), seed=k)) for k in range(FRAMES - 1)]
     problem = Given(rig=RIG, shutter=SHUTTER, matches=windows)
     found = {}
     for name in (*OURS, "windows-linear", "gs-vo", "no-motion"):
