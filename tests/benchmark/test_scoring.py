@@ -9,13 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from solver_trials import RIG
 
 from rsbench.benchmark.scoring import WORST_POSE, answered, pose_errors
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 
-RIG = StereoRig(camera=PinholeCamera(width=900, height=900, fx=810, fy=810, cx=449.5, cy=449.5), baseline=0.6)
 W, D = np.array([0.01, -0.03, 0.02]), np.array([0.1, -0.05, 0.3])
 few = settings(max_examples=40)
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)

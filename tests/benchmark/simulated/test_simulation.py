@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from solver_trials import RIG, SHUTTER
+from solver_trials import RIG, SHUTTER, matches_of
 
 from rsbench.benchmark.simulated import simulation
 from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
@@ -19,13 +19,12 @@ from rsbench.core.rig import SIDES
 from rsbench.core.shutter import RollingShutter
 
 MOTION = LinearMotion(w=np.deg2rad([0.8, -1.5, 1.0]), d=np.array([0.2, -0.1, 0.25]))
-OPTIONS = SimulationOptions(pairs=40, tracks=30)
 
 
 @pytest.mark.parametrize("model", ["linear", "twist", "accelerated", "spline"])
 def test_without_noise_all_matches_satisfy_the_exact_constraint(model: str) -> None:
     motion = make_motion(model, MOTION.w, MOTION.d)
-    c = simulate(RIG, SHUTTER, motion, OPTIONS, np.random.default_rng(1)).correspondences
+    c = matches_of(motion, seed=1, pairs=40, tracks=30)
     assert len(c.left) == len(c.right) == 40 and len(c.tracks) == 30
     for side, halves in zip(SIDES, ([0, 1, 4, 5], [2, 3, 6, 7]), strict=True):
         for matches in (getattr(c, side), c.tracks[:, halves]):
@@ -50,7 +49,7 @@ def test_fast_projection_agrees_with_the_search_over_all_rows(motion: Motion) ->
     rng = np.random.default_rng(3)
     pixels = rng.uniform(0.0, 899.0, (300, 2))
     points = back_project(RIG, SHUTTER, motion, "left", 0, pixels, rng.uniform(2.0, 10.0, 300))
-    world = simulation.MovingRig(RIG, SHUTTER, motion, OPTIONS)
+    world = simulation.MovingRig(RIG, SHUTTER, motion, SimulationOptions())
     for side in SIDES:
         for frame in (0, 1):
             expected = rs_project(RIG, SHUTTER, motion, side, frame, points)
@@ -62,11 +61,7 @@ def test_fast_projection_agrees_with_the_search_over_all_rows(motion: Motion) ->
 
 
 def test_noise_has_the_stated_deviation_on_every_coordinate() -> None:
-    options = SimulationOptions(pairs=2000, tracks=2000, noise_px=0.7)
-    noisy = simulate(RIG, SHUTTER, MOTION, options, np.random.default_rng(4)).correspondences
-    exact = simulate(
-        RIG, SHUTTER, MOTION, replace(options, noise_px=0.0), np.random.default_rng(4)
-    ).correspondences
+    noisy, exact = (matches_of(MOTION, seed=4, pairs=2000, tracks=2000, noise_px=px) for px in (0.7, 0.0))
     for name in ("left", "right", "tracks"):
         noise = (getattr(noisy, name) - getattr(exact, name)) / 0.7
         # Per coordinate, within the 1e-5 tails of chi-squared; coordinates are independent.
@@ -113,9 +108,8 @@ def test_outliers_are_as_many_and_as_far_as_stated() -> None:
 
 
 def test_points_of_a_plane_lie_on_one() -> None:
-    options = SimulationOptions(tracks=60, shape="plane")
     still = LinearMotion(np.zeros(3), np.array([0.0, 0.0, 1e-9]))
-    tracks = simulate(RIG, SHUTTER, still, options, np.random.default_rng(8)).correspondences.tracks
+    tracks = matches_of(still, seed=8, tracks=60, shape="plane").tracks
     X = RIG.depth(tracks[:, 0] - tracks[:, 2])[:, None] * RIG.camera.unproject(tracks[:, :2])
     normal, *_ = np.linalg.lstsq(X, np.ones(len(X)), rcond=None)
     np.testing.assert_allclose(X @ normal, 1.0, atol=1e-6)
@@ -124,7 +118,7 @@ def test_points_of_a_plane_lie_on_one() -> None:
 def test_a_motion_that_loses_the_scene_is_refused() -> None:
     away = LinearMotion(np.array([0.0, 3.0, 0.0]), np.zeros(3))
     with pytest.raises(ValueError, match="points in view"):
-        simulate(RIG, SHUTTER, away, SimulationOptions(pairs=5), np.random.default_rng(0))
+        matches_of(away, pairs=5)
 
 
 def test_random_motion_has_the_given_magnitudes() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from solver_trials import RIG, SHUTTER, trial
 
-from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.studies.claims import (
     GLOBAL,
@@ -21,9 +21,6 @@ from rsbench.benchmark.studies.claims import (
     settings_card,
     write_cards,
 )
-from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.linear import LinearSolver
 
@@ -52,15 +49,10 @@ def test_every_sweep_has_the_readings_that_its_claims_need(sweep: str, points: i
 
 def test_readings_differ_where_there_is_noise(tmp_path: Path) -> None:
     """A choice that changes nothing would make the table longer than what it says."""
-    rig = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
-    shutter = RollingShutter(height=900, readout_ratio=0.8)
-    rng = np.random.default_rng(0)
-    matches = simulate(
-        rig, shutter, random_motion(rng, 0.03, 0.3), SimulationOptions(pairs=30, noise_px=0.3), rng
-    ).correspondences
+    matches = trial(0, degrees=1.7, metres=0.3, pairs=30, noise_px=0.3).correspondences
     answers = []
     for path in write_cards(tmp_path, SOLVER_READINGS):
-        found = load_solver_entry(path).solver.estimate(matches, rig, shutter)
+        found = load_solver_entry(path).solver.estimate(matches, RIG, SHUTTER)
         answers.append((*np.round(found.w, 9), *np.round(found.d / np.linalg.norm(found.d), 9)))
     assert len(set(answers)) >= 6  # the sign may agree by chance
 
