@@ -188,13 +188,9 @@ class SolverTrack(Track):
         except ValueError as error:
             raise RsbenchError(f"solver {entry.name!r}: {error}") from error
 
-    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
-        entries = {card: self.entry_of(card) for card in cards}
-        for entry in entries.values():
-            self.check_entry(entry)
-        return {card: self._runnable(entry) for card, entry in entries.items()}
-
-    def _runnable(self, entry: SolverEntry) -> Runnable:
+    def runnable(self, card: str) -> Runnable:
+        entry = self.entry_of(card)
+        self.check_entry(entry)
         spec = entry.solver.spec
         model = spec.motion_model if spec.motion_model in ("linear", "twist") else "linear"
         if self.choosing:

@@ -186,17 +186,10 @@ class PictureTrack(Track):
 
     # Running
 
-    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
-        chains = {card: self.chain(card) for card in dict.fromkeys(cards)}
-        return {
-            card: Runnable(
-                name=chain.entry.name,
-                built_in=chain.entry.built_in,
-                key=chain.key,
-                header={"uses": chain.uses, "description": chain.entry.description, "paper": chain.reference},
-            )
-            for card, chain in chains.items()
-        }
+    def runnable(self, card: str) -> Runnable:
+        chain = self.chain(card)
+        entry, header = chain.entry, {"uses": chain.uses, "paper": chain.reference}
+        return Runnable(entry.name, entry.built_in, chain.key, header | {"description": entry.description})
 
     def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
         problems = {problem.name: problem for problem in read_inputs(inputs, self)}

@@ -505,12 +505,12 @@ class Track(ABC):
     # Running
 
     @abstractmethod
-    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
-        """Runnables by their cards.
+    def runnable(self, card: str) -> Runnable:
+        """What a card names. Raises RsbenchError: the card is wrong, or does not fit the track."""
 
-        Raises:
-            RsbenchError: a card is wrong, or does not fit the track.
-        """
+    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
+        """Runnables by their cards; errors as ``runnable``."""
+        return {card: self.runnable(card) for card in cards}
 
     def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
         """The folder of the inputs that cards get: made in ``work`` where they need more than was exported."""

@@ -198,15 +198,12 @@ class TrajectoryTrack(Track):
 
     # Running
 
-    def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
-        found = dict[str, Runnable]()
-        for card in cards:
-            if card not in METHODS:
-                raise RsbenchError(f"--entry {card}: no method of the track {self.name!r}{choices(card, METHODS)}")
-            method = METHODS[card]
-            header = {"uses": method.uses, "description": method.description, "motion_model": method.motion_model}
-            found[card] = Runnable(card, True, card, header)
-        return found
+    def runnable(self, card: str) -> Runnable:
+        if card not in METHODS:
+            raise RsbenchError(f"--entry {card}: no method of the track {self.name!r}{choices(card, METHODS)}")
+        method = METHODS[card]
+        header = {"uses": method.uses, "description": method.description, "motion_model": method.motion_model}
+        return Runnable(card, True, card, header)
 
     def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
         windows = read_inputs(inputs, self)
