@@ -54,15 +54,13 @@ from rsbench.storage.files import read_depth, read_png, read_table, write_depth,
 RIG, SHUTTER, MOTION = PLANES
 
 
-def _each_depth(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+def _changed(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+    """A file of predictions whose depth maps, float64 when they are changed, or frames are others."""
     for picture in pictures_of(path):
-        write_depth(picture, change(read_depth(picture).astype(np.float64)).astype(np.float32))
-    return path
-
-
-def _each_frame(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
-    for picture in pictures_of(path):
-        write_png(picture, np.ascontiguousarray(change(read_png(picture))))
+        if picture.suffix == ".png":
+            write_png(picture, np.ascontiguousarray(change(read_png(picture))))
+        else:
+            write_depth(picture, change(read_depth(picture).astype(np.float64)).astype(np.float32))
     return path
 
 
@@ -97,11 +95,13 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
     """Pixel by pixel, of a map that is off by known disparities and does not know a part."""
     split = splits["depth"]
     rng = np.random.default_rng(0)
-    path = write_truth(split, tmp_path)
     off = rng.choice([0.0, 0.6, 1.4, -2.5, 5.0], (80, 96))
     known = rng.random((80, 96)) > 0.2
     product = RIG.camera.fx * RIG.baseline
-    _each_depth(path, lambda z: np.where(known, product / np.maximum(product / z + off, 0.1), 0.0))
+    path = _changed(
+        write_truth(split, tmp_path),
+        lambda z: np.where(known, product / np.maximum(product / z + off, 0.1), 0.0),
+    )
     scores = scores_of(split, path)
     for number, truth in enumerate(split.truths):
         z = truth.shown.depth().astype(np.float64)
@@ -127,14 +127,11 @@ def test_depth_scores_are_those_of_a_count(splits: dict[str, Split], tmp_path: P
 def test_frame_scores_follow_their_formulas(splits: dict[str, Split], tmp_path: Path) -> None:
     """Ten steps of grey everywhere, a picture that is moved by two pixels, and one that is half drawn."""
     split = splits["correction"]
-    brighter = scores_of(
-        split, _each_frame(write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10))
-    )
+    brighter = scores_of(split, _changed(write_truth(split, tmp_path / "a"), lambda image: image + np.uint8(10)))
     for name in ("psnr", "psnr_all", "psnr_covered", "psnr_first", "psnr_middle"):
         np.testing.assert_allclose(brighter[name], 20.0 * np.log10(25.5), rtol=1e-9)
-    moved = scores_of(
-        split, _each_frame(write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1))
-    )
+    path = _changed(write_truth(split, tmp_path / "b"), lambda image: np.roll(image, 2, axis=1))
+    moved = scores_of(split, path)
     assert np.all(np.abs(moved["epe_px"] - 2.0) < 0.3)  # dense flow is some tenths of a pixel wrong
     assert np.all(moved["ssim"] < brighter["ssim"])
     path = write_truth(split, tmp_path / "c")
@@ -189,10 +186,8 @@ FRAME_SLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @pytest.mark.parametrize("words", [*DEPTH_SLIPS, *FRAME_SLIPS])
 def test_slips_are_told(words: str, splits: dict[str, Split], tmp_path: Path) -> None:
     """And of a secret truth only what needs no truth."""
-    is_depth = words in DEPTH_SLIPS
-    split = splits["depth" if is_depth else "correction"]
-    path = write_truth(split, tmp_path)
-    (_each_depth if is_depth else _each_frame)(path, (DEPTH_SLIPS | FRAME_SLIPS)[words])
+    split = splits["depth" if words in DEPTH_SLIPS else "correction"]
+    path = _changed(write_truth(split, tmp_path), (DEPTH_SLIPS | FRAME_SLIPS)[words])
     (note,) = check_submission(path, split).notes
     assert words in note
     blind = check_submission(path, replace(split, public=False)).notes
@@ -202,12 +197,12 @@ def test_slips_are_told(words: str, splits: dict[str, Split], tmp_path: Path) ->
 def test_what_is_nearly_right_is_not_called_a_slip(splits: dict[str, Split], tmp_path: Path) -> None:
     """Noise of 3 %, a map that is 2 % too large, and frames with noise."""
     rng = np.random.default_rng(0)
-    path = _each_depth(
+    path = _changed(
         write_truth(splits["depth"], tmp_path / "a"),
         lambda z: 1.02 * z * np.exp(0.03 * rng.standard_normal(z.shape)),
     )
     assert check_submission(path, splits["depth"]).notes == ()
-    path = _each_frame(
+    path = _changed(
         write_truth(splits["correction"], tmp_path / "b"),
         lambda image: np.clip(image + rng.normal(0.0, 12.0, image.shape), 0, 255).astype(np.uint8),
     )
@@ -250,7 +245,7 @@ def test_depth_of_opencv_alone_is_read(splits: dict[str, Split], tmp_path: Path)
 
 
 def _submitted(board: Path, split: Split, folder: Path, method: str, factor: float = 1.0) -> None:
-    path = _each_depth(write_truth(split, folder / method), lambda z: factor * z)
+    path = _changed(write_truth(split, folder / method), lambda z: factor * z)
     head, *answers = lines_of(path)
     add(board, write(path, [{**head, "method": method, "uses": ["images"]}, *answers]), split, {})
 
@@ -517,17 +512,17 @@ def _by_hand(values: np.ndarray, of: np.ndarray, image: np.ndarray, row: int) ->
 def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
     """Off by 1.5 px below the middle row, and unknown in a column: of rows the first parts are right."""
     split = splits["depth"]
-    path, product = write_truth(split, tmp_path), RIG.camera.fx * RIG.baseline
-    for picture in pictures_of(path):
-        z = read_depth(picture).astype(np.float64)
+    product, wrong = RIG.camera.fx * RIG.baseline, np.zeros((80, 96))
+    wrong[40:], wrong[:, 7] = 1.0, 1.0
+
+    def change(z: np.ndarray) -> np.ndarray:
         z[40:] = product / (product / z[40:] + 1.5)
         z[:, 7] = 0.0
-        write_depth(picture, z.astype(np.float32))
-    scores = scores_of(split, path)
+        return z
+
+    scores = scores_of(split, _changed(write_truth(split, tmp_path), change))
     assert np.all(scores["bad_1_rows_1"] == 1 / 96) and np.all(scores["bad_1_rows_5"] == 1.0)
     for number, truth in enumerate(split.truths):
-        wrong = np.zeros((80, 96))
-        wrong[40:], wrong[:, 7] = 1.0, 1.0
         parts = _by_hand(wrong, truth.shown.depth() > 0, truth.shown.rolling(), 0)
         for name in (*columns("bad_1", ROWS), *columns("bad_1", TEXTURE)):
             expected = parts.get(name.removeprefix("bad_1_"), [math.nan])
@@ -538,10 +533,9 @@ def test_wrong_depth_is_counted_by_part(splits: dict[str, Split], tmp_path: Path
 def test_errors_of_frames_are_rooted_by_part(splits: dict[str, Split], tmp_path: Path) -> None:
     """Each pixel of both frames off by a level of its own; a part holds what either frame has of it."""
     split = splits["correction"]
-    path, off = write_truth(split, tmp_path), np.random.default_rng(1).integers(0, 3, (80, 96, 3))
+    off = np.random.default_rng(1).integers(0, 3, (80, 96, 3))
     off[50:] *= 9
-    for picture in pictures_of(path):
-        write_png(picture, ((read_png(picture) + off) % 256).astype(np.uint8))
+    path = _changed(write_truth(split, tmp_path), lambda frame: ((frame + off) % 256).astype(np.uint8))
     scores = scores_of(split, path)
     for number, truth in enumerate(split.truths):
         parts = dict[str, list[float]]()
