@@ -413,7 +413,7 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
 
 
 def smooth(motion: Motion) -> Motion:
-    """For a bound: of a shaken motion the twist that it shakes about, whose bound is the same to 5 %.
+    """For a bound: of a spline with vibrations, the twist around which it vibrates, whose bound is within 5 %.
 
     A derivative of a spline by its end takes a hundred times as long.
     """

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -113,7 +112,7 @@ class Answer:
 
 
 class Subject:
-    """A solver whose answers are checked; use as a context manager.
+    """A solver whose answers are checked, to be closed.
 
     An entry of another package runs in a child process, so that it may hang, exit or crash.
     """
@@ -174,10 +173,8 @@ class Subject:
             if least < -1e-12 * np.abs(estimate.covariance).max():
                 raise BrokenContractError(f"returned a covariance with the eigenvalue {least:.1e}")
 
-    def __enter__(self) -> Subject:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
+    def close(self) -> None:
+        """End the child process, if there is one."""
         if self._worker is not None:
             self._worker.close()
 
@@ -245,7 +242,7 @@ def check_solver(
     limit = entry.options.time_limit_s if time_limit_s is None else time_limit_s
     findings: list[Finding] = []
     isolated = not entry.built_in if isolated is None else isolated
-    with Subject(entry, isolated=isolated, time_limit_s=limit) as subject:
+    with contextlib.closing(Subject(entry, isolated=isolated, time_limit_s=limit)) as subject:
         for name, check in CHECKS.items():
             silent = subject.hung or (findings and findings[0].verdict == "failed")
             try:

@@ -317,10 +317,10 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
     old = {solver["name"]: solver for solver in stored.get("solvers", [])}
     changed = [solver["name"] for solver in plan["solvers"] if old.get(solver["name"]) != solver]
     words = [f"{', '.join(changed)} made by other code or another card"] if changed else []
-    words += [
-        f"{key} was {stored.get(key)}, is {plan[key]}" for key in ("rsbench",) if stored.get(key) != plan[key]
-    ]
-    words += ["of other rigs"] if stored.get("rigs") != plan.get("rigs") else []
+    if stored.get("rsbench") != plan["rsbench"]:
+        words.append(f"rsbench was {stored.get('rsbench')}, is {plan['rsbench']}")
+    if stored.get("rigs") != plan.get("rigs"):
+        words.append("of other rigs")
     if any(stored.get(key) != plan[key] for key in ("code", "motions")):
         words.append("simulated by other code")
     return words or (["differs in cells"] if stored.get("cells") != plan["cells"] else [])
