@@ -63,35 +63,20 @@ def run(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def keeper(tmp_path: Path) -> Path:
-    """The keeper's clone of a bare repository."""
-    bare, clone = tmp_path / "bare.git", tmp_path / "keeper"
-    assert run("git", "init", "-q", "--bare", "-b", "main", bare, cwd=tmp_path).returncode == 0
-    assert run("git", "clone", "-q", bare, clone, cwd=tmp_path).returncode == 0
-    shutil.copytree(BOARD, clone, dirs_exist_ok=True)
-    run("git", "checkout", "-q", "-b", "main", cwd=clone)
+    """The keeper's clone."""
+    clone = Path(shutil.copytree(BOARD, tmp_path / "keeper"))
+    assert run("git", "init", "-q", "-b", "main", cwd=clone).returncode == 0
     run("git", "add", "-A", cwd=clone)
-    run("git", "commit", "-qm", "Open the board", cwd=clone)
-    assert run("git", "push", "-q", "origin", "main", cwd=clone).returncode == 0
+    assert run("git", "commit", "-qm", "Open the board", cwd=clone).returncode == 0
     return clone
 
 
-def hand_in(tmp_path: Path, keeper: Path, branch: str, method: str) -> None:
-    """A stranger's clone, a branch, a push: the pull request, which the keeper fetches."""
-    clone = tmp_path / branch
-    run("git", "clone", "-q", tmp_path / "bare.git", clone, cwd=tmp_path)
-    run("git", "checkout", "-q", "-b", branch, cwd=clone)
-    put_answers(clone, method)
-    run("git", "add", "-A", cwd=clone)
-    run("git", "commit", "-qm", "Hand in", cwd=clone)
-    assert run("git", "push", "-q", "origin", branch, cwd=clone).returncode == 0
-    run("git", "fetch", "-q", "origin", branch, cwd=keeper)
-
-
-def put_answers(clone: Path, method: str) -> None:
-    """With errors beyond those of any doubt."""
+def put_answers(clone: Path, method: str) -> bytes:
+    """Predictions of a method with errors beyond those of any doubt."""
     lines = named(truth_lines(TRACKS["points"].split(None)), method)
     (clone / "submissions" / method).mkdir(parents=True)
-    write(clone / "submissions" / method / "predictions.jsonl", [lines[0], *erring(lines[1:], 0.05, 0.05)])
+    path = clone / "submissions" / method / "predictions.jsonl"
+    return write(path, [lines[0], *erring(lines[1:], 0.05, 0.05)]).read_bytes()
 
 
 def git(clone: Path, *words: str, given: bytes = b"") -> str:
@@ -354,9 +339,7 @@ def test_the_key_of_an_entry_signs_its_updates(board: Path, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_what_rsbench_finds_is_one_plain_line(board: Path, tmp_path: Path) -> None:
-    put_answers(tmp_path, "mine")
-    text = (tmp_path / MINE.decode()).read_text("utf-8")
-    theirs = text.encode()
+    theirs = put_answers(tmp_path, "mine")
     elsewhere = commit(board, "main", {b"submissions/another/predictions.jsonl": theirs})
     words = "submissions/another: its header names 'mine'; folder and method must agree"
     assert_refused(judge(board, elsewhere), words)
@@ -372,7 +355,7 @@ def test_what_rsbench_finds_is_one_plain_line(board: Path, tmp_path: Path) -> No
         (('"method"', '"\\u001b[31m\\u202e": 1, "method"'), "31m"),
         (("{", "[" * 60000), "not valid JSON"),
     ):
-        head = commit(board, "main", {MINE: text.replace(*change, 1).encode()})
+        head = commit(board, "main", {MINE: theirs.decode().replace(*change, 1).encode()})
         ran = judge(board, head)
         assert ran.returncode == 2 and words in ran.stderr, ran.stderr
         assert ran.stderr.count("\n") == 1 and ran.stderr[:-1].isprintable() and "Traceback" not in ran.stderr
@@ -394,14 +377,12 @@ def test_pictures_that_a_track_asks_for_are_scored(
 
 @pytest.mark.slow
 def test_one_is_scored_published_and_there_when_the_board_is_opened_again(keeper: Path, tmp_path: Path) -> None:
-    hand_in(tmp_path, keeper, "mine", "mine")
-    ran = run(sys.executable, "check.py", "main", "FETCH_HEAD", cwd=keeper)
+    head = commit(keeper, "main", {MINE: put_answers(tmp_path, "mine")})
+    ran = judge(keeper, head)
     assert ran.returncode == 0 and "mine" in ran.stdout, ran.stderr
-    assert run("git", "merge", "-q", "FETCH_HEAD", cwd=keeper).returncode == 0
-    assert run("git", "push", "-q", "origin", "main", cwd=keeper).returncode == 0
-    hand_in(tmp_path, keeper, "shouting", "MINE")
-    ran = run(sys.executable, "check.py", "main", "FETCH_HEAD", cwd=keeper)
-    assert ran.returncode != 0 and "reads like submissions/mine" in ran.stderr
+    assert run("git", "merge", "-q", head, cwd=keeper).returncode == 0
+    shouting: Files = {b"submissions/MINE/predictions.jsonl": put_answers(tmp_path / "shouting", "MINE")}
+    assert_refused(judge(keeper, commit(keeper, "main", shouting)), "reads like submissions/mine")
     tables = []
     for later in (False, True):  # from what the repository holds alone, as after a year
         if later:  # a newer rsbench has a method of an entry's name, and no doubt that the keeper spoke of
