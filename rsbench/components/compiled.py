@@ -59,11 +59,7 @@ def compiled(**options: Any) -> Callable[[F], F]: ...
 def compiled(function: F | None = None, **options: Any) -> F | Callable[[F], F]:
     """Compile at the first call, once per installation; ``options`` are those of ``numba.njit``."""
     if function is None:
-        return functools.partial(_compiled, options=options)
-    return _compiled(function, {})
-
-
-def _compiled(function: F, options: dict[str, Any]) -> F:
+        return functools.partial(compiled, **options)
     dispatcher = njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
     dispatcher._cache = _KernelCache(function)
     out: F = dispatcher
