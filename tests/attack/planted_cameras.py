@@ -24,6 +24,7 @@ from attack.planting import (
     depth_of,
     drop,
     image_of,
+    in_victim,
     manifest_of,
     noised,
     other_geometry,
@@ -678,11 +679,7 @@ def _thin_faults() -> Iterator[Fault]:
 def _frame_faults() -> Iterator[Fault]:
     """In channels of whole sequences, beyond the first two frames."""
     for name, (plant, words) in frame_faults.FAULTS.items():
-        yield Fault(f"frames: {name}", _in_victim(plant), words)
-
-
-def _in_victim(plant: Plant) -> Plant:
-    return lambda folder: plant(folder / VICTIM)
+        yield Fault(f"frames: {name}", in_victim(plant), words)
 
 
 CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {

@@ -96,8 +96,8 @@ def depth_faults() -> Iterator[Fault]:
     yield Fault(
         "patch of 1.001", depth_of("gs", "left_0", times(1.001, slice(60, 80), slice(40, 64))), (gs, "rows 6")
     )
-    yield Fault("GS depth is RS depth", copied(f"{VICTIM}/{rs}", gs), (gs, f"the same as {rs}"))
-    yield Fault("RS depth is GS depth", copied(f"{VICTIM}/{gs}", rs), (rs, f"the same as {gs}"))
+    yield Fault("GS depth is RS depth", copied(f"{VICTIM}/{rs}", f"{VICTIM}/{gs}"), (gs, f"the same as {rs}"))
+    yield Fault("RS depth is GS depth", copied(f"{VICTIM}/{gs}", f"{VICTIM}/{rs}"), (rs, f"the same as {gs}"))
     yield Fault("RS and GS depth exchanged", swapped((rs, gs)), ("depth/left_0.exr", "looks like"))
     yield Fault(
         "depth left and right exchanged",
@@ -107,7 +107,7 @@ def depth_faults() -> Iterator[Fault]:
     yield Fault(
         "depth of frames exchanged", swapped((gs, "gs_depth/left_1.exr")), (gs, "looks like gs_depth/left_1.exr")
     )
-    yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", rs), (rs, "differs"))
+    yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", f"{VICTIM}/{rs}"), (rs, "differs"))
     for row in (48, 95):
         words = ("gs_depth/left_1.exr", f"global shutter at the pose of line {row}")
         yield Fault(f"twin at the pose of row {row}", twin_at(row), words, slow=True)
@@ -199,14 +199,14 @@ def image_faults() -> Iterator[Fault]:
     yield Fault("all frames exchanged", swapped(*frames), (".png", "other colours"))
     yield Fault(
         "GS image is RS image",
-        copied(f"{VICTIM}/rs/left_0.png", "gs/left_0.png"),
+        copied(f"{VICTIM}/rs/left_0.png", f"{VICTIM}/gs/left_0.png"),
         ("gs/left_0.png", "the same as rs/left_0.png"),
     )
     for shutter in ("rs", "gs"):
         file = f"{shutter}/left_1.png"
         yield Fault(
             f"{shutter} image of another sequence",
-            copied(f"{OTHER}/{file}", file),
+            copied(f"{OTHER}/{file}", f"{VICTIM}/{file}"),
             (file, f"the same as {OTHER}/{file}"),
         )
     blurred = below_row_0(lambda image: cv2.GaussianBlur(image, (0, 0), 0.8))
