@@ -170,12 +170,6 @@ def _attempt(
 
 
 def _run(arena: Arena, surrounding: Surrounding, arguments: list[str], folder: Path) -> tuple[int, str]:
-    environment: dict[str, str] = dict(os.environ)
-    for name, value in {**arena.environment(), **surrounding.environment}.items():
-        environment.pop(name, None)
-        if value is not None:
-            environment[name] = value
-
     def first() -> None:
         if os.geteuid() == 0 and surrounding.locked:
             ctypes.CDLL(None).prctl(_CAPBSET_DROP, _DAC_OVERRIDE, 0, 0, 0)
@@ -186,7 +180,7 @@ def _run(arena: Arena, surrounding: Surrounding, arguments: list[str], folder: P
         result = subprocess.run(
             [sys.executable, "-m", "rsbench", "--quiet", *arguments],
             cwd=folder,
-            env=environment,
+            env=arena.environment(surrounding.environment),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=LIMIT_S,

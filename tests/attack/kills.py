@@ -60,6 +60,7 @@ def attack(arena: Arena, case: Case, reference: Reference, rng: np.random.Genera
             tally.check(not lost, f"{where}: changed outside --out: {sorted(lost)[:5]}")
         alone = None if whole else partial(here, arena, case, Trap())  # what it would render is known
         ending = arena.run(("--quiet", *case.arguments), before=alone)
+        tally.count("resumed")
         _check_resumed(arena, ending, reference, tally, before, f"{case.name}, after {'; '.join(deaths)}")
     tally.count("kills", kills)
     return tally
@@ -101,17 +102,15 @@ def _check_death(tally: Tally, death: Death, ending: Ending, where: str) -> None
 def _check_resumed(
     arena: Arena, ending: Ending, reference: Reference, tally: Tally, before: dict[str, str], where: str
 ) -> None:
-    tally.count("resumed")
     problem = problem_of(ending)
     tally.check(
         ending.code == 0 and not problem, f"{where}, resumed: exit code {ending.code}, {problem or ending.err}"
     )
-    if ending.code:
-        return
-    found = contents(arena.work / "out")
-    tally.check(
-        found == reference.contents, f"{where}, resumed: differs in {differing(found, reference.contents)}"
-    )
+    if ending.code == 0:
+        found = contents(arena.work / "out")
+        tally.check(
+            found == reference.contents, f"{where}, resumed: differs in {differing(found, reference.contents)}"
+        )
     now = arena.outside(arena.work / "out")
     tally.check(now == before, f"{where}, resumed: outside --out: {differing(now, before)}")
 
@@ -196,13 +195,4 @@ def _check(
     if finished or ending.code == 0:
         lost = {name: digest for name, digest in reference.contents.items() if found.get(name) != digest}
         tally.check(not lost, f"{where}, exit code {ending.code}: lost or changed {sorted(lost)[:5]}")
-    resumed = _run(arena, case, Trap())
-    problem = problem_of(resumed) or resumed.err
-    tally.check(resumed.code == 0, f"{where}, resumed: exit code {resumed.code}, {problem}")
-    if resumed.code == 0:
-        found = contents(arena.work / "out")
-        tally.check(
-            found == reference.contents, f"{where}, resumed: differs in {differing(found, reference.contents)}"
-        )
-    now = arena.outside(arena.work / "out")
-    tally.check(now == outside, f"{where}, resumed: outside --out: {differing(now, outside)}")
+    _check_resumed(arena, _run(arena, case, Trap()), reference, tally, outside, where)
