@@ -14,6 +14,7 @@ from typing import assert_type
 
 import numpy as np
 import pytest
+from documents import ROOT, blocks, rows
 from numpy.typing import NDArray
 
 import rsbench
@@ -288,8 +289,8 @@ def test_wrong_arguments_are_named_in_one_line(call: Callable[[], object], messa
 
 
 def test_the_overview_has_every_name_with_its_parameters() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "reference" / "api.md").read_text("utf-8")
-    cells = "\n".join(line.split("|")[1] for line in page.splitlines() if line.startswith("|"))
+    page = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
+    cells = "\n".join(cell for cell, *_ in rows(page))
     named = dict(re.findall(r"`(\w+)(?:\(([\w, ]*)\))?`", cells))
     assert "`RsbenchError`" in page
     assert sorted([*named, "RsbenchError"]) == NAMES
@@ -300,7 +301,6 @@ def test_the_overview_has_every_name_with_its_parameters() -> None:
 
 
 def test_the_overview_s_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "reference" / "api.md").read_text("utf-8")
-    (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    (code,) = blocks(ROOT / "docs" / "reference" / "api.md", "python")
     exec(compile(code, "api.md", "exec"), {})
     assert "e_R_deg" in capsys.readouterr().out

@@ -17,16 +17,12 @@ import cv2
 import numpy as np
 import pytest
 from commands import run_here
+from documents import ROOT, blocks
 from numpy.typing import NDArray
-from programs import ROOT
 
-PAGE = (ROOT / "docs" / "how-to" / "your-own-rig.md").read_text("utf-8")
+PAGE = ROOT / "docs" / "how-to" / "your-own-rig.md"
 SCALE = 0.75
 """Of the width and height of the frames that the page shows."""
-
-
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 
 
 def _smaller(c: Any) -> Any:
@@ -95,7 +91,7 @@ def test_three_commands_lead_from_a_calibration_to_a_rectified_pair(
 ) -> None:
     folder, truth, rotation_deg = day
     monkeypatch.chdir(folder)
-    commands = [shlex.split(line) for line in _blocks("sh")[number].splitlines()]
+    commands = [shlex.split(line) for line in blocks(PAGE, "sh")[number].splitlines()]
     assert [words[:2] for words in commands] == [["rsbench", each] for each in ("rig", "inspect", "correct")]
     said = []
     for _, *words in commands:
@@ -117,7 +113,7 @@ def test_three_commands_lead_from_a_calibration_to_a_rectified_pair(
     assert _row_difference(Path()) > 1.0
     if number == 0:
         printed = io.StringIO()
-        (script,) = _blocks("python")
+        (script,) = blocks(PAGE, "python")
         Path("points.py").write_text(script, "utf-8")
         with contextlib.redirect_stdout(printed):
             runpy.run_path("points.py")
