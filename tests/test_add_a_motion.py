@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from commands import install_project, sweep_card
 from documents import ROOT, write_blocks
+from programs import run_python
 
 SWEEP = sweep_card(
     ["rs-stereo-ease.toml", "rs-stereo-refined"], noise_px=[0.0], trials=2, more='motion_model = "ease"\n'
@@ -27,13 +26,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def rsbench(site: Path, *arguments: object, installed: bool = True) -> subprocess.CompletedProcess[str]:
-    path = [str(site)] if installed else []
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*path, *filter(None, sys.path)])}
-    command = [sys.executable, "-m", "rsbench", *map(str, arguments)]
-    return subprocess.run(
-        command, cwd=site, capture_output=True, text=True, timeout=400, check=False, env=environment
-    )
+def rsbench(site: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return run_python("-m", "rsbench", *arguments, folder=site, path=[site])
 
 
 def test_it_is_listed(site: Path) -> None:
@@ -88,8 +82,5 @@ record = motion_record(card.motion_of(card.sequence[0]))
 assert record["model"] == "ease_motion:EaseMotion", record
 assert read_motion(record).c == 0.5
 """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    result = subprocess.run(
-        [sys.executable, "-c", code], cwd=site.parent, capture_output=True, text=True, timeout=100, env=environment
-    )
+    result = run_python("-c", code, folder=site.parent)
     assert result.returncode == 0, result.stderr

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from calibration_files import matrix, opencv
 from commands import run_here
 from documents import ROOT, blocks
 from numpy.typing import NDArray
@@ -58,16 +59,13 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
 
 
 def _write_opencv(path: Path, rig: Any) -> None:
-    """As OpenCV's sample of stereo calibration writes it, by OpenCV, in millimetres."""
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    """As OpenCV's sample of stereo calibration writes it, in millimetres."""
+    values = {"R": np.asarray(rig.R), "T": 1000.0 * np.asarray(rig.t).reshape(3, 1)}
     for number, c in enumerate((rig.left, rig.right), start=1):
-        (cx, cy), k = c.centre, np.zeros((1, 5))
+        k = np.zeros((1, 5))
         k[0, : len(c.coefficients)] = c.coefficients
-        storage.write(f"M{number}", np.array([[c.fx, 0.0, cx], [0.0, c.fy, cy], [0.0, 0.0, 1.0]]))
-        storage.write(f"D{number}", k)
-    storage.write("R", np.asarray(rig.R))
-    storage.write("T", 1000.0 * np.asarray(rig.t).reshape(3, 1))
-    storage.release()
+        values |= {f"M{number}": matrix((c.fx, c.fy, *c.centre)), f"D{number}": k}
+    opencv(path, **values)
 
 
 def _psnr(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
