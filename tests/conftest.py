@@ -24,7 +24,7 @@ from rsbench.storage.work_folder import temporary, user_cache
 if TYPE_CHECKING:
     from rsbench.dataset.card import DatasetCard
     from rsbench.dataset.sequence import Sequence
-    from rsbench.scenes.model import Light, Scene
+    from rsbench.scenes.model import Scene
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.
@@ -131,35 +131,17 @@ def built_scene() -> Callable[[str], Scene]:
 @pytest.fixture(scope="module")
 def scenes_once(built_scene: Callable[[str], Scene], give_back: Callable[[], None]) -> Iterator[None]:
     """Sequences of one scene of ours, seen from one place, share it in the renderer: loading it takes seconds."""
-    from rsbench.components.cards import card_path
-    from rsbench.dataset import generation
-    from rsbench.renderers import scene
-    from rsbench.scenes.load import load_scene
-    from rsbench.verification import rerender
+    from kept_scenes import kept_scenes
 
-    made = scene.MitsubaScene
-    kept: dict[tuple[str, Light], scene.MitsubaScene] = {}
+    from rsbench.components.cards import list_cards
+    from rsbench.scenes.load import load_scene
 
     def loaded(card: str | Path) -> Scene:
-        return (
-            built_scene(Path(card).stem)
-            if card_path("scenes", Path(card).stem) == Path(card)
-            else load_scene(card)
-        )
+        ours = list_cards("scenes").get(Path(card).stem)
+        return built_scene(ours.stem) if ours and str(card) in (ours.stem, str(ours)) else load_scene(card)
 
-    def once(seen: Scene) -> scene.MitsubaScene:
-        key = seen.name, seen.light  # the light in the frame of the view tells views apart
-        if key not in kept:
-            kept.clear()  # hundreds of MB: not two at a time
-            kept[key] = made(seen)
-        return kept[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "load_scene", built_scene)
-        patch.setattr(rerender, "load_scene", loaded)
-        patch.setattr(scene, "MitsubaScene", once)
+    with kept_scenes(loaded):
         yield
-    kept.clear()
     give_back()
 
 

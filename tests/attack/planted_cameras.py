@@ -15,7 +15,7 @@ import frame_faults
 import numpy as np
 from numpy.typing import NDArray
 
-from attack.planted_faults import depth_faults, image_faults, scene_of_victim, twin_at
+from attack.planted_faults import depth_faults, image_faults, rendered_as, twin_at
 from attack.planting import (
     RNG,
     VICTIM,
@@ -37,7 +37,7 @@ from attack.planting import (
     times,
 )
 from attack.wet_castle import WET_CASTLE
-from rsbench.components.cards import load_card, parse_card
+from rsbench.components.cards import parse_card
 from rsbench.components.rig_tables import RigTables, tables_of
 from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
@@ -49,7 +49,6 @@ from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.renderers.image import Sensor, compressed, expose, linear_of_codes, processed, rows_needed
-from rsbench.renderers.options import RendererOptions
 from rsbench.storage.files import (
     read_depth,
     read_mask,
@@ -405,29 +404,6 @@ def _times_as(change: Callable[[Sequence], Sequence], names: tuple[str, ...]) ->
     return plant
 
 
-def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tuple[Any, int]) -> Plant:
-    """Image and depth of one view as another rig, shutter or motion makes them."""
-
-    def plant(folder: Path) -> None:
-        from rsbench.renderers.image import to_srgb8
-        from rsbench.renderers.render import LinePoses, render
-
-        home = folder / VICTIM
-        sequence = change(read_sequence(home))
-        side, frame = view
-        R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
-        if shutter == "gs":
-            line = sequence.shutter.first_line(side)
-            R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
-        options = load_card(RendererOptions, "renderers", "preview")
-        columns = sequence.shutter.axis(side) == 0
-        seen = render(scene_of_victim(), sequence.rig.sensor(side), LinePoses(R, t, columns=columns), options)
-        write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
-        write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
-
-    return plant
-
-
 def _lens_faults() -> Iterator[Fault]:
     own, geometry = f"{VICTIM}/sequence.json", ("sequence.json", "pairs of depth maps disagree", "camera")
     yield Fault("no lens everywhere", other_geometry(_without_lens), geometry)
@@ -449,7 +425,7 @@ def _lens_faults() -> Iterator[Fault]:
     yield Fault("depth without the lens", _depth_without_lens, ("gs_depth/right_0.exr", "differs"))
     yield Fault("depth along the ray", _along_the_ray, ("rs_depth/right_1.exr", "along the ray"))
     yield Fault("flow of ideal pixels", _flow_of_ideal_pixels, ("flow/left_0.exr", "differ from what depth"))
-    seen = _rendered_as(_without_lens, "rs", ("right", 1))
+    seen = rendered_as(_without_lens, "rs", ("right", 1))
     yield Fault("frame without the lens", seen, ("rs_depth/right_1.exr", "differs"), slow=True)
 
 
@@ -485,7 +461,7 @@ def _column_faults() -> Iterator[Fault]:
     words = ("gs_depth/left_1.exr", "global shutter at the pose of line 127")
     yield Fault("twin at the pose of the last column", twin_at(127), words, slow=True)
     for change, word in ((_read(scan="right"), "scan"), (_read(scan="top"), "rows")):
-        seen = _rendered_as(change, "rs", ("left", 0))
+        seen = rendered_as(change, "rs", ("left", 0))
         yield Fault(f"frame of another {word}", seen, ("rs_depth/left_0.exr", "differs"), slow=True)
 
 
@@ -528,7 +504,7 @@ def _late_faults() -> Iterator[Fault]:
     words = ("gs_depth/left_1.exr", "global shutter at the pose of line 95")
     yield Fault("twin at the pose of the top row", twin_at(0), words, slow=True)
     for shutter in ("rs", "gs"):
-        file, seen = f"{shutter}_depth/right_0.exr", _rendered_as(at_once, shutter, ("right", 0))
+        file, seen = f"{shutter}_depth/right_0.exr", rendered_as(at_once, shutter, ("right", 0))
         yield Fault(f"{shutter} frame without the delay", seen, (file, "differs"), slow=True)
 
 
@@ -546,7 +522,7 @@ def _opposite_faults() -> Iterator[Fault]:
         _poses_as(_read(right_scan=None), ("right", 0)),
         ("poses/right_0.csv", "differs"),
     )
-    seen = _rendered_as(_read(right_scan=None), "rs", ("right", 0))
+    seen = rendered_as(_read(right_scan=None), "rs", ("right", 0))
     yield Fault("right frame from the top", seen, ("rs_depth/right_0.exr", "differs"), slow=True)
 
 
@@ -646,10 +622,10 @@ def _rig_file_faults() -> Iterator[Fault]:
     yield Fault("times of the left camera", _times_as(at_once, (table,)), (table, "time_ns"))
     exchange = swapped(("rs/left_0.png", "rs/right_0.png"))
     yield Fault("left and right images exchanged", exchange, ("rs/left_0.png", "is 144 x 88 pixels"))
-    seen = _rendered_as(at_once, "rs", ("right", 1))
+    seen = rendered_as(at_once, "rs", ("right", 1))
     words = ("rs_depth/right_1.exr", "looks read at the times of the other camera's lines")
     yield Fault("frame at the left camera's times", seen, words, slow=True)
-    ahead = _rendered_as(_rig_with(turn=np.eye(3)), "gs", ("right", 0))
+    ahead = rendered_as(_rig_with(turn=np.eye(3)), "gs", ("right", 0))
     yield Fault("twin of a camera that looks ahead", ahead, ("gs_depth/right_0.exr", "differs"), slow=True)
 
 

@@ -125,23 +125,34 @@ def scene_of_victim(name: str = VICTIM) -> Any:
     return MitsubaScene(scene.seen_from(scene.viewpoints["default"]))
 
 
-def twin_at(row: int) -> Plant:
-    """The global-shutter twin, image and depth, at the pose of another row."""
+def rendered_as(
+    change: Callable[[Sequence], Sequence], shutter: str, view: tuple[Any, int], line: int | None = None
+) -> Plant:
+    """Image and depth of one view as another rig, shutter or motion makes them; a twin at the pose of a line."""
 
     def plant(folder: Path) -> None:
         from rsbench.renderers.image import to_srgb8
-        from rsbench.renderers.render import render_global
+        from rsbench.renderers.render import LinePoses, render
 
-        sequence = read_sequence(folder / VICTIM)
-        poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, "left", 1)
-        options = load_card(RendererOptions, "renderers", "preview")
-        name = sequence.manifest["scene"]["name"]
+        home, (side, frame) = folder / VICTIM, view
+        sequence = change(read_sequence(home))
+        R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
+        if shutter == "gs":
+            at = sequence.shutter.first_line(side) if line is None else line
+            R, t = np.broadcast_to(R[at], R.shape), np.broadcast_to(t[at], t.shape)
+        options, name = load_card(RendererOptions, "renderers", "preview"), sequence.manifest["scene"]["name"]
         scene = scene_of_victim(str(WET_CASTLE) if name == "wet-castle" else name)
-        frame = render_global(scene, sequence.rig.camera, poses.R[row], poses.t[row], options)
-        write_png(sequence.folder / "gs/left_1.png", to_srgb8(frame.image, options.exposure))
-        write_depth(sequence.folder / "gs_depth/left_1.exr", frame.depth)
+        poses = LinePoses(R, t, columns=sequence.shutter.axis(side) == 0)
+        seen = render(scene, sequence.rig.sensor(side), poses, options)
+        write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
+        write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
 
     return plant
+
+
+def twin_at(line: int) -> Plant:
+    """The global-shutter twin, image and depth, at the pose of another line."""
+    return rendered_as(lambda sequence: sequence, "gs", ("left", 1), line)
 
 
 def _every_depth(change: Callable[[Any], Any]) -> Plant:
