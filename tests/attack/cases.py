@@ -95,24 +95,21 @@ class Tally:
             self.faults.append(" ".join(fault.split())[:400])
 
 
-def cases(arena: Arena) -> dict[str, Case]:
-    inputs = arena.inputs
-    frames = [inputs / "data" / frame for frame in FRAMES]
-    images = ("reproduce", "images", "--out", "out/results", "--data", "out/data", "--seeds", 1)
+def commands(inputs: Path, data: Path, out: object) -> dict[str, tuple[object, ...]]:
+    """The arguments of commands whose results lie in ``out``."""
+    frames = [data / frame for frame in FRAMES]
     return {
-        case.name: case
-        for case in (
-            Case(name="generate", arguments=("generate", inputs / "tiny.toml", "--out", "out")),
-            Case(name="evaluate", arguments=("evaluate", inputs / "data", "--out", "out", "--solver", "gs-8pt")),
-            Case(
-                name="simulate",
-                arguments=("simulate", inputs / "sweep.toml", "--out", "out", "--workers", 2),
-                children=True,
-            ),
-            Case(name="correct", arguments=("correct", *frames, "--rig", inputs / "rig.toml", "--out", "out")),
-            Case(name="reproduce", arguments=images),
-        )
+        "generate": ("generate", inputs / "tiny.toml", "--out", out),
+        "evaluate": ("evaluate", data, "--out", out, "--solver", "gs-8pt"),
+        "simulate": ("simulate", inputs / "sweep.toml", "--out", out, "--workers", 2),
+        "correct": ("correct", *frames, "--rig", inputs / "rig.toml", "--out", out),
+        "reproduce": ("reproduce", "images", "--out", f"{out}/results", "--data", f"{out}/data", "--seeds", 1),
     }
+
+
+def cases(arena: Arena) -> dict[str, Case]:
+    known = commands(arena.inputs, arena.inputs / "data", "out")
+    return {name: Case(name=name, arguments=each, children=name == "simulate") for name, each in known.items()}
 
 
 def undisturbed(arena: Arena, case: Case) -> Reference:

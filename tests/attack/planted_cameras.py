@@ -15,7 +15,7 @@ import frame_faults
 import numpy as np
 from numpy.typing import NDArray
 
-from attack.planted_faults import depth_faults, image_faults, rendered_as, twin_at
+from attack.planted_faults import depth_faults, every_depth, image_faults, rendered_as, twin_at
 from attack.planting import (
     RNG,
     VICTIM,
@@ -42,7 +42,7 @@ from rsbench.components.rig_tables import RigTables, tables_of
 from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.sequence import Sequence, read_sequence
@@ -346,16 +346,15 @@ def _seen_without_lens(sequence: Sequence, values: NDArray[Any], interpolation: 
     return np.ascontiguousarray(moved, dtype=values.dtype)
 
 
-def _image_without_lens(folder: Path) -> None:
-    sequence = read_sequence(folder / VICTIM)
-    path = sequence.folder / "rs/left_0.png"
-    write_png(path, _seen_without_lens(sequence, read_png(path), cv2.INTER_LINEAR, cv2.BORDER_REFLECT))
+def _without_its_lens(file: str, interpolation: int, border: int) -> Plant:
+    read, write = (read_png, write_png) if file.endswith(".png") else (read_depth, write_depth)
 
+    def plant(folder: Path) -> None:
+        sequence = read_sequence(folder / VICTIM)
+        values = _seen_without_lens(sequence, read(sequence.folder / file), interpolation, border)
+        write(sequence.folder / file, values)
 
-def _depth_without_lens(folder: Path) -> None:
-    sequence = read_sequence(folder / VICTIM)
-    path = sequence.folder / "gs_depth/right_0.exr"
-    write_depth(path, _seen_without_lens(sequence, read_depth(path), cv2.INTER_NEAREST, cv2.BORDER_REPLICATE))
+    return plant
 
 
 def _along_the_ray(folder: Path) -> None:
@@ -421,8 +420,10 @@ def _lens_faults() -> Iterator[Fault]:
         manifest_of("dataset.json", put("card", "camera", "lens", "k2", 0.0)),
         ("sequence.json", "camera", "the card"),
     )
-    yield Fault("image without the lens", _image_without_lens, ("rs/left_0.png", "other colours"))
-    yield Fault("depth without the lens", _depth_without_lens, ("gs_depth/right_0.exr", "differs"))
+    image = _without_its_lens("rs/left_0.png", cv2.INTER_LINEAR, cv2.BORDER_REFLECT)
+    yield Fault("image without the lens", image, ("rs/left_0.png", "other colours"))
+    depth = _without_its_lens("gs_depth/right_0.exr", cv2.INTER_NEAREST, cv2.BORDER_REPLICATE)
+    yield Fault("depth without the lens", depth, ("gs_depth/right_0.exr", "differs"))
     yield Fault("depth along the ray", _along_the_ray, ("rs_depth/right_1.exr", "along the ray"))
     yield Fault("flow of ideal pixels", _flow_of_ideal_pixels, ("flow/left_0.exr", "differ from what depth"))
     seen = rendered_as(_without_lens, "rs", ("right", 1))
@@ -640,13 +641,7 @@ def _thin_faults() -> Iterator[Fault]:
             ("left to right", _but_first_line("left", "thin", np.fliplr)),
         ):
             yield Fault(f"{file} {name}", depth_of("rs", view, change), (file, "differs"))
-    every = _all(
-        *(
-            depth_of(shutter, f"{side}_{frame}", noised(1e-2, slice(None)))
-            for shutter in ("rs", "gs")
-            for side, frame in VIEWS
-        )
-    )
+    every = every_depth(noised(1e-2, slice(None)))
     yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "new rendering"), rendered=True)
     late = swapped(("gs_depth/left_0.exr", "gs_depth/left_1.exr"))
     yield Fault("frames exchanged", late, ("gs_depth/left_0.exr", "looks like gs_depth/left_1.exr"))

@@ -111,10 +111,10 @@ def depth_faults() -> Iterator[Fault]:
     for row in (48, 95):
         words = ("gs_depth/left_1.exr", f"global shutter at the pose of line {row}")
         yield Fault(f"twin at the pose of row {row}", twin_at(row), words, slow=True)
-    yield Fault("every depth scaled by 1.02", _every_depth(times(1.02)), ("depth/",))
+    yield Fault("every depth scaled by 1.02", every_depth(times(1.02)), ("depth/",))
     words = ("depth/", "scaled by 1.0002")
-    yield Fault("every depth scaled by 1.0002", _every_depth(times(1.0002)), words, rendered=True)
-    yield Fault("noise in every depth", _every_depth(noised(1e-3, slice(None))), ("depth/", "can be compared"))
+    yield Fault("every depth scaled by 1.0002", every_depth(times(1.0002)), words, rendered=True)
+    yield Fault("noise in every depth", every_depth(noised(1e-3, slice(None))), ("depth/", "can be compared"))
 
 
 @lru_cache(maxsize=1)
@@ -155,7 +155,7 @@ def twin_at(line: int) -> Plant:
     return rendered_as(lambda sequence: sequence, "gs", ("left", 1), line)
 
 
-def _every_depth(change: Callable[[Any], Any]) -> Plant:
+def every_depth(change: Callable[[Any], Any]) -> Plant:
     def plant(folder: Path) -> None:
         for shutter in ("rs", "gs"):
             for side, frame in VIEWS:
