@@ -30,6 +30,7 @@ from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.runtime import rtsys
 
+from rsbench.components.imports import hash_of_files
 from rsbench.storage.work_folder import temporary, user_cache
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -169,12 +170,8 @@ _STOPWATCH = _Stopwatch()
 def source_version() -> str:
     """Hash of all sources of rsbench that hold compiled code."""
     package = Path(str(resources.files("rsbench")))
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        text = path.read_bytes()
-        if any(mark in text for mark in _MARKS):
-            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + text + b"\0")
-    return digest.hexdigest()
+    texts = {path: path.read_bytes() for path in sorted(package.rglob("*.py"))}
+    return hash_of_files(package, [path for path, text in texts.items() if any(mark in text for mark in _MARKS)])
 
 
 @functools.cache

@@ -45,7 +45,7 @@ from rsbench.components.imports import (
     start_child,
 )
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.untrusted_files import unpack_arrays
+from rsbench.storage.untrusted_files import PLAIN_KINDS, unpack_arrays
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Environment variables that limit the threads of numerical libraries."""
@@ -66,8 +66,6 @@ _COMMAND = (
 )
 _LENGTH_BYTES = 8
 _LONGEST_BYTES = 1 << 32
-_KINDS = "biufU"
-"""Kinds of arrays: truth values, numbers and text."""
 Server = Callable[..., object]
 """Answers one call, in the child: picklable arguments in, plain data out."""
 
@@ -338,7 +336,7 @@ def decode(data: bytes, classes: Mapping[str, type]) -> Any:
 
 def _flat(value: object, arrays: list[NDArray[Any]]) -> object:
     if isinstance(value, np.ndarray):
-        if value.dtype.kind not in _KINDS:
+        if value.dtype.kind not in PLAIN_KINDS:
             raise TypeError(f"an array of {value.dtype} is not plain data")
         arrays.append(value)
         return {"array": len(arrays) - 1}

@@ -43,7 +43,8 @@ _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE
 """Names that are devices on Windows, with any suffix, and names whose last dot it drops."""
 _OPEN = re.compile(r"/dev/[^/]+|/dev/fd/\d+|/proc/[^/]+(/task/\d+)?/fd/\d+")
 """Devices and open files of a process, which may be read; not files in folders such as /dev/shm."""
-_KINDS = "biufU"
+PLAIN_KINDS = "biufU"
+"""Kinds of arrays that are plain data: truth values, numbers and text."""
 _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
 
@@ -242,7 +243,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     stream = io.BytesIO(data)
     old = np.lib.format.read_magic(stream) == (1, 0)
     shape, _, dtype = (np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0)(stream)
-    if dtype.kind not in _KINDS:
+    if dtype.kind not in PLAIN_KINDS:
         raise ValueError(f"{member.filename} holds {dtype}, not numbers, truth values or text")
     if math.prod(shape) * dtype.itemsize > len(data):
         raise ValueError(f"{member.filename} holds {len(data)} bytes, not {shape} of {dtype}")

@@ -39,7 +39,7 @@ ADDS = """
 
 def child(code: str, **environment: str | None) -> subprocess.CompletedProcess[str]:
     """Another Python on these sources, with some variables set or (None) absent."""
-    return run_python("-c", textwrap.dedent(code), **environment)
+    return run_python("-c", textwrap.dedent(code), environment=environment)
 
 
 def test_the_folder_of_the_environment_comes_before_the_user_s(tmp_path: Path) -> None:
