@@ -67,6 +67,11 @@ def fault(file: str, change: Change, *words: str) -> Fault:
     return kinds[Path(file).suffix](file, change), (file, *words)
 
 
+def copy_of(source: str, target: str, *words: str) -> Fault:
+    """A file with the content of another one."""
+    return copied(source, target), (target, *words)
+
+
 def array(name: str, change: Change) -> Callable[[Arrays], object]:
     """One of the arrays of an npz file."""
     return lambda arrays: arrays.update({name: change(arrays[name])})
@@ -159,10 +164,7 @@ FAULTS: dict[str, Fault] = {
         "flow/right_0.exr", lambda flow: np.roll(flow, 1, axis=0), "shifted by one row"
     ),
     "flow of one row off by 0.01 px": fault("flow/left_1.exr", one_row, "row 30"),
-    "flow of the other camera": (
-        copied("flow/left_0.exr", "flow/right_0.exr"),
-        ("flow/right_0.exr", "the same as flow/left_0.exr"),
-    ),
+    "flow of the other camera": copy_of("flow/left_0.exr", "flow/right_0.exr", "the same as flow/left_0.exr"),
     "flow mask upside down": fault("flow_mask/left_0.png", np.flipud, _SURFACE),
     "flow mask: sky is surface": fault("flow_mask/right_1.png", classes(SKY, VISIBLE), _SURFACE),
     "flow mask: nothing is out of view": fault(
@@ -172,10 +174,7 @@ FAULTS: dict[str, Fault] = {
     "normals with y and z exchanged": fault("normals/left_1.exr", lambda n: n[..., [0, 2, 1]], "flat pixels"),
     "normals scaled": fault("normals/right_0.exr", scaled(0.9)),
     "normals upside down": fault("normals/right_1.exr", np.flipud, "length"),
-    "instances of the other camera": (
-        copied("instances/left_0.png", "instances/right_0.png"),
-        ("instances/right_0.png", "no depth"),
-    ),
+    "instances of the other camera": copy_of("instances/left_0.png", "instances/right_0.png", "no depth"),
     "instances exchanged": fault(
         "instances/left_1.png", swapped_numbers, "another instance than instances/right_1.png"
     ),
@@ -258,18 +257,15 @@ FAULTS: dict[str, Fault] = {
     "tracks in float32": fault(
         TRACKS, array("pixels", lambda pixels: pixels.astype(np.float32)), "pixels is float32"
     ),
-    "a twin at the pose of another row": (
-        copied("gs_twin/0047/left_0.png", "gs_twin/0024/left_0.png"),
-        ("gs_twin/0024/left_0.png", "row 24 differs from rs_clean/left_0.png"),
+    "a twin at the pose of another row": copy_of(
+        "gs_twin/0047/left_0.png", "gs_twin/0024/left_0.png", "row 24 differs from rs_clean/left_0.png"
     ),
-    "a twin that is the first one": (
-        copied("gs_depth/right_1.exr", "gs_twin_depth/0024/right_1.exr"),
-        ("gs_twin_depth/0024/right_1.exr", "row 24 differs"),
+    "a twin that is the first one": copy_of(
+        "gs_depth/right_1.exr", "gs_twin_depth/0024/right_1.exr", "row 24 differs"
     ),
     "depth of a twin scaled": fault("gs_twin_depth/0024/left_1.exr", scaled(1.001), "scaled by 1.001"),
-    "correction flow of another twin": (
-        copied("gs_twin_flow/0024/left_0.exr", "gs_twin_flow/0047/left_0.exr"),
-        ("gs_twin_flow/0047/left_0.exr", "differ from what depth and motion make"),
+    "correction flow of another twin": copy_of(
+        "gs_twin_flow/0024/left_0.exr", "gs_twin_flow/0047/left_0.exr", "differ from what depth and motion make"
     ),
     "a twin's mask: all is hidden": fault(
         "gs_twin_flow_mask/0047/right_0.png",

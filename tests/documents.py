@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from pathlib import Path
 
@@ -12,6 +13,12 @@ ROOT = Path(__file__).parents[1]
 def blocks(document: Path, language: str) -> list[str]:
     """All code of one language."""
     return re.findall(rf"^```{language}\n(.*?)^```", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def notebook_code(notebook: Path) -> str:
+    """The code of all cells."""
+    cells = json.loads(notebook.read_text("utf-8"))["cells"]
+    return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
 
 
 def write_blocks(document: Path, folder: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attack.planting import Plant, cell, copied
-from channel_faults import Fault, array, classes, fault, one_view
+from attack.planting import Plant, cell
+from channel_faults import Fault, array, classes, copy_of, fault, one_view
 from numpy.typing import NDArray
 
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
@@ -92,10 +92,8 @@ FAULTS: dict[str, Fault] = {
         array("classes", classes(1, 2)),
         "are marked hidden, but visible according to rs_depth/left_3.exr",
     ),
-    "matches of the frames before": (
-        copied(matches_file(1), matches_file(2)),
-        (matches_file(2), " not "),  # the depth at the keypoints, or else the place
-    ),
+    # Of the depth at the keypoints, or else of the place.
+    "matches of the frames before": copy_of(matches_file(1), matches_file(2), " not "),
     "tracks moved by 0.1 px": fault(
         TRACKS,
         array("pixels", one_view(7, lambda pixels: pixels + 0.1)),
@@ -134,8 +132,5 @@ FAULTS: dict[str, Fault] = {
     "stamps that are late": (samples_of(stamped_late), (MEASURED, "stamp_ns differs by up to 1000 ns")),
     "one row timed late": fault("timing/left_3.csv", cell(21, 1, "322500002"), "row 20"),
     "exposure of no length": fault("timing/right_2.csv", cell(8, 3, "1"), "exposure_end_ns"),
-    "timing of the frame before": (
-        copied("timing/left_2.csv", "timing/left_3.csv"),
-        ("timing/left_3.csv", "those of frame 2"),
-    ),
+    "timing of the frame before": copy_of("timing/left_2.csv", "timing/left_3.csv", "those of frame 2"),
 }

@@ -6,9 +6,9 @@ import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,7 +24,10 @@ def program(file: str) -> ModuleType:
 
 
 def run_python(
-    *words: object, folder: Path | None = None, path: Iterable[Path] = (), **environment: str | None
+    *words: object,
+    folder: Path | None = None,
+    path: Iterable[Path] = (),
+    environment: Mapping[str, str | None] = MappingProxyType({}),
 ) -> subprocess.CompletedProcess[str]:
     """Another Python with these arguments, in a folder; ``path`` comes before our own path.
 
@@ -41,3 +44,11 @@ def run_python(
         timeout=400,
         check=False,
     )
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process runs; one that has ended may wait for its parent."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

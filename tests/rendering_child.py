@@ -80,7 +80,7 @@ def child(tmp_path: Path, name: str, size: tuple[int, int], **environ: str) -> A
 
 def run_child(program: str, *words: str, **environ: str) -> None:
     """A program in a process of its own, which must end well."""
-    done = run_python("-c", program, *words, **environ)
+    done = run_python("-c", program, *words, environment=environ)
     assert done.returncode == 0, done.stderr
 
 

@@ -15,7 +15,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from documents import ROOT, blocks
+from documents import ROOT, blocks, notebook_code
 
 README = ROOT / "README.md"
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="README's commands are written for bash")
@@ -143,9 +143,7 @@ assert len(plt.get_fignums()) == 2
 
 @pytest.mark.slow
 def test_the_notebook_runs(installed: Path, tmp_path: Path) -> None:
-    notebook = Path(_run(["rsbench", "docs", "tour.ipynb"], tmp_path, installed).strip())
-    cells = json.loads(notebook.read_text("utf-8"))["cells"]
-    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    code = notebook_code(Path(_run(["rsbench", "docs", "tour.ipynb"], tmp_path, installed).strip()))
     script = tmp_path / "tour.py"
     script.write_text(f"{code}\n{_TRUTHS}", "utf-8")
     _run([sys.executable, "-W", "error", str(script)], tmp_path, installed)

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from programs import is_running
 
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.process_jobs import Cluster, run_jobs
@@ -191,7 +192,7 @@ def test_what_is_stopped_ends_there(there: Cluster, local: Any, tmp_path: Path, 
                 list(outcomes)  # waits for a third outcome
         else:
             wait_until(lambda: len(begun()) >= 3)
-    wait_until(lambda: not any(_alive(pid) for pid in begun()))
+    wait_until(lambda: not any(is_running(pid) for pid in begun()))
     wait_until(lambda: not any(worker.processing for worker in local.scheduler.workers.values()))
     assert not job_states(local) and len(begun()) < len(jobs)
 
@@ -217,14 +218,6 @@ def test_a_run_that_is_stopped_waits_for_no_frozen_worker(
     finally:
         thaw.cancel()
         os.kill(frozen, signal.SIGCONT)
-
-
-def _alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended may wait for its parent."""
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except FileNotFoundError:
-        return False
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
