@@ -337,8 +337,3 @@ def limit_files(size: int, deadly: bool) -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-
-
-def read_log(log: Path) -> list[str]:
-    """The operations that were counted."""
-    return log.read_text("utf-8").splitlines()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from attack.arena import Arena, Ending, Trap, contents, read_log, set_trap
+from attack.arena import Arena, Ending, Trap, contents, set_trap
 
 
 def keep_frames(folder: Path) -> None:
@@ -128,7 +128,7 @@ def undisturbed(arena: Arena, case: Case) -> Reference:
         results.append((time.monotonic() - start, contents(arena.work / "out")))
     if results[0][1] != results[1][1]:
         raise RuntimeError(f"{case.name}: two runs differ in {differing(results[0][1], results[1][1])}")
-    return Reference(seconds=results[0][0], contents=results[0][1], operations=read_log(log_of(arena)))
+    return Reference(seconds=results[0][0], contents=results[0][1], operations=operations_of(arena))
 
 
 def place(arena: Arena) -> None:
@@ -147,6 +147,11 @@ def frames_of(arena: Arena) -> Path:
 
 def log_of(arena: Arena) -> Path:
     return arena.root / "home" / ".operations"
+
+
+def operations_of(arena: Arena) -> list[str]:
+    """The operations that were counted."""
+    return log_of(arena).read_text("utf-8").splitlines()
 
 
 def here(arena: Arena, case: Case, trap: Trap) -> None:

@@ -107,10 +107,6 @@ def attack(arena: Arena, expected: dict[str, dict[str, str]], pairs: list[tuple[
     return tally
 
 
-def every_pair() -> list[tuple[Surrounding, str]]:
-    return [(surrounding, command) for surrounding in SURROUNDINGS for command in COMMANDS]
-
-
 @contextmanager
 def _surrounded(arena: Arena, surrounding: Surrounding) -> Iterator[None]:
     for base in (arena.work, arena.inputs) if surrounding.folder else ():

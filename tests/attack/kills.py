@@ -19,8 +19,8 @@ from functools import partial
 
 import numpy as np
 
-from attack.arena import Arena, Ending, Trap, contents, limit_files, read_log
-from attack.cases import Case, Reference, Tally, differing, here, log_of, place, problem_of
+from attack.arena import Arena, Ending, Trap, contents, limit_files
+from attack.cases import Case, Reference, Tally, differing, here, operations_of, place, problem_of
 
 CHAIN = 4
 """Deaths after which a command is let alone."""
@@ -129,7 +129,7 @@ def attack_files(
     place(arena)
     _run(arena, case, Trap())
     _run(arena, case, Trap())
-    again = _first_of_each(read_log(log_of(arena)), case)
+    again = _first_of_each(operations_of(arena), case)
     for number in _some(again, rng, count):
         _attempt(arena, case, reference, tally, number, finished=True)
     for size in rng.integers(1, 20000, sizes).tolist():
@@ -182,7 +182,7 @@ def _check(
 ) -> None:
     outside = arena.outside(arena.work / "out")
     ending = arena.run(("--quiet", *case.arguments), before=before)
-    operations = read_log(log_of(arena))
+    operations = operations_of(arena)
     where = text if number is None else f"{text} ({operations[number - 1].replace(str(arena.root), '')})"
     tally.count("failed operations")
     tally.count(f"exit code {ending.code}")
