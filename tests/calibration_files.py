@@ -18,7 +18,10 @@ TURN = np.array([0.004, -0.010, 0.003])
 R, T = Rotation.from_rotvec(TURN).as_matrix(), np.array([-0.1198, 0.0006, -0.0012])
 KB = (-0.01, 0.02, -0.01, 0.002)
 LINE_DELAY = 25.6e-6
-FOUR = np.vstack([np.column_stack([R, T]), [0, 0, 0, 1]])
+OWN = {"left": (LEFT, D_LEFT), "right": (RIGHT, D_RIGHT)}
+"""Intrinsics and distortion of each camera."""
+PINHOLE = ("fx", "fy", "cx", "cy")
+EIGHT = (*PINHOLE, "k1", "k2", "p1", "p2")
 
 
 def matrix(intrinsics: tuple[float, ...]) -> np.ndarray:
@@ -28,6 +31,26 @@ def matrix(intrinsics: tuple[float, ...]) -> np.ndarray:
 
 def five(d: tuple[float, ...]) -> np.ndarray:
     return np.array([[*d, 0.0]])
+
+
+def square(R_: np.ndarray, t: Any) -> np.ndarray:
+    """A pose as a matrix (4, 4)."""
+    return np.vstack([np.column_stack([R_, t]), [0, 0, 0, 1]])
+
+
+FOUR = square(R, T)
+RECTIFIED = dict(
+    zip(
+        ("R1", "R2", "P1", "P2", "Q"),
+        cv2.stereoRectify(matrix(LEFT), five(D_LEFT), matrix(RIGHT), five(D_RIGHT), SIZE, R, T[:, None], alpha=0),
+        strict=False,
+    )
+)
+
+
+def keyed(names: tuple[str, ...], *values: tuple[float, ...]) -> dict[str, float]:
+    """The numbers of one camera under the names of a tool."""
+    return dict(zip(names, [number for each in values for number in each], strict=True))
 
 
 def opencv(path: Path, **values: Any) -> Path:
@@ -46,27 +69,15 @@ def opencv_yml(folder: Path, suffix: str = "yml") -> Path:
 
 def opencv_two_files(folder: Path) -> Path:
     """As OpenCV's sample stereo_calib writes them."""
-    R1, R2, P1, P2, Q = cv2.stereoRectify(
-        matrix(LEFT), five(D_LEFT), matrix(RIGHT), five(D_RIGHT), SIZE, R, T[:, None], alpha=0
-    )[:5]
     opencv(folder / "intrinsics.yml", M1=matrix(LEFT), D1=five(D_LEFT), M2=matrix(RIGHT), D2=five(D_RIGHT))
-    return opencv(folder / "extrinsics.yml", R=R, T=T[:, None], R1=R1, R2=R2, P1=P1, P2=P2, Q=Q)
+    return opencv(folder / "extrinsics.yml", R=R, T=T[:, None], **RECTIFIED)
 
 
 def opencv_rectified(folder: Path) -> Path:
     """Without R and T; a name for each key that others use."""
-    R1, R2, P1, P2, _ = cv2.stereoRectify(
-        matrix(LEFT), five(D_LEFT), matrix(RIGHT), five(D_RIGHT), SIZE, R, T[:, None], alpha=0
-    )[:5]
     values = {"cameraMatrixL": matrix(LEFT), "distCoeffsL": five(D_LEFT)}
-    values |= {
-        "cameraMatrixR": matrix(RIGHT),
-        "distCoeffsR": five(D_RIGHT),
-        "R1": R1,
-        "R2": R2,
-        "P1": P1,
-        "P2": P2,
-    }
+    values |= {"cameraMatrixR": matrix(RIGHT), "distCoeffsR": five(D_RIGHT)}
+    values |= {name: RECTIFIED[name] for name in ("R1", "R2", "P1", "P2")}
     return opencv(folder / "rectified.xml", **values, imageSize=np.array(SIZE))
 
 
@@ -100,9 +111,7 @@ def kalibr(folder: Path) -> Path:
 
 def openvins(folder: Path) -> Path:
     """T_imu_cam, with the IMU somewhere, and OpenCV's first line."""
-    imu = np.vstack(
-        [np.column_stack([Rotation.from_rotvec([1.0, 0.5, -2.0]).as_matrix(), [0.1, 0.2, 0.3]]), [0, 0, 0, 1]]
-    )
+    imu = square(Rotation.from_rotvec([1.0, 0.5, -2.0]).as_matrix(), [0.1, 0.2, 0.3])
     blocks = [
         f"cam{k}:\n{four_by_four('T_imu_cam', imu @ np.linalg.inv(each))}{kalibr_camera(*own)}"
         f"  timeshift_cam_imu: {shift} # s\n"
@@ -131,11 +140,9 @@ def ros_text(intrinsics: tuple[float, ...], d: tuple[float, ...], R_: np.ndarray
 
 
 def ros(folder: Path) -> Path:
-    R1, R2, P1, P2, _ = cv2.stereoRectify(
-        matrix(LEFT), five(D_LEFT), matrix(RIGHT), five(D_RIGHT), SIZE, R, T[:, None], alpha=0
-    )[:5]
-    (folder / "left.yaml").write_text(ros_text(LEFT, D_LEFT, R1, P1))
-    (folder / "right.yaml").write_text(ros_text(RIGHT, D_RIGHT, R2, P2))
+    for number, (side, own) in enumerate(OWN.items(), start=1):
+        text = ros_text(*own, RECTIFIED[f"R{number}"], RECTIFIED[f"P{number}"])
+        (folder / f"{side}.yaml").write_text(text)
     return folder / "left.yaml"
 
 
@@ -143,13 +150,7 @@ def basalt(folder: Path) -> Path:
     centre, q = -R.T @ T, Rotation.from_matrix(R.T).as_quat()
     names = ("px", "py", "pz", "qx", "qy", "qz", "qw")
     poses = [dict.fromkeys(names, 0.0) | {"qw": 1.0}, dict(zip(names, [*centre, *q], strict=True))]
-    cameras = [
-        {
-            "camera_type": "pinhole-radtan8",
-            "intrinsics": dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), [*own, *d], strict=True)),
-        }
-        for own, d in ((LEFT, D_LEFT), (RIGHT, D_RIGHT))
-    ]
+    cameras = [{"camera_type": "pinhole-radtan8", "intrinsics": keyed(EIGHT, *own)} for own in OWN.values()]
     path = folder / "calib.json"
     path.write_text(
         json.dumps({"value0": {"T_imu_cam": poses, "intrinsics": cameras, "resolution": [SIZE, SIZE]}})
@@ -159,12 +160,11 @@ def basalt(folder: Path) -> Path:
 
 def zed(folder: Path) -> Path:
     def camera(name: str, own: tuple[float, ...], d: tuple[float, ...]) -> str:
-        keys = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), [*own, *d], strict=True))
-        return f"[{name}]\n" + "".join(f"{key}={value!r}\n" for key, value in keys.items()) + "k3=0\n"
+        numbers = keyed(EIGHT, own, d).items()
+        return f"[{name}]\n" + "".join(f"{key}={value!r}\n" for key, value in numbers) + "k3=0\n"
 
-    vga = camera("LEFT_CAM_VGA", (350.0, 350.0, 336.0, 188.0), D_LEFT) + camera(
-        "RIGHT_CAM_VGA", (350.0, 350.0, 336.0, 188.0), D_RIGHT
-    )
+    small = (350.0, 350.0, 336.0, 188.0)
+    vga = camera("LEFT_CAM_VGA", small, D_LEFT) + camera("RIGHT_CAM_VGA", small, D_RIGHT)
     turn = "".join(
         f"{key}_{size}={value!r}\n"
         for size in ("HD", "VGA")
@@ -217,18 +217,12 @@ def depthai(folder: Path) -> Path:
 
 def realsense(folder: Path) -> Path:
     def camera(own: tuple[float, ...], d: tuple[float, ...]) -> dict[str, Any]:
-        return dict(zip(("fx", "fy", "ppx", "ppy"), own, strict=True)) | {
-            "width": 1280,
-            "height": 720,
-            "model": "distortion.brown_conrady",
-            "coeffs": [*d, 0.0],
-        }
+        model = {"model": "distortion.brown_conrady", "coeffs": [*d, 0.0]}
+        return {"width": 1280, "height": 720, **keyed(("fx", "fy", "ppx", "ppy"), own), **model}
 
     apart = {"rotation": R.T.ravel().tolist(), "translation": T.tolist()}
     path = folder / "realsense.json"
-    path.write_text(
-        json.dumps({"left": camera(LEFT, D_LEFT), "right": camera(RIGHT, D_RIGHT), "left_to_right": apart})
-    )
+    path.write_text(json.dumps({side: camera(*own) for side, own in OWN.items()} | {"left_to_right": apart}))
     return path
 
 
@@ -242,20 +236,13 @@ def wxyz(matrix_: np.ndarray) -> list[float]:
 
 
 def rig_config(folder: Path) -> Path:
+    places = {
+        "left": {"ref_sensor": True},
+        "right": {"cam_from_rig_rotation": wxyz(R), "cam_from_rig_translation": T.tolist()},
+    }
     cameras = [
-        {
-            "image_prefix": "left/",
-            "ref_sensor": True,
-            "camera_model_name": "OPENCV",
-            "camera_params": half(LEFT, D_LEFT),
-        },
-        {
-            "image_prefix": "right/",
-            "cam_from_rig_rotation": wxyz(R),
-            "cam_from_rig_translation": T.tolist(),
-            "camera_model_name": "OPENCV",
-            "camera_params": half(RIGHT, D_RIGHT),
-        },
+        {"image_prefix": f"{side}/", "camera_model_name": "OPENCV", "camera_params": half(*own), **places[side]}
+        for side, own in OWN.items()
     ]
     path = folder / "rig_config.json"
     path.write_text(json.dumps([{"cameras": cameras}]))
@@ -265,7 +252,7 @@ def rig_config(folder: Path) -> Path:
 def colmap(folder: Path) -> Path:
     cameras = [
         f"{k} OPENCV 1280 720 {' '.join(map(repr, half(own, d)))}"
-        for k, (own, d) in enumerate(((LEFT, D_LEFT), (RIGHT, D_RIGHT)), start=1)
+        for k, (own, d) in enumerate(OWN.values(), start=1)
     ]
     (folder / "cameras.txt").write_text("# Camera list\n" + "\n".join(cameras) + "\n")
     pose = " ".join(map(repr, [*wxyz(R), *T.tolist()]))
@@ -286,9 +273,7 @@ def rig_config_and_cameras(folder: Path) -> Path:
 
 
 def euroc(folder: Path) -> Path:
-    body = np.vstack(
-        [np.column_stack([Rotation.from_rotvec([0.3, 1.5, -0.2]).as_matrix(), [0.1, -0.2, 0.05]]), [0, 0, 0, 1]]
-    )
+    body = square(Rotation.from_rotvec([0.3, 1.5, -0.2]).as_matrix(), [0.1, -0.2, 0.05])
     for k, (each, own, d) in enumerate(((np.eye(4), LEFT, D_LEFT), (FOUR, RIGHT, D_RIGHT))):
         (folder / f"cam{k}").mkdir()
         data = (body @ np.linalg.inv(each)).ravel().tolist()
@@ -306,9 +291,9 @@ def toml(folder: Path) -> Path:
     path = folder / "rig.toml"
     sides = [
         f"[{side}]\nwidth = 1280\nheight = 720\n"
-        + "".join(f"{key} = {value!r}\n" for key, value in zip(("fx", "fy", "cx", "cy"), own, strict=True))
+        + "".join(f"{key} = {value!r}\n" for key, value in keyed(PINHOLE, own).items())
         + f'lens = {{ model = "brown-conrady", k1 = {d[0]}, k2 = {d[1]}, p1 = {d[2]}, p2 = {d[3]} }}\n'
-        for side, own, d in (("left", LEFT, D_LEFT), ("right", RIGHT, D_RIGHT))
+        for side, (own, d) in OWN.items()
     ]
     path.write_text("".join(sides) + f"[right_from_left]\ntranslation = {T.tolist()}\nrotation = {R.tolist()}\n")
     return path

@@ -12,6 +12,7 @@ import io
 import json
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -102,3 +103,13 @@ def install_package(folder: Path, name: str, points: str) -> None:
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", "utf-8")
     (info / "entry_points.txt").write_text(points, "utf-8")
+
+
+def install_project(folder: Path) -> None:
+    """Metadata of the package that pyproject.toml in a folder of ``sys.path`` describes."""
+    project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
+    tables = [
+        "\n".join([f"[{group}]", *(f"{name} = {value}" for name, value in points.items())])
+        for group, points in project["entry-points"].items()
+    ]
+    install_package(folder, project.get("name", "documented"), "\n".join(tables) + "\n")

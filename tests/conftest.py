@@ -8,6 +8,7 @@ import gc
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from rsbench.storage.work_folder import temporary, user_cache
 if TYPE_CHECKING:
     from rsbench.dataset.card import DatasetCard
     from rsbench.dataset.sequence import Sequence
-    from rsbench.scenes.model import Light, Scene
+    from rsbench.scenes.model import Scene
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell without job control: the commands that tests interrupt would inherit it.
@@ -53,36 +54,6 @@ LARGE_SCENES = (
 So each scene is built once, and those of child processes do not lie beside its own.
 """
 
-LONG = (
-    "test_trajectory.py",
-    "test_s3.py",
-    "test_workers.py",
-    "test_mirror.py",
-    "test_evaluation_entries.py",
-    "test_correct_one_camera.py",
-    "test_generation.py",
-    "test_run_sweep.py",
-    "test_contract.py",
-    "test_compiled.py",
-    "test_interrupted.py",
-    "test_attack.py",
-    "test_running.py",
-    "test_lens_sequences.py",
-    "test_bound.py",
-    "test_isolation.py",
-    "test_correct_command.py",
-    "test_add_a_motion.py",
-    "test_solve_command.py",
-    "test_refined_solver.py",
-    "test_sequence_jobs.py",
-    "test_board.py",
-    "test_shutter_decision.py",
-    "test_reproduce_simulated.py",
-    "test_channels.py",
-)
-"""Files that take 20 s of a processor and more, the longest first: a process that gets one at the end works on
-alone."""
-
 
 def pytest_configure(config: pytest.Config) -> None:
     """The process that reports tells the skips of all."""
@@ -91,14 +62,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long comes first, so that no process works alone at the end."""
+    """Files with many slow tests come first, after large scenes, so that no process works alone at the end."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
 
-    def place(item: pytest.Item) -> int:
-        if item.path.name in LARGE_SCENES:
-            return LARGE_SCENES.index(item.path.name)
-        if item.path.name in LONG:
-            return len(LARGE_SCENES) + 1 + LONG.index(item.path.name)
-        return len(LARGE_SCENES) + (0 if item.get_closest_marker("slow") else 1 + len(LONG))
+    def place(item: pytest.Item) -> tuple[int, int]:
+        name = item.path.name
+        return LARGE_SCENES.index(name) if name in LARGE_SCENES else len(LARGE_SCENES), -slow[item.path]
 
     items.sort(key=place)
 
@@ -162,35 +131,17 @@ def built_scene() -> Callable[[str], Scene]:
 @pytest.fixture(scope="module")
 def scenes_once(built_scene: Callable[[str], Scene], give_back: Callable[[], None]) -> Iterator[None]:
     """Sequences of one scene of ours, seen from one place, share it in the renderer: loading it takes seconds."""
-    from rsbench.components.cards import card_path
-    from rsbench.dataset import generation
-    from rsbench.renderers import scene
-    from rsbench.scenes.load import load_scene
-    from rsbench.verification import rerender
+    from kept_scenes import kept_scenes
 
-    made = scene.MitsubaScene
-    kept: dict[tuple[str, Light], scene.MitsubaScene] = {}
+    from rsbench.components.cards import list_cards
+    from rsbench.scenes.load import load_scene
 
     def loaded(card: str | Path) -> Scene:
-        return (
-            built_scene(Path(card).stem)
-            if card_path("scenes", Path(card).stem) == Path(card)
-            else load_scene(card)
-        )
+        ours = list_cards("scenes").get(Path(card).stem)
+        return built_scene(ours.stem) if ours and str(card) in (ours.stem, str(ours)) else load_scene(card)
 
-    def once(seen: Scene) -> scene.MitsubaScene:
-        key = seen.name, seen.light  # the light in the frame of the view tells views apart
-        if key not in kept:
-            kept.clear()  # hundreds of MB: not two at a time
-            kept[key] = made(seen)
-        return kept[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "load_scene", built_scene)
-        patch.setattr(rerender, "load_scene", loaded)
-        patch.setattr(scene, "MitsubaScene", once)
+    with kept_scenes(loaded):
         yield
-    kept.clear()
     give_back()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from commands import bytes_below
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
@@ -25,8 +26,7 @@ def evaluate(dataset: Path, out: Path, step: Any = lambda word: None, **changes:
 
 
 def contents(out: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(out.rglob("*")) if path.is_file() and path.name not in (*MACHINE, KEPT.name))
-    return {str(path.relative_to(out)): path.read_bytes() for path in files}
+    return bytes_below(out, *MACHINE, KEPT.name)
 
 
 def times(out: Path) -> dict[str, int]:

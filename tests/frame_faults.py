@@ -10,25 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from channel_faults import affine_of, arrays_of, copied, one_view, table_of, tracks_of
+from attack.planting import Plant, cell
+from channel_faults import Fault, array, classes, copy_of, fault, one_view
 from numpy.typing import NDArray
 
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
 from rsbench.dataset.imu import MEASURED, TRUE, ImuSamples, gravity_of, write_imu
 from rsbench.dataset.sequence import read_sequence
 
-Plant = Callable[[Path], None]
-Words = tuple[str, ...]
 Array = NDArray[Any]
-
-
-def matches_of(first: int, name: str, change: Callable[[Array], Array]) -> Plant:
-    return arrays_of(matches_file(first), lambda arrays: arrays.update({name: change(arrays[name])}))
 
 
 def swapped(values: Array) -> Array:
     """What belongs to frames 2 and 3 exchanged."""
     return values[:, [*range(4), 6, 7, 4, 5, *range(8, values.shape[1])]]
+
+
+def swapped_frames(arrays: dict[str, Array]) -> None:
+    arrays.update({name: swapped(arrays[name]) for name in ("pixels", "tau")})
 
 
 def last_points_scaled(arrays: dict[str, Array]) -> None:
@@ -55,17 +54,20 @@ def shaken(samples: ImuSamples, late: Array) -> ImuSamples:
     return samples._replace(measured=samples.measured + white * late[:, None])
 
 
-def late_by_a_sample(samples: ImuSamples, late: Array) -> ImuSamples:
+def _with_true(samples: ImuSamples, true: Array) -> ImuSamples:
     """Measured is true, bias and noise as before."""
-    true = np.where(late[:, None], np.roll(samples.true, 1, axis=0), samples.true)
     return samples._replace(true=true, measured=samples.measured + true - samples.true)
+
+
+def late_by_a_sample(samples: ImuSamples, late: Array) -> ImuSamples:
+    return _with_true(samples, np.where(late[:, None], np.roll(samples.true, 1, axis=0), samples.true))
 
 
 def at_rest(samples: ImuSamples, late: Array) -> ImuSamples:
     """The body no longer turns."""
     true = samples.true.copy()
     true[late, :3] = 0.0
-    return samples._replace(true=true, measured=samples.measured + true - samples.true)
+    return _with_true(samples, true)
 
 
 def another_bias(samples: ImuSamples, late: Array) -> ImuSamples:
@@ -78,55 +80,48 @@ def stamped_late(samples: ImuSamples, late: Array) -> ImuSamples:
     return samples._replace(stamps_ns=samples.stamps_ns + 1000 * late)
 
 
-FAULTS: dict[str, tuple[Plant, Words]] = {
-    "matches moved by half a pixel": (
-        matches_of(2, "pixels", lambda pixels: pixels + 0.5),
-        (matches_file(2), "not those of the point in their row"),
+FAULTS: dict[str, Fault] = {
+    "matches moved by half a pixel": fault(
+        matches_file(2), array("pixels", lambda pixels: pixels + 0.5), "not those of the point in their row"
     ),
-    "matches with a tenth of the error": (
-        matches_of(1, "error", lambda error: 0.1 * error),
-        (matches_file(1), "not the distance from the true place"),
+    "matches with a tenth of the error": fault(
+        matches_file(1), array("error", lambda error: 0.1 * error), "not the distance from the true place"
     ),
-    "matches that are all hidden": (
-        matches_of(2, "classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),
-        (matches_file(2), "are marked hidden, but visible according to rs_depth/left_3.exr"),
+    "matches that are all hidden": fault(
+        matches_file(2),
+        array("classes", classes(1, 2)),
+        "are marked hidden, but visible according to rs_depth/left_3.exr",
     ),
-    "matches of the frames before": (
-        copied(matches_file(1), matches_file(2)),
-        (matches_file(2), " not "),  # the depth at the keypoints, or else the place
+    # Of the depth at the keypoints, or else of the place.
+    "matches of the frames before": copy_of(matches_file(1), matches_file(2), " not "),
+    "tracks moved by 0.1 px": fault(
+        TRACKS,
+        array("pixels", one_view(7, lambda pixels: pixels + 0.1)),
+        *("right_3", "not at the pixel in their row"),
     ),
-    "tracks moved by 0.1 px": (
-        tracks_of("pixels", one_view(7, lambda pixels: pixels + 0.1)),
-        (TRACKS, "right_3", "not at the pixel in their row"),
+    "tracks of another time": fault(
+        TRACKS, array("tau", one_view(4, lambda tau: tau - 1.0)), "left_2", "another time than their row"
     ),
-    "tracks of another time": (
-        tracks_of("tau", one_view(4, lambda tau: tau - 1.0)),
-        (TRACKS, "left_2", "another time than their row"),
+    "tracks of frames exchanged": fault(TRACKS, swapped_frames, "left_2", "points"),
+    "tracks that are all hidden": fault(
+        TRACKS,
+        array("classes", one_view(5, classes(1, 2))),
+        *("right_2", "are marked hidden, but visible according to rs_depth/right_2.exr"),
     ),
-    "tracks of frames exchanged": (
-        arrays_of(TRACKS, lambda arrays: arrays.update({n: swapped(arrays[n]) for n in ("pixels", "tau")})),
-        (TRACKS, "left_2", "points"),
+    "points of the last frame scaled": fault(
+        TRACKS, last_points_scaled, "points are not at the pixel in their row"
     ),
-    "tracks that are all hidden": (
-        tracks_of("classes", one_view(5, lambda classes: np.where(classes == 1, 2, classes))),
-        (TRACKS, "right_2", "are marked hidden, but visible according to rs_depth/right_2.exr"),
+    "affine frames transposed": fault(
+        AFFINE, array("jacobians", one_view(6, lambda J: np.swapaxes(J, 1, 2))), "left_3", "looks transposed"
     ),
-    "points of the last frame scaled": (
-        arrays_of(TRACKS, last_points_scaled),
-        (TRACKS, "points are not at the pixel in their row"),
+    "affine frames stretched": fault(
+        AFFINE,
+        array("jacobians", one_view(5, lambda J: J @ np.diag([1.0, 1.01]))),
+        *("right_2", "not those of plane, motion and row times"),
     ),
-    "affine frames transposed": (
-        affine_of("jacobians", one_view(6, lambda J: np.swapaxes(J, 1, 2))),
-        (AFFINE, "left_3", "looks transposed"),
-    ),
-    "affine frames stretched": (
-        affine_of("jacobians", one_view(5, lambda J: J @ np.diag([1.0, 1.01]))),
-        (AFFINE, "right_2", "not those of plane, motion and row times"),
-    ),
-    "affine frames exchanged": (
-        affine_of("jacobians", swapped),
-        (AFFINE, "left_3", "derivatives"),  # present without a pixel, or of another frame
-    ),
+    "affine frames exchanged": fault(
+        AFFINE, array("jacobians", swapped), "left_3", "derivatives"
+    ),  # present without a pixel, or of another frame
     "inertial samples a sample late": (
         samples_of(late_by_a_sample),
         (TRUE, "differs from what the motion makes"),
@@ -135,10 +130,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     "twice the noise": (samples_of(shaken), (MEASURED, "noise of the gyroscope is")),
     "a bias that jumps": (samples_of(another_bias), (TRUE, "steps of the bias of the")),
     "stamps that are late": (samples_of(stamped_late), (MEASURED, "stamp_ns differs by up to 1000 ns")),
-    "one row timed late": (table_of("left_3", 20, 1, "322500002"), ("timing/left_3.csv", "row 20")),
-    "exposure of no length": (table_of("right_2", 7, 3, "1"), ("timing/right_2.csv", "exposure_end_ns")),
-    "timing of the frame before": (
-        copied("timing/left_2.csv", "timing/left_3.csv"),
-        ("timing/left_3.csv", "those of frame 2"),
-    ),
+    "one row timed late": fault("timing/left_3.csv", cell(21, 1, "322500002"), "row 20"),
+    "exposure of no length": fault("timing/right_2.csv", cell(8, 3, "1"), "exposure_end_ns"),
+    "timing of the frame before": copy_of("timing/left_2.csv", "timing/left_3.csv", "those of frame 2"),
 }

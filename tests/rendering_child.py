@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from programs import run_python
 
 from rsbench.renderers import llvm
 
@@ -82,10 +80,7 @@ def child(tmp_path: Path, name: str, size: tuple[int, int], **environ: str) -> A
 
 def run_child(program: str, *words: str, **environ: str) -> None:
     """A program in a process of its own, which must end well."""
-    command = [sys.executable, "-c", program, *words]
-    done = subprocess.run(
-        command, env={**os.environ, **environ}, capture_output=True, text=True, timeout=300, check=False
-    )
+    done = run_python("-c", program, *words, environment=environ)
     assert done.returncode == 0, done.stderr
 
 

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from commands import install_package, sweep_card
+from commands import install_project, sweep_card
+from documents import ROOT, write_blocks
+from programs import run_python
 
-from rsbench.components.cards import read_toml
-
-DOCUMENT = Path(__file__).parents[1] / "docs" / "how-to" / "add-a-motion.md"
 SWEEP = sweep_card(
     ["rs-stereo-ease.toml", "rs-stereo-refined"], noise_px=[0.0], trials=2, more='motion_model = "ease"\n'
 )
@@ -24,26 +20,14 @@ SWEEP = sweep_card(
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files of the document, installed."""
     folder = tmp_path_factory.mktemp("site")
-    for language in ("python", "toml"):
-        for block in re.findall(
-            rf"^```{language}\n(.*?)^```", DOCUMENT.read_text("utf-8"), re.DOTALL | re.MULTILINE
-        ):
-            name, content = block.removeprefix("# ").split("\n", 1)
-            (folder / name).write_text(content, "utf-8")
-    groups = read_toml(folder / "pyproject.toml")["project"]["entry-points"]
-    lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in table.items()) for group, table in groups.items()]
-    install_package(folder, "ease-motion", "\n".join(lines) + "\n")
+    write_blocks(ROOT / "docs" / "how-to" / "add-a-motion.md", folder)
+    install_project(folder)
     (folder / "mine.toml").write_text(SWEEP)
     return folder
 
 
-def rsbench(site: Path, *arguments: object, installed: bool = True) -> subprocess.CompletedProcess[str]:
-    path = [str(site)] if installed else []
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*path, *filter(None, sys.path)])}
-    command = [sys.executable, "-m", "rsbench", *map(str, arguments)]
-    return subprocess.run(
-        command, cwd=site, capture_output=True, text=True, timeout=400, check=False, env=environment
-    )
+def rsbench(site: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return run_python("-m", "rsbench", *arguments, folder=site, path=[site])
 
 
 def test_it_is_listed(site: Path) -> None:
@@ -87,7 +71,7 @@ def test_what_it_cannot_be_is_one_line(site: Path, setting: str, words: str) -> 
 
 def test_a_class_beside_the_card_needs_no_package(site: Path, tmp_path: Path) -> None:
     (tmp_path / "ease_motion.py").write_text((site / "ease_motion.py").read_text())
-    card = (Path(__file__).parents[1] / "cards" / "datasets" / "smoke.toml").read_text()
+    card = (ROOT / "cards" / "datasets" / "smoke.toml").read_text()
     card = card.replace("[motion]\n", '[motion]\nmodel = "ease_motion:EaseMotion"\nparameters = { c = 0.5 }\n')
     (tmp_path / "eased.toml").write_text(card)
     code = f"""
@@ -98,8 +82,5 @@ record = motion_record(card.motion_of(card.sequence[0]))
 assert record["model"] == "ease_motion:EaseMotion", record
 assert read_motion(record).c == 0.5
 """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    result = subprocess.run(
-        [sys.executable, "-c", code], cwd=site.parent, capture_output=True, text=True, timeout=100, env=environment
-    )
+    result = run_python("-c", code, folder=site.parent)
     assert result.returncode == 0, result.stderr

@@ -98,8 +98,7 @@ def test_committed_rows_say_what_the_page_concludes() -> None:
     assert not np.any(rows.failed)
 
 
-REPOSITORY = Path(__file__).parents[1]
-TUNING_FOLDER = REPOSITORY / "results/tuning"
+TUNING_FOLDER = ROOT / "results/tuning"
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +153,6 @@ def test_what_is_committed_is_of_a_seed_of_its_own_and_the_cards_stand(tuning: M
         assert list(rows["option"][rows["best"]]) == ["card"], f"{name}: its card does not have what is best"
 
 
-ROOT = Path(__file__).parents[1]
 GYRO_FOLDER = ROOT / "results/gyro"
 
 

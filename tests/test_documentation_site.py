@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from html.parser import HTMLParser
+from html import unescape
 from pathlib import Path
 from urllib.parse import unquote, urldefrag
 
@@ -70,11 +70,6 @@ def test_a_section_says_of_each_of_its_pages_what_it_is_for() -> None:
         assert set(_children(page)) <= linked, page
 
 
-def test_every_document_has_a_page(site: Path) -> None:
-    for page in _pages():
-        assert (site / f"{page}.html").is_file()
-
-
 def test_every_public_name_is_in_the_reference(site: Path) -> None:
     page = (site / "reference" / "python.html").read_text("utf-8")
     assert [name for name in rsbench.__all__ if f'id="rsbench.{name}"' not in page] == []
@@ -92,34 +87,16 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
             assert marker not in text, f"{page.name}: {marker}"
 
 
-class _Links(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.ids: set[str] = set()
-        self.targets: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name == "id" and value:
-                self.ids.add(value)
-            if (tag, name) in (("a", "href"), ("img", "src")) and value and "://" not in value:
-                self.targets.append(value)
-
-
-def _links(page: Path) -> _Links:
-    found = _Links()
-    found.feed(page.read_text("utf-8"))
-    return found
-
-
 def test_links_and_their_anchors_lead_somewhere(site: Path) -> None:
-    pages = {path.resolve(): _links(path) for path in _own(site)}
+    pages = {path.resolve(): path.read_text("utf-8") for path in _own(site)}
+    ids = {path: set(map(unescape, re.findall(r'\sid="([^"]+)"', text))) for path, text in pages.items()}
     broken = []
-    for path, found in pages.items():
-        for target in found.targets:
+    for path, text in pages.items():
+        targets = map(unescape, re.findall(r'<(?:a|img)\s(?:[^>]*\s)?(?:href|src)="([^"]+)"', text))
+        for target in (each for each in targets if "://" not in each):
             file, anchor = urldefrag(target)
             to = (path.parent / unquote(file)).resolve() if file else path
-            missing = anchor and to in pages and unquote(anchor) not in pages[to].ids
+            missing = anchor and to in pages and unquote(anchor) not in ids[to]
             if not to.exists() or missing:
                 broken.append(f"{path.relative_to(site.resolve())}: {target}")
     assert broken == []

@@ -10,22 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from documents import ROOT, notebook_code
 from PIL import Image, ImageSequence
 
 import rsbench
 from rsbench.cli.small_commands import docs, list_documents
 
-ROOT = Path(__file__).parents[1]
-NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+NOTEBOOK = ROOT / "examples" / "tour.ipynb"
 
 
-def test_there_is_a_notebook() -> None:
-    assert [path.name for path in NOTEBOOKS] == ["tour.ipynb"]
-
-
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_committed_without_outputs(notebook: Path) -> None:
-    content = json.loads(notebook.read_text("utf-8"))
+def test_the_notebook_is_committed_without_outputs() -> None:
+    assert list((ROOT / "examples").glob("*.ipynb")) == [NOTEBOOK]
+    content = json.loads(NOTEBOOK.read_text("utf-8"))
     assert content["nbformat"] == 4
     for cell in content["cells"]:
         assert cell["id"]
@@ -33,11 +29,8 @@ def test_notebooks_are_committed_without_outputs(notebook: Path) -> None:
             assert cell["outputs"] == [] and cell["execution_count"] is None
 
 
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_use_public_names_alone(notebook: Path) -> None:
-    cells = json.loads(notebook.read_text("utf-8"))["cells"]
-    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    modules = set()
+def test_the_notebook_uses_public_names_alone() -> None:
+    code, modules = notebook_code(NOTEBOOK), set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
@@ -52,7 +45,7 @@ def test_documents_and_examples_are_listed_by_name(capsys: pytest.CaptureFixture
     assert {path for path in documents.values() if path.suffix == ".md"} == {
         path for path in (ROOT / "docs").rglob("*.md") if path.name != "index.md"
     }
-    assert documents["tour.ipynb"] == ROOT / "examples" / "tour.ipynb"
+    assert documents["tour.ipynb"] == NOTEBOOK
     docs()
     listed = capsys.readouterr().out
     assert all(name in listed for name in documents) and "A tour of rsbench" in listed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -107,22 +107,31 @@ def test_depth_is_that_of_a_wall(programs_: Programs) -> None:
 def test_dots_are_drawn_where_the_row_equation_has_them(
     programs_: Programs, ratio: float, scans: tuple[str, str], k1: float, side: Side
 ) -> None:
-    rng = np.random.default_rng(7)
     foreign = programs_.rig.equal(ratio=ratio, scans=scans, k1=k1, **SMALL)
     rig, shutter = programs_.case.ours(foreign)
-    motion = TwistMotion(*programs_.motion.between(programs_.motion.Twist(W, D), 0.0, 1.0))
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 4))
-    depth = rng.uniform(3.0, 12.0, x.shape)
-    points = np.stack([x * depth, y * depth, depth], axis=-1).reshape(-1, 3)
-    image = _dots(programs_, foreign, programs_.motion.Twist(W, D), points, side)
-    found = 0
-    for point in points:
-        true = _seen(rig, shutter, motion, side, point)
-        if true is not None and np.all((true > 12.0) & (true < np.array([147.0, 107.0]))):
+    law = programs_.motion.Twist(W, D)
+    motion = TwistMotion(*programs_.motion.between(law, 0.0, 1.0))
+    points = _points(np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 4)))
+    image = _dots(programs_, foreign, law, points, side)
+    assert _found(image, [_seen(rig, shutter, motion, side, point) for point in points], 12.0) >= 8
+
+
+def _points(directions: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Points (n, 3), 3 to 12 m away, of image coordinates x and y of a focal length of 1."""
+    x, y = directions
+    depth = np.random.default_rng(7).uniform(3.0, 12.0, x.shape)
+    return np.stack([x * depth, y * depth, depth], axis=-1).reshape(-1, 3)
+
+
+def _found(image: NDArray[np.float32], expected: Iterable[NDArray[np.float64] | None], border: float) -> int:
+    """How many dots lie within a border, all where they are expected."""
+    found, (height, width) = 0, image.shape
+    for true in expected:
+        if true is not None and np.all((true > border) & (true < np.array([width, height]) - border)):
             # Across a dot of 1.4 px a tilt of 6 deg shifts the centroid by 0.005 px and the lens by up to 0.02.
             np.testing.assert_allclose(_centroid(image, true), true, atol=0.03)
             found += 1
-    assert found >= 8
+    return found
 
 
 def _dots(programs_: Programs, rig: Any, law: Any, points: NDArray[np.float64], side: Side) -> NDArray[np.float32]:
@@ -160,18 +169,9 @@ def _seen(
 @pytest.mark.parametrize("side", SIDES)
 def test_rigs_show_dots_where_opencv_projects_them(programs_: Programs, row: str, side: Side) -> None:
     rig, law = programs_.frames.RIGS[row], programs_.motion.Linear(W, D)
-    camera, rng = rig.camera(side), np.random.default_rng(7)
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.4, 0.4, 5))
-    depth = rng.uniform(3.0, 12.0, x.shape)
-    points = np.stack([x * depth, y * depth, depth], axis=-1).reshape(-1, 3)
+    points = _points(np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.4, 0.4, 5)))
     image = _dots(programs_, rig, law, points, side)
-    found = 0
-    for point in points:
-        true = _seen_by_opencv(rig, camera, side, point)
-        if np.all((true > 15.0) & (true < np.array([camera.width, camera.height]) - 15.0)):
-            np.testing.assert_allclose(_centroid(image, true), true, atol=0.03)
-            found += 1
-    assert found >= 10
+    assert _found(image, [_seen_by_opencv(rig, rig.camera(side), side, point) for point in points], 15.0) >= 10
 
 
 def _seen_by_opencv(rig: Any, camera: Any, side: Side, point: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from commands import install_package
+from commands import install_project
+from documents import ROOT, blocks, write_blocks
 
 import rsbench
 from rsbench.benchmark.simulated.contract import CHECKS, check_solver
@@ -29,7 +30,6 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import load_dataset_card
 from rsbench.solvers.engine.base import list_solvers, load_solver_entry
 
-ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
@@ -42,10 +42,6 @@ def _tracked() -> list[Path]:
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True)
     paths = [ROOT / name for name in listed.stdout.split("\0") if name]
     return [path for path in paths if path.is_file()]
-
-
-def _blocks(document: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
 
 
 # Sizes
@@ -237,14 +233,14 @@ def test_the_five_functions_of_a_correction_exist() -> None:
 
 
 def test_the_conversion_to_the_papers_axes_holds() -> None:
-    (code,) = _blocks(ROOT / "docs" / "explanation" / "conventions.md", "python")
+    (code,) = blocks(ROOT / "docs" / "explanation" / "conventions.md", "python")
     exec(compile(code, "conventions.md", "exec"), {})  # asserts
 
 
 def test_the_dataset_is_read_as_documented(
     smoke_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (code,) = _blocks(ROOT / "docs" / "reference" / "dataset-format.md", "python")
+    (code,) = blocks(ROOT / "docs" / "reference" / "dataset-format.md", "python")
     monkeypatch.chdir(smoke_dataset.parent)
     exec(compile(code.replace("data/smoke", str(smoke_dataset)), "dataset-format.md", "exec"), {})
     assert "(96, 128, 3)" in capsys.readouterr().out
@@ -261,10 +257,7 @@ def test_every_key_of_a_dataset_is_documented(smoke_dataset: Path) -> None:
 @pytest.fixture
 def documented_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The files of docs/how-to/add-a-solver.md in a folder on the import path."""
-    document = ROOT / "docs" / "how-to" / "add-a-solver.md"
-    for block in [*_blocks(document, "python"), *_blocks(document, "toml")]:
-        name, content = re.fullmatch(r"# (\S+)\n(.*)", block, flags=re.DOTALL).groups()  # pyrefly: ignore[missing-attribute]
-        (tmp_path / name).write_text(content, "utf-8")
+    write_blocks(ROOT / "docs" / "how-to" / "add-a-solver.md", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
     sys.modules.pop("scipy_solver", None)
@@ -298,9 +291,7 @@ def test_the_documented_checks_are_those_that_run() -> None:
 
 
 def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
-    groups = read_toml(documented_solver / "pyproject.toml")["project"]["entry-points"]
-    lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in table.items()) for group, table in groups.items()]
-    install_package(documented_solver, "scipy-solver", "\n".join(lines) + "\n")
+    install_project(documented_solver)
     assert "scipy" in {entry.name for entry in metadata.entry_points(group="rsbench.solvers")}
     assert "scipy" in list_solvers()
     assert load_solver_entry("scipy").name == "scipy"
@@ -320,7 +311,7 @@ def test_badges_and_citation_tell_what_the_package_says() -> None:
     (licence,) = re.findall(r"badge/licence-(\w+)-", readme)
     assert (f">={python}", licence) == (project["requires-python"], project["license"])
     citation = (ROOT / "CITATION.cff").read_text("utf-8")
-    (entry,) = _blocks(ROOT / "README.md", "bibtex")
+    (entry,) = blocks(ROOT / "README.md", "bibtex")
     for bibtex, cff in (("title", "title"), ("version", "version"), ("url", "repository-code")):
         (shown,) = re.findall(rf"^  {bibtex} *= \{{+(.*?)\}}+,?$", entry, re.MULTILINE)
         (stated,) = re.findall(rf"^{cff}: \"?(.*?)\"?$", citation, re.MULTILINE)
@@ -329,7 +320,7 @@ def test_badges_and_citation_tell_what_the_package_says() -> None:
 
 
 def test_the_documented_card_is_one(tmp_path: Path) -> None:
-    text, *_ = _blocks(DOCS / "how-to" / "make-data.md", "toml")
+    text, *_ = blocks(DOCS / "how-to" / "make-data.md", "toml")
     (tmp_path / "mine.toml").write_text(text, "utf-8")
     card = load_dataset_card(str(tmp_path / "mine.toml"))
     assert card.camera.lens is not None and card.sensor is not None and "imu" in card.channels

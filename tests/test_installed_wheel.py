@@ -15,9 +15,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from documents import ROOT, blocks, notebook_code
 
-ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text("utf-8")
+README = ROOT / "README.md"
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="README's commands are written for bash")
 
 
@@ -28,18 +28,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(out)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = out.glob("*.whl")
-    install = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--target",
-        str(target),
-    ]
-    subprocess.run([*install, str(wheel)], check=True, capture_output=True, timeout=120)
+    options = ["--quiet", "--no-deps", "--no-index", "--target", str(target)]
+    install = [sys.executable, "-m", "pip", "install", *options, str(wheel)]
+    subprocess.run(install, check=True, capture_output=True, timeout=120)
     return target
 
 
@@ -53,15 +44,14 @@ def _run(command: list[str], folder: Path, installed: Path) -> str:
 
 def _printed_commands() -> list[tuple[str, list[str]]]:
     """README's commands, each with the lines that it should print."""
-    sessions = re.findall(r"^```console\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
-    commands = re.split(r"^\$ ", "".join(sessions), flags=re.MULTILINE)[1:]
+    commands = re.split(r"^\$ ", "".join(blocks(README, "console")), flags=re.MULTILINE)[1:]
     return [(lines[0], lines[1:]) for lines in map(str.splitlines, commands)]
 
 
 def _printed_python() -> tuple[str, str]:
     """README's Python, and the line that it should print."""
-    (code,) = re.findall(r"^```python\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
-    code, _, printed = str(code).rpartition("\n# ")
+    (code,) = blocks(README, "python")
+    code, _, printed = code.rpartition("\n# ")
     return code, printed.strip()
 
 
@@ -153,9 +143,7 @@ assert len(plt.get_fignums()) == 2
 
 @pytest.mark.slow
 def test_the_notebook_runs(installed: Path, tmp_path: Path) -> None:
-    notebook = Path(_run(["rsbench", "docs", "tour.ipynb"], tmp_path, installed).strip())
-    cells = json.loads(notebook.read_text("utf-8"))["cells"]
-    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    code = notebook_code(Path(_run(["rsbench", "docs", "tour.ipynb"], tmp_path, installed).strip()))
     script = tmp_path / "tour.py"
     script.write_text(f"{code}\n{_TRUTHS}", "utf-8")
     _run([sys.executable, "-W", "error", str(script)], tmp_path, installed)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import ast
-import csv
 import importlib
 import re
-from pathlib import Path
 
 import pytest
+from documents import ROOT, results
 
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS, judge_image_claims
 
-ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "explanation" / "paper.md").read_text("utf-8")
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
@@ -65,7 +63,7 @@ def test_verdicts_are_those_of_the_stored_results() -> None:
     shown = {row[0]: row[2] for row in ROWS if len(row) == 6}
     expected = {}
     for claim in CLAIMS:
-        settings = [row for row in _stored("best-readings.csv") if row["claim"] == claim.key]
+        settings = [row for row in results("claims/best-readings.csv") if row["claim"] == claim.key]
         most = [row for row in settings if row["matches"] == settings[0]["matches"]]
         noises = {row["noise"]: _word([row]) for row in most}
         single = [f"{n.replace('1e-3', '10^-3')}: {word}" for n, word in noises.items() if word != "depends"]
@@ -84,17 +82,13 @@ def test_the_best_readings_are_those_of_the_claims() -> None:
     """The literal verdict on the mean is that of claims.csv."""
     literal = {
         (row["claim"], row["matches"], row["noise"]): row["verdict"]
-        for row in _stored("claims.csv")
+        for row in results("claims/claims.csv")
         if (row["solver"], row["statistic"]) == ("literal", "mean")
     }
-    for row in _stored("best-readings.csv"):
+    for row in results("claims/best-readings.csv"):
         key = row["claim"], row["matches"], row["noise"]
         assert literal.get(key, row["literal"]) == row["literal"], key
     assert len(literal) > 20
-
-
-def _stored(name: str) -> list[dict[str, str]]:
-    return list(csv.DictReader((ROOT / "results" / "claims" / name).read_text("utf-8").splitlines()))
 
 
 def _word(settings: list[dict[str, str]]) -> str:

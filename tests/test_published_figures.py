@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import statistics
-from pathlib import Path
+
+from documents import ROOT, results, rows, section
 
 from rsbench.benchmark.studies.claims import CLAIMS
 from rsbench.benchmark.studies.correction_bench import METHODS
 
-ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 RESULTS = {path.name: path.read_text("utf-8") for path in sorted((ROOT / "docs").glob("results*.md"))}
-
-
-def _table(name: str) -> list[dict[str, str]]:
-    return list(csv.DictReader((ROOT / "results" / name).read_text("utf-8").splitlines()))
 
 
 README_ROWS = {
@@ -40,8 +35,7 @@ def test_readme_is_short_and_shows_rows_of_the_results_pages() -> None:
         for line in text.splitlines():
             name, *cells = line.strip("| ").split(" | ")
             pages.setdefault(name, []).append(cells)
-    rows = [line.strip("| ").split(" | ") for line in readme.splitlines() if line.startswith("| ")]
-    shown = {name: cells for name, *cells in rows if re.search(r"\d", " ".join(cells))}
+    shown = {name: cells for name, *cells in rows(readme) if re.search(r"\d", " ".join(cells))}
     assert shown.keys() == {*README_ROWS, "`linear`", "`twist`", "`inertial`"}
     for name, cells in shown.items():
         if name in README_ROWS:
@@ -61,33 +55,28 @@ def test_figures_shown_are_those_of_the_committed_results() -> None:
     shown = "|".join(
         ["castle", "old-town", "room", "[gr]s-[a-z0-9-]+", *(re.escape(claim.key) for claim in CLAIMS)]
     )
-    rows = re.findall(rf"^\| (?:{shown}) \|.*$", "\n".join(RESULTS.values()), re.MULTILINE)
-    assert {claim.key for claim in CLAIMS} <= {row.split(" | ")[0].removeprefix("| ") for row in rows}
-    assert len(rows) > 60
-    assert [row for row in rows if row not in published] == []
+    lines = re.findall(rf"^\| (?:{shown}) \|.*$", "\n".join(RESULTS.values()), re.MULTILINE)
+    assert {claim.key for claim in CLAIMS} <= {line.split(" | ")[0].removeprefix("| ") for line in lines}
+    assert len(lines) > 60
+    assert [line for line in lines if line not in published] == []
 
 
 def test_real_cameras_shown_are_those_of_the_study() -> None:
-    section = RESULTS["results-correction.md"].partition("## Cameras with lens")[2].partition("\n## ")[0]
+    text = section(RESULTS["results-correction.md"], "Cameras with lens")
     published = (ROOT / "results" / "real" / "README.md").read_text("utf-8")
-    rows = [
-        line.removesuffix("|")
-        for line in section.splitlines()
-        if re.match(r"\| [a-z-]+, (mild|aggressive) ", line)
-    ]
-    assert len(rows) == 8 and all(row in published for row in rows)
-    assert max(float(row["sigmas"]) for row in _table("real/summary.csv")) < 4.0, "64 of 64"
+    shown = re.findall(r"^(\| [a-z-]+, (?:mild|aggressive) .*)\|$", text, re.MULTILINE)
+    assert len(shown) == 8 and all(line in published for line in shown)
+    assert max(float(row["sigmas"]) for row in results("real/summary.csv")) < 4.0, "64 of 64"
 
 
 def test_the_cost_of_a_wrong_motion_model_is_that_of_the_sweep() -> None:
     sweep = {
         (row["variant"], row["value"], row["solver"]): float(row["e_T_median"])
-        for row in _table("sweeps/wrong-motion.csv")
+        for row in results("sweeps/wrong-motion.csv")
     }
-    section = RESULTS["results-solvers.md"].partition("## A wrong motion model")[2].partition("\n## ")[0]
-    header, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    header, _, *body = rows(section(RESULTS["results-solvers.md"], "A wrong motion model"))
     solvers = [cell.strip("`") for cell in header[2:]]
-    shown = {(data, value, s): float(e) for data, value, *es in rows for s, e in zip(solvers, es, strict=True)}
+    shown = {(data, value, s): float(e) for data, value, *es in body for s, e in zip(solvers, es, strict=True)}
     assert shown.keys() == sweep.keys()
     assert all(shown[key] == float(f"{sweep[key]:.2g}") for key in sweep)
 
@@ -96,7 +85,7 @@ def test_the_cost_of_estimated_motion_is_that_of_the_study() -> None:
     """At most 0.03 dB in any view on covered pixels, 0.16 dB on all."""
     views = {
         (v["stratum"], v["sequence"], v["side"], v["frame"], v["method"]): v
-        for v in _table("correction/views.csv")
+        for v in results("correction/views.csv")
     }
     for column, figure in (("psnr_covered", "0.03 dB"), ("psnr_all", "0.16 dB")):
         worst = max(
@@ -111,33 +100,30 @@ def test_the_cost_of_estimated_motion_is_that_of_the_study() -> None:
 def test_the_literal_correction_is_that_of_figure_4() -> None:
     """Least and largest mean of the views over the seeds, on pixels with depth, and that of the uncorrected."""
     seeds: dict[str, list[dict[str, str]]] = {}
-    for row in _table("fig4/literal.csv"):
+    for row in results("fig4/literal.csv"):
         seeds.setdefault(row["ransac_seed"], []).append(row)
     psnr, before = (
-        [statistics.mean(float(row[column]) for row in rows) for rows in seeds.values()]
+        [statistics.mean(float(row[column]) for row in of_seed) for of_seed in seeds.values()]
         for column in ("psnr_drawn", "psnr_rolling_drawn")
     )
     bounds = f"{min(psnr):.1f} to {max(psnr):.1f} dB"
     assert len(seeds) == 10
-    section = " ".join(
-        RESULTS["results-paper.md"].partition("## Corrected images")[2].partition("\n## ")[0].split()
-    )
-    assert f"ten RANSAC seeds have {bounds} on the pixels that have a depth" in section
-    assert f"uncorrected frame has {statistics.mean(before):.1f} dB" in section
+    text = " ".join(section(RESULTS["results-paper.md"], "Corrected images").split())
+    assert f"ten RANSAC seeds have {bounds} on the pixels that have a depth" in text
+    assert f"uncorrected frame has {statistics.mean(before):.1f} dB" in text
     assert bounds in " ".join((DOCS / "report.md").read_text("utf-8").split())
 
 
 def test_corrections_shown_are_those_of_the_study() -> None:
     """Covered / all PSNR, and the interval of what ours gains on the covered pixels, of each stratum."""
-    rows = {(row["stratum"], row["method"]): row for row in _table("correction/summary.csv")}
+    summary = {(row["stratum"], row["method"]): row for row in results("correction/summary.csv")}
     keys = {method.title: method.key for method in METHODS}
-    section = RESULTS["results-correction.md"].partition("## Correction against")[2].partition("\n## ")[0]
-    shown = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")][2:]
+    shown = rows(section(RESULTS["results-correction.md"], "Correction against"))[2:]
     assert len(shown) > 5
     for title, *cells in shown:
         key = keys[title.removesuffix(" (oracle)").strip("*")]
         for stratum, cell in zip(("mild", "moderate", "aggressive"), cells, strict=True):
-            row = rows[stratum, key]
+            row = summary[stratum, key]
             expected = f"{float(row['psnr_covered']):.1f} / {float(row['psnr_all']):.1f}"
             if key != "ours":
                 low, high = (round(float(row[f"gain_{end}"]), 1) + 0.0 for end in ("low", "high"))  # no -0.0
@@ -146,18 +132,17 @@ def test_corrections_shown_are_those_of_the_study() -> None:
 
 
 def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
-    root = Path(__file__).parents[1]
     tables = {
         path.name.removesuffix(".md"): path.read_text("utf-8").splitlines()
         for folder in ("leaderboard", "laws", "footage")
-        for path in (root / "results" / folder / "site").glob("*.md")
+        for path in (ROOT / "results" / folder / "site").glob("*.md")
     }
 
     def table(start: str) -> list[str]:
         (found,) = (lines for name, lines in tables.items() if name.startswith(start))
         return found
 
-    page = (root / "docs" / "results-leaderboard.md").read_text("utf-8")
+    page = RESULTS["results-leaderboard.md"]
     words = " ".join(page.split())
     for protocol, score, column in (("points-1--", "an AUC@5", 3), ("points-2--", "a `near bound`", 4)):
         bound = next(line for line in table(protocol) if line.startswith("| cramer-rao"))
@@ -169,5 +154,5 @@ def test_results_tell_the_bound_and_rows_of_the_committed_board() -> None:
         *("points-1--", "pose-1--", "depth-1--", "correction-1--"),
         *("correction-mono-1--footage", "correction-mono-1--standard"),
     )
-    for rows, board in zip(shown, boards, strict=True):
-        assert set(rows) <= set(table(board)) and len(rows) > 5
+    for lines, board in zip(shown, boards, strict=True):
+        assert set(lines) <= set(table(board)) and len(lines) > 5

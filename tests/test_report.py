@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
+from documents import ROOT, results
 
 from rsbench.benchmark.studies.claims import CLAIMS
 
-ROOT = Path(__file__).parents[1]
 REPORT = (ROOT / "docs" / "report.md").read_text("utf-8")
 TEXT = " ".join(REPORT.split())
 SETTINGS = (
@@ -19,10 +17,6 @@ SETTINGS = (
     *("up to 5 deg", "AUC@5", "Figure 3", "Figure 4", "x86-64", "30 dB on the pixels"),
 )
 """Sizes of experiments, names and years."""
-
-
-def table(name: str) -> list[dict[str, str]]:
-    return list(csv.DictReader((ROOT / "results" / name).read_text("utf-8").splitlines()))
 
 
 def claims() -> Iterator[str]:
@@ -40,7 +34,7 @@ def claims() -> Iterator[str]:
 
 
 def medians() -> Iterator[str]:
-    pose = [row for row in table("images/scores/pose.csv") if row["sequence"] == "castle"]
+    pose = [row for row in results("images/scores/pose.csv") if row["sequence"] == "castle"]
 
     def e_T(solver: str) -> float:
         found = [float(row["e_T_deg"]) for row in pose if row["solver"] == solver]
@@ -52,7 +46,7 @@ def medians() -> Iterator[str]:
     yield f"{words} is {linear:.3g} deg, that of `rs-stereo-refined` {refined:.2g} deg"
     wrong = {
         row["solver"]: float(row["e_T_median"])
-        for row in table("sweeps/wrong-motion.csv")
+        for row in results("sweeps/wrong-motion.csv")
         if (row["variant"], float(row["value"])) == ("twist", 2.0)
     }
     own, twist, ignoring = (
@@ -62,7 +56,7 @@ def medians() -> Iterator[str]:
     yield f"assumes a twist has {twist:.2g} deg"
     views = {
         tuple(row[key] for key in ("stratum", "sequence", "side", "frame", "method")): float(row["psnr_covered"])
-        for row in table("correction/views.csv")
+        for row in results("correction/views.csv")
     }
     cost = max(value - views[(*key[:4], "ours")] for key, value in views.items() if key[4] == "true-motion")
     yield f"at most {cost:.2f} dB in any view"
@@ -78,7 +72,7 @@ def bounds() -> Iterator[str]:
 
 def cameras() -> Iterator[str]:
     boards = [next((ROOT / "results/leaderboard/site").glob(f"{name}-1--*.csv")) for name in ("points", "pose")]
-    rows = [{row["method"]: row for row in table(f"leaderboard/site/{board.name}")} for board in boards]
+    rows = [{row["method"]: row for row in results(f"leaderboard/site/{board.name}")} for board in boards]
     shown = re.findall(r"^\| .*: `(.*?)` \| (.*) \| (.*) \|$", REPORT, re.MULTILINE)
     assert len(shown) == 4
     for method, *cells in shown:
@@ -94,14 +88,16 @@ def cameras() -> Iterator[str]:
 def literal() -> Iterator[str]:
     """Of the paper's own solver, matches and view: the means of the views of each seed, from the least on."""
     seeds: dict[str, list[float]] = {}
-    for row in table("fig4/literal.csv"):
+    for row in results("fig4/literal.csv"):
         seeds.setdefault(row["ransac_seed"], []).append(float(row["psnr_drawn"]))
     means = [float(np.mean(views)) for views in seeds.values()]
     yield f"{min(means):.1f} to {max(means):.1f} dB"
 
 
 def corrections() -> Iterator[str]:
-    rows = {(row["stratum"], row["method"]): float(row["psnr_covered"]) for row in table("correction/summary.csv")}
+    rows = {
+        (row["stratum"], row["method"]): float(row["psnr_covered"]) for row in results("correction/summary.csv")
+    }
     methods = {
         "uncorrected": "none",
         "one camera, constant velocity": "mono",

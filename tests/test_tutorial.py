@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 import runpy
 import shlex
 from pathlib import Path
@@ -11,26 +10,23 @@ from pathlib import Path
 import cv2
 import pytest
 from commands import run_here
+from documents import ROOT, blocks
 
-TUTORIAL = (Path(__file__).parents[1] / "docs" / "get-started" / "tutorial.md").read_text("utf-8")
-
-
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", TUTORIAL, re.DOTALL | re.MULTILINE)
+TUTORIAL = ROOT / "docs" / "get-started" / "tutorial.md"
 
 
 @pytest.mark.slow
 def test_the_tutorial_ends_with_its_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (card,) = _blocks("toml")
+    (card,) = blocks(TUTORIAL, "toml")
     for full, small in (("480", "240"), ("360", "180"), ("420", "210")):
         assert full in card
         card = card.replace(full, small)
     Path("first.toml").write_text(card, "utf-8")
-    (script,) = _blocks("python")
+    (script,) = blocks(TUTORIAL, "python")
     Path("picture.py").write_text(script, "utf-8")
     verbs = []
-    for program, *words in (shlex.split(line) for block in _blocks("sh") for line in block.splitlines()):
+    for program, *words in (shlex.split(line) for block in blocks(TUTORIAL, "sh") for line in block.splitlines()):
         verbs.append(words[0])
         if program == "python":
             runpy.run_path(words[0])

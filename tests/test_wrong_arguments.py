@@ -34,103 +34,75 @@ WRONG: dict[str, Callable[[], Any]] = {
     "a class": lambda: int,
 }
 LONGEST = 400
+UNCHECKED = {
+    "PinholeCamera": {"lens"},
+    "RollingShutter": {"right_size"},
+    "SplineMotion": {"periods"},
+    "StereoRig": {"sides"},
+}
+"""Parameters whose errors are not one short line yet."""
 CAMERA = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
 
 
+Call = tuple[Callable[..., Any], dict[str, Any]]
+
+
 @pytest.fixture(scope="module")
-def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
-    """A small call of each public function and constructor, by its name."""
+def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Call]:
+    """A small call of each public function and constructor, by its name: what it requires, and a little more."""
     camera = rsbench.PinholeCamera(**CAMERA)
     rig = rsbench.StereoRig(camera=camera, baseline=0.3)
     shutter = rsbench.RollingShutter(height=48, readout_ratio=0.8)
     motion = rsbench.LinearMotion([0.01, -0.02, 0.01], [0.1, 0.0, 0.2])
-    matches = rsbench.simulate(rig, shutter, motion, pairs=20, tracks=20).correspondences
-    image, nowhere = np.zeros((48, 64, 3), np.uint8), str(tmp_path_factory.mktemp("empty"))
     moving = {"rig": rig, "shutter": shutter, "motion": motion}
-    given = {"correspondences": matches, "rig": rig, "shutter": shutter}
-    estimate = rsbench.estimate_motion(matches, rig, shutter)
+    matches = rsbench.simulate(**moving, pairs=20, tracks=20).correspondences
+    image, nowhere = np.zeros((48, 64, 3), np.uint8), str(tmp_path_factory.mktemp("empty"))
+    estimated = {"correspondences": matches, "rig": rig, "shutter": shutter, "solver": "gs-8pt"}
     vectors = {"w": [0.0, 0.0, 0.1], "d": [0.0, 0.1, 0.0]}
-    return {
-        "PinholeCamera": (rsbench.PinholeCamera, CAMERA),
-        "StereoRig": (rsbench.StereoRig, {"camera": camera, "baseline": 0.3, "origin": "middle"}),
-        "RollingShutter": (rsbench.RollingShutter, {"height": 48, "readout_ratio": 0.8, "scan": "top"}),
-        "LinearMotion": (rsbench.LinearMotion, vectors),
-        "TwistMotion": (rsbench.TwistMotion, vectors),
-        "AcceleratedMotion": (rsbench.AcceleratedMotion, {**vectors, "acceleration": 0.1}),
-        "SplineMotion": (rsbench.SplineMotion, {**vectors, "preset": "handheld", "seed": 1, "interval": None}),
-        "MotionEstimate": (rsbench.MotionEstimate, {**vectors, "success": True, "metric": True}),
-        "SolverSpec": (
-            rsbench.SolverSpec,
-            {
-                "needs": {"left"},
-                "minimum": {"left": 5},
-                "metric": False,
-                "motion_model": "linear",
-                "shutter": "rolling",
-            }
-            | {"reference": "none", "reference_point": "body", "assumes": "nothing", "motion_parameters": {}},
-        ),
-        "Correspondences": (rsbench.Correspondences, {"left": np.zeros((0, 4)), "tracks": np.zeros((0, 8))}),
-        "project": (rsbench.project, {"points": [[0.0, 0.0, 5.0]], **moving, "side": "left", "frame": 0}),
-        "simulate": (
-            rsbench.simulate,
-            {**moving, "pairs": 5, "tracks": 5, "noise_px": 0.3, "outlier_ratio": 0.0, "depth": (2.0, 9.0)}
-            | {"shape": "box", "seed": 0},
-        ),
-        "estimate_motion": (
-            rsbench.estimate_motion,
-            {**given, "solver": "gs-8pt", "motion_model": None, "threshold_px": None, "seed": 0},
-        ),
-        "pose_errors": (
-            rsbench.pose_errors,
-            {"found": estimate, "motion": motion, "rig": rig, "reference_point": "body"},
-        ),
-        "match": (rsbench.match, {"images": [image] * 4, "features": "sift"}),
-        "stereo_depth": (
-            rsbench.stereo_depth,
-            {"left": image, "right": image, "rig": rig, "side": "left", "matcher": "sgm"},
-        ),
-        "correct": (
-            rsbench.correct,
-            {"images": [image] * 4, "rig": rig, "readout_ratio": 0.8, "camera": None, "solver": "gs-8pt"}
-            | {
-                "motion_model": None,
-                "matcher": "sgm",
-                "features": "sift",
-                "corrector": "fusion",
-                "target_row": 0.0,
-            }
-            | {"inpaint": None, "seed": 0, "gyro": None, "focal_sigma": 0.0, "k1_sigma": 0.0},
-        ),
-        "correct one camera": (
-            rsbench.correct,
-            {"images": [image] * 2, "camera": camera, "readout_ratio": 0.8, "target_row": 0.0, "inpaint": None}
-            | {"seed": 0, "gyro": None, "solver": "rs-stereo-refined", "corrector": "fusion"}
-            | {"gyro_clock_error": 0.0},
-        ),
-        "estimate_trajectory": (
-            rsbench.estimate_trajectory,
-            {"sequence": [matches], "rig": rig, "shutter": shutter, "features": "sift", "seed": 0, "gyro": None},
-        ),
-        "read_dataset": (rsbench.read_dataset, {"folder": nowhere}),
-        "read_rig": (rsbench.read_rig, {"path": nowhere, "size": (640, 480), "fps": 20.0}),
-        "generate": (rsbench.generate, {"card": "nowhere", "out": nowhere, "sequences": None, "workers": 1}),
-        "verify": (rsbench.verify, {"folder": nowhere, "stride": 1, "rerender": "no", "scenes": ()}),
-        "evaluate": (
-            rsbench.evaluate,
-            {"folder": nowhere, "out": nowhere, "solvers": ["gs-8pt"], "correct_with": "gs-8pt", "matcher": "sgm"}
-            | {"features": "sift", "corrector": "fusion", "metrics": (), "only": (), "seeds": 1, "seed": 0},
-        ),
-        "load_solver": (rsbench.load_solver, {"name_or_path": "gs-8pt"}),
+    spec = {"needs": {"left"}, "minimum": {"left": 5}, "metric": False, "motion_model": "linear"}
+    spec |= {"shutter": "rolling", "reference": "none", "reference_point": "body", "assumes": "nothing"}
+    given: dict[str, dict[str, Any]] = {
+        "PinholeCamera": CAMERA,
+        "StereoRig": {"camera": camera, "baseline": 0.3},
+        "RollingShutter": {"height": 48, "readout_ratio": 0.8},
+        "LinearMotion": vectors,
+        "TwistMotion": vectors,
+        "AcceleratedMotion": vectors,
+        "SplineMotion": {**vectors, "preset": "handheld", "seed": 1},
+        "MotionEstimate": {**vectors, "success": True},
+        "SolverSpec": spec,
+        "Correspondences": {},
+        "project": {"points": [[0.0, 0.0, 5.0]], **moving},
+        "simulate": {**moving, "pairs": 5, "tracks": 5},
+        "estimate_motion": estimated,
+        "pose_errors": {"found": rsbench.estimate_motion(**estimated), "motion": motion, "rig": rig},
+        "match": {"images": [image] * 4, "features": "sift"},
+        "stereo_depth": {"left": image, "right": image, "rig": rig},
+        "correct": {
+            "images": [image] * 4,
+            "rig": rig,
+            "readout_ratio": 0.8,
+            "solver": "gs-8pt",
+            "features": "sift",
+        },
+        "estimate_trajectory": {"sequence": [matches], "rig": rig, "shutter": shutter},
+        "read_dataset": {"folder": nowhere},
+        "read_rig": {"path": nowhere, "size": (640, 480), "fps": 20.0},
+        "generate": {"card": "nowhere", "out": nowhere},
+        "verify": {"folder": nowhere, "rerender": "no"},
+        "evaluate": {"folder": nowhere, "out": nowhere, "solvers": ["gs-8pt"], "correct_with": "gs-8pt"},
+        "load_solver": {"name_or_path": "gs-8pt"},
     }
+    found = {name: (getattr(rsbench, name), arguments) for name, arguments in given.items()}
+    one = {"images": [image] * 2, "camera": camera, "readout_ratio": 0.8}
+    return {**found, "correct one camera": (rsbench.correct, one)}
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_wrong_argument_is_one_short_line(wrong: str, calls: dict[str, Any]) -> None:
+def test_a_wrong_argument_is_one_short_line(wrong: str, calls: dict[str, Call]) -> None:
     bad = []
     for name, (function, arguments) in calls.items():
-        assert set(arguments) <= set(inspect.signature(function).parameters) or name == "load_solver", name
-        for argument in arguments:
+        for argument in inspect.signature(function).parameters.keys() - UNCHECKED.get(name, set()):
             try:
                 function(**{**arguments, argument: WRONG[wrong]()})
             except (rsbench.RsbenchError, ValueError) as error:

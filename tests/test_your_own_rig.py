@@ -16,17 +16,14 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from calibration_files import matrix, opencv
 from commands import run_here
+from documents import ROOT, blocks
 from numpy.typing import NDArray
-from programs import ROOT
 
-PAGE = (ROOT / "docs" / "how-to" / "your-own-rig.md").read_text("utf-8")
+PAGE = ROOT / "docs" / "how-to" / "your-own-rig.md"
 SCALE = 0.75
 """Of the width and height of the frames that the page shows."""
-
-
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 
 
 def _smaller(c: Any) -> Any:
@@ -62,16 +59,13 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
 
 
 def _write_opencv(path: Path, rig: Any) -> None:
-    """As OpenCV's sample of stereo calibration writes it, by OpenCV, in millimetres."""
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    """As OpenCV's sample of stereo calibration writes it, in millimetres."""
+    values = {"R": np.asarray(rig.R), "T": 1000.0 * np.asarray(rig.t).reshape(3, 1)}
     for number, c in enumerate((rig.left, rig.right), start=1):
-        (cx, cy), k = c.centre, np.zeros((1, 5))
+        k = np.zeros((1, 5))
         k[0, : len(c.coefficients)] = c.coefficients
-        storage.write(f"M{number}", np.array([[c.fx, 0.0, cx], [0.0, c.fy, cy], [0.0, 0.0, 1.0]]))
-        storage.write(f"D{number}", k)
-    storage.write("R", np.asarray(rig.R))
-    storage.write("T", 1000.0 * np.asarray(rig.t).reshape(3, 1))
-    storage.release()
+        values |= {f"M{number}": matrix((c.fx, c.fy, *c.centre)), f"D{number}": k}
+    opencv(path, **values)
 
 
 def _psnr(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
@@ -95,7 +89,7 @@ def test_three_commands_lead_from_a_calibration_to_a_rectified_pair(
 ) -> None:
     folder, truth, rotation_deg = day
     monkeypatch.chdir(folder)
-    commands = [shlex.split(line) for line in _blocks("sh")[number].splitlines()]
+    commands = [shlex.split(line) for line in blocks(PAGE, "sh")[number].splitlines()]
     assert [words[:2] for words in commands] == [["rsbench", each] for each in ("rig", "inspect", "correct")]
     said = []
     for _, *words in commands:
@@ -117,7 +111,7 @@ def test_three_commands_lead_from_a_calibration_to_a_rectified_pair(
     assert _row_difference(Path()) > 1.0
     if number == 0:
         printed = io.StringIO()
-        (script,) = _blocks("python")
+        (script,) = blocks(PAGE, "python")
         Path("points.py").write_text(script, "utf-8")
         with contextlib.redirect_stdout(printed):
             runpy.run_path("points.py")

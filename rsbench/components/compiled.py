@@ -30,6 +30,7 @@ from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.runtime import rtsys
 
+from rsbench.components.imports import hash_of_files
 from rsbench.storage.work_folder import temporary, user_cache
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -59,11 +60,7 @@ def compiled(**options: Any) -> Callable[[F], F]: ...
 def compiled(function: F | None = None, **options: Any) -> F | Callable[[F], F]:
     """Compile at the first call, once per installation; ``options`` are those of ``numba.njit``."""
     if function is None:
-        return functools.partial(_compiled, options=options)
-    return _compiled(function, {})
-
-
-def _compiled(function: F, options: dict[str, Any]) -> F:
+        return functools.partial(compiled, **options)
     dispatcher = njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
     dispatcher._cache = _KernelCache(function)
     out: F = dispatcher
@@ -173,12 +170,8 @@ _STOPWATCH = _Stopwatch()
 def source_version() -> str:
     """Hash of all sources of rsbench that hold compiled code."""
     package = Path(str(resources.files("rsbench")))
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        text = path.read_bytes()
-        if any(mark in text for mark in _MARKS):
-            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + text + b"\0")
-    return digest.hexdigest()
+    texts = {path: path.read_bytes() for path in sorted(package.rglob("*.py"))}
+    return hash_of_files(package, [path for path, text in texts.items() if any(mark in text for mark in _MARKS)])
 
 
 @functools.cache

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rsbench.core.errors import RsbenchError
+from rsbench.storage.untrusted_files import positive_variable, sha256
 
 _NUMERIC_ROOMS = ("core", "solvers", "vision", "capture", "pipeline")
 """Packages whose source decides what a component of ours answers."""
@@ -121,13 +122,8 @@ def own_source_version() -> str:
 
 
 def hash_of_files(folder: Path, files: list[Path]) -> str:
-    text = "\n".join(f"{path.relative_to(folder).as_posix()} {file_hash(path)}" for path in files)
+    text = "\n".join(f"{path.relative_to(folder).as_posix()} {sha256(path)}" for path in files)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def entry_points_by_name(group: str) -> dict[str, list[metadata.EntryPoint]]:
@@ -272,7 +268,8 @@ def try_import(module: str, version: str = "") -> None:
 
 @functools.cache
 def _fate(module: str, version: str) -> str:
-    limit_s, path = _import_limit(), json.dumps([str(entry) for entry in sys.path])
+    limit_s = positive_variable(IMPORT_LIMIT, _LIMIT_S, " of seconds")
+    path = json.dumps([str(entry) for entry in sys.path])
     with lifeline() as line:
         process = start_child(_COMMAND, path, module, str(limit_s), line=line)
         try:
@@ -280,10 +277,7 @@ def _fate(module: str, version: str) -> str:
         except subprocess.TimeoutExpired:
             return f"took longer than {limit_s:g} s ({IMPORT_LIMIT} allows more)"
         finally:
-            if _POSIX:
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.killpg(process.pid, signal.SIGKILL)
-            process.kill()
+            kill_group(process)
             process.wait()
     return "" if code == _IMPORTED else ending(code)
 
@@ -314,12 +308,12 @@ def start_child(
     )
 
 
-def _import_limit() -> float:
-    text = os.environ.get(IMPORT_LIMIT, "")
-    with contextlib.suppress(ValueError):
-        if math.isfinite(limit_s := float(text or _LIMIT_S)) and limit_s > 0.0:
-            return limit_s
-    raise RsbenchError(f"{IMPORT_LIMIT} = {text!r}: must be a positive number of seconds")
+def kill_group(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process of ``start_child`` and all of its group."""
+    if _POSIX:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
 
 
 def import_and_end(module: str, limit_s: float, line: int) -> NoReturn:
@@ -398,13 +392,13 @@ def _import_beside(module: str, folder: Path) -> object:
     beside = next((path for path in (first.with_suffix(".py"), first / "__init__.py") if path.is_file()), None)
     if beside is not None:
         _refuse_other(first.name, beside)
-    try_import(module, "".join(file_hash(file) for file in with_neighbours(beside)) if beside is not None else "")
+    try_import(module, "".join(map(sha256, with_neighbours(beside))) if beside is not None else "")
     before = set(sys.modules)
     found = importlib.import_module(module)
     for name in set(sys.modules) - before:
         file = _file_of(name)
         if file is not None and file.is_relative_to(folder):
-            _beside_cards[name] = file, file_hash(file)
+            _beside_cards[name] = file, sha256(file)
     for file in with_neighbours(beside) if beside is not None else ():
         if file.parent == folder and file.stem in sys.modules:
             _refuse_other(file.stem, file)
@@ -424,7 +418,7 @@ def _put_on_path(folder: str) -> None:
 def _forget_changed(folder: Path) -> None:
     """Forget the modules of a folder when the file of one of them has changed."""
     mine = {name: file for name, (file, _) in _beside_cards.items() if file.is_relative_to(folder)}
-    if any(not file.is_file() or file_hash(file) != _beside_cards[name][1] for name, file in mine.items()):
+    if any(not file.is_file() or sha256(file) != _beside_cards[name][1] for name, file in mine.items()):
         for name in mine:
             del _beside_cards[name]
             sys.modules.pop(name, None)

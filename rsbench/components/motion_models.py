@@ -115,12 +115,7 @@ def make_motion(name: str, w: ArrayLike, d: ArrayLike, parameters: Mapping[str, 
     if model.__module__.partition(".")[0] == "rsbench":
         try:
             return model(w, d, **dict(parameters or {}))
-        except (
-            TypeError,
-            ValueError,
-            ArithmeticError,
-            LookupError,
-        ) as error:  # parameters may have any type and shape
+        except (TypeError, ValueError, ArithmeticError, LookupError) as error:  # parameters of any type and shape
             raise RsbenchError(f"{where}: {error}") from error
     with blaming(where, "cannot be made"):
         motion = model(w, d, **dict(parameters or {}))
@@ -404,40 +399,6 @@ def inertial_translation_jacobian(
             T_v[i, j] = a * by_v[i]
 
 
-@final
-@kernel_for(InertialMotion)
-@dataclass(frozen=True)
-class InertialKernel(MotionKernel):
-    """Constant velocity in the world; v is that of the world in the body at time 0: T = a exp(tau1 w) v."""
-
-    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        return inertial_move(theta, tau0, tau1, R, A)
-
-    def translation_jacobian(
-        self,
-        theta: FloatArray,
-        tau0: float,
-        tau1: float,
-        R: FloatArray,
-        A: FloatArray,
-        T_w: FloatArray,
-        T_v: FloatArray,
-    ) -> None:
-        inertial_translation_jacobian(theta, tau0, tau1, T_w, T_v)
-
-    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        return np.concatenate([w, so3.exp(-w) @ d], dtype=np.float64)
-
-    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return theta[:3], so3.exp(theta[:3]) @ theta[3:]
-
-    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
-        out, (w, d) = np.eye(6), self.motion(theta)
-        out[3:, :3] = -so3.hat(d) @ so3.left_jacobian(w)
-        out[3:, 3:] = so3.exp(w)
-        return out
-
-
 @compiled
 def beta(k: float, tau: float) -> tuple[float, float]:
     """beta(tau) of a constant acceleration k (Zhuang et al., ICCV 2017), 1 at tau = 1, and its derivative."""
@@ -451,46 +412,6 @@ def accelerated_move(k: float, theta: FloatArray, tau0: float, tau1: float, R: F
     (beta0, speed0), (beta1, speed1) = beta(k, tau0), beta(k, tau1)
     T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
     return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
-
-
-@compiled
-def accelerated_translation_jacobian(
-    k: float,
-    theta: FloatArray,
-    tau0: float,
-    R: FloatArray,
-    A: FloatArray,
-    tau1: float,
-    T_w: FloatArray,
-    T_v: FloatArray,
-) -> None:
-    """dT/dw and dT/dv of ``accelerated_move``."""
-    beta0, beta1 = beta(k, tau0)[0], beta(k, tau1)[0]
-    linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
-
-
-@final
-@kernel_for(AcceleratedMotion)
-@dataclass(frozen=True)
-class AcceleratedKernel(MotionKernel):
-    """Constant acceleration: the paper's motion at the times beta(tau); v is d."""
-
-    acceleration: float
-
-    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        return accelerated_move(self.acceleration, theta, tau0, tau1, R, A)
-
-    def translation_jacobian(
-        self,
-        theta: FloatArray,
-        tau0: float,
-        tau1: float,
-        R: FloatArray,
-        A: FloatArray,
-        T_w: FloatArray,
-        T_v: FloatArray,
-    ) -> None:
-        accelerated_translation_jacobian(self.acceleration, theta, tau0, R, A, tau1, T_w, T_v)
 
 
 @compiled
@@ -514,42 +435,6 @@ def twist_translation_jacobian(
             T_v[i, j] = A[i, j]
 
 
-@final
-@kernel_for(TwistMotion)
-@dataclass(frozen=True)
-class TwistKernel(MotionKernel):
-    """Constant twist; v is its linear part: T = a J(a w) v, a = tau1 - tau0."""
-
-    def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        return twist_move(theta, tau0, tau1, R, A)
-
-    def translation_jacobian(
-        self,
-        theta: FloatArray,
-        tau0: float,
-        tau1: float,
-        R: FloatArray,
-        A: FloatArray,
-        T_w: FloatArray,
-        T_v: FloatArray,
-    ) -> None:
-        twist_translation_jacobian(theta, tau0, tau1, A, T_w, T_v)
-
-    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)], dtype=np.float64)
-
-    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return theta[:3], so3.left_jacobian(theta[:3]) @ theta[3:]
-
-    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
-        out, step = np.eye(6), 1e-6
-        for j in range(3):
-            shift = step * np.eye(6)[j]
-            out[3:, j] = (self.motion(theta + shift)[1] - self.motion(theta - shift)[1]) / (2 * step)
-        out[3:, 3:] = so3.left_jacobian(theta[:3])
-        return out
-
-
 @compiled
 def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
     """dT/dw of T = a (v + b phi x v + c phi x (phi x v)), phi = a w."""
@@ -563,14 +448,9 @@ def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
             T_w[i, j] += a * a * (c * (phi[i] * v[j] - 2 * v[i] * phi[j]) + along[i] * phi[j])
 
 
-_NUMBERS: dict[type[MotionKernel], float] = {LinearKernel: 0.0, TwistKernel: 1.0, InertialKernel: 2.0}
-"""Numbers of the laws without parameters; ``AcceleratedKernel`` has 3."""
-
-
-@final
 @dataclass(frozen=True)
 class AnyLaw(MotionKernel):
-    """Any of the laws of motion of this package."""
+    """Any of the laws of motion of this package, by its number: one compiled function for all of them."""
 
     number: float
     acceleration: float = 0.0
@@ -601,15 +481,68 @@ class AnyLaw(MotionKernel):
         elif self.number == 2.0:
             inertial_translation_jacobian(theta, tau0, tau1, T_w, T_v)
         else:
-            accelerated_translation_jacobian(self.acceleration, theta, tau0, R, A, tau1, T_w, T_v)
+            beta0, beta1 = beta(self.acceleration, tau0)[0], beta(self.acceleration, tau1)[0]
+            linear_translation_jacobian(theta, beta0, R, A, beta1, T_w, T_v)
+
+
+@final
+@kernel_for(TwistMotion)
+@dataclass(frozen=True)
+class TwistKernel(AnyLaw):
+    """Constant twist; v is its linear part: T = a J(a w) v, a = tau1 - tau0."""
+
+    number: float = 1.0
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        return np.concatenate([w, np.linalg.solve(so3.left_jacobian(w), d)], dtype=np.float64)
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return theta[:3], so3.left_jacobian(theta[:3]) @ theta[3:]
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        out, step = np.eye(6), 1e-6
+        for j in range(3):
+            shift = step * np.eye(6)[j]
+            out[3:, j] = (self.motion(theta + shift)[1] - self.motion(theta - shift)[1]) / (2 * step)
+        out[3:, 3:] = so3.left_jacobian(theta[:3])
+        return out
+
+
+@final
+@kernel_for(InertialMotion)
+@dataclass(frozen=True)
+class InertialKernel(AnyLaw):
+    """Constant velocity in the world; v is that of the world in the body at time 0: T = a exp(tau1 w) v."""
+
+    number: float = 2.0
+
+    def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
+        return np.concatenate([w, so3.exp(-w) @ d], dtype=np.float64)
+
+    def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return theta[:3], so3.exp(theta[:3]) @ theta[3:]
+
+    def motion_jacobian(self, theta: FloatArray) -> FloatArray:
+        out, (w, d) = np.eye(6), self.motion(theta)
+        out[3:, :3] = -so3.hat(d) @ so3.left_jacobian(w)
+        out[3:, 3:] = so3.exp(w)
+        return out
+
+
+@final
+@kernel_for(AcceleratedMotion)
+@dataclass(frozen=True)
+class AcceleratedKernel(AnyLaw):
+    """Constant acceleration: the paper's motion at the times beta(tau); v is d."""
+
+    number: float = 3.0
 
 
 def any_law(kernel: MotionKernel) -> MotionKernel:
     """The kernel as ``AnyLaw``; that of another package as it is."""
-    if isinstance(kernel, AcceleratedKernel):
-        return AnyLaw(3.0, kernel.acceleration)
-    number = _NUMBERS.get(type(kernel))
-    return kernel if number is None else AnyLaw(number)
+    if isinstance(kernel, LinearKernel):
+        return AnyLaw(0.0)
+    return AnyLaw(kernel.number, kernel.acceleration) if isinstance(kernel, AnyLaw) else kernel
 
 
 def quick_law(kernel: MotionKernel) -> MotionKernel:
@@ -630,7 +563,8 @@ def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -
             f"motion model {motion_name!r} has no kernel, so no solver can assume it; these have: {known}"
         )
     motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), KERNELS[model]
-    return kernel(**{field.name: float(getattr(motion, field.name)) for field in dataclasses.fields(kernel)})  # pyrefly: ignore[bad-argument-type]
+    names = [field.name for field in dataclasses.fields(kernel) if hasattr(motion, field.name)]  # pyrefly: ignore[bad-argument-type]
+    return kernel(**{name: float(getattr(motion, name)) for name in names})
 
 
 def has_kernel(motion_name: str) -> bool:

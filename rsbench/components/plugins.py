@@ -52,10 +52,6 @@ class NoOptions:
     """Options of a kind whose cards set only parameters."""
 
 
-def _anything_goes(component: Any) -> None:
-    pass
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """Options of running a component, set by its card."""
@@ -84,7 +80,7 @@ class Kind(Generic[Component, Options]):
     """Dataclass of the keys that a card may set beside the parameters; all have defaults."""
     built_in: Mapping[str, str] = field(default_factory=dict)
     """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
-    check: Callable[[Component], None] = _anything_goes
+    check: Callable[[Component], None] = lambda component: None
     """Raises ValueError for a component whose declarations are inconsistent."""
 
     def __post_init__(self) -> None:
@@ -158,10 +154,16 @@ def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManage
 
 def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Component, Options]:
     """The entry of a component that was made without a card, named after its class."""
+    return _without_card(kind, component, type(component).__name__, "")
+
+
+def _without_card(
+    kind: Kind[Component, Options], component: Component, name: str, description: str
+) -> Entry[Component, Options]:
     return Entry(
-        name=type(component).__name__,
+        name=name,
         path=None,
-        description="",
+        description=description,
         component=component,
         options=kind.options(),
         key=component_key(component, {}),
@@ -200,15 +202,7 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
     if offer.path is not None:
         return _from_card(kind, offer.path)
     cls, where = _offered_class(kind, offer)
-    component = make_component(kind, cls, {}, where)
-    return Entry(
-        name=offer.name,
-        path=None,
-        description=_first_paragraph(cls),
-        component=component,
-        options=kind.options(),
-        key=component_key(component, {}),
-    )
+    return _without_card(kind, make_component(kind, cls, {}, where), offer.name, _first_paragraph(cls))
 
 
 def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) -> type[Component]:

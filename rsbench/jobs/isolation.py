@@ -35,16 +35,24 @@ from typing import Any, BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.components.imports import end_with, ending, import_untried, start_child
+from rsbench.components.imports import (
+    end_with,
+    ending,
+    exception_text,
+    import_untried,
+    kill_group,
+    lifeline,
+    start_child,
+)
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.untrusted_files import unpack_arrays
+from rsbench.storage.untrusted_files import PLAIN_KINDS, unpack_arrays
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Environment variables that limit the threads of numerical libraries."""
 ONE_THREAD = dict.fromkeys(THREAD_VARIABLES, "1")
 """Environment of a child process whose numerical libraries use one thread."""
 START_LIMIT_S = 300.0
-"""Default time limit for loading a module and compiling its functions, seconds."""
+"""Time limit for loading a module and compiling its functions, seconds."""
 NO_ANSWER = "gave no valid answer"
 _POLL_S = 0.1
 _LAST_ANSWER_S = 10.0
@@ -58,8 +66,6 @@ _COMMAND = (
 )
 _LENGTH_BYTES = 8
 _LONGEST_BYTES = 1 << 32
-_KINDS = "biufU"
-"""Kinds of arrays: truth values, numbers and text."""
 Server = Callable[..., object]
 """Answers one call, in the child: picklable arguments in, plain data out."""
 
@@ -98,7 +104,6 @@ class IsolatedWorker:
         factory: Callable[..., Server],
         *arguments: object,
         classes: tuple[type, ...] = (),
-        start_limit_s: float = START_LIMIT_S,
         environment: Mapping[str, str] | None = None,
         cancel: threading.Event | None = None,
         memory_mb: float | None = None,
@@ -109,7 +114,6 @@ class IsolatedWorker:
                 answers the calls. Both raise ``EntryFailure`` where the entry is at fault.
             arguments: picklable.
             classes: the dataclasses that answers may hold.
-            start_limit_s: time for ``factory``.
             environment: variables that the child has besides those of this process.
             cancel: once set, perhaps by another thread, calls end with ``Cancelled``.
             memory_mb: limit of the child's memory; not applied where the system does not report its use.
@@ -117,7 +121,6 @@ class IsolatedWorker:
         self._memory_mb = memory_mb
         self._start = (factory, arguments)
         self._classes = {cls.__name__: cls for cls in classes}
-        self._start_limit_s = start_limit_s
         self._environment = {**os.environ, **(environment or {})}
         self.cancel = cancel or threading.Event()
         """See the argument; another event may take its place between calls."""
@@ -137,7 +140,7 @@ class IsolatedWorker:
                     self.close()  # it died after its last answer: not a fault of this call
                 if self._child is None:
                     self._child = _Child(self._environment)
-                    started = self._exchange(self._start, self._start_limit_s)
+                    started = self._exchange(self._start, START_LIMIT_S)
                     if not started.success:
                         self.close()
                         return replace(started, reason=f"did not start: {started.reason}")
@@ -193,18 +196,11 @@ class _Child:
         self.overdue = False
         """Whether an answer did not come in time, or took too much memory."""
         self._printed = b""
-        self._lifeline: int | None = None
-        lifeline_end = -1
-        if _POSIX:
-            lifeline_end, self._lifeline = os.pipe()
-        try:
-            path = json.dumps([str(entry) for entry in sys.path])
-            self._process = start_child(
-                _COMMAND, path, line=lifeline_end, stream=subprocess.PIPE, environment=environment
-            )
-        finally:
-            if _POSIX:
-                os.close(lifeline_end)
+        path = json.dumps([str(entry) for entry in sys.path])
+        with contextlib.ExitStack() as stack:
+            line = stack.enter_context(lifeline())
+            self._process = start_child(_COMMAND, path, line=line, stream=subprocess.PIPE, environment=environment)
+            self._lifeline = stack.pop_all()
         self._answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._readers = [
             threading.Thread(target=read, daemon=True) for read in (self._read_answers, self._read_output)
@@ -234,7 +230,7 @@ class _Child:
                 self.overdue = True
                 return None, f"used more than {memory_mb:g} MB of memory"
             if ended := self.ended:
-                self._kill_group()  # its own children may keep the pipe open
+                kill_group(self._process)  # its own children may keep the pipe open
             try:  # a process that ended may have answered before
                 answer = self._answers.get(timeout=_LAST_ANSWER_S if ended else min(left, _POLL_S))
             except queue.Empty:
@@ -256,12 +252,9 @@ class _Child:
 
     def kill(self) -> None:
         """End the process and its group, and wait for that."""
-        self._kill_group()
-        self._process.kill()
+        kill_group(self._process)
         self._process.wait()
-        if self._lifeline is not None:
-            os.close(self._lifeline)
-            self._lifeline = None
+        self._lifeline.close()
         for reader in self._readers:
             reader.join(_POLL_S)  # at once, unless a process that has left the group holds the pipe
         for stream, reader in zip((self._process.stdout, self._process.stderr), self._readers, strict=True):
@@ -270,11 +263,6 @@ class _Child:
         with contextlib.suppress(OSError, ValueError):
             if self._process.stdin is not None:
                 self._process.stdin.close()
-
-    def _kill_group(self) -> None:
-        if _POSIX:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
 
     def _ending(self) -> str:
         """How the process ended, after waiting for a second at most."""
@@ -306,7 +294,7 @@ class _Child:
 
 def one_line(error: BaseException) -> str:
     """An exception in one short line."""
-    return _short(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+    return _short(exception_text(error))
 
 
 def _short(text: str) -> str:
@@ -348,7 +336,7 @@ def decode(data: bytes, classes: Mapping[str, type]) -> Any:
 
 def _flat(value: object, arrays: list[NDArray[Any]]) -> object:
     if isinstance(value, np.ndarray):
-        if value.dtype.kind not in _KINDS:
+        if value.dtype.kind not in PLAIN_KINDS:
             raise TypeError(f"an array of {value.dtype} is not plain data")
         arrays.append(value)
         return {"array": len(arrays) - 1}
@@ -388,10 +376,9 @@ def send(stream: BinaryIO, data: bytes) -> None:
 
 def receive(stream: BinaryIO) -> bytes | None:
     """The next message; None at the end of the stream or for anything else."""
-    length = (
-        int.from_bytes(head, "big") if len(head := stream.read(_LENGTH_BYTES)) == _LENGTH_BYTES else _LONGEST_BYTES
-    )
-    if length >= _LONGEST_BYTES:
+    head = stream.read(_LENGTH_BYTES)
+    length = int.from_bytes(head, "big")
+    if len(head) < _LENGTH_BYTES or length >= _LONGEST_BYTES:
         return None
     data = stream.read(length)
     return data if len(data) == length else None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import io
 import json
 import os
@@ -33,9 +32,10 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import check_image_size, check_size, open_regular, read_bytes, read_text
+from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes, read_text
 from rsbench.storage.untrusted_files import load_arrays as load_arrays
 from rsbench.storage.untrusted_files import read_json as read_json
+from rsbench.storage.untrusted_files import sha256 as sha256
 from rsbench.storage.work_folder import HIDDEN, refuse_url
 
 if TYPE_CHECKING:
@@ -45,11 +45,6 @@ MATCH_SETS = ("left", "right", "stereo_0", "stereo_1", "tracks")
 _SET = 255
 """The value of set pixels of a mask."""
 POSE_COLUMNS = "row,tau,qw,qx,qy,qz,tx,ty,tz"
-
-
-def sha256(path: Path) -> str:
-    with open_regular(path) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()  # pyrefly: ignore[bad-argument-type]
 
 
 def write_bytes(path: Path, data: bytes) -> None:

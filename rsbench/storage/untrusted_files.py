@@ -9,6 +9,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import errno
+import hashlib
 import io
 import json
 import math
@@ -16,6 +17,7 @@ import os
 import re
 import stat
 import zipfile
+from collections import Counter
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -41,7 +43,8 @@ _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE
 """Names that are devices on Windows, with any suffix, and names whose last dot it drops."""
 _OPEN = re.compile(r"/dev/[^/]+|/dev/fd/\d+|/proc/[^/]+(/task/\d+)?/fd/\d+")
 """Devices and open files of a process, which may be read; not files in folders such as /dev/shm."""
-_KINDS = "biufU"
+PLAIN_KINDS = "biufU"
+"""Kinds of arrays that are plain data: truth values, numbers and text."""
 _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
 
@@ -60,11 +63,16 @@ def check_amount(where: object, what: str, amount: int, limit: int) -> None:
 
 
 def _factor() -> float:
-    text = os.environ.get(LIMITS) or "1"
+    return positive_variable(LIMITS, 1.0, ", by which all limits are multiplied")
+
+
+def positive_variable(name: str, default: float, meaning: str) -> float:
+    """A positive number in an environment variable; RsbenchError, which ends with its meaning, for other text."""
+    text = os.environ.get(name) or str(default)
     with contextlib.suppress(ValueError):
-        if math.isfinite(factor := float(text)) and factor > 0.0:
-            return factor
-    raise RsbenchError(f"{LIMITS} = {text!r}: must be a positive number, by which all limits are multiplied")
+        if math.isfinite(value := float(text)) and value > 0.0:
+            return value
+    raise RsbenchError(f"{name} = {text!r}: must be a positive number{meaning}")
 
 
 # Names and paths
@@ -142,6 +150,12 @@ def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
     return data
 
 
+def sha256(path: Path) -> str:
+    """Hash of the bytes of a regular file."""
+    with open_regular(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()  # pyrefly: ignore[bad-argument-type]
+
+
 def read_text(path: Path, limit: int = FILE_BYTES) -> str:
     """The content of a file in UTF-8, with a byte order mark or without.
 
@@ -187,8 +201,7 @@ def _keyed(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object; refuses two values for one key, with ValueError."""
     found = dict(pairs)
     if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f"the key {twice[:100]!r} stands twice in one object")
     return found
 
@@ -230,7 +243,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     stream = io.BytesIO(data)
     old = np.lib.format.read_magic(stream) == (1, 0)
     shape, _, dtype = (np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0)(stream)
-    if dtype.kind not in _KINDS:
+    if dtype.kind not in PLAIN_KINDS:
         raise ValueError(f"{member.filename} holds {dtype}, not numbers, truth values or text")
     if math.prod(shape) * dtype.itemsize > len(data):
         raise ValueError(f"{member.filename} holds {len(data)} bytes, not {shape} of {dtype}")

@@ -66,9 +66,9 @@ _BEFORE = 1.0
 
 def upright(image: Image, orientation: int) -> Image:
     """A stored image (H, W[, C]) as it is shown."""
-    a, b, c, _ = _MATRICES[orientation]
+    a, b, c, d = _MATRICES[orientation]
     turned = np.swapaxes(image, 0, 1) if a == 0 else image
-    across, down = (c, b) if a == 0 else (a, _MATRICES[orientation][3])
+    across, down = (c, b) if a == 0 else (a, d)
     return np.ascontiguousarray(turned[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
 
 
@@ -273,7 +273,8 @@ def write_frames(
 
     shown, codec, notes = named or out, _CODECS[out.suffix.lower()], list[str]()
     options = {"movflags": "+faststart"} if codec == "libx264" else {}
-    base = times.base if times is not None and codec != "mjpeg" else 1 / Fraction(fps).limit_denominator(1001)
+    times = None if codec == "mjpeg" else times
+    base = 1 / Fraction(fps).limit_denominator(1001) if times is None else times.base
     count, stream, sound, white = 0, None, iter(()), 255.0
     try:
         with av.open(str(out), mode="w", options=options) as container:
@@ -285,8 +286,7 @@ def write_frames(
                     sound = _sound(container, like, shown, notes)
                     notes += _format_notes(shown, codec, image, stream)
                 frame = _frame(image, stream, white)
-                timed = times is not None and codec != "mjpeg" and count < len(times.stamps)
-                frame.pts = times.stamps[count] if timed and times is not None else count
+                frame.pts = times.stamps[count] if times is not None and count < len(times.stamps) else count
                 frame.time_base = base
                 until = float(frame.pts * base) + _BEFORE
                 for packet in stream.encode(frame):

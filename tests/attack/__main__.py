@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from attack.stage import stage
+from attack.stage import say, stage
 
 if TYPE_CHECKING:
     from attack.arena import Arena
@@ -54,11 +54,6 @@ class Extent:
 
 LONG = Extent(kills=100, files=None, sizes=10, inputs=10_000, surroundings=None)
 SAMPLE = Extent(kills=2, files=0, sizes=1, inputs=300, surroundings=1, cases=("generate", "correct"))
-
-
-def say(text: str) -> None:
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
 
 
 def main() -> int:
@@ -172,7 +167,8 @@ def _surroundings(arena: Arena, references: dict[str, Reference], extent: Extent
 
     from attack import environment
 
-    pairs = [pair for pair in environment.every_pair() if pair[1] in (*extent.cases, "solve", "verify")]
+    commands = [name for name in environment.COMMANDS if name in (*extent.cases, "solve", "verify")]
+    pairs = [(surrounding, name) for surrounding in environment.SURROUNDINGS for name in commands]
     if extent.surroundings is not None:
         # One of strange names first, which has ended the process by a signal.
         order = np.random.default_rng([seed, len(pairs)]).permutation(len(pairs)).tolist()

@@ -78,8 +78,11 @@ class Arena:
     def work(self) -> Path:
         return self.root / "work"
 
-    def environment(self) -> dict[str, str]:
-        return {"HOME": str(self.root / "home"), "TMPDIR": str(self.root / "tmp"), "COLUMNS": "200"}
+    def environment(self, changes: Mapping[str, str | None]) -> dict[str, str]:
+        """The variables of this process, with the arena's folders, and some that are changed or (None) absent."""
+        own = {"HOME": str(self.root / "home"), "TMPDIR": str(self.root / "tmp"), "COLUMNS": "200"}
+        everything = {**os.environ, **own, **changes}
+        return {name: value for name, value in everything.items() if value is not None}
 
     def clear(self) -> None:
         """Empty what commands write."""
@@ -95,10 +98,6 @@ class Arena:
             for path in sorted(self.root.rglob("*"))
             if not any(path.is_relative_to(folder) for folder in skipped)
         }
-
-    def leftovers(self) -> list[str]:
-        """What lies in the temporary folder."""
-        return sorted(path.name for path in (self.root / "tmp").iterdir())
 
     def run(
         self,
@@ -145,10 +144,9 @@ def _become(
             os.dup2(descriptor, number)
             os.close(descriptor)
         os.chdir(arena.work)
-        for name, value in {**arena.environment(), **environment}.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+        variables = arena.environment(environment)
+        os.environ.clear()
+        os.environ.update(variables)
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # as ``main`` sets it at once
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
@@ -211,20 +209,24 @@ def _bury() -> int:
             return len(survivors)
         if not found:
             if time.monotonic() > end:
-                survivors |= (alive := _children())
-                for pid in alive:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
+                survivors |= (alive := {pid for pid, parent in parents().items() if parent == os.getpid()})
+                kill(alive)
             time.sleep(0.002)
 
 
-def _children() -> set[int]:
-    found = set()
+def parents() -> dict[int, int]:
+    """The parent of each process."""
+    found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError, IndexError):
-            if path.read_text().rpartition(")")[2].split()[1] == str(os.getpid()):
-                found.add(int(path.parent.name))
+            found[int(path.parent.name)] = int(path.read_text(errors="replace").rpartition(")")[2].split()[1])
     return found
+
+
+def kill(pids: Iterable[int]) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def _digest(path: Path) -> str:
@@ -335,8 +337,3 @@ def limit_files(size: int, deadly: bool) -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-
-
-def read_log(log: Path) -> list[str]:
-    """The operations that were counted."""
-    return log.read_text("utf-8").splitlines()

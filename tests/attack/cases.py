@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from attack.arena import Arena, Ending, Trap, contents, read_log, set_trap
+from attack.arena import Arena, Ending, Trap, contents, set_trap
 
 
 def keep_frames(folder: Path) -> None:
@@ -95,24 +95,21 @@ class Tally:
             self.faults.append(" ".join(fault.split())[:400])
 
 
-def cases(arena: Arena) -> dict[str, Case]:
-    inputs = arena.inputs
-    frames = [inputs / "data" / frame for frame in FRAMES]
-    images = ("reproduce", "images", "--out", "out/results", "--data", "out/data", "--seeds", 1)
+def commands(inputs: Path, data: Path, out: object) -> dict[str, tuple[object, ...]]:
+    """The arguments of commands whose results lie in ``out``."""
+    frames = [data / frame for frame in FRAMES]
     return {
-        case.name: case
-        for case in (
-            Case(name="generate", arguments=("generate", inputs / "tiny.toml", "--out", "out")),
-            Case(name="evaluate", arguments=("evaluate", inputs / "data", "--out", "out", "--solver", "gs-8pt")),
-            Case(
-                name="simulate",
-                arguments=("simulate", inputs / "sweep.toml", "--out", "out", "--workers", 2),
-                children=True,
-            ),
-            Case(name="correct", arguments=("correct", *frames, "--rig", inputs / "rig.toml", "--out", "out")),
-            Case(name="reproduce", arguments=images),
-        )
+        "generate": ("generate", inputs / "tiny.toml", "--out", out),
+        "evaluate": ("evaluate", data, "--out", out, "--solver", "gs-8pt"),
+        "simulate": ("simulate", inputs / "sweep.toml", "--out", out, "--workers", 2),
+        "correct": ("correct", *frames, "--rig", inputs / "rig.toml", "--out", out),
+        "reproduce": ("reproduce", "images", "--out", f"{out}/results", "--data", f"{out}/data", "--seeds", 1),
     }
+
+
+def cases(arena: Arena) -> dict[str, Case]:
+    known = commands(arena.inputs, arena.inputs / "data", "out")
+    return {name: Case(name=name, arguments=each, children=name == "simulate") for name, each in known.items()}
 
 
 def undisturbed(arena: Arena, case: Case) -> Reference:
@@ -131,7 +128,7 @@ def undisturbed(arena: Arena, case: Case) -> Reference:
         results.append((time.monotonic() - start, contents(arena.work / "out")))
     if results[0][1] != results[1][1]:
         raise RuntimeError(f"{case.name}: two runs differ in {differing(results[0][1], results[1][1])}")
-    return Reference(seconds=results[0][0], contents=results[0][1], operations=read_log(log_of(arena)))
+    return Reference(seconds=results[0][0], contents=results[0][1], operations=operations_of(arena))
 
 
 def place(arena: Arena) -> None:
@@ -150,6 +147,11 @@ def frames_of(arena: Arena) -> Path:
 
 def log_of(arena: Arena) -> Path:
     return arena.root / "home" / ".operations"
+
+
+def operations_of(arena: Arena) -> list[str]:
+    """The operations that were counted."""
+    return log_of(arena).read_text("utf-8").splitlines()
 
 
 def here(arena: Arena, case: Case, trap: Trap) -> None:

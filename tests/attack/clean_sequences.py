@@ -17,9 +17,9 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, get_args
-from unittest.mock import patch
 
 import numpy as np
+from kept_scenes import kept_scenes
 from small_scenes import write_box_scene
 
 from attack.wet_castle import WET_CASTLE
@@ -37,7 +37,7 @@ from rsbench.dataset.motion_cards import TAKEN, MovingCard
 from rsbench.renderers.image import Mosaic, Sensor
 from rsbench.scenes.load import load_scene, read_scene_card
 from rsbench.scenes.model import Scene
-from rsbench.verification import rerender, verify_dataset
+from rsbench.verification import verify_dataset
 
 MODELS = ("linear", "twist", "accelerated", "spline")
 PER_DATASET = 3
@@ -295,28 +295,12 @@ def false_alarms(
     count: int, folder: Path, seed: int = 0, chosen: SequenceOf[str] = ()
 ) -> Iterator[tuple[str, int, int, list[str]]]:
     """Of each dataset its name, how many sequences it has, motions that were refused, and what verify found."""
-    from rsbench.renderers import scene
-
-    kept: dict[object, scene.MitsubaScene] = {}
-
-    def once(seen: Scene) -> scene.MitsubaScene:
-        """The renderer's scene, which takes seconds; the light in the frame of the view tells views apart."""
-        key = seen.name, seen.light, *((m.name, m.mover, m.vertices.tobytes()) for m in seen.meshes if m.mover)
-        if key not in kept:
-            kept.clear()
-            kept[key] = made(seen)
-        return kept[key]
-
-    made, built = scene.MitsubaScene, lru_cache(maxsize=1)(load_scene)
+    built = lru_cache(maxsize=1)(load_scene)
 
     def loaded(name: str | Path) -> Scene:
         return built(card_path("scenes", name))
 
-    with (
-        patch.object(generation, "load_scene", loaded),
-        patch.object(rerender, "load_scene", loaded),
-        patch.object(scene, "MitsubaScene", once),
-    ):
+    with kept_scenes(loaded):
         for card in random_cards(count, folder, seed, chosen):
             out = folder / card.name
             refused = _generated(card, out)

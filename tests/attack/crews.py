@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import os
 import signal
 import subprocess
 import sys
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from attack.arena import GRACE_S, LIMIT_S, Arena, contents
+from attack.arena import GRACE_S, LIMIT_S, Arena, contents, kill, parents
 from attack.cases import Tally, differing, place
 from attack.tiny import SWEEP, to_toml
 
@@ -46,7 +45,7 @@ class Run:
 
     def alive(self) -> list[int]:
         """Its processes, itself too."""
-        return [pid for pid in _processes() if self.mark in _read(pid, "environ")]
+        return [pid for pid in parents() if self.mark in _read(pid, "environ")]
 
 
 @dataclass(kw_only=True)
@@ -89,8 +88,7 @@ class Cluster:
 
     def close(self) -> None:
         started = [*self.machines, *([self.scheduler] if self.scheduler else [])]
-        for pid in [pid for process in started for pid in _tree(process.pid)]:
-            _kill(pid)
+        kill([pid for process in started for pid in _tree(process.pid)])
         for process in started:
             process.wait()
 
@@ -159,7 +157,7 @@ def _crew(cluster: Cluster | None) -> tuple[object, ...]:
 
 def _start(arena: Arena, arguments: tuple[object, ...]) -> Run:
     mark, errors = f"{_MARK}={uuid.uuid4().hex}", arena.root / "home" / ".err"
-    environment = {**os.environ, **arena.environment(), _MARK: mark.partition("=")[2]}
+    environment = arena.environment({_MARK: mark.partition("=")[2]})
     command = [sys.executable, "-m", "rsbench", "--quiet", *map(str, arguments)]
     with errors.open("w") as log:
         process = subprocess.Popen(
@@ -209,7 +207,7 @@ def _disturbed(
             break
         pid = _drawn(run, cluster, rng)
         who = _name(pid, run, cluster)
-        _kill(pid)
+        kill([pid])
         deaths.append(f"{who} at {moment:.2f} s")
         tally.count(who)
         if pid == run.process.pid:
@@ -218,8 +216,7 @@ def _disturbed(
         code = run.process.wait(LIMIT_S)
     except subprocess.TimeoutExpired:
         tally.check(False, f"hung after {'; '.join(deaths)}")
-        for pid in run.alive():
-            _kill(pid)
+        kill(run.alive())
         return run.process.wait()
     if deaths:
         late = time.monotonic() + GRACE_S
@@ -256,9 +253,9 @@ def _check_end(run: Run, code: int, where: str, tally: Tally) -> None:
 
 def _tree(pid: int) -> list[int]:
     """A process and all below it."""
-    found, parents = [pid], {other: _parent(other) for other in _processes()}
+    found, known = [pid], parents()
     for member in found:
-        found += [other for other, parent in parents.items() if parent == member]
+        found += [other for other, parent in known.items() if parent == member]
     return found
 
 
@@ -267,23 +264,9 @@ def _end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
 
 
-def _processes() -> list[int]:
-    return [int(path.name) for path in Path("/proc").glob("[0-9]*")]
-
-
-def _parent(pid: int) -> int:
-    fields = _read(pid, "stat").rpartition(")")[2].split()
-    return int(fields[1]) if fields else 0
-
-
 def _read(pid: int, name: str) -> str:
     """A file of a process, which may be gone."""
     try:
         return Path(f"/proc/{pid}/{name}").read_text(errors="replace")
     except OSError:
         return ""
-
-
-def _kill(pid: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from attack.arena import Arena, contents
-from attack.cases import FRAMES, Tally, differing
+from attack.cases import Tally, commands, differing
 from attack.tiny import ROOT
 
 LIMIT_S = 300.0
@@ -107,10 +107,6 @@ def attack(arena: Arena, expected: dict[str, dict[str, str]], pairs: list[tuple[
     return tally
 
 
-def every_pair() -> list[tuple[Surrounding, str]]:
-    return [(surrounding, command) for surrounding in SURROUNDINGS for command in COMMANDS]
-
-
 @contextmanager
 def _surrounded(arena: Arena, surrounding: Surrounding) -> Iterator[None]:
     for base in (arena.work, arena.inputs) if surrounding.folder else ():
@@ -130,26 +126,15 @@ def _surrounded(arena: Arena, surrounding: Surrounding) -> Iterator[None]:
             shutil.rmtree(arena.inputs / surrounding.folder)
 
 
-def _arguments(command: str, data: Path, inputs: Path, out: Path) -> list[str]:
-    frames = [data / frame for frame in FRAMES]
-    words: dict[str, list[object]] = {
-        "generate": ["generate", inputs / "tiny.toml", "--out", out],
-        "evaluate": ["evaluate", data, "--out", out, "--solver", "gs-8pt"],
-        "simulate": ["simulate", inputs / "sweep.toml", "--out", out, "--workers", 1],
-        "correct": ["correct", *frames, "--rig", inputs / "rig.toml", "--out", out],
-        "solve": ["solve", ROOT / "examples" / "problem.json", "--json"],
-        "verify": ["verify", data],
-    }
-    return list(map(str, words[command]))
-
-
 def _attempt(
     arena: Arena, surrounding: Surrounding, command: str, expected: dict[str, str] | None, tally: Tally
 ) -> None:
     work, data = arena.work / surrounding.folder, arena.inputs / surrounding.folder / "data"
     out, where = work / "out", f"{surrounding.name}: {command}"
     outside = arena.outside(out)
-    code, err = _run(arena, surrounding, _arguments(command, data, arena.inputs, out), work)
+    known = commands(arena.inputs, data, out)
+    known |= {"solve": ("solve", ROOT / "examples" / "problem.json", "--json"), "verify": ("verify", data)}
+    code, err = _run(arena, surrounding, list(map(str, known[command])), work)
     tally.count("runs")
     tally.count(f"exit code {code}")
     tally.check(code != -9, f"{where}: hung")
@@ -170,12 +155,6 @@ def _attempt(
 
 
 def _run(arena: Arena, surrounding: Surrounding, arguments: list[str], folder: Path) -> tuple[int, str]:
-    environment: dict[str, str] = dict(os.environ)
-    for name, value in {**arena.environment(), **surrounding.environment}.items():
-        environment.pop(name, None)
-        if value is not None:
-            environment[name] = value
-
     def first() -> None:
         if os.geteuid() == 0 and surrounding.locked:
             ctypes.CDLL(None).prctl(_CAPBSET_DROP, _DAC_OVERRIDE, 0, 0, 0)
@@ -186,7 +165,7 @@ def _run(arena: Arena, surrounding: Surrounding, arguments: list[str], folder: P
         result = subprocess.run(
             [sys.executable, "-m", "rsbench", "--quiet", *arguments],
             cwd=folder,
-            env=environment,
+            env=arena.environment(surrounding.environment),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=LIMIT_S,

@@ -19,8 +19,8 @@ from functools import partial
 
 import numpy as np
 
-from attack.arena import Arena, Ending, Trap, contents, limit_files, read_log
-from attack.cases import Case, Reference, Tally, differing, here, log_of, place, problem_of
+from attack.arena import Arena, Ending, Trap, contents, limit_files
+from attack.cases import Case, Reference, Tally, differing, here, operations_of, place, problem_of
 
 CHAIN = 4
 """Deaths after which a command is let alone."""
@@ -60,6 +60,7 @@ def attack(arena: Arena, case: Case, reference: Reference, rng: np.random.Genera
             tally.check(not lost, f"{where}: changed outside --out: {sorted(lost)[:5]}")
         alone = None if whole else partial(here, arena, case, Trap())  # what it would render is known
         ending = arena.run(("--quiet", *case.arguments), before=alone)
+        tally.count("resumed")
         _check_resumed(arena, ending, reference, tally, before, f"{case.name}, after {'; '.join(deaths)}")
     tally.count("kills", kills)
     return tally
@@ -101,17 +102,15 @@ def _check_death(tally: Tally, death: Death, ending: Ending, where: str) -> None
 def _check_resumed(
     arena: Arena, ending: Ending, reference: Reference, tally: Tally, before: dict[str, str], where: str
 ) -> None:
-    tally.count("resumed")
     problem = problem_of(ending)
     tally.check(
         ending.code == 0 and not problem, f"{where}, resumed: exit code {ending.code}, {problem or ending.err}"
     )
-    if ending.code:
-        return
-    found = contents(arena.work / "out")
-    tally.check(
-        found == reference.contents, f"{where}, resumed: differs in {differing(found, reference.contents)}"
-    )
+    if ending.code == 0:
+        found = contents(arena.work / "out")
+        tally.check(
+            found == reference.contents, f"{where}, resumed: differs in {differing(found, reference.contents)}"
+        )
     now = arena.outside(arena.work / "out")
     tally.check(now == before, f"{where}, resumed: outside --out: {differing(now, before)}")
 
@@ -130,7 +129,7 @@ def attack_files(
     place(arena)
     _run(arena, case, Trap())
     _run(arena, case, Trap())
-    again = _first_of_each(read_log(log_of(arena)), case)
+    again = _first_of_each(operations_of(arena), case)
     for number in _some(again, rng, count):
         _attempt(arena, case, reference, tally, number, finished=True)
     for size in rng.integers(1, 20000, sizes).tolist():
@@ -183,7 +182,7 @@ def _check(
 ) -> None:
     outside = arena.outside(arena.work / "out")
     ending = arena.run(("--quiet", *case.arguments), before=before)
-    operations = read_log(log_of(arena))
+    operations = operations_of(arena)
     where = text if number is None else f"{text} ({operations[number - 1].replace(str(arena.root), '')})"
     tally.count("failed operations")
     tally.count(f"exit code {ending.code}")
@@ -196,13 +195,4 @@ def _check(
     if finished or ending.code == 0:
         lost = {name: digest for name, digest in reference.contents.items() if found.get(name) != digest}
         tally.check(not lost, f"{where}, exit code {ending.code}: lost or changed {sorted(lost)[:5]}")
-    resumed = _run(arena, case, Trap())
-    problem = problem_of(resumed) or resumed.err
-    tally.check(resumed.code == 0, f"{where}, resumed: exit code {resumed.code}, {problem}")
-    if resumed.code == 0:
-        found = contents(arena.work / "out")
-        tally.check(
-            found == reference.contents, f"{where}, resumed: differs in {differing(found, reference.contents)}"
-        )
-    now = arena.outside(arena.work / "out")
-    tally.check(now == outside, f"{where}, resumed: outside --out: {differing(now, outside)}")
+    _check_resumed(arena, _run(arena, case, Trap()), reference, tally, outside, where)

@@ -13,7 +13,7 @@ import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,21 +29,7 @@ _NUMBERS = (
     b"0 -1 1 2 3 255 65535 65536 2147483647 4294967295 99999999999999999999 "
     b"1e308 -1e308 1e-320 5e-324 1e-170 1e200 nan inf"
 ).split()
-_WORDS = (
-    *_NUMBERS,
-    b"-inf",
-    b"NaN",
-    b"null",
-    b"true",
-    b'"x"',
-    b"''",
-    b"[]",
-    b"{}",
-    b"1e999",
-    b"0x10",
-    b"1_0",
-    b"\xff",
-)
+_WORDS = (*_NUMBERS, *b"-inf NaN null true \"x\" '' [] {} 1e999 0x10 1_0 \xff".split())
 _INTEGERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 100_000_000)
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?")
 
@@ -281,16 +267,11 @@ def _cards(inputs: Path, folder: Path) -> Iterator[Loader]:
     for kind, load in readers.items():
         cards = ROOT / kind if (ROOT / kind).is_dir() else ROOT / "cards" / kind
         seeds = [path.read_bytes() for path in sorted(cards.glob("*.toml"))]
-        if kind in ("scenes", "datasets", "sweeps"):
-            seeds.append(
-                (
-                    inputs / {"scenes": "box.toml", "datasets": "tiny.toml", "sweeps": "sweep.toml"}[kind]
-                ).read_bytes()
-            )
+        own = {"scenes": "box.toml", "datasets": "tiny.toml", "sweeps": "sweep.toml"}
+        seeds += [(inputs / own[kind]).read_bytes()] if kind in own else []
         yield _toml(f"{kind} card", _place(folder, kind) / "card.toml", seeds, load)
-    yield _toml(
-        "rig card", _place(folder, "rig") / "rig.toml", [(inputs / "rig.toml").read_bytes()], read_rig_card
-    )
+    rig = (inputs / "rig.toml").read_bytes()
+    yield _toml("rig card", _place(folder, "rig") / "rig.toml", [rig], read_rig_card)
 
 
 def _toml(name: str, path: Path, seeds: list[bytes], load: Callable[[Path], object]) -> Loader:
@@ -298,10 +279,13 @@ def _toml(name: str, path: Path, seeds: list[bytes], load: Callable[[Path], obje
     return Loader(name=name, path=path, seeds=tuple(seeds), load=load, trees=trees, write=to_toml)
 
 
-def _json(name: str, path: Path, load: Callable[[Path], object], slow: bool = False) -> Loader:
+def _file(name: str, path: Path, load: Callable[[Path], object], **more: Any) -> Loader:
     """One whose valid file lies at its path."""
-    seed = path.read_bytes()
-    return Loader(name=name, path=path, seeds=(seed,), load=load, trees=(json.loads(seed),), slow=slow)
+    return Loader(name=name, path=path, seeds=(path.read_bytes(),), load=load, **more)
+
+
+def _json(name: str, path: Path, load: Callable[[Path], object], **more: Any) -> Loader:
+    return _file(name, path, load, trees=(json.loads(path.read_bytes()),), **more)
 
 
 def _place(folder: Path, name: str) -> Path:
@@ -319,21 +303,16 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
     data = folder / "data"
     shutil.copytree(inputs / "data", data)
     huge = _many_names(json.loads((data / "dataset.json").read_bytes()))
-    manifest = _json(
-        "dataset.json", data / "dataset.json", lambda path: _inside(read_dataset(path.parent), path.parent)
-    )
-    yield replace(manifest, huge=huge)
+
+    def read(path: Path) -> None:
+        _inside(read_dataset(path.parent), path.parent)
+
+    yield _json("dataset.json", data / "dataset.json", read, huge=huge)
     for number, name in enumerate(VERIFIED):
         path = folder / f"verified-{number}" / name
         shutil.copytree(inputs / "data", folder / f"verified-{number}")
-        yield Loader(
-            name=f"verify {name}",
-            path=path,
-            seeds=(path.read_bytes(),),
-            load=partial(_verify, folder / f"verified-{number}"),
-            huge=huge if name == "dataset.json" else (),
-            slow=True,
-        )
+        verify, many = partial(_verify, folder / f"verified-{number}"), huge if name == "dataset.json" else ()
+        yield _file(f"verify {name}", path, verify, huge=many, slow=True)
     data = folder / "sequence"
     shutil.copytree(inputs / "data" / "one", data)
     yield _json("sequence.json", data / "sequence.json", lambda path: read_sequence(path.parent))
@@ -349,11 +328,9 @@ def _datasets(inputs: Path, folder: Path) -> Iterator[Loader]:
     for suffix in (".hdr", ".exr"):
         path = files / f"sky{suffix}"
         yield Loader(name=f"environment {suffix}", path=path, seeds=(_sky(path),), load=read_environment)
-    matches = _matches()
-    yield Loader(
-        name="matches", path=files / "matches.npz", seeds=(matches,), load=load_matches, change=mutated_npz
-    )
-    yield Loader(name="arrays", path=files / "arrays.npz", seeds=(matches,), load=load_arrays, change=mutated_npz)
+    for name, load in (("matches", load_matches), ("arrays", load_arrays)):
+        _write_matches(files / f"{name}.npz")
+        yield _file(name, files / f"{name}.npz", load, change=mutated_npz)
 
 
 def _verify(data: Path, path: Path) -> None:
@@ -397,13 +374,9 @@ def _inside(sequences: list[Any], folder: Path) -> None:
             raise AssertionError(f"sequence {sequence.name!r} lies in {sequence.folder}")
 
 
-def _matches() -> bytes:
-    import numpy as np
-
-    buffer = io.BytesIO()
+def _write_matches(path: Path) -> None:
     sets: dict[str, Any] = {name: np.ones((3, 4)) for name in ("left", "right", "stereo_0", "stereo_1")}
-    np.savez_compressed(buffer, **sets, tracks=np.ones((2, 8)))
-    return buffer.getvalue()
+    np.savez_compressed(path, **sets, tracks=np.ones((2, 8)))
 
 
 def _meshes(inputs: Path, folder: Path) -> Iterator[Loader]:
@@ -429,8 +402,6 @@ def _meshes(inputs: Path, folder: Path) -> Iterator[Loader]:
 
 
 def _problems(folder: Path) -> Iterator[Loader]:
-    import numpy as np
-
     from rsbench.core.errors import RsbenchError
     from rsbench.pipeline.problem import read_problems
 
@@ -454,17 +425,9 @@ def _problems(folder: Path) -> Iterator[Loader]:
     )
     camera = tree.pop("camera")
     arrays: dict[str, Any] = {key: np.array(value) for key, value in tree.items() if not isinstance(value, dict)}
-    buffer = io.BytesIO()
-    np.savez(
-        buffer, camera=np.array([camera[key] for key in ("width", "height", "fx", "fy", "cx", "cy")]), **arrays
-    )
-    yield Loader(
-        name="problem npz",
-        path=place / "problem.npz",
-        seeds=(buffer.getvalue(),),
-        load=read,
-        change=mutated_npz,
-    )
+    arrays["camera"] = np.array([camera[key] for key in ("width", "height", "fx", "fy", "cx", "cy")])
+    np.savez(place / "problem.npz", **arrays)
+    yield _file("problem npz", place / "problem.npz", read, change=mutated_npz)
 
 
 def _answers(folder: Path) -> Loader:
@@ -546,18 +509,8 @@ def _results(inputs: Path, results: dict[str, Path], folder: Path) -> Iterator[L
         shutil.copytree(results[source], target)
     yield _json("sweep.json", sweep / "sweep.json", lambda path: read_card(path.parent))
     trials = next((folder / "trials" / "trials").glob("*.npz"))
-    yield Loader(
-        name="trials",
-        path=trials,
-        seeds=(trials.read_bytes(),),
-        load=lambda path: summarise_sweep(path.parents[1]),
-        change=mutated_npz,
-        slow=True,
-    )
-    pose = tables / "scores" / "pose.csv"
-    yield Loader(
-        name="scores", path=pose, seeds=(pose.read_bytes(),), load=lambda p: read_scores(p.parents[1], "pose")
-    )
+    yield _file("trials", trials, lambda path: summarise_sweep(path.parents[1]), change=mutated_npz, slow=True)
+    yield _file("scores", tables / "scores" / "pose.csv", lambda p: read_scores(p.parents[1], "pose"))
     yield _json("columns.json", tables / "scores" / "columns.json", lambda p: read_headings(p.parents[1], "pose"))
     evaluated = folder / "evaluated"
     shutil.copytree(results["evaluate"], evaluated)
@@ -593,17 +546,7 @@ def _predictions(inputs: Path, evaluation: Path, folder: Path) -> Iterator[Loade
     below = places.folder
     yield _json("motion record", below / "motion" / "gs-8pt.json", score, slow=True)
     yield _json("seconds", below / "seconds.json", score, slow=True)
-    for name, paths in (
-        ("correction record", (below / "corrected").glob("*.json")),
-        ("depth record", (below / "depth").glob("*.json")),
-    ):
-        yield _json(name, sorted(paths)[0], score, slow=True)
-    disparity = sorted((below / "depth").glob("*.npz"))[0]
-    yield Loader(
-        name="disparity",
-        path=disparity,
-        seeds=(disparity.read_bytes(),),
-        load=score,
-        change=mutated_npz,
-        slow=True,
-    )
+    for name, part in (("correction record", "corrected"), ("depth record", "depth")):
+        yield _json(name, min((below / part).glob("*.json")), score, slow=True)
+    disparity = min((below / "depth").glob("*.npz"))
+    yield _file("disparity", disparity, score, change=mutated_npz, slow=True)

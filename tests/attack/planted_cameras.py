@@ -15,7 +15,7 @@ import frame_faults
 import numpy as np
 from numpy.typing import NDArray
 
-from attack.planted_faults import depth_faults, image_faults, scene_of_victim, twin_at
+from attack.planted_faults import depth_faults, every_depth, image_faults, rendered_as, twin_at
 from attack.planting import (
     RNG,
     VICTIM,
@@ -24,6 +24,7 @@ from attack.planting import (
     depth_of,
     drop,
     image_of,
+    in_victim,
     manifest_of,
     noised,
     other_geometry,
@@ -36,19 +37,18 @@ from attack.planting import (
     times,
 )
 from attack.wet_castle import WET_CASTLE
-from rsbench.components.cards import load_card, parse_card
+from rsbench.components.cards import parse_card
 from rsbench.components.rig_tables import RigTables, tables_of
 from rsbench.core import so3
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import row_poses
-from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
 from rsbench.dataset.sequence import Sequence, read_sequence
 from rsbench.dataset.timing import write_timing
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.renderers.image import Sensor, compressed, expose, linear_of_codes, processed, rows_needed
-from rsbench.renderers.options import RendererOptions
 from rsbench.storage.files import (
     read_depth,
     read_mask,
@@ -346,16 +346,15 @@ def _seen_without_lens(sequence: Sequence, values: NDArray[Any], interpolation: 
     return np.ascontiguousarray(moved, dtype=values.dtype)
 
 
-def _image_without_lens(folder: Path) -> None:
-    sequence = read_sequence(folder / VICTIM)
-    path = sequence.folder / "rs/left_0.png"
-    write_png(path, _seen_without_lens(sequence, read_png(path), cv2.INTER_LINEAR, cv2.BORDER_REFLECT))
+def _without_its_lens(file: str, interpolation: int, border: int) -> Plant:
+    read, write = (read_png, write_png) if file.endswith(".png") else (read_depth, write_depth)
 
+    def plant(folder: Path) -> None:
+        sequence = read_sequence(folder / VICTIM)
+        values = _seen_without_lens(sequence, read(sequence.folder / file), interpolation, border)
+        write(sequence.folder / file, values)
 
-def _depth_without_lens(folder: Path) -> None:
-    sequence = read_sequence(folder / VICTIM)
-    path = sequence.folder / "gs_depth/right_0.exr"
-    write_depth(path, _seen_without_lens(sequence, read_depth(path), cv2.INTER_NEAREST, cv2.BORDER_REPLICATE))
+    return plant
 
 
 def _along_the_ray(folder: Path) -> None:
@@ -404,29 +403,6 @@ def _times_as(change: Callable[[Sequence], Sequence], names: tuple[str, ...]) ->
     return plant
 
 
-def _rendered_as(change: Callable[[Sequence], Sequence], shutter: str, view: tuple[Any, int]) -> Plant:
-    """Image and depth of one view as another rig, shutter or motion makes them."""
-
-    def plant(folder: Path) -> None:
-        from rsbench.renderers.image import to_srgb8
-        from rsbench.renderers.render import LinePoses, render
-
-        home = folder / VICTIM
-        sequence = change(read_sequence(home))
-        side, frame = view
-        R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
-        if shutter == "gs":
-            line = sequence.shutter.first_line(side)
-            R, t = np.broadcast_to(R[line], R.shape), np.broadcast_to(t[line], t.shape)
-        options = load_card(RendererOptions, "renderers", "preview")
-        columns = sequence.shutter.axis(side) == 0
-        seen = render(scene_of_victim(), sequence.rig.sensor(side), LinePoses(R, t, columns=columns), options)
-        write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
-        write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
-
-    return plant
-
-
 def _lens_faults() -> Iterator[Fault]:
     own, geometry = f"{VICTIM}/sequence.json", ("sequence.json", "pairs of depth maps disagree", "camera")
     yield Fault("no lens everywhere", other_geometry(_without_lens), geometry)
@@ -444,11 +420,13 @@ def _lens_faults() -> Iterator[Fault]:
         manifest_of("dataset.json", put("card", "camera", "lens", "k2", 0.0)),
         ("sequence.json", "camera", "the card"),
     )
-    yield Fault("image without the lens", _image_without_lens, ("rs/left_0.png", "other colours"))
-    yield Fault("depth without the lens", _depth_without_lens, ("gs_depth/right_0.exr", "differs"))
+    image = _without_its_lens("rs/left_0.png", cv2.INTER_LINEAR, cv2.BORDER_REFLECT)
+    yield Fault("image without the lens", image, ("rs/left_0.png", "other colours"))
+    depth = _without_its_lens("gs_depth/right_0.exr", cv2.INTER_NEAREST, cv2.BORDER_REPLICATE)
+    yield Fault("depth without the lens", depth, ("gs_depth/right_0.exr", "differs"))
     yield Fault("depth along the ray", _along_the_ray, ("rs_depth/right_1.exr", "along the ray"))
     yield Fault("flow of ideal pixels", _flow_of_ideal_pixels, ("flow/left_0.exr", "differ from what depth"))
-    seen = _rendered_as(_without_lens, "rs", ("right", 1))
+    seen = rendered_as(_without_lens, "rs", ("right", 1))
     yield Fault("frame without the lens", seen, ("rs_depth/right_1.exr", "differs"), slow=True)
 
 
@@ -484,7 +462,7 @@ def _column_faults() -> Iterator[Fault]:
     words = ("gs_depth/left_1.exr", "global shutter at the pose of line 127")
     yield Fault("twin at the pose of the last column", twin_at(127), words, slow=True)
     for change, word in ((_read(scan="right"), "scan"), (_read(scan="top"), "rows")):
-        seen = _rendered_as(change, "rs", ("left", 0))
+        seen = rendered_as(change, "rs", ("left", 0))
         yield Fault(f"frame of another {word}", seen, ("rs_depth/left_0.exr", "differs"), slow=True)
 
 
@@ -527,7 +505,7 @@ def _late_faults() -> Iterator[Fault]:
     words = ("gs_depth/left_1.exr", "global shutter at the pose of line 95")
     yield Fault("twin at the pose of the top row", twin_at(0), words, slow=True)
     for shutter in ("rs", "gs"):
-        file, seen = f"{shutter}_depth/right_0.exr", _rendered_as(at_once, shutter, ("right", 0))
+        file, seen = f"{shutter}_depth/right_0.exr", rendered_as(at_once, shutter, ("right", 0))
         yield Fault(f"{shutter} frame without the delay", seen, (file, "differs"), slow=True)
 
 
@@ -545,7 +523,7 @@ def _opposite_faults() -> Iterator[Fault]:
         _poses_as(_read(right_scan=None), ("right", 0)),
         ("poses/right_0.csv", "differs"),
     )
-    seen = _rendered_as(_read(right_scan=None), "rs", ("right", 0))
+    seen = rendered_as(_read(right_scan=None), "rs", ("right", 0))
     yield Fault("right frame from the top", seen, ("rs_depth/right_0.exr", "differs"), slow=True)
 
 
@@ -645,10 +623,10 @@ def _rig_file_faults() -> Iterator[Fault]:
     yield Fault("times of the left camera", _times_as(at_once, (table,)), (table, "time_ns"))
     exchange = swapped(("rs/left_0.png", "rs/right_0.png"))
     yield Fault("left and right images exchanged", exchange, ("rs/left_0.png", "is 144 x 88 pixels"))
-    seen = _rendered_as(at_once, "rs", ("right", 1))
+    seen = rendered_as(at_once, "rs", ("right", 1))
     words = ("rs_depth/right_1.exr", "looks read at the times of the other camera's lines")
     yield Fault("frame at the left camera's times", seen, words, slow=True)
-    ahead = _rendered_as(_rig_with(turn=np.eye(3)), "gs", ("right", 0))
+    ahead = rendered_as(_rig_with(turn=np.eye(3)), "gs", ("right", 0))
     yield Fault("twin of a camera that looks ahead", ahead, ("gs_depth/right_0.exr", "differs"), slow=True)
 
 
@@ -663,13 +641,7 @@ def _thin_faults() -> Iterator[Fault]:
             ("left to right", _but_first_line("left", "thin", np.fliplr)),
         ):
             yield Fault(f"{file} {name}", depth_of("rs", view, change), (file, "differs"))
-    every = _all(
-        *(
-            depth_of(shutter, f"{side}_{frame}", noised(1e-2, slice(None)))
-            for shutter in ("rs", "gs")
-            for side, frame in VIEWS
-        )
-    )
+    every = every_depth(noised(1e-2, slice(None)))
     yield Fault("noise in every depth map", every, ("gs_depth/left_0.exr", "new rendering"), rendered=True)
     late = swapped(("gs_depth/left_0.exr", "gs_depth/left_1.exr"))
     yield Fault("frames exchanged", late, ("gs_depth/left_0.exr", "looks like gs_depth/left_1.exr"))
@@ -678,11 +650,7 @@ def _thin_faults() -> Iterator[Fault]:
 def _frame_faults() -> Iterator[Fault]:
     """In channels of whole sequences, beyond the first two frames."""
     for name, (plant, words) in frame_faults.FAULTS.items():
-        yield Fault(f"frames: {name}", _in_victim(plant), words)
-
-
-def _in_victim(plant: Plant) -> Plant:
-    return lambda folder: plant(folder / VICTIM)
+        yield Fault(f"frames: {name}", in_victim(plant), words)
 
 
 CAMERA_FAULTS: dict[str, tuple[Fault, ...]] = {

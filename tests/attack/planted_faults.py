@@ -96,8 +96,8 @@ def depth_faults() -> Iterator[Fault]:
     yield Fault(
         "patch of 1.001", depth_of("gs", "left_0", times(1.001, slice(60, 80), slice(40, 64))), (gs, "rows 6")
     )
-    yield Fault("GS depth is RS depth", copied(f"{VICTIM}/{rs}", gs), (gs, f"the same as {rs}"))
-    yield Fault("RS depth is GS depth", copied(f"{VICTIM}/{gs}", rs), (rs, f"the same as {gs}"))
+    yield Fault("GS depth is RS depth", copied(f"{VICTIM}/{rs}", f"{VICTIM}/{gs}"), (gs, f"the same as {rs}"))
+    yield Fault("RS depth is GS depth", copied(f"{VICTIM}/{gs}", f"{VICTIM}/{rs}"), (rs, f"the same as {gs}"))
     yield Fault("RS and GS depth exchanged", swapped((rs, gs)), ("depth/left_0.exr", "looks like"))
     yield Fault(
         "depth left and right exchanged",
@@ -107,14 +107,14 @@ def depth_faults() -> Iterator[Fault]:
     yield Fault(
         "depth of frames exchanged", swapped((gs, "gs_depth/left_1.exr")), (gs, "looks like gs_depth/left_1.exr")
     )
-    yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", rs), (rs, "differs"))
+    yield Fault("depth of another sequence", copied(f"{OTHER}/{rs}", f"{VICTIM}/{rs}"), (rs, "differs"))
     for row in (48, 95):
         words = ("gs_depth/left_1.exr", f"global shutter at the pose of line {row}")
         yield Fault(f"twin at the pose of row {row}", twin_at(row), words, slow=True)
-    yield Fault("every depth scaled by 1.02", _every_depth(times(1.02)), ("depth/",))
+    yield Fault("every depth scaled by 1.02", every_depth(times(1.02)), ("depth/",))
     words = ("depth/", "scaled by 1.0002")
-    yield Fault("every depth scaled by 1.0002", _every_depth(times(1.0002)), words, rendered=True)
-    yield Fault("noise in every depth", _every_depth(noised(1e-3, slice(None))), ("depth/", "can be compared"))
+    yield Fault("every depth scaled by 1.0002", every_depth(times(1.0002)), words, rendered=True)
+    yield Fault("noise in every depth", every_depth(noised(1e-3, slice(None))), ("depth/", "can be compared"))
 
 
 @lru_cache(maxsize=1)
@@ -125,26 +125,37 @@ def scene_of_victim(name: str = VICTIM) -> Any:
     return MitsubaScene(scene.seen_from(scene.viewpoints["default"]))
 
 
-def twin_at(row: int) -> Plant:
-    """The global-shutter twin, image and depth, at the pose of another row."""
+def rendered_as(
+    change: Callable[[Sequence], Sequence], shutter: str, view: tuple[Any, int], line: int | None = None
+) -> Plant:
+    """Image and depth of one view as another rig, shutter or motion makes them; a twin at the pose of a line."""
 
     def plant(folder: Path) -> None:
         from rsbench.renderers.image import to_srgb8
-        from rsbench.renderers.render import render_global
+        from rsbench.renderers.render import LinePoses, render
 
-        sequence = read_sequence(folder / VICTIM)
-        poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, "left", 1)
-        options = load_card(RendererOptions, "renderers", "preview")
-        name = sequence.manifest["scene"]["name"]
+        home, (side, frame) = folder / VICTIM, view
+        sequence = change(read_sequence(home))
+        R, t = row_poses(sequence.rig, sequence.shutter, sequence.motion, side, frame)
+        if shutter == "gs":
+            at = sequence.shutter.first_line(side) if line is None else line
+            R, t = np.broadcast_to(R[at], R.shape), np.broadcast_to(t[at], t.shape)
+        options, name = load_card(RendererOptions, "renderers", "preview"), sequence.manifest["scene"]["name"]
         scene = scene_of_victim(str(WET_CASTLE) if name == "wet-castle" else name)
-        frame = render_global(scene, sequence.rig.camera, poses.R[row], poses.t[row], options)
-        write_png(sequence.folder / "gs/left_1.png", to_srgb8(frame.image, options.exposure))
-        write_depth(sequence.folder / "gs_depth/left_1.exr", frame.depth)
+        poses = LinePoses(R, t, columns=sequence.shutter.axis(side) == 0)
+        seen = render(scene, sequence.rig.sensor(side), poses, options)
+        write_png(home / shutter / f"{side}_{frame}.png", to_srgb8(seen.image, options.exposure))
+        write_depth(home / f"{shutter}_depth" / f"{side}_{frame}.exr", seen.depth)
 
     return plant
 
 
-def _every_depth(change: Callable[[Any], Any]) -> Plant:
+def twin_at(line: int) -> Plant:
+    """The global-shutter twin, image and depth, at the pose of another line."""
+    return rendered_as(lambda sequence: sequence, "gs", ("left", 1), line)
+
+
+def every_depth(change: Callable[[Any], Any]) -> Plant:
     def plant(folder: Path) -> None:
         for shutter in ("rs", "gs"):
             for side, frame in VIEWS:
@@ -199,14 +210,14 @@ def image_faults() -> Iterator[Fault]:
     yield Fault("all frames exchanged", swapped(*frames), (".png", "other colours"))
     yield Fault(
         "GS image is RS image",
-        copied(f"{VICTIM}/rs/left_0.png", "gs/left_0.png"),
+        copied(f"{VICTIM}/rs/left_0.png", f"{VICTIM}/gs/left_0.png"),
         ("gs/left_0.png", "the same as rs/left_0.png"),
     )
     for shutter in ("rs", "gs"):
         file = f"{shutter}/left_1.png"
         yield Fault(
             f"{shutter} image of another sequence",
-            copied(f"{OTHER}/{file}", file),
+            copied(f"{OTHER}/{file}", f"{VICTIM}/{file}"),
             (file, f"the same as {OTHER}/{file}"),
         )
     blurred = below_row_0(lambda image: cv2.GaussianBlur(image, (0, 0), 0.8))

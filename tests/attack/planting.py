@@ -122,9 +122,14 @@ def image_of(shutter: str, view: str, change: Callable[[NDArray[np.uint8]], NDAr
     return plant
 
 
+def in_victim(plant: Plant) -> Plant:
+    """The same for the folder of the one sequence."""
+    return lambda folder: plant(folder / VICTIM)
+
+
 def copied(source: str, target: str) -> Plant:
     def plant(folder: Path) -> None:
-        shutil.copyfile(folder / source, folder / VICTIM / target)
+        shutil.copyfile(folder / source, folder / target)
 
     return plant
 
@@ -140,10 +145,10 @@ def removed(place: str) -> Plant:
     return lambda folder: (folder / place).unlink()
 
 
-def swapped(*pairs: tuple[str, str]) -> Plant:
+def exchanged(*pairs: tuple[str, str]) -> Plant:
     def plant(folder: Path) -> None:
         for one, other in pairs:
-            a, b = (folder / VICTIM / each for each in (one, other))
+            a, b = folder / one, folder / other
             kept = a.read_bytes()
             a.write_bytes(b.read_bytes())
             b.write_bytes(kept)
@@ -151,21 +156,30 @@ def swapped(*pairs: tuple[str, str]) -> Plant:
     return plant
 
 
-def poses_of(view: str, change: Callable[[list[list[str]]], list[list[str]]]) -> Plant:
-    """``change`` takes and gives the lines of the file, header first, split at commas."""
+def swapped(*pairs: tuple[str, str]) -> Plant:
+    return in_victim(exchanged(*pairs))
+
+
+Lines = list[list[str]]
+
+
+def table_of(file: str, change: Callable[[Lines], Lines]) -> Plant:
+    """``change`` takes and gives the lines of a CSV file, header first, split at commas."""
 
     def plant(folder: Path) -> None:
-        path = folder / VICTIM / f"poses/{view}.csv"
+        path = folder / file
         lines = [line.split(",") for line in path.read_text().splitlines()]
         path.write_text("\n".join(",".join(line) for line in change(lines)) + "\n")
 
     return plant
 
 
-def rows_scaled(
-    columns: slice, factor: float, rows: slice = slice(1, None)
-) -> Callable[[list[list[str]]], list[list[str]]]:
-    def change(lines: list[list[str]]) -> list[list[str]]:
+def poses_of(view: str, change: Callable[[Lines], Lines]) -> Plant:
+    return table_of(f"{VICTIM}/poses/{view}.csv", change)
+
+
+def rows_scaled(columns: slice, factor: float, rows: slice = slice(1, None)) -> Callable[[Lines], Lines]:
+    def change(lines: Lines) -> Lines:
         for line in lines[rows]:
             line[columns] = [repr(factor * float(value)) for value in line[columns]]
         return lines
@@ -173,15 +187,17 @@ def rows_scaled(
     return change
 
 
-def cell(row: int, column: int, value: str) -> Callable[[list[list[str]]], list[list[str]]]:
-    def change(lines: list[list[str]]) -> list[list[str]]:
-        lines[row][column] = value
+def cell(line: int, column: int, value: str) -> Callable[[Lines], Lines]:
+    """Line 1 is that of row 0."""
+
+    def change(lines: Lines) -> Lines:
+        lines[line][column] = value
         return lines
 
     return change
 
 
-def renumbered(lines: list[list[str]]) -> list[list[str]]:
+def renumbered(lines: Lines) -> Lines:
     return [lines[0], *([str(row), *line[1:]] for row, line in enumerate(lines[1:]))]
 
 

@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from small_scenes import SCENE, write_box_scene
+from small_scenes import DATASET, write_box_scene
 
 ROOT = Path(__file__).parents[2]
 LINKED = ("rsbench", "docs", "examples")
@@ -54,23 +54,8 @@ def write_inputs(folder: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(RIG, "utf-8")
     scene = write_box_scene(folder, "box")
-    motion = {
-        "rotation_deg": 1.5,
-        "rotation_axis": [0.4, 1.0, -0.6],
-        "translation": 0.2,
-        "translation_axis": [-0.7, 0.3, -0.6],
-    }
-    card = {
-        "name": "tiny",
-        "baseline": 0.3,
-        "readout_ratio": 0.8,
-        "renderer": "preview",
-        "seed": 1,
-        "camera": CAMERA,
-        "motion": motion,
-        "sequence": [{"name": name, "scene": str(scene)} for name in ("one", "two")],
-    }
-    (folder / "tiny.toml").write_text(to_toml(card), "utf-8")
+    sequences = [f'[[sequence]]\nname = "{name}"\nscene = "{scene}"\n' for name in ("one", "two")]
+    (folder / "tiny.toml").write_text("\n".join([DATASET, *sequences]), "utf-8")
     (folder / "sweep.toml").write_text(to_toml(SWEEP), "utf-8")
 
 
@@ -113,6 +98,3 @@ def _value(value: Any) -> str:
 def _key(key: object) -> str:
     text = str(key)
     return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else json.dumps(text)
-
-
-__all__ = ["CAMERA", "RIG", "ROOT", "SCENE", "SWEEP", "make_checkout", "to_toml", "write_inputs"]

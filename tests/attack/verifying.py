@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -12,13 +11,9 @@ from attack.clean_sequences import false_alarms
 from attack.planted_cameras import CAMERA_FAULTS, card_of
 from attack.planted_faults import FAULTS
 from attack.planting import found, planted
+from attack.stage import say
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-
-
-def say(text: str) -> None:
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
 
 
 def missed_faults(root: Path) -> int:

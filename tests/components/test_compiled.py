@@ -6,10 +6,12 @@ import os
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import run_python
 
 from rsbench.components import compiled, motion_kernels, motion_models
 from rsbench.components.motion_models import LinearMotion
@@ -37,11 +39,7 @@ ADDS = """
 
 def child(code: str, **environment: str | None) -> subprocess.CompletedProcess[str]:
     """Another Python on these sources, with some variables set or (None) absent."""
-    changed = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path), **environment}
-    env = {name: value for name, value in changed.items() if value is not None}
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], env=env, capture_output=True, text=True, timeout=300
-    )
+    return run_python("-c", textwrap.dedent(code), environment=environment)
 
 
 def test_the_folder_of_the_environment_comes_before_the_user_s(tmp_path: Path) -> None:
@@ -109,23 +107,13 @@ def test_two_processes_may_compile_at_once(tmp_path: Path) -> None:
         import adds
         sys.stdout.write(str(adds.add({a}, {a})))
     """
-    calls = [("3", "6"), ("2j", "4j")]
-    environment = {
-        **os.environ,
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-    }
+
+    def added(a: str) -> str:
+        return child(code.format(folder=str(tmp_path), a=a), NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout
+
     for _ in range(2):
-        running = [
-            subprocess.Popen(
-                [sys.executable, "-c", textwrap.dedent(code.format(folder=str(tmp_path), a=a))],
-                env=environment,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-            for a, _ in calls
-        ]
-        assert [process.communicate()[0] for process in running] == [expected for _, expected in calls]
+        with ThreadPoolExecutor(2) as pool:
+            assert list(pool.map(added, ("3", "2j"))) == ["6", "4j"]
 
 
 def test_every_source_with_compiled_code_decides_the_version() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from commands import install_package
+from programs import run_python
 
 from rsbench.components import imports
 from rsbench.components.plugins import Entry, Kind, NoOptions, list_names, load_class, load_entry, offers
@@ -338,15 +337,7 @@ def test_a_package_that_starts_a_thread_keeps_no_command_from_ending(
     module += 'class Mine(Solver):\n    """\x1b[2J\x1b[31mRed\x07 words.\n\n    More."""\n'
     (tmp_path / "waiting.py").write_text(module, "utf-8")
     install(tmp_path, monkeypatch, "waiting", "[rsbench.solvers]\nwaiting = waiting:Mine\n")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    ran = subprocess.run(
-        [sys.executable, "-m", "rsbench", "list", "solvers"],
-        capture_output=True,
-        text=True,
-        timeout=300,  # an hour without the mend
-        env=environment,
-        check=False,
-    )
+    ran = run_python("-m", "rsbench", "list", "solvers", path=[tmp_path])  # an hour without the mend
     assert ran.returncode == 0, ran.stderr
     assert "waiting" in ran.stdout and "rs-stereo-refined" in ran.stdout and "the end" in ran.stdout
     assert "\x1b" not in ran.stdout + ran.stderr and "\x07" not in ran.stdout

@@ -20,27 +20,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from programs import is_running
 
 from rsbench.core.errors import RsbenchError
-from rsbench.jobs.process_jobs import Cluster, LostJobsError, finished_jobs, run_jobs
+from rsbench.jobs.process_jobs import Cluster, run_jobs
 
 pytestmark = [
     pytest.mark.skipif(find_spec("distributed") is None, reason="needs rsbench[cluster]"),
     pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
 ]
-
-
-@pytest.fixture(scope="module")
-def local() -> Iterator[Any]:
-    from distributed import LocalCluster
-
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", host="127.0.0.1") as cluster:
-        yield cluster
-
-
-@pytest.fixture
-def there(local: Any) -> Cluster:
-    return Cluster(address=local.scheduler_address)
 
 
 @pytest.fixture(scope="module")
@@ -70,27 +58,7 @@ def pid_of(cluster: Any, address: str) -> int:
     return pid
 
 
-def test_all_jobs_are_done(there: Cluster) -> None:
-    jobs = [float(k * k) for k in range(20)]
-    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, there, {}, math.sqrt)}
-    assert done == {float(k * k): float(k) for k in range(20)}
-
-
-def test_a_job_that_always_dies_is_named_when_the_others_are_done(there: Cluster, tmp_path: Path) -> None:
-    note = tmp_path / "tries"
-    deadly, done = f"printf x >> {note}; kill -9 $PPID", list[str]()
-    with pytest.raises(LostJobsError, match="3 times"):
-        for job, _ in finished_jobs(functools.partial, [deadly, "true", "exit 3"], there, {}, os.system):
-            done.append(job)
-    assert sorted(done) == ["exit 3", "true"] and note.read_text() == "xxx"
-
-
-def test_limits_hold_there_too(there: Cluster) -> None:
-    jobs = run_jobs(
-        functools.partial, ["__import__('time').sleep(1000)"], there, {}, eval, seconds_of=lambda job: 0.3
-    )
-    ((_, outcome),) = jobs
-    assert outcome.reason == "took longer than 0.3 s"
+SQUARES = {float(k * k): float(k) for k in range(6)}
 
 
 def test_a_worker_of_the_cluster_that_is_killed_loses_nothing(there: Cluster, local: Any, tmp_path: Path) -> None:
@@ -115,8 +83,7 @@ def test_results_that_die_with_their_workers_before_they_are_fetched_are_made_ag
     there: Cluster, local: Any
 ) -> None:
     """All results but one lie in the memory of the workers when these are killed."""
-    jobs = [float(k * k) for k in range(6)]
-    with closing(run_jobs(functools.partial, jobs, there, {}, math.sqrt)) as outcomes:
+    with closing(run_jobs(functools.partial, list(SQUARES), there, {}, math.sqrt)) as outcomes:
         done = [next(outcomes)]
         wait_until(lambda: job_states(local) == ["memory"] * 5)
         killed = set(local.scheduler.workers)
@@ -124,7 +91,7 @@ def test_results_that_die_with_their_workers_before_they_are_fetched_are_made_ag
             os.kill(pid_of(local, address), signal.SIGKILL)
         wait_until(lambda: not killed & set(local.scheduler.workers))
         done += list(outcomes)
-    assert {job: outcome.value for job, outcome in done} == {float(k * k): float(k) for k in range(6)}
+    assert {job: outcome.value for job, outcome in done} == SQUARES
 
 
 def test_a_result_that_dies_while_it_is_fetched_is_made_again(
@@ -141,9 +108,8 @@ def test_a_result_that_dies_while_it_is_fetched_is_made_again(
         return await gather(keys=keys, **others)
 
     monkeypatch.setitem(local.scheduler.handlers, "gather", kill_and_gather)
-    jobs = [float(k * k) for k in range(6)]
-    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, there, {}, math.sqrt)}
-    assert done == {float(k * k): float(k) for k in range(6)} and killed
+    done = run_jobs(functools.partial, list(SQUARES), there, {}, math.sqrt)
+    assert {job: outcome.value for job, outcome in done} == SQUARES and killed
 
 
 def looked_at(
@@ -226,7 +192,7 @@ def test_what_is_stopped_ends_there(there: Cluster, local: Any, tmp_path: Path, 
                 list(outcomes)  # waits for a third outcome
         else:
             wait_until(lambda: len(begun()) >= 3)
-    wait_until(lambda: not any(_alive(pid) for pid in begun()))
+    wait_until(lambda: not any(is_running(pid) for pid in begun()))
     wait_until(lambda: not any(worker.processing for worker in local.scheduler.workers.values()))
     assert not job_states(local) and len(begun()) < len(jobs)
 
@@ -252,14 +218,6 @@ def test_a_run_that_is_stopped_waits_for_no_frozen_worker(
     finally:
         thaw.cancel()
         os.kill(frozen, signal.SIGCONT)
-
-
-def _alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended may wait for its parent."""
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except FileNotFoundError:
-        return False
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from programs import is_running
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
@@ -266,17 +267,9 @@ def alive(note: Path) -> list[int]:
     """Processes of a note that still run; they are given a moment to go."""
     pids = [int(pid) for pid in note.read_text().split()]
     end = time.monotonic() + 20.0
-    while (running := [pid for pid in pids if _runs(pid)]) and time.monotonic() < end:
+    while (running := [pid for pid in pids if is_running(pid)]) and time.monotonic() < end:
         time.sleep(0.02)
     return running
-
-
-def _runs(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
 
 
 PARENT = """

@@ -15,15 +15,35 @@ import pytest
 
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.isolation import EntryFailure, IsolatedWorker, receive
-from rsbench.jobs.process_jobs import LostJobsError, finished_jobs, run_jobs
+from rsbench.jobs.process_jobs import LostJobsError, Workers, finished_jobs, run_jobs
 
 ASK = "__import__('os').getpid()"
 
 
-def test_all_jobs_are_done_by_few_processes() -> None:
+def test_all_jobs_are_done(workers: Workers) -> None:
     jobs = [float(k * k) for k in range(20)]
-    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, 2, {}, math.sqrt)}
+    done = {job: outcome.value for job, outcome in run_jobs(functools.partial, jobs, workers, {}, math.sqrt)}
     assert done == {float(k * k): float(k) for k in range(20)}
+
+
+def test_a_job_that_always_dies_is_named_when_the_others_are_done(workers: Workers, tmp_path: Path) -> None:
+    """Each try appends a letter; the shell's parent is the child that serves the job."""
+    note = tmp_path / "tries"
+    deadly, done = f"printf x >> {note}; kill -9 $PPID", dict[str, int]()
+    with pytest.raises(LostJobsError, match=r"kill -9 \$PPID \(killed by signal 9 \(SIGKILL\), 3 times\)"):
+        for job, value in finished_jobs(functools.partial, [deadly, "true", "exit 3"], workers, {}, os.system):
+            done[job] = os.waitstatus_to_exitcode(value)
+    assert done == {"true": 0, "exit 3": 3} and note.read_text() == "xxx"
+
+
+def test_a_job_that_takes_too_long_fails_alone(workers: Workers) -> None:
+    limits = {"__import__('time').sleep(1000)": 0.3, "7": 60.0}
+    jobs = run_jobs(functools.partial, list(limits), workers, {}, eval, seconds_of=limits.__getitem__)
+    long, short = map(dict(jobs).__getitem__, limits)
+    assert long.reason == "took longer than 0.3 s" and short.value == 7
+
+
+def test_jobs_are_done_by_few_processes() -> None:
     pids = {outcome.value for _, outcome in run_jobs(functools.partial, [ASK] * 6, 2, {}, eval)}
     assert 1 <= len(pids) <= 2 and os.getpid() not in pids
 
@@ -32,15 +52,6 @@ def test_the_environment_reaches_the_children() -> None:
     given = {"RSBENCH_TEST_WORD": "yes"}
     ((_, outcome),) = run_jobs(functools.partial, ["RSBENCH_TEST_WORD"], 1, given, os.getenv)
     assert outcome.value == "yes" and "RSBENCH_TEST_WORD" not in os.environ
-
-
-def test_a_job_that_ends_its_process_is_tried_three_times_and_the_others_are_done(tmp_path: Path) -> None:
-    """Each try appends a letter; the shell's parent is the child that serves the job."""
-    note = tmp_path / "tries"
-    deadly, good = f"printf x >> {note}; kill -9 $PPID", "true"
-    outcomes = dict(run_jobs(functools.partial, [deadly, good], 1, {}, os.system))
-    assert outcomes[deadly].ended and outcomes[deadly].reason == "killed by signal 9 (SIGKILL)"
-    assert outcomes[good].value == 0 and note.read_text() == "xxx"
 
 
 def test_a_job_that_was_killed_once_is_done(tmp_path: Path) -> None:
@@ -89,16 +100,6 @@ def test_a_process_that_died_between_two_jobs_costs_the_second_nothing() -> None
         kill_and_await(pid)
         outcome = worker.call(ASK, limit_s=60.0)
     assert outcome.success and outcome.value != pid
-
-
-def test_jobs_that_are_lost_are_named_when_the_others_are_done() -> None:
-    done = []
-    with pytest.raises(
-        LostJobsError, match=r"not done: kill -9 \$PPID \(killed by signal 9 \(SIGKILL\), 3 times\)"
-    ):
-        for job, value in finished_jobs(functools.partial, ["kill -9 $PPID", "true", "exit 3"], 1, {}, os.system):
-            done.append((job, os.waitstatus_to_exitcode(value)))
-    assert done == [("true", 0), ("exit 3", 3)]
 
 
 def test_a_job_that_takes_too_much_fails_alone(tmp_path: Path) -> None:

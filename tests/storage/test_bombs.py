@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 import struct
-import subprocess
 import sys
 import time
 import zipfile
@@ -20,8 +18,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-
-ROOT = Path(__file__).parents[2]
+from programs import run_python
 
 CHILD = """
 import json, resource, sys
@@ -190,15 +187,8 @@ def test_files_that_unfold_are_refused_in_little_memory(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in BOMBS]
     for path in paths:
         BOMBS[path.name][0](path)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     start = time.monotonic()
-    result = subprocess.run(
-        [sys.executable, "-c", CHILD, *map(str, paths)],
-        capture_output=True,
-        text=True,
-        timeout=100,
-        env=environment,
-    )
+    result = run_python("-c", CHILD, *paths)
     assert result.returncode == 0, result.stderr
     found = [json.loads(line) for line in result.stdout.splitlines()]
     assert [name for name, _, _ in found] == list(BOMBS)

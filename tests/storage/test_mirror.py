@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 import pytest
 from commands import assert_refused, run_here, sweep_card
-from evaluations import contents
+from evaluations import MACHINE, contents
 from leaderboards import jobs_here, small_split
 from small_scenes import write_box_scene, write_small_card
 
@@ -31,7 +31,6 @@ from rsbench.storage.work_folder import WORK, work_folder
 fsspec = pytest.importorskip("fsspec", reason="needs rsbench[cloud]")
 URL = "memory://bucket/mine"
 SWEEP = sweep_card(["gs-8pt"], noise_px=[0.0, 0.5], trials=3)
-TIMES = ("provenance.json", "seconds.json", "seconds.csv")
 
 
 @pytest.fixture
@@ -51,7 +50,7 @@ def without_times(files: Mapping[str, bytes]) -> dict[str, bytes]:
     return {
         path: re.sub(rb"&#34;command&#34;: .*", b"", data) if path == "report.html" else data
         for path, data in files.items()
-        if Path(path).name not in TIMES and not path.startswith("seconds/") and path != ".rsbench/lock"
+        if Path(path).name not in MACHINE and not path.startswith("seconds/") and path != ".rsbench/lock"
     }
 
 

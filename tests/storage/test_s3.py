@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import assert_refused, bytes_below, run_here, sweep_card
-from evaluations import MACHINE, contents
+from evaluations import contents
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import load_dataset_card
@@ -154,28 +154,6 @@ def test_a_sweep_that_is_killed_goes_on_elsewhere(
     here = {path: data for path, data in contents(tmp_path / "out").items() if not path.startswith("seconds/")}
     assert there.pop("notes.txt") == b"not ours" and there.pop("provenance.json")
     assert {path: data for path, data in there.items() if not path.startswith("seconds/")} == here
-
-
-@pytest.mark.slow
-def test_an_evaluation_that_is_killed_goes_on_elsewhere(
-    card: Path, bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    generate_dataset(load_dataset_card(str(card)).only(["a"]), tmp_path / "data")
-    words = ["evaluate", str(tmp_path / "data"), "--solver", "gs-8pt", "--out"]
-    assert run_here(*words, tmp_path / "out").returncode == 0
-    with subprocess.Popen([sys.executable, "-c", _EAGER, "-q", *words, "s3://data/images"]) as process:
-        while process.poll() is None and not bucket.find("data/images/predictions/a/motion"):
-            bucket.invalidate_cache()
-        process.kill()
-    before = {path for path in stored(bucket, "images") if path.startswith("predictions/")}
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
-    run = run_here(*words, "s3://data/images")
-    assert run.returncode == 0 and "report: s3://data/images/report.html" in run.stdout, run.stderr
-    there, here = stored(bucket, "images"), contents(tmp_path / "out")
-    here.pop(".rsbench/lock", None)
-    there.pop(".rsbench/lock", None)
-    assert before <= there.keys() and {path for path in there if Path(path).name not in MACHINE} == here.keys()
-    assert all(there[path] == data for path, data in here.items() if path != "report.html")  # it names --out
 
 
 @pytest.mark.usefixtures("bucket")
