@@ -23,6 +23,7 @@ from rsbench.renderers.integrators import (
     placed,
     sunsky_radiance,
 )
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points, subpixel_grid
 from rsbench.renderers.scene import MitsubaScene
@@ -32,8 +33,6 @@ Float32Array = NDArray[np.float32]
 
 def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
     """What the rays through pixel centres meet."""
-    import mitsuba as mi
-
     depth, labels, gloss = result = Hits.none(len(rows), camera.width)
     for place, row in enumerate(rows):
         for column in range(camera.width):
@@ -82,9 +81,6 @@ def _sunsky(
     sample: int,
     objects: list[Placed],
 ) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
     sky_points_here = [mi.Vector3f(*point) for point in _sky_points(options.samples, options.sky_rays)[sample]]
     facet = mi.Point2f(facet_points(options.samples)[sample].tolist()) if scene.glossy else None
     return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), True, sky_points_here, objects, facet)
@@ -104,9 +100,6 @@ def _path(
     sample: int,
     objects: list[Placed],
 ) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
     sampler = lane_sampler()
     sampler.seed_lanes(options.seed, pixel, sample)
     ray = mi.RayDifferential3f(origin, dr.normalize(direction))
