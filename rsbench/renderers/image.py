@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.errors import RsbenchError
+from rsbench.scenes.model import linear_to_srgb, srgb_to_linear
 
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 _MOSAIC_BITS = 16
@@ -104,9 +105,8 @@ class Sensor:
     def noiseless(self) -> Sensor:
         """The same exposure, fall-off and brightness without noise, rounding, mosaic and compression."""
         clean: dict[str, Any] = {"photon_noise": False, "read_noise": 0.0, "dark_current": 0.0, "bit_depth": 0}
-        alike: dict[str, Any] = {"mosaic": "none", "jpeg_quality": 0}
-        right: dict[str, Any] = {"right_mosaic": None, "right_jpeg_quality": None}
-        return replace(self, **clean, **alike, **right)
+        clean |= {"mosaic": "none", "jpeg_quality": 0, "right_mosaic": None, "right_jpeg_quality": None}
+        return replace(self, **clean)
 
     def of(self, side: str, frame: int) -> Sensor:
         """The sensor of one camera at one time, both of whose frames and cameras are alike."""
@@ -242,15 +242,12 @@ def to_srgb8(image: ArrayLike, exposure: float) -> NDArray[np.uint8]:
 
 def linear_of_codes(codes: ArrayLike) -> NDArray[np.float64]:
     """Linear values of 8-bit sRGB codes (...), also between them: the inverse of ``to_srgb8`` at exposure 1."""
-    encoded = np.clip(np.asarray(codes, dtype=np.float64) / 255.0, 0.0, 1.0)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return srgb_to_linear(np.clip(np.asarray(codes, dtype=np.float64) / 255.0, 0.0, 1.0))
 
 
 def srgb_of(linear: NDArray[Any]) -> NDArray[Any]:
     """sRGB values (...), from 0 to 1, of linear ones, clipped; of their type."""
-    linear = np.clip(linear, 0.0, 1.0)
-    curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
-    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, curve))
+    return linear_to_srgb(np.clip(linear, 0.0, 1.0))
 
 
 _BLOCK = 16
