@@ -58,11 +58,11 @@ def flat(surface: str, triangles: ArrayLike, *, turned: bool = False) -> Piece:
     normal = _area_vectors(points)
     length = np.linalg.norm(normal, axis=1)
     points, normal = points[length > 1e-10], normal[length > 1e-10]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit(normal)
     side = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     level = np.linalg.norm(side, axis=1) < 1e-3
     side[level] = np.array([1.0, 0.0, 0.0]) - normal[level] * normal[level, :1]
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    side = unit(side)
     up = _cross(normal, side)
     uv = np.stack([np.einsum("nkc,nc->nk", points, axis) for axis in (side, up)], axis=2)
     uv = uv[..., ::-1] if turned else uv
@@ -213,11 +213,9 @@ def revolve(
 def tube(surface: str, path: ArrayLike, radii: ArrayLike, segments: int = 8) -> Piece:
     """A round tube along a path (n, 3): trunks, branches, pipes, ropes."""
     line = np.asarray(path, dtype=np.float64)
-    along = np.gradient(line, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    along = unit(np.gradient(line, axis=0))
     reference = np.where(np.abs(along[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-    side = _cross(reference, along)
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    side = unit(_cross(reference, along))
     other = _cross(along, side)
     angles = np.linspace(0, 2 * np.pi, segments + 1)
     ring = side[:, None] * np.cos(angles)[:, None] + other[:, None] * np.sin(angles)[:, None]
@@ -231,8 +229,7 @@ def grid(surface: str, points: FloatArray, uv: FloatArray, normals: FloatArray |
     """A sheet of points (rows, columns, 3) with uv (rows, columns, 2); its own normals if none are given."""
     if normals is None:
         across, along = np.gradient(points, axis=1), np.gradient(points, axis=0)
-        facing = _cross(across, along)
-        normals = facing / np.linalg.norm(facing, axis=2, keepdims=True)
+        normals = unit(_cross(across, along))
 
     def cut(values: FloatArray) -> FloatArray:
         a, b, c, d = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]
@@ -274,6 +271,11 @@ def cushion(surface: str, size: Sequence[float], at: Sequence[float] = (0, 0, 0)
 
 def _at_height(xy: FloatArray, z: float) -> FloatArray:
     return np.concatenate([xy, np.full((*xy.shape[:-1], 1), z)], axis=-1)
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) of length 1 of the same directions."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -27,6 +27,7 @@ from rsbench.scenes.parts import (
     rectangle,
     revolve,
     tube,
+    unit,
 )
 from rsbench.scenes.surfaces import PICTURES, SPINES, cell_uv
 
@@ -62,8 +63,7 @@ def bush(rng: np.random.Generator, size: float = 0.8, leaf: str = "leaves") -> l
 
 def _sprays(rng: np.random.Generator, leaf: str, radii: FloatArray, count: int) -> list[Piece]:
     """Small leafy flaps around an ellipsoid, which give a crown a broken outline."""
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = unit(rng.normal(size=(count, 3)))
     centre = direction * radii * rng.uniform(0.9, 1.2, (count, 1))
     a = rng.normal(size=(count, 3)) * 0.08
     b = np.cross(a, rng.normal(size=(count, 3)))
@@ -379,15 +379,10 @@ def _leaflets(rng: np.random.Generator, path: FloatArray, count: int, size: floa
     """Pointed leaves along a path."""
     t = rng.random((count, 1))
     root = path[0] + (path[-1] - path[0]) * t
-    out = rng.normal(size=(count, 3))
-    out /= np.linalg.norm(out, axis=1, keepdims=True)
-    side = np.cross(out, rng.normal(size=(count, 3)))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    tip, a, b = (
-        root + out * size,
-        root + out * size * 0.5 + side * size * 0.22,
-        root + out * size * 0.5 - side * size * 0.22,
-    )
+    out = unit(rng.normal(size=(count, 3)))
+    side = unit(np.cross(out, rng.normal(size=(count, 3))))
+    tip, middle, wide = root + out * size, root + out * size * 0.5, side * size * 0.22
+    a, b = middle + wide, middle - wide
     return [flat("leaves_fine", np.concatenate([np.stack([root, a, tip], 1), np.stack([root, tip, b], 1)]))]
 
 
