@@ -284,10 +284,8 @@ def _read_basalt(files: Files) -> Calibration:
     poses = []
     for k, each in enumerate((top.get("T_imu_cam") or [])[:2]):
         place = Fields(each, f"{top.where}: T_imu_cam {k}")
-        q = [place.number(key) for key in ("qw", "qx", "qy", "qz")]
-        poses.append(
-            Pose(quaternion_of(q, place.where), np.array([place.number(key) for key in ("px", "py", "pz")]))
-        )
+        q = place.each("qw", "qx", "qy", "qz")
+        poses.append(Pose(quaternion_of(q, place.where), np.array(place.each("px", "py", "pz"))))
     if len(poses) < 2:
         raise RsbenchError(f"{top.where}: T_imu_cam: must be of both cameras")
     apart = compose(inverse(poses[1]), poses[0])
@@ -296,7 +294,7 @@ def _read_basalt(files: Files) -> Calibration:
 
 def _basalt_camera(camera: Fields, size: Sequence[float] | None) -> tuple[Table, str]:
     own, kind = camera.inner("intrinsics"), camera.text("camera_type")
-    intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]
+    intrinsics = own.each("fx", "fy", "cx", "cy")
     if kind in ("eucm", "ucm"):
         profile = unified_profile(own.number("alpha"), own.number("beta", 1.0))
         return fitted(size, intrinsics, profile, kind, camera.where)
@@ -362,10 +360,10 @@ def _read_zed(files: Files) -> Calibration:
     stereo = top.inner("STEREO")
     turn, shift = list[float](), list[float]()
     for key in ("RX", "CV", "RZ"):
-        own = next((k for k in (f"{key}_{name}", f"R{key[-1:]}_{name}", key) if k in stereo), f"{key}_{name}")
+        own = stereo.known(f"{key}_{name}", f"R{key[-1:]}_{name}", key)
         turn.append(stereo.number(own, None if key != "CV" or own in stereo else 0.0))
     for key in ("Baseline", "TY", "TZ"):
-        own = next((k for k in (f"{key}_{name}", key) if k in stereo), key)
+        own = f"{key}_{name}" if f"{key}_{name}" in stereo else key
         shift.append(stereo.number(own, None if key == "Baseline" else 0.0))
     t = np.array([-shift[0], shift[1], shift[2]]) * (files.given.unit or UNITS["mm"])
     apart = Pose(so3.exp(np.array(turn)), t)
@@ -376,7 +374,7 @@ def _zed_camera(top: Fields, side: str, name: str, size: Size) -> Table:
     section = next((key for key in top.tree if key.upper() == f"{side}_CAM_{name}"), f"{side}_CAM_{name}")
     own = top.inner(section)
     disto = next((top.inner(key) for key in top.tree if key.upper() == f"{side}_DISTO"), own)
-    intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]
+    intrinsics = own.each("fx", "fy", "cx", "cy")
     if "p1" in disto:
         values = [disto.number(key, 0.0) for key in COEFFICIENTS["rational"]]
         return table_of(size, intrinsics, brown(values, disto.where))
@@ -412,7 +410,7 @@ def _read_depthai(files: Files) -> Calibration:
             R = rotation_of(apart.numbers("rotationMatrix", 9), f"{apart.where}: rotationMatrix")
             place = apart.inner("translation")
             unit = _depthai_unit(apart)
-            t = np.array([place.number(key) for key in "xyz"]) * (files.given.unit or unit)
+            t = np.array(place.each(*"xyz")) * (files.given.unit or unit)
             links[socket, to], links[to, socket] = Pose(R, t), inverse(Pose(R, t))
     return Calibration(
         format="DepthAI",
@@ -454,7 +452,7 @@ def _depthai_camera(camera: Fields) -> Table:
     if kind not in (0, 1):
         raise RsbenchError(f"{camera.where}: cameraType = {kind}: must be 0 (perspective) or 1 (fisheye)")
     lens = brown(d, camera.where) if kind == 0 else lens_of("kannala-brandt", d, camera.where)
-    return table_of((camera.number("width"), camera.number("height")), (K[0], K[4], K[2], K[5]), lens)
+    return table_of(camera.each("width", "height"), (K[0], K[4], K[2], K[5]), lens)
 
 
 # RealSense.
@@ -518,8 +516,7 @@ def _realsense_camera(camera: Fields) -> Table:
             "infrared or another stream whose coefficients are 0, or calibrate with OpenCV"
         )
     lens = by_name(model, d, camera.where) if any(d) or model == "kannala_brandt4" else None
-    size = [camera.number(key) for key in ("width", "height")]
-    return table_of(size, [camera.number(key) for key in ("fx", "fy", "ppx", "ppy")], lens)
+    return table_of(camera.each("width", "height"), camera.each("fx", "fy", "ppx", "ppy"), lens)
 
 
 # COLMAP.

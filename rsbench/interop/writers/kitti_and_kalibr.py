@@ -39,6 +39,7 @@ from rsbench.interop.writers.sequence_views import (
     number,
     numbers,
     one_by_one,
+    projections,
     reads_from_top,
     world_from_camera,
     write_lines,
@@ -102,10 +103,8 @@ def disparity_values(disparity: FloatArray) -> tuple[NDArray[np.uint16], int]:
 
 def _kitti_calibration(sequence: Sequence) -> list[str]:
     """P0 to P3 (3 x 4) from the frame of the left camera; the grey cameras 0 and 1 stand where 2 and 3 do."""
-    left = np.concatenate([sequence.rig.camera.K, np.zeros((3, 1))], axis=1)
-    right = left.copy()
-    right[0, 3] = -sequence.rig.camera.fx * sequence.rig.baseline
-    return [f"P{k}: {numbers(right if k % 2 else left)}" for k in range(4)]
+    both = projections(sequence.rig.camera, sequence.rig.baseline)
+    return [f"P{k}: {numbers(both[k % 2])}" for k in range(4)]
 
 
 _KALIBR_ABOUT = (

@@ -71,6 +71,11 @@ def views_in_time(sequence: Sequence) -> list[View]:
     return [View(side, frame) for frame in range(sequence.frames) for side in SIDES]
 
 
+def views_by_camera(sequence: Sequence) -> list[View]:
+    """Left 0, left 1, and so on, then those of the right camera."""
+    return [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
+
+
 def first_pose(sequence: Sequence, view: View) -> Pose:
     """``cam_from_world`` (3, 3), (3,) of the line that is read first: that of the global-shutter twin."""
     start = sequence.shutter.start(view.frame, view.side)
@@ -124,9 +129,19 @@ def corner_matrix(camera: PinholeCamera) -> FloatArray:
 
 def copy_image(sequence: Sequence, view: View, images: Images, path: Path) -> None:
     """The PNG of a view, byte for byte."""
-    source = inside(sequence.folder, picture_file(images, view.side, view.frame + sequence.first))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, read_bytes(source))
+    copy_file(sequence.folder, picture_file(images, view.side, view.frame + sequence.first), path)
+
+
+def copy_file(folder: Path, name: str, to: Path) -> None:
+    """A file of a folder, byte for byte."""
+    to.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(to, read_bytes(inside(folder, name)))
+
+
+def projections(camera: PinholeCamera, baseline: float) -> tuple[FloatArray, FloatArray]:
+    """P1, P2 (3, 4) of a rectified pair, as OpenCV's stereoRectify names them; from the left camera's axes."""
+    right = np.column_stack([camera.K, [-camera.fx * baseline, 0.0, 0.0]])
+    return np.column_stack([camera.K, np.zeros(3)]), right
 
 
 def number(value: float) -> str:

@@ -53,6 +53,7 @@ from rsbench.interop.writers.sequence_views import (
     one_by_one,
     reads_from_top,
     seen_by,
+    views_by_camera,
     views_in_time,
     world_from_camera,
 )
@@ -208,7 +209,7 @@ def _write_gsplat(sequence: Sequence, root: Path, images: Images) -> Note:
             copy_image(sequence, view, images, folder / "images" / view.name)
     if images == "gs":
         return about_moving_objects(sequence), {}
-    views = [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
+    views = views_by_camera(sequence)
     sentences, record = compare_rows(sequence, views, partial(_gsplat_pixels, sequence), _GSPLAT_LAW)
     return sentences + about_moving_objects(sequence), record
 
