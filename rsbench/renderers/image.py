@@ -38,12 +38,10 @@ _RANGES: dict[str, tuple[float, float]] = {
     "bit_depth": (0, 16),
     "jpeg_quality": (0, 100),
     "vignetting": (0.0, 1.0),
-    "right_exposure_s": (0.0, 3600.0),
-    "right_gain": (1e-3, 1e6),
-    "right_jpeg_quality": (0, 100),
     "right_brightness": (1e-3, 1e3),
 }
-_BRIGHTNESS = (1e-3, 1e3)
+_BY_CAMERA = ("exposure_s", "gain", "mosaic", "jpeg_quality")
+_RANGES |= {f"right_{name}": _RANGES[name] for name in _BY_CAMERA if name in _RANGES}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +95,7 @@ class Sensor:
         for name in ("mosaic", "right_mosaic"):
             if (value := getattr(self, name)) not in (*get_args(Mosaic), None):
                 raise ValueError(f"sensor {name} = {value!r}: allowed are {', '.join(get_args(Mosaic))}")
-        low, high = _BRIGHTNESS
+        low, high = _RANGES["right_brightness"]
         if not all(math.isfinite(value) and low <= value <= high for value in self.brightness):
             raise ValueError(f"sensor brightness = {list(self.brightness)}: allowed is {low:g} to {high:g}")
 
@@ -162,7 +160,6 @@ class Sensor:
         return np.asarray((shot + self.read_noise**2 + step**2 / 12) / self.white**2, dtype=np.float64)
 
 
-_BY_CAMERA = ("exposure_s", "gain", "mosaic", "jpeg_quality")
 _DEFAULTS = {
     "brightness": (1.0, 1.0),
     "right_brightness": 1.0,

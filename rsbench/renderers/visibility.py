@@ -47,7 +47,7 @@ class SceneRays:
         found = blocked(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
             left = np.flatnonzero(~found)
-            own = inverse(each.world_from_object(_at(tau, left)))
+            own = inverse(each.world_from_object(np.asarray(tau)[left]))
             found[left] = blocked(scene, transform(own, eyes[left]), transform(own, points[left]))
         return found
 
@@ -64,7 +64,7 @@ class SceneRays:
         """What rays to the points, and beyond, meet first; ``tau`` as for ``blocked``."""
         met = _met(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
-            pose = each.world_from_object(_at(tau, slice(None)))
+            pose = each.world_from_object(np.asarray(tau))
             own = inverse(pose)
             other = _met(scene, transform(own, eyes), transform(own, points))
             nearer = other.distance < met.distance
@@ -84,10 +84,6 @@ class _Met(NamedTuple):
     instances: NDArray[np.uint16]
     distance: NDArray[np.float32]
     """(n,) in units of the distance to the point."""
-
-
-def _at(tau: FloatArray | None, chosen: Any) -> FloatArray:
-    return np.asarray(tau)[chosen]
 
 
 def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
