@@ -15,7 +15,14 @@ from rsbench.components.rig_tables import CameraTable, Size
 from rsbench.core import so3
 from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens_fit import Profile, continued, kannala_brandt_of
+from rsbench.core.lens_fit import (
+    Profile,
+    continued,
+    fov_profile,
+    kannala_brandt_of,
+    mirror_profile,
+    unified_profile,
+)
 from rsbench.core.rig import Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
@@ -155,23 +162,40 @@ def brown(coefficients: Iterable[float], where: str) -> Lens | None:
     )
 
 
-def fitted(
-    size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], profile: Profile, name: str, where: str
+_PROFILES: Mapping[str, Callable[..., Profile]] = {
+    "fov": fov_profile,
+    "eucm": unified_profile,
+    "ucm": unified_profile,
+    "omni": mirror_profile,
+}
+"""Radial models that we have not."""
+
+
+def camera_table(
+    size: Sequence[float] | FloatArray | None,
+    intrinsics: Sequence[float],
+    name: str,
+    coefficients: Sequence[float],
+    where: str,
 ) -> tuple[Table, str]:
-    """The Kannala-Brandt camera nearest to one of another radial model, and a note on the error of the fit."""
+    """Camera table, of a lens by the name of its model with us or in other tools.
+
+    Of a model that we have not it is the nearest Kannala-Brandt camera, with a note on the error of the fit.
+    """
+    if name.lower() not in _PROFILES:
+        lens = lens_of(name, coefficients, where) if name in COEFFICIENTS else by_name(name, coefficients, where)
+        return table_of(size, intrinsics, lens), ""
     if size is None:
         raise RsbenchError(f"{where}: {name}: fitting a Kannala-Brandt lens needs the size of the images; add it")
     fx, fy, cx, cy = intrinsics
     try:
         camera = PinholeCamera(width=round(size[0]), height=round(size[1]), fx=fx, fy=fy, cx=cx, cy=cy)
-        fit = kannala_brandt_of(camera, profile)
+        fit = kannala_brandt_of(camera, _PROFILES[name.lower()](*coefficients))
     except ValueError as error:
         raise RsbenchError(f"{where}: {name}: {error}") from error
-    table = table_of(size, (fit.fx, fit.fy, cx, cy), fit.lens)
-    return (
-        table,
-        f"{name} of {where.rsplit(': ', 1)[-1]} became the nearest kannala-brandt, within {fit.error_px:.2g} px",
-    )
+    camera_name = where.rsplit(": ", 1)[-1]
+    words = f"{name} of {camera_name} became the nearest kannala-brandt, within {fit.error_px:.2g} px"
+    return table_of(size, (fit.fx, fit.fy, cx, cy), fit.lens), words
 
 
 def rotation_of(values: FloatArray, where: str) -> FloatArray:
