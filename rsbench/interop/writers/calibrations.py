@@ -18,7 +18,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_parts import Calibration, Table, camera_of
 from rsbench.interop.writers.colmap_and_tum import camera_line
-from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, yaml_transform
+from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, write_chain, yaml_transform
 from rsbench.interop.writers.sequence_views import number, projections
 from rsbench.storage.files import write_bytes
 
@@ -98,8 +98,8 @@ def _toml(value: Any) -> str:
 
 
 def _write_kalibr(found: Calibration, out: Path) -> list[Path]:
-    cameras, text = cameras_of(found), ""
-    for k, (side, camera) in enumerate(cameras.items()):
+    chain = list[list[str]]()
+    for k, (side, camera) in enumerate(cameras_of(found).items()):
         lens = camera.lens
         if lens is not None and (lens.model not in KALIBR_LENSES or any(lens.coefficients[4:])):
             raise RsbenchError(f"{side}: Kalibr has no place for {_name(camera)}: its radtan has k1, k2, p1, p2")
@@ -109,8 +109,8 @@ def _write_kalibr(found: Calibration, out: Path) -> list[Path]:
         if k == 1:
             assert found.right_from_left is not None
             lines += yaml_transform("T_cn_cnm1", Pose(*found.right_from_left))
-        text += f"cam{k}:\n" + "".join(f"  {line}\n" for line in lines)
-    write_bytes(out, text.encode())
+        chain.append(lines)
+    write_chain(out, chain)
     return [out]
 
 

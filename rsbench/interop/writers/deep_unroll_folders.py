@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import SIDES, Side
+from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.layout import SHUTTERS, picture_file
@@ -43,7 +43,6 @@ from rsbench.interop.writers.sequence_views import (
     one_by_one,
     reads_from_top,
     seen_by,
-    views_by_camera,
     write_lines,
 )
 from rsbench.storage.files import write_bytes
@@ -79,7 +78,7 @@ def _write_carla(sequence: Sequence, root: Path, images: Images) -> Note:
         write_lines(
             place / "gt_vel.log", ["# Ground truth velocity in camera frame", "# wx, wy, wz, x, y, z", velocity]
         )
-    views = views_by_camera(sequence)
+    views = [View(*view) for view in views_of(sequence.frames)]
     for view in views:
         _write_carla_frame(sequence, view, folder / f"seq_{view.side}")
     _write_carla_calibration(sequence, folder)

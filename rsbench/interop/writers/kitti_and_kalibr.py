@@ -12,7 +12,7 @@ Pixels are ours in both: (0, 0) is the centre of the first one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -133,11 +133,7 @@ KALIBR_LENSES: Mapping[LensModel, tuple[str, str]] = {
 def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
     folder = root / sequence.name
     folder.mkdir(parents=True)
-    blocks = [
-        f"cam{k}:\n" + "".join(f"  {line}\n" for line in _kalibr_camera(sequence, side))
-        for k, side in enumerate(SIDES)
-    ]
-    write_bytes(folder / "camchain.yaml", "".join(blocks).encode())
+    write_chain(folder / "camchain.yaml", [_kalibr_camera(sequence, side) for side in SIDES])
     sentences = list[str]()
     if delay := sequence.shutter.right_delay * sequence.frame_period_s:
         sentences.append(
@@ -161,6 +157,12 @@ def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
         lines += yaml_transform("T_cam_imu", Pose(rig.own(side).R, rig.own(side).R @ rig.offset(side)))
         lines.append(f"timeshift_cam_imu: {number(sequence.imu.time_offset_s)}")
     return lines
+
+
+def write_chain(path: Path, cameras: Iterable[list[str]]) -> None:
+    """A camera chain of the lines of each camera."""
+    lines = [line for k, own in enumerate(cameras) for line in (f"cam{k}:", *(f"  {each}" for each in own))]
+    write_lines(path, lines)
 
 
 def kalibr_camera(camera: PinholeCamera, side: Side, line_delay_s: float | None) -> list[str]:

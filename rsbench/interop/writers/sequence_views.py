@@ -71,11 +71,6 @@ def views_in_time(sequence: Sequence) -> list[View]:
     return [View(side, frame) for frame in range(sequence.frames) for side in SIDES]
 
 
-def views_by_camera(sequence: Sequence) -> list[View]:
-    """Left 0, left 1, and so on, then those of the right camera."""
-    return [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
-
-
 def first_pose(sequence: Sequence, view: View) -> Pose:
     """``cam_from_world`` (3, 3), (3,) of the line that is read first: that of the global-shutter twin."""
     start = sequence.shutter.start(view.frame, view.side)
@@ -318,26 +313,18 @@ _TRIED = 5_000
 """Pixels of each image that are compared."""
 
 
-def largest_row_error(sequence: Sequence, views: list[View], law: Law) -> float:
-    """The largest distance, px, between points of the depth in frames and by a format's motion model.
+def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> Note:
+    """The largest distance, px, between points of the depth in frames and by a law, and a sentence if it is not 0.
 
-    Each point is projected with the model's pose of the line that saw it. 0 where no image has depth.
+    Each point is projected with the law's pose of the line that saw it. 0 where no image has depth; 1e-6 px is the
+    accuracy to which our own numbers read back.
     """
-    worst = 0.0
+    error = 0.0
     for view in views:
         points = world_points(sequence, view, "rs", step_of(sequence.rig.sensor(view.side), _TRIED))
         away = np.linalg.norm(law(view, points) - points.pixels, axis=-1)
-        if len(away):  # NaN: behind the camera, a large error
-            worst = max(worst, float(np.max(np.nan_to_num(away, nan=math.inf))))
-    return worst
-
-
-def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> Note:
-    """The largest row-motion error of a law and, where it is not exact, a sentence.
-
-    1e-6 px is the accuracy to which our own numbers read back.
-    """
-    error = largest_row_error(sequence, views, law)
+        # NaN: behind the camera, a large error
+        error = max(error, float(np.max(np.nan_to_num(away, nan=math.inf), initial=0.0)))
     sentence = f"the format's motion of the rows ({name}) is up to {error:.2g} px from the true one"
     return [] if error < 1e-6 else [sentence], {"largest_row_error_px": error}
 

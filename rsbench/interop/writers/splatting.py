@@ -53,7 +53,6 @@ from rsbench.interop.writers.sequence_views import (
     one_by_one,
     reads_from_top,
     seen_by,
-    views_by_camera,
     views_in_time,
     world_from_camera,
 )
@@ -209,7 +208,7 @@ def _write_gsplat(sequence: Sequence, root: Path, images: Images) -> Note:
             copy_image(sequence, view, images, folder / "images" / view.name)
     if images == "gs":
         return about_moving_objects(sequence), {}
-    views = views_by_camera(sequence)
+    views = [View(*view) for view in views_of(sequence.frames)]
     sentences, record = compare_rows(sequence, views, partial(_gsplat_pixels, sequence), _GSPLAT_LAW)
     return sentences + about_moving_objects(sequence), record
 
