@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -196,10 +197,7 @@ def test_kalibr_says_readout_and_clocks(tmp_path: Path) -> None:
 def test_lenses_of_kalibr(tmp_path: Path, intrinsics: Any, names: tuple[str, str, Any], lens: Lens | None) -> None:
     model, distortion, d = names
     text = CAMERA.replace("pinhole", model).replace("radtan", distortion).replace(str(list(D_LEFT)), str(d))
-    path = chain(tmp_path, text.replace(str(list(LEFT)), str(list(intrinsics))))
-    card, _ = read_camera_file(path) if lens is None else (None, ())
-    assert card is None or card.camera is not None
-    found = read_calibration(path)
+    found = read_calibration(chain(tmp_path, text.replace(str(list(LEFT)), str(list(intrinsics)))))
     assert found.left.get("lens") == (None if lens is None else lens.record())
 
 
@@ -226,22 +224,32 @@ def test_symmetric_models_become_the_nearest_kannala_brandt(
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("make", "changes", "words"),
     [
-        ({"pinhole": "omni", str(list(LEFT)): str([1.4, *LEFT])}, "tangential.*omni"),
-        ({"radtan": "thin_prism"}, "lens model 'thin_prism'"),
-        ({"pinhole": "scara"}, "camera_model = 'scara': must be one of pinhole, omni"),
-        ({"[1280, 720]": "[1280]"}, "resolution"),
-        ({"701.2": "nan"}, "intrinsics"),
-        ({"  resolution: [1280, 720]\n": ""}, "resolution: is missing"),
+        (made.kalibr, {"pinhole": "omni", str(list(LEFT)): str([1.4, *LEFT])}, "tangential.*omni"),
+        (made.kalibr, {"radtan": "thin_prism"}, "lens model 'thin_prism'"),
+        (made.kalibr, {"pinhole": "scara"}, "camera_model = 'scara': must be one of pinhole, omni"),
+        (made.kalibr, {"[1280, 720]": "[1280]"}, "resolution"),
+        (made.kalibr, {"701.2": "nan"}, "intrinsics"),
+        (made.kalibr, {"  resolution: [1280, 720]\n": ""}, "resolution: is missing"),
+        (made.ros, {"camera_name": "binning_x: 2\nbinning_y: 2\ncamera_name"}, "binning_x = 2"),
+        (made.ros, {"701.2": "0.0"}, "not calibrated"),
+        (made.basalt, {"pinhole-radtan8": "fov"}, "camera_type = 'fov': must be one of"),
+        (made.realsense, {"brown_conrady": "inverse_brown_conrady"}, "model = inverse_brown_conrady"),
+        (made.depthai, {'"toCameraSocket": 0': '"toCameraSocket": 0, "lengthUnit": 9'}, "lengthUnit = 9"),
     ],
 )
-def test_what_kalibr_has_and_we_have_not_is_refused_by_name(tmp_path: Path, changes: Any, words: str) -> None:
-    text = CAMERA
+def test_what_others_have_and_we_have_not_is_refused_by_name(
+    tmp_path: Path, make: Callable[[Path], Path], changes: dict[str, str], words: str
+) -> None:
+    path = make(tmp_path)
+    text = path.read_text()
     for old, new in changes.items():
+        assert old in text
         text = text.replace(old, new)
-    with pytest.raises(RsbenchError, match=words):
-        rsbench.read_rig(chain(tmp_path, text, CAMERA))
+    path.write_text(text)
+    with refused(match=words):
+        rsbench.read_rig(path)
 
 
 def test_a_chain_without_transforms_is_refused(tmp_path: Path) -> None:
@@ -321,17 +329,6 @@ def test_camera_info_of_single_cameras_has_no_extrinsics(tmp_path: Path) -> None
         rsbench.read_rig(tmp_path / "left.yaml")
 
 
-def test_binned_and_uncalibrated_cameras_of_ros_are_refused(tmp_path: Path) -> None:
-    path = made.ros(tmp_path)
-    text = path.read_text()
-    path.write_text(text + "binning_x: 2\nbinning_y: 2\n")
-    with pytest.raises(RsbenchError, match="binning_x = 2"):
-        rsbench.read_rig(path)
-    path.write_text(re.sub(r"701\.2", "0.0", text))
-    with pytest.raises(RsbenchError, match="not calibrated"):
-        rsbench.read_rig(path)
-
-
 # Others.
 
 
@@ -391,12 +388,9 @@ def test_a_fisheye_that_sees_behind_itself_needs_a_crop(tmp_path: Path) -> None:
     assert_refused(run_here("rig", path, "--crop", "2000x20+0+0"), "--crop 2000x20+0+0: must lie inside")
 
 
-def test_an_inverse_lens_of_realsense_is_refused_unless_it_is_none(tmp_path: Path) -> None:
+def test_an_inverse_lens_of_realsense_without_coefficients_is_none(tmp_path: Path) -> None:
     path = made.realsense(tmp_path)
     text = path.read_text().replace("brown_conrady", "inverse_brown_conrady")
-    path.write_text(text)
-    with pytest.raises(RsbenchError, match="model = inverse_brown_conrady"):
-        rsbench.read_rig(path)
     path.write_text(re.sub(r'"coeffs": \[[^\]]*\]', '"coeffs": [0, 0, 0, 0, 0]', text))
     assert rsbench.read_rig(path).rig.sensor("right").lens is None
 
@@ -406,9 +400,6 @@ def test_units_of_depthai(tmp_path: Path) -> None:
     text = path.read_text()
     path.write_text(text.replace('"toCameraSocket": 0', '"toCameraSocket": 0, "lengthUnit": 1'))
     same_numbers(rsbench.read_rig(path).rig)
-    path.write_text(text.replace('"toCameraSocket": 0', '"toCameraSocket": 0, "lengthUnit": 9'))
-    with pytest.raises(RsbenchError, match="lengthUnit = 9"):
-        rsbench.read_rig(path)
 
 
 def test_lenses_of_basalt(tmp_path: Path) -> None:
@@ -423,10 +414,6 @@ def test_lenses_of_basalt(tmp_path: Path) -> None:
     rig = rsbench.read_rig(path).rig
     assert rig.sensor("left").lens == SPHERES
     assert rig.sensor("right").lens == FISHEYE
-    tree["value0"]["intrinsics"][0]["camera_type"] = "fov"
-    path.write_text(json.dumps(tree))
-    with pytest.raises(RsbenchError, match="camera_type = 'fov': must be one of"):
-        rsbench.read_rig(path)
 
 
 def test_pixels_of_colmap_begin_at_the_corner(tmp_path: Path) -> None:
