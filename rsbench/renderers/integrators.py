@@ -196,7 +196,10 @@ def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]
 
 
 def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any, Any]:
-    """Ray parameter (0: none), label (see ``SHADED``) and BSDF of the first surface along rays."""
+    """Ray parameter (0: none), label (see ``SHADED``) and BSDF of the first surface along rays.
+
+    A single ray that meets nothing has no BSDF: None.
+    """
     nearest = first(scene, ray, active, objects)
     hit = nearest.surface(mi.RayFlags.Minimal, active)
     seen, shaded = hit.is_valid() & active, active & False
@@ -204,7 +207,8 @@ def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequenc
     for each in objects:
         shaded = shaded | each.meets(to_sun, seen & _not(shaded))
     label = dr.select(seen, nearest.label, 0)
-    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label), hit.bsdf()
+    bsdf = hit.bsdf() if dr.is_jit_v(seen) or seen else None
+    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label), bsdf
 
 
 def _not(value: Any) -> Any:
