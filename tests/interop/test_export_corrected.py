@@ -134,9 +134,8 @@ def test_colmap_gets_corrected_frames_with_the_poses_of_their_time(tmp_path: Pat
     assert len(points) == note["points"] > 1000
     R, t = found["right_000000.png"]
     first = points[points[:, 0] <= note["points"] / (FRAMES - 1)]
-    _hold_colours(
-        first, sequence.rig.camera.project(first[:, 1:4] @ R.T + t), sequence.image("gs", "right", 0, row)
-    )
+    places = sequence.rig.camera.project(first[:, 1:4] @ R.T + t)
+    _hold_colours(first, places, sequence.image("gs", "right", 0, row))
 
 
 def _hold_colours(points: FloatArray, places: FloatArray, image: NDArray[np.uint8]) -> None:

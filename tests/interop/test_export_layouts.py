@@ -227,9 +227,8 @@ def test_carla_rs_velocities_and_radial_depth(tmp_path: Path, turning: bool) -> 
         np.testing.assert_allclose(note["largest_row_error_px"], worst, rtol=1e-6)
         assert worst > 0.1 and "up to" in note["told"][0]
     else:
-        assert worst < SAME_PX and note["told"] == [
-            "the two cameras are sequences of their own: the delay of the right one is not written"
-        ]
+        (words,) = note["told"]
+        assert worst < SAME_PX and words.endswith("the delay of the right one is not written")
     names = ("gs_f.depth", "gs_f.png", "gs_m.png", "rs.depth", "rs.png")
     files = {f"000{k}_{name}" for k in (0, 1) for name in names} | {"gt_vel.log"}
     assert {path.name for path in (out / "planes/seq_left").iterdir()} == files

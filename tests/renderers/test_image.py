@@ -85,9 +85,8 @@ def test_a_row_has_the_same_bits_by_itself() -> None:
     np.testing.assert_array_equal(expose(image[[3, 8]], sensor, 5, 12, [3, 8]), whole[[3, 8]])
     difference = expose(image, sensor, 6, 12, np.arange(12)) - whole
     light = image * fall_off(sensor, 9, 12, np.arange(12))[..., None]
-    assert difference.var() == pytest.approx(2 * sensor.variance(light).mean(), rel=0.5), (
-        "another seed, other noise"
-    )
+    # Another seed, other noise.
+    assert difference.var() == pytest.approx(2 * sensor.variance(light).mean(), rel=0.5)
 
 
 def test_rows_and_colours_err_independently() -> None:

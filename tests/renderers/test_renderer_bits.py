@@ -129,10 +129,8 @@ def points() -> Any:
     pixel, sample = np.divmod(np.arange(50 * SAMPLES), SAMPLES)
     sampler = lane_sampler()
     sampler.seed_lanes(mi.UInt32(3), mi.UInt32(pixel), mi.UInt32(sample))
-    pairs = np.stack([np.array(sampler.next_2d()).T for _ in range(DIMENSIONS)])
-    return pairs.reshape(DIMENSIONS, 50, SAMPLES, 2).swapaxes(0, 1), np.array(sampler.next_1d()).reshape(
-        50, SAMPLES
-    )
+    pairs = np.stack([np.array(sampler.next_2d()).T.reshape(50, SAMPLES, 2) for _ in range(DIMENSIONS)], axis=1)
+    return pairs, np.array(sampler.next_1d()).reshape(50, SAMPLES)
 
 
 def test_the_second_coordinate_is_sobols() -> None:

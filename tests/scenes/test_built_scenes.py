@@ -119,10 +119,9 @@ def test_no_seed_leads_a_camera_of_these_cards_into_a_wall(scene: Scene, name: s
         dataset = load_dataset_card(card)
         for sequence in dataset.sequence:
             if sequence.scene == name:
-                way = (1 + dataset.shutter_for(sequence).readout_ratio) * np.linalg.norm(
-                    dataset.motion_of(sequence).d
-                )
-                own = dataset.rig_of(sequence).baseline / 2 + float(way)
+                way = float(np.linalg.norm(dataset.motion_of(sequence).d))
+                way *= 1 + dataset.shutter_for(sequence).readout_ratio
+                own = dataset.rig_of(sequence).baseline / 2 + way
                 reach[sequence.viewpoint] = max(own, reach.get(sequence.viewpoint, 0.0))
     for view, farthest in reach.items():
         assert farthest < nearest_surface(scene, view), view

@@ -252,12 +252,9 @@ def test_faces_that_name_no_vertex_are_refused(tmp_path: Path, shading: str) -> 
         "accessors": [*TRIANGLE["accessors"], faces],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
     }
+    data = glb(header, CORNERS + np.array([0, 1, 70_000], np.uint32).tobytes())
     with refused("beyond its 3"):
-        read(
-            tmp_path,
-            glb(header, CORNERS + np.array([0, 1, 70_000], np.uint32).tobytes()),
-            f'shading = "{shading}"',
-        )
+        read(tmp_path, data, f'shading = "{shading}"')
 
 
 def test_files_outside_the_models_folder_are_not_read(tmp_path: Path) -> None:

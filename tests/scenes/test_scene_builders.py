@@ -97,11 +97,12 @@ def test_what_a_builder_does_wrong_is_one_line(tmp_path: Path, name: str, old: s
         load_scene(card)
 
 
+GREY = np.zeros((2, 2), dtype=np.uint8)
 MESH = SceneMesh(
     name="sound",
     vertices=np.eye(3),
     faces=np.array([[0, 1, 2]], dtype=np.int32),
-    material=Material(name="m", texture=np.zeros((2, 2, 3), dtype=np.uint8)),
+    material=Material(name="m", texture=GREY[..., None].repeat(3, axis=2)),
     uv=np.zeros((3, 2)),
     normals=np.eye(3),
 )
@@ -120,10 +121,7 @@ MESH = SceneMesh(
         (lambda mesh: replace(mesh, faces=np.zeros((0, 3), dtype=np.int32)), "faces of shape (0, 3)"),
         (lambda mesh: replace(mesh, faces=np.eye(3)), "whole numbers"),
         (lambda mesh: replace(mesh, faces=np.array([[0, 1, -1]])), "beyond its 3"),
-        (
-            lambda mesh: replace(mesh, material=Material(name="m", texture=np.zeros((2, 2), dtype=np.uint8))),
-            "texture of shape (2, 2)",
-        ),
+        (lambda mesh: replace(mesh, material=Material(name="m", texture=GREY)), "texture of shape (2, 2)"),
         (lambda mesh: replace(mesh, name="sound"), "has the name of another"),
     ],
 )

@@ -214,10 +214,8 @@ def test_assembling_merges_by_surface_and_keeps_texture_scale() -> None:
     assert len(tiled.faces) == 24 and tiled.material is surfaces["tiled"].material
     assert tiled.uv is not None
     for face in tiled.faces:
-        metres = (tiled.uv[face] - tiled.uv[face[0]]) * (4.0, 2.0)
-        assert np.linalg.norm(metres, axis=1) == pytest.approx(
-            np.linalg.norm(tiled.vertices[face] - tiled.vertices[face[0]], axis=1)
-        )
+        metres = np.linalg.norm((tiled.uv[face] - tiled.uv[face[0]]) * (4.0, 2.0), axis=1)
+        assert metres == pytest.approx(np.linalg.norm(tiled.vertices[face] - tiled.vertices[face[0]], axis=1))
     offsets = [tiled.uv[0] % 1, tiled.uv[36] % 1]
     assert not np.allclose(offsets[0], offsets[1])
 
