@@ -165,9 +165,8 @@ def _ground(rng: np.random.Generator) -> list[Piece]:
         pieces.append(tube("bark_fine", path, np.full(4, float(rng.uniform(0.006, 0.025))), 6))
     for _ in range(25):
         a, b, size = float(rng.uniform(-7, 7)), float(rng.uniform(3.5, 18)), float(rng.uniform(0.08, 0.35))
-        pieces += placed(
-            [lump("stone", rng, (size * 1.4, size, size * 0.7), 0.2, 2)], (a, b, float(_height(a, b)))
-        )
+        stone = lump("stone", rng, (size * 1.4, size, size * 0.7), 0.2, 2)
+        pieces += placed([stone], (a, b, float(_height(a, b))))
     return pieces
 
 
