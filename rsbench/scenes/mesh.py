@@ -331,9 +331,8 @@ def _roughness(source: Any, where: str) -> float | None:
             "without, or leave gloss out"
         )
     # What a file does not state is 1, by glTF's specification.
-    metal, roughness = (
-        1.0 if each is None else float(each) for each in (source.metallicFactor, source.roughnessFactor)
-    )
+    factors = (source.metallicFactor, source.roughnessFactor)
+    metal, roughness = (1.0 if each is None else float(each) for each in factors)
     if metal > 0.0:
         raise RsbenchError(
             f'{where} is metal (metallicFactor = {metal:g}), and gloss = "file" takes clear coats on diffuse '

@@ -93,10 +93,8 @@ class Parts:
     @property
     def apart(self) -> bool:
         """Whether the files contain the relative pose of the cameras."""
-        return (
-            bool(self.values["rotation"] and self.values["translation"])
-            or {"r1", "r2", "p2"} <= self.values["rectified"].keys()
-        )
+        both = self.values["rotation"] and self.values["translation"]
+        return bool(both) or {"r1", "r2", "p2"} <= self.values["rectified"].keys()
 
 
 def _is_camera_matrix(K: FloatArray) -> bool:

@@ -99,9 +99,9 @@ def _of_element(element: ElementTree.Element) -> Any:
         return {child.tag: _of_element(child) for child in element}
     words = (element.text or "").split()
     values = [_number(word) for word in words]
-    return (
-        values[0] if len(values) == 1 else values if all(not isinstance(v, str) for v in values) else element.text
-    )
+    if len(values) == 1:
+        return values[0]
+    return element.text if any(isinstance(value, str) for value in values) else values
 
 
 def _of_ini(text: str) -> Any:

@@ -228,10 +228,8 @@ def kalibr_in_body(path: Path) -> list[tuple[Table, Pose]]:
 
 
 def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:
-    model, distortion = (
-        camera.text("camera_model", default="pinhole"),
-        camera.text("distortion_model", default="none"),
-    )
+    model = camera.text("camera_model", default="pinhole")
+    distortion = camera.text("distortion_model", default="none")
     where, size = camera.where, camera.numbers("resolution", 2)
     known = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}
     if model not in known:

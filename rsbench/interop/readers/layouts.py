@@ -591,10 +591,9 @@ def _middlebury(folder: Path) -> Recording:
     width, height, baseline = (fields.number(key) for key in ("width", "height", "baseline"))
     offset = fields.number("doffs", float(K1[0, 2] - K0[0, 2]))
     left, right = (_pinhole((width, height), K, fields.where) for K in (K0, K1))
-    images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
+    images: dict[View, Path] = {(side, 0): folder / f"im{k}.png" for k, side in enumerate(SIDES)}
     disparities: dict[View, Callable[[], FloatArray]] = {}
-    views: tuple[View, ...] = (("left", 0), ("right", 0))
-    for k, view in enumerate(views):
+    for k, view in enumerate(images):
         named = [folder / f"disp{k}.pfm", folder / f"disp{k}GT.pfm"]  # the second in MiddEval3 and ETH3D
         for path in [each for each in named if each.is_file()][:1]:
             disparities[view] = partial(_middlebury_disparities, path, offset)

@@ -120,18 +120,14 @@ def _line_delay(found: Calibration, side: Side, camera: PinholeCamera) -> float 
     if own is not None:
         return float(own)
     top = found.readout
-    ratio = (
-        top.get("readout_ratio") if side == "left" else top.get("right_readout_ratio", top.get("readout_ratio"))
-    )
+    ratio = top.get("readout_ratio")
+    if side == "right":
+        ratio = top.get("right_readout_ratio", ratio)
     if ratio == 0.0:
         return 0.0
-    if (
-        ratio is None
-        or "frame_period_s" not in top
-        or {top.get("scan", "top"), top.get("right_scan", "top")} != {"top"}
-    ):
-        return None
-    return ratio * top["frame_period_s"] / camera.height
+    downwards = {top.get("scan", "top"), top.get("right_scan", "top")} == {"top"}
+    known = ratio is not None and "frame_period_s" in top and downwards
+    return ratio * top["frame_period_s"] / camera.height if known else None
 
 
 def _name(camera: PinholeCamera) -> str:
