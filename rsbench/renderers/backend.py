@@ -211,17 +211,6 @@ def probe_cuda(timeout: float = 120.0) -> llvm.ProbeResult:
     driver = driver_library()
     if driver is None:
         return llvm.ProbeResult(ok=False, reason="no NVIDIA driver on this machine")
-    try:
-        status = driver.stat()
-    except OSError as error:
-        return llvm.ProbeResult(ok=False, reason=f"{driver} cannot be read ({error.strerror})")
     devices = ",".join(sorted(glob.glob("/dev/nvidia[0-9]*")))
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
-    key = f"cuda|{driver}|{status.st_mtime_ns}|{status.st_size}|{devices}|{visible}"
-    known = llvm.recall(key)
-    if known is not None:
-        return llvm.ProbeResult(ok=True, version=known)
-    verdict = llvm.run_child(_CUDA_PROBE, [], {}, timeout)
-    if verdict.ok:
-        llvm.remember(key, verdict.version)
-    return verdict
+    machine = f"{devices}|{os.environ.get('CUDA_VISIBLE_DEVICES', 'all')}"
+    return llvm.remembered("cuda", driver, machine, lambda: llvm.run_child(_CUDA_PROBE, [], {}, timeout))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core.errors import RsbenchError
+from rsbench.scenes.model import linear_to_srgb, srgb_to_linear
 
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 _MOSAIC_BITS = 16
@@ -37,12 +38,10 @@ _RANGES: dict[str, tuple[float, float]] = {
     "bit_depth": (0, 16),
     "jpeg_quality": (0, 100),
     "vignetting": (0.0, 1.0),
-    "right_exposure_s": (0.0, 3600.0),
-    "right_gain": (1e-3, 1e6),
-    "right_jpeg_quality": (0, 100),
     "right_brightness": (1e-3, 1e3),
 }
-_BRIGHTNESS = (1e-3, 1e3)
+_BY_CAMERA = ("exposure_s", "gain", "mosaic", "jpeg_quality")
+_RANGES |= {f"right_{name}": _RANGES[name] for name in _BY_CAMERA if name in _RANGES}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +95,7 @@ class Sensor:
         for name in ("mosaic", "right_mosaic"):
             if (value := getattr(self, name)) not in (*get_args(Mosaic), None):
                 raise ValueError(f"sensor {name} = {value!r}: allowed are {', '.join(get_args(Mosaic))}")
-        low, high = _BRIGHTNESS
+        low, high = _RANGES["right_brightness"]
         if not all(math.isfinite(value) and low <= value <= high for value in self.brightness):
             raise ValueError(f"sensor brightness = {list(self.brightness)}: allowed is {low:g} to {high:g}")
 
@@ -104,9 +103,8 @@ class Sensor:
     def noiseless(self) -> Sensor:
         """The same exposure, fall-off and brightness without noise, rounding, mosaic and compression."""
         clean: dict[str, Any] = {"photon_noise": False, "read_noise": 0.0, "dark_current": 0.0, "bit_depth": 0}
-        alike: dict[str, Any] = {"mosaic": "none", "jpeg_quality": 0}
-        right: dict[str, Any] = {"right_mosaic": None, "right_jpeg_quality": None}
-        return replace(self, **clean, **alike, **right)
+        clean |= {"mosaic": "none", "jpeg_quality": 0, "right_mosaic": None, "right_jpeg_quality": None}
+        return replace(self, **clean)
 
     def of(self, side: str, frame: int) -> Sensor:
         """The sensor of one camera at one time, both of whose frames and cameras are alike."""
@@ -162,7 +160,6 @@ class Sensor:
         return np.asarray((shot + self.read_noise**2 + step**2 / 12) / self.white**2, dtype=np.float64)
 
 
-_BY_CAMERA = ("exposure_s", "gain", "mosaic", "jpeg_quality")
 _DEFAULTS = {
     "brightness": (1.0, 1.0),
     "right_brightness": 1.0,
@@ -242,15 +239,12 @@ def to_srgb8(image: ArrayLike, exposure: float) -> NDArray[np.uint8]:
 
 def linear_of_codes(codes: ArrayLike) -> NDArray[np.float64]:
     """Linear values of 8-bit sRGB codes (...), also between them: the inverse of ``to_srgb8`` at exposure 1."""
-    encoded = np.clip(np.asarray(codes, dtype=np.float64) / 255.0, 0.0, 1.0)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return srgb_to_linear(np.clip(np.asarray(codes, dtype=np.float64) / 255.0, 0.0, 1.0))
 
 
 def srgb_of(linear: NDArray[Any]) -> NDArray[Any]:
     """sRGB values (...), from 0 to 1, of linear ones, clipped; of their type."""
-    linear = np.clip(linear, 0.0, 1.0)
-    curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
-    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, curve))
+    return linear_to_srgb(np.clip(linear, 0.0, 1.0))
 
 
 _BLOCK = 16

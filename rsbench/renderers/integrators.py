@@ -19,7 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.sensor import level
 
 
 class Hits(NamedTuple):
@@ -46,8 +48,6 @@ _BELOW_A_COAT = 0.95
 
 def is_glossy(bsdf: Any, active: Any) -> Any:
     """Whether BSDFs have a coat."""
-    import mitsuba as mi
-
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection) & active
 
 
@@ -61,8 +61,6 @@ class Coat:
             normal: unit shading normals towards the eye.
             ray: that met the surfaces.
         """
-        import mitsuba as mi
-
         self._bsdf, self._frame = hit.bsdf(), mi.Frame3f(normal)
         self._hit = mi.SurfaceInteraction3f(hit)
         self._hit.sh_frame, self._hit.wi = self._frame, self._frame.to_local(-ray.d)
@@ -73,9 +71,6 @@ class Coat:
 
     def below(self, active: Any) -> Any:
         """Radiance of the surface below by an even radiance of 1 from all sides: its albedo through the coat."""
-        import drjit as dr
-        import mitsuba as mi
-
         upright = self._bsdf.eval(_context("diffuse"), self._hit, mi.Vector3f(0, 0, 1), active)
         return upright * (dr.pi * _BELOW_A_COAT)
 
@@ -84,16 +79,12 @@ class Coat:
 
         The middle of the square is the mirror direction, or nearly; the mean over all of it is the coat's light.
         """
-        import mitsuba as mi
-
         found, share = self._bsdf.sample(_context("coat"), self._hit, mi.Float(0.5), facet, active)
         return self._hit.spawn_ray(self._frame.to_world(found.wo)), share
 
 
 @cache
 def _context(part: str) -> Any:
-    import mitsuba as mi
-
     context = mi.BSDFContext()
     if part != "all":
         context.type_mask = mi.BSDFFlags.Diffuse if part == "diffuse" else mi.BSDFFlags.Glossy
@@ -119,9 +110,6 @@ class Placed:
     def carried(self, ray: Any, active: Any) -> tuple[Any, Any]:
         """A ray of the world in the frame of the object, where its parameters mean the same; and whether it may
         meet the object."""
-        import drjit as dr
-        import mitsuba as mi
-
         origin = mi.Point3f(*self._turned(ray.o - mi.Vector3f(*self.pose[9:])))
         direction = mi.Vector3f(*level(self._turned(ray.d)))
         centre, square = self.ball
@@ -161,8 +149,6 @@ class First(NamedTuple):
 
     def surface(self, flags: Any, active: Any) -> Any:
         """Mitsuba's interaction, position and normals in the world."""
-        import mitsuba as mi
-
         hit = self.found.compute_surface_interaction(self.ray, flags, active)
         at = self._out(hit.p)
         hit.p = mi.Point3f(*(value + place for value, place in zip(at, self.pose[9:], strict=True)))
@@ -177,8 +163,6 @@ class First(NamedTuple):
 
 def first(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> First:
     """The nearest of what stands still and of the objects."""
-    import mitsuba as mi
-
     here = [mi.Float(float(k in (0, 4, 8))) for k in range(12)]
     nearest = First(
         scene.scene.ray_intersect_preliminary(ray, coherent=True, active=active), ray, here, mi.UInt32(0)
@@ -212,10 +196,10 @@ def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]
 
 
 def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any, Any]:
-    """Ray parameter (0: none), label (see ``SHADED``) and BSDF of the first surface along rays."""
-    import drjit as dr
-    import mitsuba as mi
+    """Ray parameter (0: none), label (see ``SHADED``) and BSDF of the first surface along rays.
 
+    A single ray that meets nothing has no BSDF: None.
+    """
     nearest = first(scene, ray, active, objects)
     hit = nearest.surface(mi.RayFlags.Minimal, active)
     seen, shaded = hit.is_valid() & active, active & False
@@ -223,30 +207,18 @@ def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequenc
     for each in objects:
         shaded = shaded | each.meets(to_sun, seen & _not(shaded))
     label = dr.select(seen, nearest.label, 0)
-    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label), hit.bsdf()
+    bsdf = hit.bsdf() if dr.is_jit_v(seen) or seen else None
+    return dr.select(seen, hit.t, 0), dr.select(shaded, label + SHADED, label), bsdf
 
 
 def _not(value: Any) -> Any:
-    import drjit as dr
-
     return ~value if dr.is_jit_v(value) else not value
 
 
 def _either(first: Any, own: Any, other: Any) -> Any:
-    import drjit as dr
-
     if dr.is_jit_v(first):
         return dr.select(first, own, other)
     return own if first else other
-
-
-def level(direction: list[Any]) -> list[Any]:
-    """See ``sensor.LEAST_COMPONENT``."""
-    import drjit as dr
-
-    from rsbench.renderers.sensor import LEAST_COMPONENT
-
-    return [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
 
 
 def sunsky_radiance(
@@ -267,9 +239,6 @@ def sunsky_radiance(
     The coat of a glossy surface mirrors the sun, and by ``facet``, a point of the unit square, what the mirrored
     ray meets: its light without what glossy surfaces there would mirror in turn. Without ``facet``, the sun alone.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     sky = scene.sky
     flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
     hit = first_surface(scene, ray, flags, active, objects)
@@ -300,7 +269,7 @@ def sunsky_radiance(
         if facet is None:
             return found
         mirrored, share = coat.mirrored(facet, shiny)
-        mirrored.d = mi.Vector3f(*level(list(mirrored.d)))
+        mirrored.d = mi.Vector3f(*level(mirrored.d))
         return found + share * sunsky_radiance(scene, mirrored, shiny, sky_points, objects)
 
     shiny = is_glossy(hit.bsdf(), on_surface)
@@ -317,9 +286,6 @@ def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, sky_points: Sequence[A
     A unit normal plus a point on the unit sphere is a direction that the cosine law draws; of those directions the
     sky's light is summed with and without what hides it. Their ratio is exact where nothing or all is hidden.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     seen, whole = mi.Color3f(0.0), mi.Color3f(0.0)
     for point in sky_points:
         direction = dr.normalize(normal + _WITHIN * point)
@@ -333,8 +299,6 @@ def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, sky_points: Sequence[A
 @cache
 def path_integrator(max_depth: int) -> Any:
     """Mitsuba's path tracer, paths of at most ``max_depth`` segments."""
-    import mitsuba as mi
-
     return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
 
 
@@ -348,16 +312,12 @@ def lane_sampler() -> Any:
     image. A new one each time: what it would draw next depends on the path so far, and so keeps the whole scene
     alive.
     """
-    import mitsuba as mi
-
     _register_lane_sampler()
     return mi.load_dict({"type": "rsbench_lanes"})
 
 
 @cache
 def _register_lane_sampler() -> None:
-    import mitsuba as mi
-
     class LaneSampler(mi.Sampler):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
@@ -415,6 +375,4 @@ def sobol(x: Any) -> Any:
 
 def unit(x: Any) -> Any:
     """32 bits as a number from 0 to below 1, which 24 of them fill."""
-    import mitsuba as mi
-
     return mi.Float(x >> 8) * (1.0 / (1 << 24))

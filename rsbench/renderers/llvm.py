@@ -21,7 +21,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -212,21 +212,30 @@ def _missing_links(library: Path) -> tuple[Path, ...]:
 
 def probe(candidate: Candidate, timeout: float = 60.0) -> ProbeResult:
     """Whether Dr.Jit works with the library, found out in a child process; good news is remembered on disk."""
-    path = candidate.path
+
+    def compile_kernel() -> ProbeResult:
+        with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
+            environ = {"DRJIT_LIBLLVM_PATH": str(candidate.path), "DRJIT_CACHE_DIR": scratch}
+            verdict = run_child(_PROBE, [str(library) for library in candidate.preload], environ, timeout)
+        if verdict.ok and int(verdict.version.split(".")[0]) < MINIMUM_VERSION:
+            return ProbeResult(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
+        return verdict
+
+    machine = f"{importlib.metadata.version('drjit')}|{cpu_key()}"
+    return remembered("llvm", candidate.path, machine, compile_kernel)
+
+
+def remembered(kind: str, library: Path, machine: str, probe: Callable[[], ProbeResult]) -> ProbeResult:
+    """The result of a probe, which is not repeated after a success with the same library on the same machine."""
     try:
-        status = path.stat()
+        status = library.stat()
     except OSError as error:
-        return ProbeResult(ok=False, reason=f"cannot be opened ({error.strerror})")
-    drjit = importlib.metadata.version("drjit")
-    key = f"llvm|{path}|{status.st_mtime_ns}|{status.st_size}|{drjit}|{cpu_key()}"
+        return ProbeResult(ok=False, reason=f"{library} cannot be opened ({error.strerror})")
+    key = f"{kind}|{library}|{status.st_mtime_ns}|{status.st_size}|{machine}"
     known = recall(key)
     if known is not None:
         return ProbeResult(ok=True, version=known)
-    with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
-        environ = {"DRJIT_LIBLLVM_PATH": str(path), "DRJIT_CACHE_DIR": scratch}
-        verdict = run_child(_PROBE, [str(library) for library in candidate.preload], environ, timeout)
-    if verdict.ok and int(verdict.version.split(".")[0]) < MINIMUM_VERSION:
-        return ProbeResult(ok=False, reason=f"is LLVM {verdict.version}; {MINIMUM_VERSION} or newer is needed")
+    verdict = probe()
     if verdict.ok:
         remember(key, verdict.version)
     return verdict

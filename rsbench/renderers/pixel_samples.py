@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.so3 import FloatArray
+from rsbench.renderers.mitsuba_modules import mi
 
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -79,8 +80,6 @@ def instant_of(seed: Any, pixel: Any, sample: Any, samples: int, instants: int) 
     Which sample has which part changes from pixel to pixel, so that no corner of all pixels is seen first. All
     follow from (seed, pixel, sample) alone, as the random numbers of the path tracer do.
     """
-    import mitsuba as mi
-
     turn, salt = mi.sample_tea_32(seed, pixel)
     within, _ = mi.sample_tea_32(salt, sample)
     part = (sample * golden_step(samples) + turn % samples) % samples

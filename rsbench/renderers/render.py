@@ -22,8 +22,10 @@ from rsbench.core.geometry import Geometry, poses_of
 from rsbench.core.rig import View
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
+from rsbench.renderers import scalar_tracing, wavefront
 from rsbench.renderers.image import Sensor, expose, processed, rows_needed
 from rsbench.renderers.integrators import Hits
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import instant_count, instant_times
 from rsbench.renderers.scene import MitsubaScene
@@ -112,14 +114,11 @@ def render_global(
     Raises:
         RsbenchError: the pose has the wrong shape or is not finite.
     """
-    options = RendererOptions() if options is None else options
     R, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
     if R.shape != (3, 3) or t.shape != (3,):
         raise RsbenchError(f"camera pose has shapes {R.shape} and {t.shape}: (3, 3) and (3,) are needed")
-    rows = range(camera.height)
     poses = LinePoses(np.broadcast_to(R, (camera.height, 3, 3)), np.broadcast_to(t, (camera.height, 3)))
-    _check_objects(scene, None, options)
-    return _single_pass(scene, camera, (poses, poses), options, rows)
+    return render(scene, camera, poses, replace(options or RendererOptions(), method="single-pass"))
 
 
 def _single_pass(
@@ -197,17 +196,8 @@ def _checked_rows(rows: Sequence[int] | None, height: int) -> Sequence[int]:
     return [int(row) for row in rows]
 
 
-def _tracer() -> ModuleType | Any:
-    import drjit as dr
-    import mitsuba as mi
-
-    if dr.is_jit_v(mi.Float):
-        from rsbench.renderers import wavefront
-
-        return wavefront
-    from rsbench.renderers import scalar_tracing
-
-    return scalar_tracing
+def _tracer() -> ModuleType:
+    return wavefront if dr.is_jit_v(mi.Float) else scalar_tracing
 
 
 def sensed_rows(

@@ -6,7 +6,6 @@ The same formulas as the wavefront, sample for sample; only rounding differs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 from rsbench.core.camera import PinholeCamera
 from rsbench.renderers.integrators import (
     Hits,
-    Placed,
     depth_and_label,
     is_glossy,
     lane_sampler,
@@ -23,6 +21,7 @@ from rsbench.renderers.integrators import (
     placed,
     sunsky_radiance,
 )
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points, subpixel_grid
 from rsbench.renderers.scene import MitsubaScene
@@ -32,8 +31,6 @@ Float32Array = NDArray[np.float32]
 
 def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
     """What the rays through pixel centres meet."""
-    import mitsuba as mi
-
     depth, labels, gloss = result = Hits.none(len(rows), camera.width)
     for place, row in enumerate(rows):
         for column in range(camera.width):
@@ -54,8 +51,24 @@ def radiance_rows(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
     """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
-    trace = _sunsky if options.integrator == "sunsky" else _path
     grid = subpixel_grid(options.samples).tolist()
+    sky = sky_points(options.samples, options.sky_rays).tolist() if options.sky_rays else [[]] * options.samples
+    facets = facet_points(options.samples).tolist()
+
+    def sunsky(origin: Any, direction: Any, pixel: int, sample: int, pose: int) -> Any:
+        above = [mi.Vector3f(*point) for point in sky[sample]]
+        facet = mi.Point2f(facets[sample]) if scene.glossy else None
+        ray = mi.Ray3f(origin, dr.normalize(direction))
+        return sunsky_radiance(scene, ray, True, above, placed(scene, sensor, pose), facet)
+
+    def path(origin: Any, direction: Any, pixel: int, sample: int, pose: int) -> Any:
+        sampler = lane_sampler()
+        sampler.seed_lanes(options.seed, pixel, sample)
+        ray = mi.RayDifferential3f(origin, dr.normalize(direction))
+        radiance, _, _ = path_integrator(options.max_depth).sample(scene.scene, sampler, ray)
+        return radiance
+
+    trace = sunsky if options.integrator == "sunsky" else path
     result = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     for place, row in enumerate(rows):
         for column in range(camera.width):
@@ -66,49 +79,6 @@ def radiance_rows(
                     instant = instant_of(options.seed, pixel, number, options.samples, sensor.instants)
                     pose += sensor.lines * int(instant)
                 origin, direction = sensor.row_ray(column + dx, row + dy, pose)
-                objects = placed(scene, sensor, pose)
-                light = trace(scene, origin, direction, options, pixel, number, objects)
-                total += np.asarray(light, dtype=np.float32)
+                total += np.asarray(trace(origin, direction, pixel, number, pose), dtype=np.float32)
             result[place, column] = total / np.float32(options.samples)
     return result
-
-
-def _sunsky(
-    scene: MitsubaScene,
-    origin: Any,
-    direction: Any,
-    options: RendererOptions,
-    pixel: int,
-    sample: int,
-    objects: list[Placed],
-) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
-    sky_points_here = [mi.Vector3f(*point) for point in _sky_points(options.samples, options.sky_rays)[sample]]
-    facet = mi.Point2f(facet_points(options.samples)[sample].tolist()) if scene.glossy else None
-    return sunsky_radiance(scene, mi.Ray3f(origin, dr.normalize(direction)), True, sky_points_here, objects, facet)
-
-
-@cache
-def _sky_points(samples: int, rays: int) -> Any:
-    return sky_points(samples, rays).tolist() if rays else [[]] * samples
-
-
-def _path(
-    scene: MitsubaScene,
-    origin: Any,
-    direction: Any,
-    options: RendererOptions,
-    pixel: int,
-    sample: int,
-    objects: list[Placed],
-) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
-    sampler = lane_sampler()
-    sampler.seed_lanes(options.seed, pixel, sample)
-    ray = mi.RayDifferential3f(origin, dr.normalize(direction))
-    radiance, _, _ = path_integrator(options.max_depth).sample(scene.scene, sampler, ray)
-    return radiance

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
 from rsbench.renderers.backend import VARIANTS, start_backend
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.scenes.load import irradiance_map
-from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh
+from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh, srgb_to_linear
 
 
 class Reflectances:
@@ -32,9 +33,6 @@ class Reflectances:
         Raises:
             RsbenchError: a texture is none.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         materials = {id(material): material for _, material in surfaces}
         textures = {key: checked_texture(each) for key, each in materials.items() if each.texture is not None}
         begins = dict(zip(textures, np.cumsum([0, *(t[..., 0].size for t in textures.values())]), strict=False))
@@ -68,9 +66,6 @@ class Reflectances:
 
     def at(self, hit: Any, active: Any) -> Any:
         """Reflectance (RGB) of the surfaces of Mitsuba's interactions."""
-        import drjit as dr
-        import mitsuba as mi
-
         number = dr.reinterpret_array(mi.UInt32, hit.shape)
         begin, width, height = (dr.gather(mi.UInt32, each, number, active) for each in self._places)
         textured = active & (width > 0)
@@ -88,17 +83,11 @@ class Reflectances:
 
 def _number(shape: Any) -> int:
     """Identifier of a shape inside a kernel."""
-    import drjit as dr
-    import mitsuba as mi
-
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _between(coordinate: Any, size: Any) -> list[tuple[Any, Any]]:
     """The two texels of an axis about coordinates, each with its share; the last one's neighbour is the first."""
-    import drjit as dr
-    import mitsuba as mi
-
     place = dr.fma(coordinate, mi.Float(size), -0.5)
     whole, count = dr.floor(place), mi.Int32(dr.maximum(size, 1))
     share, at = place - whole, mi.Int32(whole)
@@ -122,20 +111,12 @@ def checked_texture(material: Material) -> NDArray[np.uint8]:
     return texture
 
 
-def srgb_to_linear(value: Any) -> NDArray[np.float64]:
-    """Linear intensity of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    value = np.asarray(value, dtype=np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.0) + 0.055) / 1.055) ** 2.4)
-
-
 @cache
 def linear_codes() -> NDArray[np.float32]:
     """Linear intensity (256,) of each 8-bit sRGB code, with the rounding of Mitsuba's own conversion.
 
     Looking them up is several times faster than letting Mitsuba convert whole textures, and bit for bit the same.
     """
-    import mitsuba as mi
-
     codes = mi.Bitmap(np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, axis=2))
     linear = codes.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     return np.array(linear)[0, :, 0]
@@ -160,9 +141,6 @@ class MitsubaScene:
 
     def __init__(self, scene: Scene) -> None:
         variant = start_backend().variant
-        import drjit as dr
-        import mitsuba as mi
-
         self.name = scene.name
         self.light = scene.light
         drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
@@ -183,7 +161,9 @@ class MitsubaScene:
         for number, mesh in enumerate(drawn):
             key = id(mesh.material)
             if key not in materials:
-                own = _without_texture(mesh.material) if bare else mesh.material
+                own = mesh.material
+                if bare and own.roughness is None:  # Mitsuba itself evaluates glossy materials
+                    own = replace(own, texture=None)
                 materials[key] = own, _loaded(own)
             own, bsdf = materials[key]
             of = moved[mesh.mover - 1] if mesh.mover else content
@@ -226,8 +206,6 @@ class MitsubaScene:
 
 def give_back_memory() -> None:
     """Return to the system what Dr.Jit keeps of freed arrays."""
-    import drjit as dr
-
     dr.sync_thread()
     dr.flush_malloc_cache()
 
@@ -237,8 +215,6 @@ class Sky:
 
     def __init__(self, light: Light, emitter: Any) -> None:
         """``emitter``: Mitsuba's emitter of the sky, used where the light has an environment map."""
-        import drjit as dr
-        import mitsuba as mi
 
         def opaque(values: Any) -> Any:
             return [dr.opaque(mi.Float, float(value)) for value in values]
@@ -248,7 +224,7 @@ class Sky:
         self.sun_radiance = mi.Color3f(*opaque(np.asarray(light.sun_irradiance) / np.pi))
         self.horizon = mi.Color3f(*opaque(light.sky_horizon))
         self.zenith = mi.Color3f(*opaque(light.sky_zenith))
-        self.overhead = mi.Color3f(*opaque(mean_sky(light)))
+        self.overhead = mi.Color3f(*opaque(light.mean_sky))
         self.mapped = light.environment is not None
         if light.environment is not None:
             open_ = irradiance_map(light.environment.radiance)
@@ -256,8 +232,6 @@ class Sky:
 
     def seen_along(self, direction: Any) -> Any:
         """Radiance of the sky along unit directions: the horizon's colour below, towards the zenith's above."""
-        import drjit as dr
-
         if self.mapped:
             return _looked_up(self._around, direction)
         return self.horizon + (self.zenith - self.horizon) * dr.maximum(dr.dot(direction, self.up), 0)
@@ -268,8 +242,6 @@ class Sky:
         The integral of max(n.w, 0) max(up.w, 0) over all directions w is 2 / 3 (sin a + (pi - a) cos a), with a
         between n and up: Cho and Saul, Kernel methods for deep learning, NIPS 2009, in three dimensions.
         """
-        import drjit as dr
-
         if self.mapped:
             return _looked_up(self._open, normal)
         level = dr.clip(dr.dot(normal, self.up), -1, 1)
@@ -280,20 +252,9 @@ class Sky:
 
 def _looked_up(emitter: Any, direction: Any) -> Any:
     """Radiance of an environment map along unit directions, as ``path`` has it."""
-    import drjit as dr
-    import mitsuba as mi
-
     ray = dr.zeros(mi.SurfaceInteraction3f)
     ray.wi = -direction
     return mi.Color3f(emitter.eval(ray))
-
-
-def mean_sky(light: Light) -> NDArray[np.float64]:
-    """Cosine-weighted mean radiance (3,) of the sky over the upper hemisphere: E / pi of level ground.
-
-    The integral of (horizon + (zenith - horizon) cos) cos over the hemisphere is pi horizon / 3 + 2 pi zenith / 3.
-    """
-    return np.asarray(light.sky_horizon) / 3.0 + 2.0 * np.asarray(light.sky_zenith) / 3.0
 
 
 def _unit(vector: Any, field: str) -> NDArray[np.float64]:
@@ -316,9 +277,6 @@ def _lights(light: Light) -> dict[str, Any]:
 
 def _ball(vertices: Sequence[NDArray[np.float64]]) -> tuple[Any, Any]:
     """Centre, and square of the radius, of a ball around vertices (n, 3); no smaller by rounding."""
-    import drjit as dr
-    import mitsuba as mi
-
     every = np.concatenate(vertices)
     centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
     square = float(np.max(np.sum((every - centre) ** 2, axis=1)))
@@ -334,36 +292,26 @@ def _sun(light: Light) -> dict[str, Any]:
 
 def _sky(light: Light) -> dict[str, Any]:
     """The sky as an environment map, whose pole (row 0 of the map) is the zenith."""
-    import mitsuba as mi
-
     up = _unit(light.up, "up")
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     side /= np.linalg.norm(side)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = side, up, np.cross(side, up)
     height = np.cos(np.pi * (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS).clip(0.0)[:, None]
     horizon, zenith = np.asarray(light.sky_horizon), np.asarray(light.sky_zenith)
     colours = (horizon + (zenith - horizon) * height).astype(np.float32)
-    bitmap = mi.Bitmap(np.repeat(colours[:, None], 2 * _SKY_ROWS, axis=1).copy())
-    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose.tolist())}
+    colours = np.repeat(colours[:, None], 2 * _SKY_ROWS, axis=1)
+    return _environment_map(colours, np.stack([side, up, np.cross(side, up)], axis=1))
 
 
 def _mapped(radiance: NDArray[np.float32], environment: Environment) -> dict[str, Any]:
     """Mitsuba's environment map, whose middle looks along its z, with -x at its right and y at its pole."""
-    import mitsuba as mi
+    return _environment_map(radiance, environment.frame_from_map @ np.diag([-1.0, -1.0, 1.0]))
 
+
+def _environment_map(radiance: NDArray[np.float32], rotation: NDArray[np.float64]) -> dict[str, Any]:
     pose = np.eye(4)
-    pose[:3, :3] = environment.frame_from_map @ np.diag([-1.0, -1.0, 1.0])
-    return {
-        "type": "envmap",
-        "bitmap": mi.Bitmap(radiance.copy()),
-        "to_world": mi.ScalarTransform4f(pose.tolist()),
-    }
-
-
-def _without_texture(material: Material) -> Material:
-    """The material without its texture, unless it is glossy, since Mitsuba itself evaluates glossy materials."""
-    return replace(material, texture=None) if material.roughness is None else material
+    pose[:3, :3] = rotation
+    bitmap = mi.Bitmap(radiance.copy())
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose.tolist())}
 
 
 def _loaded(material: Material) -> Any:
@@ -372,9 +320,6 @@ def _loaded(material: Material) -> Any:
     Dr.Jit pads a texture to four channels at its first use and only then drops the original; used one by one, the
     textures of a scene take a third less memory at the peak than all at once in the first image.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     reflectance: Any
     if material.texture is None:
         reflectance = {"type": "rgb", "value": srgb_to_linear(material.colour).tolist()}
@@ -398,8 +343,6 @@ def _loaded(material: Material) -> Any:
 
 
 def _texture(material: Material) -> dict[str, Any]:
-    import mitsuba as mi
-
     return {
         "type": "bitmap",
         "data": mi.TensorXf(linear_codes()[checked_texture(material)]),
@@ -431,8 +374,6 @@ def _check(mesh: SceneMesh) -> None:
 
 
 def _mesh(mesh: SceneMesh, bsdf: Any) -> Any:
-    import mitsuba as mi
-
     _check(mesh)
     shape = mi.Mesh(
         mesh.name,

@@ -12,7 +12,7 @@ sample: no ray is interpolated. It takes the steps that the lens needs, which th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import cache, lru_cache
 from typing import Any
@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core.camera import Lens, PinholeCamera, inverse_2x2
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose, inverse
+from rsbench.renderers.mitsuba_modules import dr, mi
 
 _EXACT_PX = 1e-8
 """Largest error of an undistorted ray, px, in double precision; rounding to single precision errs a thousand
@@ -36,9 +37,6 @@ class LensRays:
     """Ideal coordinates of the pixels of one camera; numbers are data of the kernel, the model is its code."""
 
     def __init__(self, camera: PinholeCamera, lens: Lens) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.lens, self.width, self.steps = lens, dr.opaque(mi.UInt32, camera.width), chord_steps(camera, lens)
         self._centre = [dr.opaque(mi.Float64, value) for value in (camera.cx, camera.cy)]
         self._per_pixel = [dr.opaque(mi.Float64, 1.0 / value) for value in (camera.fx, camera.fy)]
@@ -53,9 +51,6 @@ class LensRays:
 
     def pixel(self, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
         """Values that all samples of the pixel around (x, y) share, for ``coordinates``."""
-        import drjit as dr
-        import mitsuba as mi
-
         if self.lens.model == "double-sphere":
             return ()
         column, row = (
@@ -71,15 +66,11 @@ class LensRays:
 
     def coordinates(self, x: Any, y: Any, pixel: tuple[Any, ...]) -> tuple[Any, Any]:
         """Ideal coordinates, in single precision, of pixel coordinates (x, y) inside a pixel."""
-        import mitsuba as mi
-
         solve = {"kannala-brandt": self._kannala, "double-sphere": self._spheres}.get(self.lens.model, self._brown)
         found = solve(*self._distorted(x, y), *pixel)
         return mi.Float(found[0]), mi.Float(found[1])
 
     def _distorted(self, x: Any, y: Any) -> list[Any]:
-        import mitsuba as mi
-
         rates = zip((x, y), self._centre, self._per_pixel, strict=True)
         return [(mi.Float64(value) - centre) * rate for value, centre, rate in rates]
 
@@ -115,8 +106,6 @@ class LensRays:
 
     def _spheres(self, xd: Any, yd: Any) -> tuple[Any, Any]:
         """Closed form of the double sphere. NumPy: ``Lens.undistort``."""
-        import drjit as dr
-
         *_, xi, alpha = self._k.values()
         s = xd * xd + yd * yd
         z = (1 - alpha * alpha * s) / (alpha * dr.sqrt(1 - (2 * alpha - 1) * s) + 1 - alpha)
@@ -131,8 +120,6 @@ class LensRays:
         return 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
 
     def _kannala(self, xd: Any, yd: Any, angle0: Any, rate: Any, radius0: Any, tangent0: Any) -> tuple[Any, Any]:
-        import drjit as dr
-
         k1, k2, _, _, k3, k4, *_ = self._k.values()
         radius = dr.sqrt(xd * xd + yd * yd)
         angle = angle0 + rate * (radius - radius0)
@@ -179,6 +166,11 @@ LEAST_COMPONENT = 1e-15
 for negative and its inverse for positive: rays of its packet then miss surfaces that they meet."""
 
 
+def level(direction: Iterable[Any]) -> list[Any]:
+    """Components of a direction, of which those below ``LEAST_COMPONENT`` are 0."""
+    return [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
+
+
 def pose_table(
     camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike, columns: bool = False
 ) -> NDArray[np.float32]:
@@ -222,8 +214,6 @@ def make_sensor(
     Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter. ``objects`` are
     those of objects that move, ``world_from_object``, with one more leading axis.
     """
-    import mitsuba as mi
-
     sensor_class()
     film = {
         "type": "hdrfilm",
@@ -263,17 +253,11 @@ def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[
 
 def _held(table: NDArray[np.float32]) -> Any:
     """A table as ``entries`` reads it."""
-    import drjit as dr
-    import mitsuba as mi
-
     return mi.Float(table.ravel()) if dr.is_jit_v(mi.Float) else table.ravel().tolist()
 
 
 def entries(poses: Any, row: Any, active: Any) -> list[Any]:
     """The 12 values of the pose of each lane's row."""
-    import drjit as dr
-    import mitsuba as mi
-
     if not dr.is_jit_v(mi.Float):
         return list(poses[12 * int(row) : 12 * int(row) + 12])
     return [dr.gather(mi.Float, poses, row * 12 + k, active) for k in range(12)]
@@ -282,9 +266,6 @@ def entries(poses: Any, row: Any, active: Any) -> list[Any]:
 @cache
 def sensor_class() -> Any:
     """The class behind the plugin ``rs_pinhole``, registered with the Mitsuba variant that is set."""
-    import drjit as dr
-    import mitsuba as mi
-
     scalar = not dr.is_jit_v(mi.Float)
 
     class RSPinhole(mi.Sensor):
@@ -329,8 +310,7 @@ def sensor_class() -> Any:
             u, v = _coordinates(self, x, y, active, pixel)
             p = entries(self.poses, row, active)
             direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
-            level = [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
-            return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level)
+            return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level(direction))
 
         def object_pose(self, number: int, row: Any, active: Any) -> list[Any]:
             """The 12 values of the pose of an object, counted from 0."""

@@ -16,6 +16,7 @@ from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import LEAST_COMPONENT
 
@@ -46,7 +47,7 @@ class SceneRays:
         found = blocked(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
             left = np.flatnonzero(~found)
-            own = inverse(each.world_from_object(_at(tau, left)))
+            own = inverse(each.world_from_object(np.asarray(tau)[left]))
             found[left] = blocked(scene, transform(own, eyes[left]), transform(own, points[left]))
         return found
 
@@ -63,7 +64,7 @@ class SceneRays:
         """What rays to the points, and beyond, meet first; ``tau`` as for ``blocked``."""
         met = _met(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
-            pose = each.world_from_object(_at(tau, slice(None)))
+            pose = each.world_from_object(np.asarray(tau))
             own = inverse(pose)
             other = _met(scene, transform(own, eyes), transform(own, points))
             nearer = other.distance < met.distance
@@ -85,10 +86,6 @@ class _Met(NamedTuple):
     """(n,) in units of the distance to the point."""
 
 
-def _at(tau: FloatArray | None, chosen: Any) -> FloatArray:
-    return np.asarray(tau)[chosen]
-
-
 def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
     """``SceneRays.blocked`` for one scene of Mitsuba."""
     found = [np.zeros(0, dtype=np.bool_)]
@@ -100,9 +97,6 @@ def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool
 
 def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
     """``SceneRays.surfaces`` for one scene of Mitsuba."""
-    import drjit as dr
-    import mitsuba as mi
-
     found = []
     for ray in _rays(eyes, points):
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
@@ -114,9 +108,6 @@ def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
 
 
 def _numbers(scene: Any, hit: Any) -> NDArray[np.uint16]:
-    import drjit as dr
-    import mitsuba as mi
-
     if not _wide():
         return np.array([_number(hit.shape) if hit.is_valid() else 0], dtype=np.uint16)
     keys = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
@@ -131,16 +122,11 @@ def _number(shape: Any) -> int:
 
 def _wide() -> bool:
     """Whether the backend traces arrays of rays."""
-    import drjit as dr
-    import mitsuba as mi
-
     return bool(dr.is_jit_v(mi.Float))
 
 
 def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
     """Rays whose parameter is 1 at the points: one array of all of them, or each alone."""
-    import mitsuba as mi
-
     origins, directions = np.zeros((2, 3, len(points)), dtype=np.float32)
     _fill_rays(eyes, points, origins, directions)
     if _wide():

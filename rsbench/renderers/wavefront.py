@@ -24,6 +24,7 @@ from rsbench.renderers.integrators import (
     placed,
     sunsky_radiance,
 )
+from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points, subpixel_grid
 from rsbench.renderers.scene import MitsubaScene
@@ -53,9 +54,6 @@ class _Lanes:
 
     @classmethod
     def of(cls, rows: Sequence[int], width: int, copies: int = 1) -> _Lanes:
-        import drjit as dr
-        import mitsuba as mi
-
         shape = (copies, len(rows), _padded(width))
         lane = dr.arange(mi.UInt32, shape[0] * shape[1] * shape[2])
         padded, count = dr.opaque(mi.UInt32, shape[2]), dr.opaque(mi.UInt32, len(rows))
@@ -69,10 +67,12 @@ class _Lanes:
         """Number of the row, or of the column where those are read."""
         return self.column if sensor.columns else self.row
 
+    def pixel(self, camera: PinholeCamera) -> Any:
+        """Index of the pixel in the full frame."""
+        return self.row * dr.opaque(mi.UInt32, camera.width) + self.column
+
     def image(self, channels: Sequence[Any], width: int) -> Float32Array:
         """Host array (copies, rows, width, channels) of Dr.Jit arrays with one entry per lane."""
-        import drjit as dr
-
         dr.eval(channels)
         host = np.stack([np.array(channel).reshape(self.shape)[:, :, :width] for channel in channels], axis=-1)
         return host.astype(np.float32, copy=False)
@@ -83,25 +83,21 @@ def _padded(width: int) -> int:
 
 
 def _most_lanes() -> int:
-    import mitsuba as mi
-
     return LANES_PER_LAUNCH * (_ON_GPU if str(mi.variant()).startswith("cuda") else 1)
 
 
-def _bands(rows: Sequence[int], width: int) -> Iterator[Sequence[int]]:
+def _bands(rows: Sequence[int], width: int) -> Iterator[tuple[slice, Sequence[int]]]:
+    """Rows of a launch, and their place among all."""
     step = max(1, _most_lanes() // _padded(width))
     for start in range(0, len(rows), step):
-        yield rows[start : start + step]
+        place = slice(start, min(start + step, len(rows)))
+        yield place, rows[place]
 
 
 def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
     """What the rays through pixel centres meet."""
-    import drjit as dr
-    import mitsuba as mi
-
     result = Hits.none(len(rows), camera.width)
-    done = 0
-    for band in _bands(rows, camera.width):
+    for place, band in _bands(rows, camera.width):
         lanes = _Lanes.of(band, camera.width)
         ray = mi.Ray3f(
             *sensor.row_ray(mi.Float(lanes.column), mi.Float(lanes.row), lanes.line(sensor), lanes.active)
@@ -117,8 +113,7 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
             found["gloss"] = dr.select(is_glossy(bsdf, lanes.active), mi.UInt32(1), 0)
         values = lanes.image([*found.values()], camera.width)[0]
         for number, name in enumerate(found):
-            getattr(result, name)[done : done + len(band)] = values[..., number]
-        done += len(band)
+            getattr(result, name)[place] = values[..., number]
     return result
 
 
@@ -128,23 +123,17 @@ def radiance_rows(
     """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
     trace = _sunsky_band if options.integrator == "sunsky" else _path_band
     result = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
-    done = 0
-    for band in _bands(rows, camera.width):
-        result[done : done + len(band)] = trace(scene, sensor, camera, band, options)
-        done += len(band)
+    for place, band in _bands(rows, camera.width):
+        result[place] = trace(scene, sensor, camera, band, options)
     return result
 
 
 def _pose(sensor: Any, camera: PinholeCamera, lanes: _Lanes, sample: Any, options: RendererOptions) -> Any:
     """Number of the pose that a sample of each lane is seen from: its row's, at an instant of the exposure."""
-    import drjit as dr
-    import mitsuba as mi
-
     if sensor.instants == 1:
         return lanes.line(sensor)
-    pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
     seed = dr.opaque(mi.UInt32, options.seed)
-    instant = instant_of(seed, pixel, sample, options.samples, sensor.instants)
+    instant = instant_of(seed, lanes.pixel(camera), sample, options.samples, sensor.instants)
     return lanes.line(sensor) + dr.opaque(mi.UInt32, sensor.lines) * instant
 
 
@@ -152,9 +141,6 @@ def _sunsky_band(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
     """The loop over samples runs inside the kernel, so memory does not grow with them."""
-    import drjit as dr
-    import mitsuba as mi
-
     lanes = _Lanes.of(rows, camera.width)
     grid = mi.Float(subpixel_grid(options.samples).ravel())
     count, rays = dr.opaque(mi.UInt32, options.samples), options.sky_rays
@@ -185,9 +171,6 @@ def _sunsky_band(
 
 def _entry(table: Any, number: Any) -> Any:
     """Vector of a table of three numbers each."""
-    import drjit as dr
-    import mitsuba as mi
-
     return mi.Vector3f(*(dr.gather(mi.Float, table, 3 * number + k) for k in range(3)))
 
 
@@ -195,9 +178,6 @@ def _path_band(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
     """One lane per pixel and sample, in passes; samples are added one after another whatever the passes."""
-    import drjit as dr
-    import mitsuba as mi
-
     world = scene.textured()  # which evaluates what is recorded so far
     offsets = mi.Float(subpixel_grid(options.samples).ravel())
     integrator, sampler = path_integrator(options.max_depth), lane_sampler()
@@ -212,8 +192,7 @@ def _path_band(
         x = mi.Float(lanes.column) + dr.gather(mi.Float, offsets, 2 * sample)
         y = mi.Float(lanes.row) + dr.gather(mi.Float, offsets, 2 * sample + 1)
         origin, direction = sensor.row_ray(x, y, _pose(sensor, camera, lanes, sample, options), lanes.active)
-        pixel = lanes.row * dr.opaque(mi.UInt32, camera.width) + lanes.column
-        sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), pixel, sample)
+        sampler.seed_lanes(dr.opaque(mi.UInt32, options.seed), lanes.pixel(camera), sample)
         ray = mi.RayDifferential3f(origin, dr.normalize(direction))
         radiance, _, _ = integrator.sample(world, sampler, ray, active=lanes.active)
         total = _added(total, radiance, copies)
@@ -222,9 +201,6 @@ def _path_band(
 
 def _added(total: Any, radiance: Any, copies: int) -> Any:
     """The total of each pixel, and one copy of its radiance after another."""
-    import drjit as dr
-    import mitsuba as mi
-
     dr.eval(total, radiance)
     place, step = dr.arange(mi.UInt32, dr.width(total)), dr.opaque(mi.UInt32, dr.width(total))
     last = dr.opaque(mi.UInt32, copies)

@@ -93,9 +93,8 @@ def _walls(rng: np.random.Generator, parameters: CastleBuilder) -> list[Piece]:
 def _buildings(rng: np.random.Generator, parameters: CastleBuilder) -> list[Piece]:
     pieces = placed(gatehouse(rng, "ashlar_1", "tiles_1", parameters.wall_height + 2.2), (7.0, 29.0, 0), 180)
     pieces += placed(square_tower(rng, 9.0, parameters.keep_height, "ashlar_2", 4, "tiles_0"), (-5.2, 18.5, 0))
-    pieces += placed(
-        round_tower(rng, 1.9, parameters.keep_height + 2.5, "ashlar_0", "tiles_2", 2.4), (0.2, 22.4, 0)
-    )
+    stair_tower = round_tower(rng, 1.9, parameters.keep_height + 2.5, "ashlar_0", "tiles_2", 2.4)
+    pieces += placed(stair_tower, (0.2, 22.4, 0))
     hall = HouseStyle(width=9.0, depth=6.5, storeys=2, wall="plaster_0", roof="tiles_1", gable_front=False)
     pieces += placed(house(rng, hall), (-5.6, 3.6, 0), 90)
     stable = HouseStyle(width=7.0, depth=5.0, storeys=1, storey_height=3.0, ground="planks", wall="plaster_4",

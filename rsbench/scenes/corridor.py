@@ -86,9 +86,8 @@ def _side(rng: np.random.Generator, side: int, doors: int) -> list[Piece]:
     if niche:
         places = [y for y in places if abs(y - _NICHE[0]) > _NICHE[1] / 2 + 0.9]
     doorways = [rectangle(-side * y, -0.1, _DOOR[0], _DOOR[1] + 0.1) for y in places]
-    pieces = _wall(
-        _START - 0.3 if side < 0 else -_END - 0.3, _END + 0.3 if side < 0 else 0.3 - _START, [*doorways, *niche]
-    )
+    left, right = (_START - 0.3, _END + 0.3) if side < 0 else (-_END - 0.3, 0.3 - _START)
+    pieces = _wall(left, right, [*doorways, *niche])
     if niche:
         pieces += placed(_frame(_NICHE[1], 2.3), (-_NICHE[0], 0, 0))
     for k, y in enumerate(places):

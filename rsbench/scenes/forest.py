@@ -11,7 +11,7 @@ import numpy as np
 
 from rsbench.scenes import props
 from rsbench.scenes.model import FloatArray
-from rsbench.scenes.parts import PartsBuilder, Piece, flat, grid, lump, placed, tube
+from rsbench.scenes.parts import PartsBuilder, Piece, flat, grid, lump, placed, tube, unit
 
 _CLEAR = 1.7
 """No trunk stands nearer to the path, which runs along y from -4 to 2 m, so that the rig has room."""
@@ -60,10 +60,8 @@ def _places(rng: np.random.Generator, count: int, near: float, far: float) -> li
 def _leaves(rng: np.random.Generator, surface: str, centres: FloatArray, size: float, droop: float = 0.0) -> Piece:
     """One pointed leaf of two triangles at each of the centres (n, 3), folded along its middle."""
     count = len(centres)
-    along = rng.normal(size=(count, 3)) - (0, 0, droop)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    side = np.cross(along, rng.normal(size=(count, 3)))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    along = unit(rng.normal(size=(count, 3)) - (0, 0, droop))
+    side = unit(np.cross(along, rng.normal(size=(count, 3))))
     length = size * rng.uniform(0.7, 1.3, (count, 1))
     fold = np.cross(side, along) * 0.12 * length
     tip, left, right = centres + along * length, side * 0.3 * length, -side * 0.3 * length
@@ -167,9 +165,8 @@ def _ground(rng: np.random.Generator) -> list[Piece]:
         pieces.append(tube("bark_fine", path, np.full(4, float(rng.uniform(0.006, 0.025))), 6))
     for _ in range(25):
         a, b, size = float(rng.uniform(-7, 7)), float(rng.uniform(3.5, 18)), float(rng.uniform(0.08, 0.35))
-        pieces += placed(
-            [lump("stone", rng, (size * 1.4, size, size * 0.7), 0.2, 2)], (a, b, float(_height(a, b)))
-        )
+        stone = lump("stone", rng, (size * 1.4, size, size * 0.7), 0.2, 2)
+        pieces += placed([stone], (a, b, float(_height(a, b))))
     return pieces
 
 
@@ -184,8 +181,7 @@ def _backdrop(rng: np.random.Generator) -> list[Piece]:
             x, y = 4.0 * (k - 8) + float(rng.uniform(-1, 1)), float(rng.uniform(35, 39)) + row
             radii = np.array([rng.uniform(2.4, 3.4), 1.6, rng.uniform(2.2, 3.0)])
             crown = [lump("leaves_dark" if (k + row) % 2 else "leaves", rng, radii, 0.2, 2)]
-            direction = rng.normal(size=(320, 3))
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            direction = unit(rng.normal(size=(320, 3)))
             crown.append(_leaves(rng, crown[0].surface, direction * radii * rng.uniform(0.95, 1.3, (320, 1)), 0.3))
             pieces += placed(crown, (x, y, float(_height(x, y)) + level))
     return pieces

@@ -237,8 +237,7 @@ def lit_by(light: Light, radiance: NDArray[np.float32], turn_deg: float) -> Ligh
     if own <= 0.0:
         raise RsbenchError("environment map: its upper half is black")
     up = np.asarray(light.sun_direction)[2]
-    mean = np.asarray(light.sky_horizon) / 3.0 + 2.0 * np.asarray(light.sky_zenith) / 3.0
-    factor = float((np.asarray(light.sun_irradiance) * up + np.pi * mean) @ _REC_709) / own
+    factor = float((np.asarray(light.sun_irradiance) * up + np.pi * light.mean_sky) @ _REC_709) / own
     turn = so3.exp(np.array([0.0, 0.0, np.deg2rad(turn_deg)]))
     return replace(
         light,
@@ -254,12 +253,18 @@ _SCENE_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 def _directions(height: int) -> tuple[FloatArray, FloatArray]:
     """Unit directions (H, 2 H, 3) of a map's pixels in the frame of the scene, and solid angles (H, 1)."""
-    down = np.pi * (np.arange(height) + 0.5) / height
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    directions = _around(np.pi * (np.arange(height) + 0.5) / height, height)
+    return directions, (edges[:-1] - edges[1:])[:, None] * np.pi / height
+
+
+def _around(down: FloatArray, height: int) -> FloatArray:
+    """Unit directions (n, 2 H, 3) at angles (n) from the zenith, in the columns of a map of height H."""
     around = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
     level = np.sin(down)[:, None]
-    directions = [level * np.sin(around), level * np.cos(around), np.cos(down)[:, None] + 0.0 * around]
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    return np.stack(directions, axis=-1), (edges[:-1] - edges[1:])[:, None] * np.pi / height
+    return np.stack(
+        [level * np.sin(around), level * np.cos(around), np.cos(down)[:, None] + 0.0 * around], axis=-1
+    )
 
 
 def _without_sun(
@@ -283,8 +288,7 @@ def _without_sun(
 
 def _at_edges(radiance: FloatArray) -> NDArray[np.float32]:
     """Values (H + 1, W, 3) at the edges of rows, the poles first and last."""
-    poles = (np.broadcast_to(np.mean(radiance[row], axis=0), (1, *radiance.shape[1:])) for row in (0, -1))
-    top, bottom = poles
+    top, bottom = (np.broadcast_to(np.mean(radiance[row], axis=0), (1, *radiance.shape[1:])) for row in (0, -1))
     between = 0.5 * (radiance[:-1] + radiance[1:])
     return np.concatenate([top, between, bottom]).astype(np.float32)
 
@@ -299,11 +303,7 @@ def irradiance_map(radiance: NDArray[np.float32], rows: int = 32) -> NDArray[np.
     small = np.asarray(cv2.resize(middle, (2 * height, height), interpolation=cv2.INTER_AREA), dtype=np.float64)
     directions, weights = _directions(height)
     light = (small * weights[..., None]).reshape(-1, 3)
-    down, around = np.pi * np.arange(rows + 1) / rows, np.pi * ((np.arange(2 * rows) + 0.5) / rows - 1.0)
-    level = np.sin(down)[:, None]
-    normals = np.stack(
-        [level * np.sin(around), level * np.cos(around), np.cos(down)[:, None] + 0.0 * around], axis=-1
-    )
+    normals = _around(np.pi * np.arange(rows + 1) / rows, rows)
     seen = [np.maximum(row @ directions.reshape(-1, 3).T, 0.0) @ light for row in normals]
     return (np.stack(seen) / np.pi).astype(np.float32)
 

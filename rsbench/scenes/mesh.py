@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import trimesh
@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 from rsbench.components.imports import exception_text
 from rsbench.core.errors import RsbenchError
 from rsbench.scenes.mesh_files import TEXTURE, Surface, read_mesh_file
-from rsbench.scenes.model import ROUGHEST, SMOOTHEST, FloatArray, Material, SceneBuilder, SceneMesh
+from rsbench.scenes.model import (
+    ROUGHEST,
+    SMOOTHEST,
+    FloatArray,
+    Material,
+    SceneBuilder,
+    SceneMesh,
+    linear_to_srgb,
+    srgb_to_linear,
+)
 from rsbench.scenes.parts import Piece, assemble, box, grid
 from rsbench.scenes.surfaces import paint_palette
 from rsbench.storage.untrusted_files import check_amount, check_size
@@ -148,14 +157,7 @@ class MeshBuilder(SceneBuilder):
         angle = np.deg2rad(self.heading_deg)
         heading = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         axes = self.metres_per_unit * heading @ _Z_UP[self.up_axis]
-        look = _Look(
-            shading=self.shading,
-            transparent=self.transparent,
-            gloss=self.gloss,
-            surfaces=surfaces,
-            materials={},
-        )
-        meshes = []
+        look, meshes = _Look(self, surfaces, {}), list[SceneMesh]()
         for node in sorted(model.graph.nodes_geometry):
             transform, name = model.graph[node]
             part = model.geometry[name]
@@ -166,13 +168,10 @@ class MeshBuilder(SceneBuilder):
         return tuple(meshes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Look:
+class _Look(NamedTuple):
     """What the parts of a file share, besides their geometry."""
 
-    shading: str
-    transparent: str
-    gloss: str
+    builder: MeshBuilder
     surfaces: dict[str, Surface]
     materials: dict[tuple[int, tuple[float, ...]], Material]
     """Made so far, by the identity of what trimesh read and the colour that multiplies it."""
@@ -198,7 +197,7 @@ def _scene_mesh(
         raise RsbenchError(f"{where} has faces that name vertices beyond its {len(vertices)}")
     # A mirror turns triangles over; shading normals stay on the side that the file has them.
     faces = np.ascontiguousarray(faces[:, ::-1] if np.linalg.det(linear) < 0.0 else faces, dtype=np.int32)
-    normals = _normals(part, linear, where) if look.shading == "smooth" else None
+    normals = _normals(part, linear, where) if look.builder.shading == "smooth" else None
     if part.visual.kind in ("vertex", "face"):
         return _coloured_faces(name, vertices, faces, normals, np.asarray(part.visual.face_colors)[:, :3])
     source = getattr(part.visual, "material", None)
@@ -208,10 +207,10 @@ def _scene_mesh(
     key = id(source), tuple(shades[0].tolist()) if plain else ()
     surface = look.surfaces.get(str(getattr(source, "name", None)))
     if key not in look.materials:
-        _check_alpha(source, part, where, look.transparent)
+        _check_alpha(source, part, where, look.builder.transparent)
         factor = shades[0] if plain else np.ones(3)
         material = _material(source, surface, factor, where, list(look.materials.values()))
-        roughness = _roughness(source, where) if look.gloss == "file" else None
+        roughness = _roughness(source, where) if look.builder.gloss == "file" else None
         look.materials[key] = replace(material, roughness=roughness)
     material = look.materials[key]
     if not plain:
@@ -219,7 +218,8 @@ def _scene_mesh(
             raise RsbenchError(
                 f"{where} has vertex colours over a texture: bake them into it, or remove them on export"
             )
-        colours = np.rint(255 * _to_srgb(_to_linear(np.array(material.colour)) * shades)).astype(np.uint8)
+        colours = linear_to_srgb(srgb_to_linear(material.colour) * shades)
+        colours = np.rint(255 * colours).astype(np.uint8)
         made = _coloured_faces(name, vertices, faces, normals, colours)
         return replace(made, material=replace(made.material, roughness=material.roughness))
     if material.texture is not None and (uv is None or not np.isfinite(uv).all()):
@@ -308,10 +308,10 @@ def _material(
         # A texture is multiplied by Kd where the file has one, and Kd is sRGB as textures are.
         stated = "kd" in getattr(source, "kwargs", {})
         diffuse = np.asarray(getattr(source, "diffuse", (204, 204, 204)), dtype=np.float64)[:3] / 255
-        linear = _to_linear(diffuse) if image is None or stated else np.ones(3)
+        linear = srgb_to_linear(diffuse) if image is None or stated else np.ones(3)
     linear = linear * shade
     if image is None:
-        r, g, b = (float(value) for value in _to_srgb(linear))
+        r, g, b = (float(value) for value in linear_to_srgb(linear))
         return Material(name=name, colour=(r, g, b))
     texture = _texture(image, linear, where, others)
     return Material(name=name, texture=texture if surface is None else surface.wrapped(texture))
@@ -331,9 +331,8 @@ def _roughness(source: Any, where: str) -> float | None:
             "without, or leave gloss out"
         )
     # What a file does not state is 1, by glTF's specification.
-    metal, roughness = (
-        1.0 if each is None else float(each) for each in (source.metallicFactor, source.roughnessFactor)
-    )
+    factors = (source.metallicFactor, source.roughnessFactor)
+    metal, roughness = (1.0 if each is None else float(each) for each in factors)
     if metal > 0.0:
         raise RsbenchError(
             f'{where} is metal (metallicFactor = {metal:g}), and gloss = "file" takes clear coats on diffuse '
@@ -350,7 +349,7 @@ def _texture(image: Any, factor: FloatArray, where: str, others: list[Material])
     check_amount(where, "pixels of all textures", pixels, _TEXTURES)
     texture = np.array(image.convert("RGB"), dtype=np.uint8)
     if not np.all(factor == 1.0):
-        levels = np.rint(_to_srgb(_to_linear(np.arange(256)[:, None] / 255.0) * factor) * 255)
+        levels = np.rint(linear_to_srgb(srgb_to_linear(np.arange(256)[:, None] / 255.0) * factor) * 255)
         levels = np.clip(levels, 0, 255).astype(np.uint8)
         for channel in range(3):
             texture[..., channel] = levels[texture[..., channel], channel]
@@ -380,11 +379,3 @@ def _coloured_faces(
         uv=np.repeat(centre, 3, axis=0),
         normals=None if normals is None else normals[faces].reshape(-1, 3),
     )
-
-
-def _to_linear(srgb: FloatArray) -> FloatArray:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0) + 0.055) / 1.055) ** 2.4)
-
-
-def _to_srgb(linear: FloatArray) -> FloatArray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)

@@ -192,12 +192,12 @@ def check_mesh_file(path: Path) -> tuple[bytes | None, dict[str, Surface]]:
         match suffix:
             case ".glb" | ".gltf":
                 binary = suffix == ".glb"
-                text = _json_chunk(data) if binary else data
+                text, rest = _chunks(data) if binary else (data, b"")
                 header = parse_json(text.decode("utf-8-sig"), where)
-                _check_gltf(header, where, _binary_chunk(data) if binary else b"")
+                _check_gltf(header, where, rest[8 : 8 + int.from_bytes(rest[:4], "little")])
                 surfaces = _surfaces(header, where)
                 text = json.dumps(_numbered(header)).encode()
-                return _with_json_chunk(data, text) if binary else text, surfaces
+                return _binary_gltf(data[:8], text, rest) if binary else text, surfaces
             case ".ply":
                 _check_ply(data, where)
             case ".obj":
@@ -209,23 +209,19 @@ def check_mesh_file(path: Path) -> tuple[bytes | None, dict[str, Surface]]:
     return None, {}
 
 
-def _json_chunk(data: bytes) -> bytes:
+def _chunks(data: bytes) -> tuple[bytes, bytes]:
+    """The JSON of a binary glTF, and the rest: the binary chunk after eight bytes, which begin with its size."""
     if data[:4] != b"glTF" or data[16:20] != b"JSON":
         raise ValueError("not binary glTF")
-    return data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    end = 20 + int.from_bytes(data[12:16], "little")
+    return data[20:end], data[end:]
 
 
-def _binary_chunk(data: bytes) -> bytes:
-    start = 20 + int.from_bytes(data[12:16], "little")
-    return data[start + 8 : start + 8 + int.from_bytes(data[start : start + 4], "little")]
-
-
-def _with_json_chunk(data: bytes, text: bytes) -> bytes:
-    """The same binary glTF with another JSON chunk."""
+def _binary_gltf(start: bytes, text: bytes, rest: bytes) -> bytes:
+    """A binary glTF of its magic and version, its JSON and the chunks after that."""
     text += b" " * (-len(text) % 4)
-    rest = data[20 + int.from_bytes(data[12:16], "little") :]
     size = (20 + len(text) + len(rest)).to_bytes(4, "little")
-    return data[:8] + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
+    return start + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
 
 
 def _check_gltf(header: dict[str, Any], where: str, binary: bytes) -> None:

@@ -11,10 +11,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
@@ -25,6 +25,18 @@ SMOOTHEST, ROUGHEST = 0.05, 0.5
 which follows no light from facet to facet, loses more than it mirrors: that is paint, and diffuse."""
 _UNIT = 1e-6
 """Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
+
+
+def srgb_to_linear(srgb: ArrayLike) -> FloatArray:
+    """Linear intensity of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    values = np.asarray(srgb, dtype=np.float64)
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: NDArray[Any]) -> NDArray[Any]:
+    """The inverse of ``srgb_to_linear``; values keep their type."""
+    curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
+    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, curve))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +106,14 @@ class Light:
     """Unit vector to the zenith, in the frame of the scene."""
     environment: Environment | None = field(default=None, repr=False)
     """Instead of the sky, where there is one; the sun is not in it."""
+
+    @property
+    def mean_sky(self) -> FloatArray:
+        """Cosine-weighted mean radiance (3,) of the sky over the upper hemisphere: E / pi of level ground.
+
+        The integral of (horizon + (zenith - horizon) cos) cos over it is pi horizon / 3 + 2 pi zenith / 3.
+        """
+        return np.asarray(self.sky_horizon) / 3.0 + 2.0 * np.asarray(self.sky_zenith) / 3.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -61,21 +61,9 @@ class MeshFile:
         Raises:
             RsbenchError: see ``MeshBuilder.build``.
         """
-        from rsbench.scenes.mesh import (
-            MeshBuilder,  # which loads trimesh
-            box_of,
-        )
+        from rsbench.scenes.mesh import MeshBuilder, box_of  # which load trimesh
 
-        builder = MeshBuilder(
-            file=self.file,
-            size=self.size,
-            metres_per_unit=self.metres_per_unit,
-            up_axis=self.up_axis,
-            shading=self.shading,
-            transparent=self.transparent,
-            place="origin",
-        )
-        made = builder.build(0, Path())
+        made = MeshBuilder(**asdict(self), place="origin").build(0, Path())
         middle = np.mean(box_of(made), axis=0)
         return tuple(replace(mesh, vertices=mesh.vertices - middle) for mesh in made)
 

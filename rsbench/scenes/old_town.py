@@ -104,9 +104,8 @@ def _row(
     position = np.asarray(start, dtype=np.float64)
     for k, width in enumerate(widths):
         x, y = position + along * width / 2
-        pieces += placed(
-            house(rng, _style(rng, parameters, width - 0.06, first + k)), (float(x), float(y), 0.05), heading
-        )
+        style = _style(rng, parameters, width - 0.06, first + k)
+        pieces += placed(house(rng, style), (float(x), float(y), 0.05), heading)
         if rng.random() < 0.5:
             x, y = position + along * 0.5
             pieces += placed(props.sign(f"shutter_{k % 3}"), (float(x), float(y), 2.75), heading)
@@ -133,14 +132,8 @@ def _square(rng: np.random.Generator, parameters: OldTownBuilder) -> list[Piece]
 
 def town_hall(rng: np.random.Generator) -> list[Piece]:
     """A hall on an arcade, with two framed storeys, a steep roof and a clock turret."""
-    base = [
-        panel(
-            "ashlar_1",
-            rectangle(0, 0, 10.4, 4.0),
-            0.7,
-            [[(x + a, z) for a, z in arch(2.3, 3.3)] for x in (-3.3, 0.0, 3.3)],
-        )
-    ]
+    arcade = [[(x + a, z) for a, z in arch(2.3, 3.3)] for x in (-3.3, 0.0, 3.3)]
+    base = [panel("ashlar_1", rectangle(0, 0, 10.4, 4.0), 0.7, arcade)]
     base += [box("ashlar_3", (-5.2, 2.6, 0), (5.2, 2.9, 4.0)), box("planks", (-5.2, 0, 3.95), (5.2, 2.8, 4.05))]
     for x in (-4.95, -1.65, 1.65, 4.95):
         base += [
@@ -242,11 +235,8 @@ def _market(rng: np.random.Generator, parameters: OldTownBuilder) -> list[Piece]
         (9.8, 22.6, 7.0, 2.3),
     ):
         pieces += placed(props.tree(rng, height, crown), (x, y, 0))
-        pieces.append(
-            placed([revolve("stone", [(1.0, 0), (0.95, 0.45), (0.7, 0.45), (0.7, 0.3), (0, 0.3)], 12)], (x, y, 0))[
-                0
-            ]
-        )
+        rim = [(1.0, 0), (0.95, 0.45), (0.7, 0.45), (0.7, 0.3), (0, 0.3)]
+        pieces += placed([revolve("stone", rim, 12)], (x, y, 0))
     for x, y in ((1.9, 16.2), (2.2, 16.9), (-3.2, 16.8), (4.9, 19.2), (-6.4, 18.0), (1.9, 22.2)):
         thing = props.barrel() if rng.random() < 0.5 else props.crate(0.6 + 0.3 * rng.random())
         pieces += placed(thing, (x, y, 0), float(rng.uniform(0, 90)))

@@ -58,11 +58,11 @@ def flat(surface: str, triangles: ArrayLike, *, turned: bool = False) -> Piece:
     normal = _area_vectors(points)
     length = np.linalg.norm(normal, axis=1)
     points, normal = points[length > 1e-10], normal[length > 1e-10]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit(normal)
     side = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     level = np.linalg.norm(side, axis=1) < 1e-3
     side[level] = np.array([1.0, 0.0, 0.0]) - normal[level] * normal[level, :1]
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    side = unit(side)
     up = _cross(normal, side)
     uv = np.stack([np.einsum("nkc,nc->nk", points, axis) for axis in (side, up)], axis=2)
     uv = uv[..., ::-1] if turned else uv
@@ -150,15 +150,13 @@ def prism(
     cap = corners[mapbox_earcut.triangulate_float64(corners, ends).reshape(-1, 3)]
     # Earcut does not keep a winding: turn every triangle anticlockwise.
     edges = cap[:, 1:] - cap[:, :1]
-    cap = np.where(
-        (edges[:, 0, 0] * edges[:, 1, 1] < edges[:, 0, 1] * edges[:, 1, 0])[:, None, None], cap[:, ::-1], cap
-    )
+    clockwise = edges[:, 0, 0] * edges[:, 1, 1] < edges[:, 0, 1] * edges[:, 1, 0]
+    cap = np.where(clockwise[:, None, None], cap[:, ::-1], cap)
     starts, nexts = corners, np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
     a, b, c, d = (_at_height(xy, z) for xy, z in ((starts, 0.0), (nexts, 0.0), (nexts, height), (starts, height)))
-    sides = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return flat(
-        surface, np.concatenate([_at_height(cap[:, ::-1], 0.0), _at_height(cap, height), sides]), turned=turned
-    )
+    sides = (np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1))
+    triangles = np.concatenate([_at_height(cap[:, ::-1], 0.0), _at_height(cap, height), *sides])
+    return flat(surface, triangles, turned=turned)
 
 
 def panel(
@@ -213,11 +211,9 @@ def revolve(
 def tube(surface: str, path: ArrayLike, radii: ArrayLike, segments: int = 8) -> Piece:
     """A round tube along a path (n, 3): trunks, branches, pipes, ropes."""
     line = np.asarray(path, dtype=np.float64)
-    along = np.gradient(line, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    along = unit(np.gradient(line, axis=0))
     reference = np.where(np.abs(along[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-    side = _cross(reference, along)
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    side = unit(_cross(reference, along))
     other = _cross(along, side)
     angles = np.linspace(0, 2 * np.pi, segments + 1)
     ring = side[:, None] * np.cos(angles)[:, None] + other[:, None] * np.sin(angles)[:, None]
@@ -231,8 +227,7 @@ def grid(surface: str, points: FloatArray, uv: FloatArray, normals: FloatArray |
     """A sheet of points (rows, columns, 3) with uv (rows, columns, 2); its own normals if none are given."""
     if normals is None:
         across, along = np.gradient(points, axis=1), np.gradient(points, axis=0)
-        facing = _cross(across, along)
-        normals = facing / np.linalg.norm(facing, axis=2, keepdims=True)
+        normals = unit(_cross(across, along))
 
     def cut(values: FloatArray) -> FloatArray:
         a, b, c, d = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]
@@ -274,6 +269,11 @@ def cushion(surface: str, size: Sequence[float], at: Sequence[float] = (0, 0, 0)
 
 def _at_height(xy: FloatArray, z: float) -> FloatArray:
     return np.concatenate([xy, np.full((*xy.shape[:-1], 1), z)], axis=-1)
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) of length 1 of the same directions."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -777,26 +777,19 @@ def gatehouse(rng: np.random.Generator, wall: str, roof: str, height: float = 8.
     passage = arch(wide, 4.3)
     pieces.append(panel(wall, rectangle(0, 0, 8.4, height), depth, [passage]))
     for heading, y in ((0, 0.0), (180, depth)):
-        face = (
-            _voussoirs(wide, 4.3)
-            + placed(loop_window(0.7, 1.5), (-1.6, 0, 5.3))
-            + placed(loop_window(0.7, 1.5), (1.6, 0, 5.3))
-        )
-        face += placed(
-            [panel("cloth_0", [(-0.7, 0.35), (0.0, 0.0), (0.7, 0.35), (0.7, 2.3), (-0.7, 2.3)], 0.06)],
-            (0, -0.16, 4.9),
-        )
+        face = _voussoirs(wide, 4.3)
+        for x in (-1.6, 1.6):
+            face += placed(loop_window(0.7, 1.5), (x, 0, 5.3))
+        shield = [(-0.7, 0.35), (0.0, 0.0), (0.7, 0.35), (0.7, 2.3), (-0.7, 2.3)]
+        face += placed([panel("cloth_0", shield, 0.06)], (0, -0.16, 4.9))
         face.append(box("stone", (-4.2, -0.12, 4.55), (4.2, 0.1, 4.75)))
         face += placed(corbels(8.4, wall), (0, 0, height))
         face += placed(battlement(rng, 8.4, wall), (0, -0.33, height))
         pieces += placed(face, (0, y, 0), heading)
-        leaves = [
-            block("planks", (1.5, 0.12, 3.6)),
-            *[block("iron", (1.4, 0.16, 0.1), (0, 0, z)) for z in (0.5, 1.8, 3.0)],
-        ]
-        if heading == 180:
-            for side in (-1, 1):
-                pieces += placed(leaves, (side * 1.75, y + 0.65, 0), 70 * -side)
+    leaf = [block("planks", (1.5, 0.12, 3.6))]
+    leaf += [block("iron", (1.4, 0.16, 0.1), (0, 0, z)) for z in (0.5, 1.8, 3.0)]
+    for side in (-1, 1):
+        pieces += placed(leaf, (side * 1.75, depth + 0.65, 0), 70 * -side)
     for x in np.linspace(-1.4, 1.4, 8):
         pieces.append(beam("iron", (float(x), 1.0, 2.5), (float(x), 1.0, 4.3), 0.07))
     for z in (2.7, 3.1, 3.5, 3.9):

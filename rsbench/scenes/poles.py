@@ -30,8 +30,7 @@ class PolesBuilder(PartsBuilder):
     """Least radius of a post, metres: 5 px across at 4 m in the paper's camera."""
 
     def pieces(self, rng: np.random.Generator) -> list[Piece]:
-        pieces = [*_yard(rng), *_posts(rng, self.posts, self.thinnest)]
-        return pieces
+        return [*_yard(rng), *_posts(rng, self.posts, self.thinnest)]
 
 
 def _post(surface: str, x: float, y: float, radius: float, lean: tuple[float, float] = (0.0, 0.0)) -> Piece:

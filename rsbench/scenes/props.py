@@ -27,6 +27,7 @@ from rsbench.scenes.parts import (
     rectangle,
     revolve,
     tube,
+    unit,
 )
 from rsbench.scenes.surfaces import PICTURES, SPINES, cell_uv
 
@@ -62,8 +63,7 @@ def bush(rng: np.random.Generator, size: float = 0.8, leaf: str = "leaves") -> l
 
 def _sprays(rng: np.random.Generator, leaf: str, radii: FloatArray, count: int) -> list[Piece]:
     """Small leafy flaps around an ellipsoid, which give a crown a broken outline."""
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = unit(rng.normal(size=(count, 3)))
     centre = direction * radii * rng.uniform(0.9, 1.2, (count, 1))
     a = rng.normal(size=(count, 3)) * 0.08
     b = np.cross(a, rng.normal(size=(count, 3)))
@@ -160,9 +160,8 @@ def well(rng: np.random.Generator) -> list[Piece]:
     pieces += [profile("tiles_0", roof, 2.3)]
     pieces += [tube("timber", [(-1.0, 0, 1.7), (0, 0, 1.7), (1.0, 0, 1.7)], (0.1, 0.1, 0.1), 12)]
     pieces += [tube("timber", [(0.1, 0, 1.7), (0.1, 0, 1.3), (0.1, 0, 1.15)], (0.02, 0.02, 0.02), 5)]
-    pieces += placed(
-        [revolve("planks", [(0.0, 0), (0.15, 0), (0.2, 0.34), (0.17, 0.3), (0, 0.3)], 14)], (0.1, 0, 0.85)
-    )
+    bucket = [(0.0, 0), (0.15, 0), (0.2, 0.34), (0.17, 0.3), (0, 0.3)]
+    pieces += placed([revolve("planks", bucket, 14)], (0.1, 0, 0.85))
     return pieces + placed(barrel(0.5, 0.26), (1.5, -0.4, 0), float(rng.uniform(0, 90)))
 
 
@@ -215,10 +214,8 @@ def stall(rng: np.random.Generator, awning: str = "cloth_0") -> list[Piece]:
         goods = str(rng.choice(["fruit_0", "fruit_1", "fruit_2"]))
         for _ in range(9):
             x, y = rng.uniform(-0.13, 0.13, 2)
-            basket += placed(
-                [revolve(goods, [(0, 0), (0.06, 0.03), (0.06, 0.09), (0, 0.12)], 7)],
-                (x, y, 0.12 + 0.06 * rng.random()),
-            )
+            fruit = revolve(goods, [(0, 0), (0.06, 0.03), (0.06, 0.09), (0, 0.12)], 7)
+            basket += placed([fruit], (x, y, 0.12 + 0.06 * rng.random()))
         pieces += placed(basket, (-1.0 + 0.5 * k, -0.15 + 0.12 * (k % 2), 0.92))
     return pieces + placed(crate(0.5), (0.8, -0.85, 0), float(rng.uniform(-20, 20)))
 
@@ -361,14 +358,8 @@ def vase(rng: np.random.Generator, height: float = 0.3, twigs: int = 0) -> list[
     ]
     pieces = [revolve("ceramic", [*line, (r * 0.42, height), (r * 0.3, height * 0.85)], 24)]
     for k in range(twigs):
-        angle = 2.4 * k
-        tip = np.array(
-            [
-                np.cos(angle) * (0.5 + 0.3 * (k % 2)),
-                np.sin(angle) * (0.5 + 0.3 * (k % 2)),
-                1.5 + 0.4 * rng.random(),
-            ]
-        )
+        angle, reach = 2.4 * k, 0.5 + 0.3 * (k % 2)
+        tip = np.array([np.cos(angle) * reach, np.sin(angle) * reach, 1.5 + 0.4 * rng.random()])
         path = np.stack([np.array([0, 0, 0.8]), np.array([0.15, 0.15, 1.0]) * tip, tip]) * height
         pieces.append(tube("oak", path, (0.005, 0.004, 0.003), 5))
         pieces += _leaflets(rng, path[1:], 12, height * 0.2)
@@ -379,15 +370,10 @@ def _leaflets(rng: np.random.Generator, path: FloatArray, count: int, size: floa
     """Pointed leaves along a path."""
     t = rng.random((count, 1))
     root = path[0] + (path[-1] - path[0]) * t
-    out = rng.normal(size=(count, 3))
-    out /= np.linalg.norm(out, axis=1, keepdims=True)
-    side = np.cross(out, rng.normal(size=(count, 3)))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    tip, a, b = (
-        root + out * size,
-        root + out * size * 0.5 + side * size * 0.22,
-        root + out * size * 0.5 - side * size * 0.22,
-    )
+    out = unit(rng.normal(size=(count, 3)))
+    side = unit(np.cross(out, rng.normal(size=(count, 3))))
+    tip, middle, wide = root + out * size, root + out * size * 0.5, side * size * 0.22
+    a, b = middle + wide, middle - wide
     return [flat("leaves_fine", np.concatenate([np.stack([root, a, tip], 1), np.stack([root, tip, b], 1)]))]
 
 
@@ -416,15 +402,9 @@ def table(size: tuple[float, float, float] = (1.5, 0.85, 0.76)) -> list[Piece]:
     """A plank table with an apron and turned legs."""
     w, d, h = size
     pieces = [box("oak", (-w / 2, -d / 2, h - 0.04), (w / 2, d / 2, h), turned=True)]
-    pieces += [
-        box(
-            "walnut",
-            (-w / 2 + 0.08, s * (d / 2 - 0.1) - 0.012, h - 0.14),
-            (w / 2 - 0.08, s * (d / 2 - 0.1) + 0.012, h - 0.04),
-            turned=True,
-        )
-        for s in (-1, 1)
-    ]
+    for y in (0.1 - d / 2, d / 2 - 0.1):
+        low, high = (-w / 2 + 0.08, y - 0.012, h - 0.14), (w / 2 - 0.08, y + 0.012, h - 0.04)
+        pieces.append(box("walnut", low, high, turned=True))
     leg = [(0.03, 0), (0.035, 0.06), (0.025, 0.1), (0.045, 0.3), (0.028, 0.45), (0.045, 0.52), (0.045, h - 0.04)]
     for x in (-w / 2 + 0.1, w / 2 - 0.1):
         for y in (-d / 2 + 0.1, d / 2 - 0.1):
@@ -468,11 +448,9 @@ def framed(number: int, width: float, height: float, frame: str = "walnut") -> l
     """A picture in a moulded frame on the wall y = 0, centred on the origin."""
     w, h, m = width / 2, height / 2, 0.06
     shown = picture("pictures", [(-w, -0.012, -h), (w, -0.012, -h), (w, -0.012, h), (-w, -0.012, h)])
-    outer = rectangle(0, -h - m, width + 2 * m, height + 2 * m)
-    edge = panel(frame, outer, 0.045, [rectangle(0, -h, width, height)])
-    inner = panel(
-        "brass", rectangle(0, -h - 0.02, width + 0.04, height + 0.04), 0.03, [rectangle(0, -h, width, height)]
-    )
+    outer, hole = rectangle(0, -h - m, width + 2 * m, height + 2 * m), rectangle(0, -h, width, height)
+    edge = panel(frame, outer, 0.045, [hole])
+    inner = panel("brass", rectangle(0, -h - 0.02, width + 0.04, height + 0.04), 0.03, [hole])
     return [
         sheet_cell(shown, cell_uv(number, PICTURES)),
         *placed([edge], (0, -0.045, 0)),

@@ -112,9 +112,8 @@ def _table(rng: np.random.Generator, chairs: int) -> list[Piece]:
         pieces += placed(props.chair(), (x, y, 0), heading)
     top = placed(props.vase(rng, 0.26, 9), (0.32, 0.16, 0)) + placed(props.fruit_bowl(rng), (-0.18, 0.14, 0))
     top += placed(props.candlestick(), (0.58, -0.08, 0)) + placed(props.globe(0.11), (-0.58, 0.2, 0))
-    for k, (x, y, heading) in enumerate(
-        ((-0.35, -0.18, 12), (-0.12, -0.24, -20), (0.33, -0.2, 35), (0.1, -0.08, 64))
-    ):
+    sheets = ((-0.35, -0.18, 12), (-0.12, -0.24, -20), (0.33, -0.2, 35), (0.1, -0.08, 64))
+    for k, (x, y, heading) in enumerate(sheets):
         top += placed(props.sheet_of_paper(6 + k % 2), (x, y, 0.003 * k), heading)
     for k in range(4):
         size = (0.035 + 0.008 * (k % 3), 0.17, 0.24 - 0.015 * k)
@@ -141,9 +140,8 @@ def _sides(rng: np.random.Generator) -> list[Piece]:
     pieces += placed(props.bookcase(rng, 1.3), (0.4, -y + 0.34, 0), 180)
     pieces += placed(door(0.95, 2.1, "oak", "walnut")[:4], (-1.2, -y, 0), 180)
     pieces += placed(props.table((1.1, 0.45, 0.82)), (1.7, -y + 0.35, 0), 180)
-    pieces += placed(props.vase(rng, 0.34, 8), (1.9, -y + 0.33, 0.82)) + placed(
-        props.globe(0.14), (1.4, -y + 0.35, 0.82)
-    )
+    pieces += placed(props.vase(rng, 0.34, 8), (1.9, -y + 0.33, 0.82))
+    pieces += placed(props.globe(0.14), (1.4, -y + 0.35, 0.82))
     return pieces + placed(props.framed(4, 0.8, 0.6), (1.7, -y + 0.02, 1.7), 180)
 
 
@@ -153,7 +151,6 @@ def _garden(rng: np.random.Generator) -> list[Piece]:
     z = -0.4 + 0.004 * (x * x + y * y)
     pieces = [grid("grass", np.stack([x, y, z], axis=-1), np.stack([x, y], axis=-1))]
     for k in range(9):
-        pieces += placed(
-            props.bush(rng, 1.0, "leaves_dark" if k % 2 else "leaves"), (-9.0 - 0.4 * (k % 3), 1.7 * k - 7, -0.2)
-        )
+        bush = props.bush(rng, 1.0, "leaves_dark" if k % 2 else "leaves")
+        pieces += placed(bush, (-9.0 - 0.4 * (k % 3), 1.7 * k - 7, -0.2))
     return pieces

@@ -52,9 +52,8 @@ class StreetBuilder(PartsBuilder):
             y, number = _START - float(rng.uniform(0, 3)), 0
             while y < _END:
                 width = float(rng.uniform(9.0, 14.0))
-                house = _facade(
-                    rng, width - 0.03, int(rng.integers(self.storeys[0], self.storeys[1] + 1)), 2 * number + side
-                )
+                storeys = int(rng.integers(self.storeys[0], self.storeys[1] + 1))
+                house = _facade(rng, width - 0.03, storeys, 2 * number + side)
                 pieces += placed(house, (side * _HALF, y + width / 2, 0.12), -90 * side)
                 y, number = y + width, number + 1
         return pieces
@@ -83,9 +82,8 @@ def _facade(rng: np.random.Generator, width: float, storeys: int, number: int) -
     roof = [(-0.1, 0.0), (2.6, 2.8), (_DEPTH, 2.8), (_DEPTH, 0.0)]
     pieces += placed([profile("tiles_2", roof, width)], (0, 0, top + 0.3))
     for side in (-1, 1):
-        pieces.append(
-            box(wall, (side * (width / 2 - 0.005), 0.3, -0.2), (side * (width / 2 - 0.3), _DEPTH, top + 0.28))
-        )
+        outer, inner = side * (width / 2 - 0.005), side * (width / 2 - 0.3)
+        pieces.append(box(wall, (outer, 0.3, -0.2), (inner, _DEPTH, top + 0.28)))
     return pieces + placed(chimney(rng, 2.6), (float(rng.uniform(-0.3, 0.3)) * width, 3.4, top + 2.2))
 
 

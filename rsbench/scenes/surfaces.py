@@ -380,9 +380,8 @@ def speckled(
     """Ground, grass, hay, soil or rough stone: colours mixed in patches at several scales."""
     image = plain(colours[0], np.ones((paint.pixels, paint.pixels), np.float32))
     for colour in colours[1:]:
-        image = blend(
-            image, colour, ramp(patches * paint.smooth() + 0.6 * paint.broad() + 0.3 * paint.fine(), -0.2, 0.8)
-        )
+        patchy = patches * paint.smooth() + 0.6 * paint.broad() + 0.3 * paint.fine()
+        image = blend(image, colour, ramp(patchy, -0.2, 0.8))
     return to_bytes(image * (1 + contrast * paint.broad() + grit * paint.fine()))
 
 
@@ -395,9 +394,8 @@ def leaves(paint: Painter, greens: Sequence[Colour], size: float = 0.11, depth: 
             paint.rng, paint.pixels, paint.metres, (size * 0.6, size * 1.2), (size * 0.7, size * 1.9),
             corner=size * 0.45, wobble=wobble,
         )  # fmt: skip
-        tones = pick(greens, paint.rng.random(cells.count, dtype=np.float32)) * np.float32(
-            depth + (1.0 - depth) * (layer + 1) / 4
-        )
+        tones = pick(greens, paint.rng.random(cells.count, dtype=np.float32))
+        tones = tones * np.float32(depth + (1.0 - depth) * (layer + 1) / 4)
         colour = tones[:, cells.index] * (0.7 + 0.5 * cells.across + 0.2 * paint.fine())
         shown = ramp(cells.edge, 0.004, 0.012) * (paint.per_cell(cells) < 0.5)
         image = blend(image, colour, shown)
@@ -581,11 +579,8 @@ def rug(paint: Painter) -> Bytes:
     colours: tuple[Colour, ...] = ((0.45, 0.13, 0.12), (0.16, 0.20, 0.34), (0.70, 0.58, 0.40), (0.30, 0.34, 0.22))
     image = plain(colours[0], np.ones((n, n), np.float32))
     for k, (start, end) in enumerate(((0.02, 0.06), (0.07, 0.20), (0.215, 0.24))):
-        image = blend(
-            image,
-            colours[(k + 1) % 3 + (k == 2)],
-            ramp(inset, start, start + 0.004) * ramp(inset, end + 0.004, end),
-        )
+        border = ramp(inset, start, start + 0.004) * ramp(inset, end + 0.004, end)
+        image = blend(image, colours[(k + 1) % 3 + (k == 2)], border)
     for count, size, colour in ((26, 0.045, 2), (60, 0.03, 1), (70, 0.02, 2), (40, 0.035, 3)):
         image = blend(image, colours[colour], _motifs(paint, count, size))
     pile = 1 + 0.14 * paint.fine() + 0.12 * paint.broad()
@@ -617,9 +612,8 @@ def world_map(paint: Painter) -> Bytes:
     image = blend(image, (0.48, 0.46, 0.26), ramp(land, 0.5, 0.9))
     ink = ramp(np.abs(land - 0.065), 0.04, 0.015)
     step = np.arange(paint.pixels) % (paint.pixels // 12) < 3
-    return to_bytes(
-        blend(image, (0.2, 0.14, 0.1), np.maximum(0.8 * ink, 0.5 * np.maximum(step[:, None], step[None, :])))
-    )
+    lines = np.maximum(step[:, None], step[None, :])
+    return to_bytes(blend(image, (0.2, 0.14, 0.1), np.maximum(0.8 * ink, 0.5 * lines)))
 
 
 @dataclass(frozen=True)

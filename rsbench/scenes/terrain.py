@@ -121,12 +121,8 @@ def _plots(rng: np.random.Generator) -> list[_Plot]:
             elif beside_lane and (near == _ROAD[1] or far == _ROAD[0]):
                 kind = "garden"
             else:
-                kinds = [
-                    k
-                    for k in ("wheat", "rows", "soil", "orchard", "wood", "pasture")
-                    if k not in (last, below.get(left))
-                ]
-                kind = str(rng.choice(kinds))
+                kinds = ("wheat", "rows", "soil", "orchard", "wood", "pasture")
+                kind = str(rng.choice([each for each in kinds if each not in (last, below.get(left))]))
             plots.append(_Plot(left, right, near, far, kind))
             last = below[left] = kind
     return plots
@@ -164,9 +160,8 @@ def _planted(
         tree(*place, float(rng.uniform(6, 11)))
     for _ in range(7 if plot.kind == "wheat" else 0):
         place = (plot.left + wide * rng.uniform(0.1, 0.9), plot.near + deep * rng.uniform(0.1, 0.9))
-        bale = placed(
-            leaned([revolve("straw", [(0, -0.6), (0.75, -0.6), (0.75, 0.6), (0, 0.6)], 14)], 90), (0, 0, 0.7)
-        )
+        outline = [(0, -0.6), (0.75, -0.6), (0.75, 0.6), (0, 0.6)]
+        bale = placed(leaned([revolve("straw", outline, 14)], 90), (0, 0, 0.7))
         pieces += placed(bale, at(*place), float(rng.uniform(0, 180)))
     if plot.kind not in ("road", "lane") and rng.random() < 0.45:
         row = [(x, plot.near + 0.9) for x in np.arange(plot.left + 1.0, plot.right - 1.0, 1.5)]
@@ -203,11 +198,8 @@ def _house(rng: np.random.Generator, number: int) -> list[Piece]:
         for k, x in enumerate(np.linspace(-w / 2 + 1.3, w / 2 - 1.3, 4)):
             door = side < 0 and k == 1
             front.append(block("timber", (1.24, 0.1, 2.3 if door else 1.54), (x, 0, 0.0 if door else 0.83)))
-            front.append(
-                block(
-                    "timber" if door else "glass", (1.0, 0.16, 2.1 if door else 1.3), (x, 0, 0.0 if door else 0.95)
-                )
-            )
+            surface, height, foot = ("timber", 2.1, 0.0) if door else ("glass", 1.3, 0.95)
+            front.append(block(surface, (1.0, 0.16, height), (x, 0, foot)))
         pieces += placed(front, (0, side * d / 2, 0))
     stack = chimney(rng, 2.2, 0.8)
     return pieces + placed(stack, (float(rng.uniform(-0.3, 0.3)) * w, 0.6, eaves + rise - 1.2))
@@ -237,9 +229,7 @@ def _traffic(rng: np.random.Generator, at: Place) -> list[Piece]:
         car += [block("soot", (0.6, 1.85, 0.6), (e, 0, 0.0)) for e in (-1.3, 1.3)]
         pieces += placed(car, at(x + float(rng.uniform(-2, 2)), y), heading)
     for x in np.arange(-68.0, 70.0, 17.0):
-        lamp = [
-            tube("steel", [(0, 0, -0.5), (0, 0, 6.0), (0, -0.5, 6.6), (0, -1.4, 6.7)], [0.1, 0.08, 0.07, 0.06], 8)
-        ]
-        lamp.append(block("enamel", (0.3, 0.7, 0.12), (0, -1.5, 6.6)))
+        post = [(0, 0, -0.5), (0, 0, 6.0), (0, -0.5, 6.6), (0, -1.4, 6.7)]
+        lamp = [tube("steel", post, [0.1, 0.08, 0.07, 0.06], 8), block("enamel", (0.3, 0.7, 0.12), (0, -1.5, 6.6))]
         pieces += placed(lamp, at(x, 11.7))
     return pieces

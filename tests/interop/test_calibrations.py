@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,22 +15,25 @@ import numpy as np
 import pytest
 from calibration_files import D_LEFT, D_RIGHT, FOUR, KB, LEFT, RIGHT, SIZE, WRITERS, R, T
 from commands import assert_refused, refused, run_here
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import rsbench
+from rsbench.components.rig_tables import tables_of
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, StereoRig
-from rsbench.interop.readers.calibration_parts import Assumptions, resized, with_size
+from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, resized, with_size
 from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.interop.readers.rig_files import Readout, calibration_of, read_camera_file, read_rig_file
 from rsbench.interop.writers.calibrations import rig_of, write_calibration
 
 NO_UNIT = "opencv of zed"
+OPENCV = {"M1": made.matrix(LEFT), "D1": made.five(D_LEFT), "M2": made.matrix(RIGHT), "D2": made.five(D_RIGHT)}
 FISHEYE = Lens(model="kannala-brandt", k1=KB[0], k2=KB[1], k3=KB[2], k4=KB[3])
 RATIONAL = Lens(model="rational", k1=0.7, k2=0.1, p1=1e-4, k3=0.01, k4=1.06, k5=0.3, k6=0.02)
+SPHERES = Lens(model="double-sphere", xi=-0.2, alpha=0.57)
 
 
 def same_numbers(rig: StereoRig) -> None:
@@ -82,8 +86,8 @@ lenses = st.sampled_from(
         Lens(model="brown-conrady", k1=-0.2, k2=0.03, p1=1e-4, p2=-2e-4),
         Lens(model="brown-conrady", k1=-0.2, k2=0.03, k3=1e-5),
         Lens(model="kannala-brandt", k1=-0.01, k2=0.02, k3=-0.01, k4=0.002),
-        Lens(model="rational", k1=0.7, k2=0.1, p1=1e-4, k3=0.01, k4=1.06, k5=0.3, k6=0.02),
-        Lens(model="double-sphere", xi=-0.2, alpha=0.57),
+        RATIONAL,
+        SPHERES,
     ]
 )
 COVERS = {
@@ -95,7 +99,13 @@ COVERS = {
 }
 
 
+STRAIGHT = (0.0, 0.0, 0.0), (0.0, 0.0), True
+
+
 @settings(max_examples=40, deadline=None)
+@example("kalibr", RATIONAL, None, *STRAIGHT)
+@example("opencv", SPHERES, SPHERES, *STRAIGHT)
+@example("opencv", FISHEYE, None, *STRAIGHT)
 @given(
     st.sampled_from(sorted(COVERS)),
     lenses,
@@ -119,8 +129,11 @@ def test_any_rig_that_a_format_holds_comes_back(
     right = right if one_size else replace(right, width=1280, height=720, fx=900.0, fy=900.0, cx=650.0, cy=350.0)
     rotation = Rotation.from_rotvec(turn).as_matrix()
     rig = StereoRig.of_cameras(left, right, rotation, rotation @ [-0.2, *aside])
-    toml = folder / "rig.toml"
-    write_calibration(_calibration_of_rig(rig, folder), "rig.toml", toml)
+    toml, tables = folder / "rig.toml", tables_of(rig)
+    given = Calibration(
+        format="made", left=tables["left"], right=tables["right"], right_from_left=rig.right_from_left
+    )
+    write_calibration(given, "rig.toml", toml)
     found, out = calibration_of(toml, Assumptions()), folder / PLACES[kind]
     try:
         write_calibration(found, kind, out)
@@ -134,21 +147,10 @@ def test_any_rig_that_a_format_holds_comes_back(
     again = rsbench.read_rig(out, ((left.width, left.height), (right.width, right.height))).rig
     for side in SIDES:
         pixels = np.random.default_rng(0).uniform(0, 470, (30, 2))
-        np.testing.assert_allclose(
-            again.sensor(side).unproject(pixels), rig.sensor(side).unproject(pixels), atol=1e-9
-        )
+        found_rays, true_rays = (each.sensor(side).unproject(pixels) for each in (again, rig))
+        np.testing.assert_allclose(found_rays, true_rays, atol=1e-9)
     np.testing.assert_allclose(again.right_from_left.R, rotation, atol=1e-9)
     np.testing.assert_allclose(again.right_from_left.t, rig.right_from_left.t, atol=1e-9)
-
-
-def _calibration_of_rig(rig: StereoRig, folder: Path) -> Any:
-    from rsbench.components.rig_tables import tables_of
-    from rsbench.interop.readers.calibration_parts import Calibration
-
-    tables = tables_of(rig)
-    return Calibration(
-        format="made", left=tables["left"], right=tables["right"], right_from_left=rig.right_from_left
-    )
 
 
 # Kalibr.
@@ -192,22 +194,15 @@ def test_kalibr_says_readout_and_clocks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("intrinsics", "names", "lens"),
     [
-        (
-            (*LEFT,),
-            ("pinhole", "equidistant", list(KB)),
-            Lens(model="kannala-brandt", k1=KB[0], k2=KB[1], k3=KB[2], k4=KB[3]),
-        ),
-        ((-0.2, 0.57, *LEFT), ("ds", "none", []), Lens(model="double-sphere", xi=-0.2, alpha=0.57)),
-        ((*LEFT,), ("pinhole", "none", []), None),
+        (LEFT, ("pinhole", "equidistant", list(KB)), FISHEYE),
+        ((-0.2, 0.57, *LEFT), ("ds", "none", []), SPHERES),
+        (LEFT, ("pinhole", "none", []), None),
     ],
 )
 def test_lenses_of_kalibr(tmp_path: Path, intrinsics: Any, names: tuple[str, str, Any], lens: Lens | None) -> None:
     model, distortion, d = names
     text = CAMERA.replace("pinhole", model).replace("radtan", distortion).replace(str(list(D_LEFT)), str(d))
-    path = chain(tmp_path, text.replace(str(list(LEFT)), str(list(intrinsics))))
-    card, _ = read_camera_file(path) if lens is None else (None, ())
-    assert card is None or card.camera is not None
-    found = read_calibration(path)
+    found = read_calibration(chain(tmp_path, text.replace(str(list(LEFT)), str(list(intrinsics)))))
     assert found.left.get("lens") == (None if lens is None else lens.record())
 
 
@@ -234,26 +229,36 @@ def test_symmetric_models_become_the_nearest_kannala_brandt(
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("make", "changes", "words"),
     [
-        ({"pinhole": "omni", str(list(LEFT)): str([1.4, *LEFT])}, "tangential.*omni"),
-        ({"radtan": "thin_prism"}, "lens model 'thin_prism'"),
-        ({"pinhole": "scara"}, "camera_model = 'scara': must be one of pinhole, omni"),
-        ({"[1280, 720]": "[1280]"}, "resolution"),
-        ({"701.2": "nan"}, "intrinsics"),
-        ({"  resolution: [1280, 720]\n": ""}, "resolution: is missing"),
+        (made.kalibr, {"pinhole": "omni", str(list(LEFT)): str([1.4, *LEFT])}, "tangential.*omni"),
+        (made.kalibr, {"radtan": "thin_prism"}, "lens model 'thin_prism'"),
+        (made.kalibr, {"pinhole": "scara"}, "camera_model = 'scara': must be one of pinhole, omni"),
+        (made.kalibr, {"[1280, 720]": "[1280]"}, "resolution"),
+        (made.kalibr, {"701.2": "nan"}, "intrinsics"),
+        (made.kalibr, {"  resolution: [1280, 720]\n": ""}, "resolution: is missing"),
+        (made.ros, {"camera_name": "binning_x: 2\nbinning_y: 2\ncamera_name"}, "binning_x = 2"),
+        (made.ros, {"701.2": "0.0"}, "not calibrated"),
+        (made.basalt, {"pinhole-radtan8": "fov"}, "camera_type = 'fov': must be one of"),
+        (made.realsense, {"brown_conrady": "inverse_brown_conrady"}, "model = inverse_brown_conrady"),
+        (made.depthai, {'"toCameraSocket": 0': '"toCameraSocket": 0, "lengthUnit": 9'}, "lengthUnit = 9"),
     ],
 )
-def test_what_kalibr_has_and_we_have_not_is_refused_by_name(tmp_path: Path, changes: Any, words: str) -> None:
-    text = CAMERA
+def test_what_others_have_and_we_have_not_is_refused_by_name(
+    tmp_path: Path, make: Callable[[Path], Path], changes: dict[str, str], words: str
+) -> None:
+    path = make(tmp_path)
+    text = path.read_text()
     for old, new in changes.items():
+        assert old in text
         text = text.replace(old, new)
-    with pytest.raises(RsbenchError, match=words):
-        rsbench.read_rig(chain(tmp_path, text, CAMERA))
+    path.write_text(text)
+    with refused(match=words):
+        rsbench.read_rig(path)
 
 
 def test_a_chain_without_transforms_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RsbenchError, match="T_cn_cnm1: is missing"):
+    with refused("T_cn_cnm1: is missing"):
         rsbench.read_rig(chain(tmp_path, CAMERA, CAMERA, None))
 
 
@@ -272,17 +277,15 @@ def test_a_chain_without_transforms_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_files_of_opencv_are_refused_with_a_remedy(tmp_path: Path, changes: Any, words: str) -> None:
-    values = {"M1": made.matrix(LEFT), "D1": made.five(D_LEFT), "M2": made.matrix(RIGHT), "D2": made.five(D_RIGHT)}
-    values = {k: v for k, v in (values | {"R": R, "T": T} | changes).items() if v is not None}
+    values = {k: v for k, v in (OPENCV | {"R": R, "T": T} | changes).items() if v is not None}
     path = made.opencv(tmp_path / "stereo.yml", **values)
     with pytest.raises(RsbenchError, match=words):
         rsbench.read_rig(path, SIZE)
 
 
 def test_an_inverted_or_exchanged_file_is_put_right(tmp_path: Path) -> None:
-    values = {"M1": made.matrix(LEFT), "D1": made.five(D_LEFT), "M2": made.matrix(RIGHT), "D2": made.five(D_RIGHT)}
-    inverted = made.opencv(tmp_path / "inverted.yml", **values, R=R.T, T=-R.T @ T)
-    swapped = {f"{k[0]}{3 - int(k[1])}": v for k, v in values.items()}
+    inverted = made.opencv(tmp_path / "inverted.yml", **OPENCV, R=R.T, T=-R.T @ T)
+    swapped = {f"{k[0]}{3 - int(k[1])}": v for k, v in OPENCV.items()}
     exchanged = made.opencv(tmp_path / "exchanged.yml", **swapped, R=R.T, T=-R.T @ T)
     for path, option in ((inverted, "--invert"), (exchanged, "--exchange")):
         out = tmp_path / f"{path.stem}.toml"
@@ -291,12 +294,7 @@ def test_an_inverted_or_exchanged_file_is_put_right(tmp_path: Path) -> None:
 
 
 def test_a_fisheye_of_opencv_is_told_by_its_key_or_the_option(tmp_path: Path) -> None:
-    values = {
-        "M1": made.matrix(LEFT),
-        "D1": np.array(KB)[:, None],
-        "M2": made.matrix(RIGHT),
-        "D2": np.array(KB)[:, None],
-    }
+    values = OPENCV | dict.fromkeys(("D1", "D2"), np.array(KB)[:, None])
     path = made.opencv(tmp_path / "stereo.yml", **values, R=R, T=T[:, None])
     assert read_calibration(path, Assumptions(fisheye=True)).left["lens"] == FISHEYE.record()
     path = made.opencv(tmp_path / "said.yml", fisheye=1, **values, R=R, T=T[:, None])
@@ -309,30 +307,16 @@ def test_the_calibration_that_opencv_finds_is_read_as_it_writes_it(tmp_path: Pat
     """cv2.stereoCalibrate on exact views of a board: its own vectors of coefficients and shapes."""
     rng = np.random.default_rng(0)
     board = np.stack([*np.meshgrid(np.arange(8), np.arange(6)), np.zeros((6, 8))], axis=-1).reshape(-1, 3) * 0.05
-    views = [
-        (
-            Rotation.from_rotvec(rng.normal(0, 0.3, 3)).as_matrix(),
-            [*rng.uniform(-0.3, 0.1, 2), rng.uniform(0.7, 1.2)],
-        )
-        for _ in range(12)
-    ]
     left, right = list[Any](), list[Any]()
-    for turn, shift in views:
-        X = board @ turn.T + shift
+    for _ in range(12):
+        turn = Rotation.from_rotvec(rng.normal(0, 0.3, 3)).as_matrix()
+        X = board @ turn.T + [*rng.uniform(-0.3, 0.1, 2), rng.uniform(0.7, 1.2)]
         for points, where, own, d in ((left, X, LEFT, D_LEFT), (right, X @ R.T + T, RIGHT, D_RIGHT)):
             seen, _ = cv2.projectPoints(where, np.zeros(3), np.zeros(3), made.matrix(own), np.array([*d, 0.0]))
             points.append(seen.astype(np.float32))
     boards = [board.astype(np.float32)] * len(left)
     _, M1, D1, M2, D2, turn, shift, *_ = cv2.stereoCalibrate(
-        boards,
-        left,
-        right,
-        made.matrix(LEFT),
-        made.five(D_LEFT),
-        made.matrix(RIGHT),
-        made.five(D_RIGHT),
-        SIZE,
-        flags=cv2.CALIB_FIX_INTRINSIC,
+        boards, left, right, *OPENCV.values(), SIZE, flags=cv2.CALIB_FIX_INTRINSIC
     )
     rig = rsbench.read_rig(made.opencv(tmp_path / "s.xml", M1=M1, D1=D1, M2=M2, D2=D2, R=turn, T=shift), SIZE).rig
     np.testing.assert_allclose(rig.right_from_left.R, R, atol=1e-5)
@@ -348,17 +332,6 @@ def test_camera_info_of_single_cameras_has_no_extrinsics(tmp_path: Path) -> None
     (tmp_path / "right.yaml").unlink()
     with pytest.raises(RsbenchError, match="describes only one camera: give the folder"):
         rsbench.read_rig(tmp_path / "left.yaml")
-
-
-def test_binned_and_uncalibrated_cameras_of_ros_are_refused(tmp_path: Path) -> None:
-    path = made.ros(tmp_path)
-    text = path.read_text()
-    path.write_text(text + "binning_x: 2\nbinning_y: 2\n")
-    with pytest.raises(RsbenchError, match="binning_x = 2"):
-        rsbench.read_rig(path)
-    path.write_text(re.sub(r"701\.2", "0.0", text))
-    with pytest.raises(RsbenchError, match="not calibrated"):
-        rsbench.read_rig(path)
 
 
 # Others.
@@ -389,10 +362,8 @@ def test_a_polynomial_that_folds_at_the_corners_is_continued(tmp_path: Path) -> 
     own = (534.25, 534.065, 639.57, 368.0055)
     path = made.zed(tmp_path)
     text = re.sub(r"(k|p)\d=[^\n]*\n", "", path.read_text())
-    lines = dict(zip(("k1", "k2", "p1", "p2", "k3"), d, strict=True)) | dict(
-        zip(("fx", "fy", "cx", "cy"), own, strict=True)
-    )
-    section = "".join(f"{key}={value}\n" for key, value in lines.items())
+    keys = ("k1", "k2", "p1", "p2", "k3", "fx", "fy", "cx", "cy")
+    section = "".join(f"{key}={value}\n" for key, value in zip(keys, (*d, *own), strict=True))
     path.write_text(re.sub(r"(_CAM_HD\]\n)(f[^\n]*\n|c[xy][^\n]*\n)*", lambda found: found[1] + section, text))
     found = rsbench.read_rig(path, SIZE)
     words = re.search(r"continued from ([\d.]+) on, ([\d.]+) px off", found.notes[0])
@@ -422,12 +393,9 @@ def test_a_fisheye_that_sees_behind_itself_needs_a_crop(tmp_path: Path) -> None:
     assert_refused(run_here("rig", path, "--crop", "2000x20+0+0"), "--crop 2000x20+0+0: must lie inside")
 
 
-def test_an_inverse_lens_of_realsense_is_refused_unless_it_is_none(tmp_path: Path) -> None:
+def test_an_inverse_lens_of_realsense_without_coefficients_is_none(tmp_path: Path) -> None:
     path = made.realsense(tmp_path)
     text = path.read_text().replace("brown_conrady", "inverse_brown_conrady")
-    path.write_text(text)
-    with pytest.raises(RsbenchError, match="model = inverse_brown_conrady"):
-        rsbench.read_rig(path)
     path.write_text(re.sub(r'"coeffs": \[[^\]]*\]', '"coeffs": [0, 0, 0, 0, 0]', text))
     assert rsbench.read_rig(path).rig.sensor("right").lens is None
 
@@ -437,9 +405,6 @@ def test_units_of_depthai(tmp_path: Path) -> None:
     text = path.read_text()
     path.write_text(text.replace('"toCameraSocket": 0', '"toCameraSocket": 0, "lengthUnit": 1'))
     same_numbers(rsbench.read_rig(path).rig)
-    path.write_text(text.replace('"toCameraSocket": 0', '"toCameraSocket": 0, "lengthUnit": 9'))
-    with pytest.raises(RsbenchError, match="lengthUnit = 9"):
-        rsbench.read_rig(path)
 
 
 def test_lenses_of_basalt(tmp_path: Path) -> None:
@@ -452,12 +417,8 @@ def test_lenses_of_basalt(tmp_path: Path) -> None:
     ]
     path.write_text(json.dumps(tree))
     rig = rsbench.read_rig(path).rig
-    assert rig.sensor("left").lens == Lens(model="double-sphere", xi=-0.2, alpha=0.57)
+    assert rig.sensor("left").lens == SPHERES
     assert rig.sensor("right").lens == FISHEYE
-    tree["value0"]["intrinsics"][0]["camera_type"] = "fov"
-    path.write_text(json.dumps(tree))
-    with pytest.raises(RsbenchError, match="camera_type = 'fov': must be one of"):
-        rsbench.read_rig(path)
 
 
 def test_pixels_of_colmap_begin_at_the_corner(tmp_path: Path) -> None:
@@ -549,9 +510,8 @@ def test_a_scaled_camera_sees_the_same_rays(tmp_path: Path) -> None:
     assert whole is not None and half is not None
     pixels = np.random.default_rng(0).uniform([0, 0], [630, 350], (40, 2))
     # A pixel of the half image covers four of the whole one.
-    np.testing.assert_allclose(
-        half.sensor("left").unproject(pixels), whole.sensor("left").unproject(2 * pixels + 0.5), atol=1e-9
-    )
+    expected = whole.sensor("left").unproject(2 * pixels + 0.5)
+    np.testing.assert_allclose(half.sensor("left").unproject(pixels), expected, atol=1e-9)
     with pytest.raises(RsbenchError, match="other proportions"):
         resized(found, (640, 480))
     with pytest.raises(RsbenchError, match=r"1280 x 720.*--resize"):

@@ -11,6 +11,7 @@ from commands import assert_refused, run_here
 from evo.tools import file_interface
 from exported_data import HEIGHT, PLACE, dataset, only, opencv_pixels
 from general_rigs import RIGS, SCANS
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rsbench.core.rig import SIDES, Side
@@ -59,6 +60,17 @@ def data(tmp_path: Path) -> Path:
     return dataset(tmp_path / "data", frames=FRAMES)
 
 
+def _refused(folder: Path, out: Path, to: str, *words: str) -> None:
+    assert_refused(run_here("export", folder, "--to", to, "--out", out), *words)
+    assert not out.exists()
+
+
+def _assert_pose(found: tuple[FloatArray, FloatArray], sequence: Sequence, side: Side, tau: Any) -> None:
+    """``cam_from_world`` of a camera at times (...)."""
+    for part, true in zip(found, sequence.rig.cam_from_world(sequence.motion, tau, side), strict=True):
+        np.testing.assert_allclose(part, true, atol=_NINE_DIGITS)
+
+
 def _export(folder: Path, name: str, out: Path) -> dict[str, Any]:
     result = run_here("export", folder, "--to", name, "--out", out)
     assert result.returncode == 0, result.stderr
@@ -79,10 +91,8 @@ def test_evo_reads_the_cameras_of_a_corrected_sequence(tmp_path: Path, data: Pat
         read = file_interface.read_tum_trajectory_file(tmp_path / "out/walk" / name)
         assert read.check()[0], read.check()[1]
         np.testing.assert_allclose(read.timestamps, tau, atol=_NINE_DIGITS)
-        R, t = sequence.rig.cam_from_world(sequence.motion, tau, side)
         poses = np.linalg.inv(np.array(read.poses_se3))
-        np.testing.assert_allclose(poses[:, :3, :3], R, atol=_NINE_DIGITS)
-        np.testing.assert_allclose(poses[:, :3, 3], t, atol=_NINE_DIGITS)
+        _assert_pose((poses[:, :3, :3], poses[:, :3, 3]), sequence, side, tau)
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -115,25 +125,24 @@ def test_colmap_gets_corrected_frames_with_the_poses_of_their_time(tmp_path: Pat
     folder = tmp_path / "out/walk"
     found = _images(folder / "sparse/images.txt")
     assert sorted(found) == sorted(path.name for path in (folder / "images").iterdir())
-    for name, (R, t) in found.items():
+    for name, pose in found.items():
         side: Side = "left" if name.startswith("left") else "right"
-        tau = int(name[-10:-4]) + sequence.shutter.readout_ratio * row / HEIGHT
-        true = sequence.rig.cam_from_world(sequence.motion, tau, side)
-        np.testing.assert_allclose(R, true.R, atol=_NINE_DIGITS)
-        np.testing.assert_allclose(t, true.t, atol=_NINE_DIGITS)
+        _assert_pose(pose, sequence, side, int(name[-10:-4]) + sequence.shutter.readout_ratio * row / HEIGHT)
         assert (folder / "images" / name).read_bytes() == (tmp_path / "walk/corrected" / name).read_bytes()
         assert (folder / "masks" / f"{name}.png").is_file()
     points = np.loadtxt(folder / "sparse/points3D.txt")
     assert len(points) == note["points"] > 1000
-    _hold_colours(sequence, points[points[:, 0] <= note["points"] / (FRAMES - 1)], found["right_000000.png"], row)
+    R, t = found["right_000000.png"]
+    first = points[points[:, 0] <= note["points"] / (FRAMES - 1)]
+    places = sequence.rig.camera.project(first[:, 1:4] @ R.T + t)
+    _hold_colours(first, places, sequence.image("gs", "right", 0, row))
 
 
-def _hold_colours(sequence: Sequence, points: FloatArray, pose: tuple[FloatArray, FloatArray], row: int) -> None:
-    x = points[:, 1:4] @ pose[0].T + pose[1]
-    pixels = np.round(sequence.rig.camera.project(x)).astype(int)
-    inside = np.all((pixels >= 0) & (pixels < [64, HEIGHT]), axis=1)
-    seen = sequence.image("gs", "right", 0, row)[pixels[inside, 1], pixels[inside, 0]].astype(float)
-    off = np.abs(seen - points[inside, 4:7])
+def _hold_colours(points: FloatArray, places: FloatArray, image: NDArray[np.uint8]) -> None:
+    """Points have the colours of an image at their places there (n, 2) px."""
+    pixels = np.round(places).astype(int)
+    inside = np.all((pixels >= 0) & (pixels < image.shape[1::-1]), axis=1)
+    off = np.abs(image[pixels[inside, 1], pixels[inside, 0]].astype(float) - points[inside, 4:7])
     # Waves of some 12 px and 50 levels, looked up in whole pixels: half a pixel of them is 13 levels.
     assert np.median(off) < 13.0 and np.count_nonzero(inside) > 300
 
@@ -158,16 +167,8 @@ def test_a_lens_stays_a_lens(tmp_path: Path) -> None:
     _corrected(dataset(tmp_path / "data", "brown", frames=FRAMES), tmp_path / "walk")
     _export(tmp_path / "walk", "colmap", tmp_path / "out")
     line = (tmp_path / "out/walk/sparse/cameras.txt").read_text("utf-8").splitlines()[0].split()
-    assert line[1] == "OPENCV" and [float(word) for word in line[4:]] == [
-        60,
-        61,
-        31,
-        25.5,
-        -0.1,
-        0.02,
-        0.001,
-        -0.002,
-    ]
+    assert line[1] == "OPENCV"
+    assert [float(word) for word in line[4:]] == [60, 61, 31, 25.5, -0.1, 0.02, 0.001, -0.002]
 
 
 def test_a_frame_whose_row_has_no_pose_is_left_out(tmp_path: Path, data: Path) -> None:
@@ -182,23 +183,19 @@ def test_a_frame_whose_row_has_no_pose_is_left_out(tmp_path: Path, data: Path) -
 def test_a_picture_of_another_size_is_one_line(tmp_path: Path, data: Path) -> None:
     _corrected(data, tmp_path / "walk")
     write_png(tmp_path / "walk/corrected/left_000001.png", np.zeros((8, 8, 3), dtype=np.uint8))
-    result = run_here("export", tmp_path / "walk", "--to", "colmap", "--out", tmp_path / "out")
-    assert_refused(result, "left_000001.png")
-    assert not (tmp_path / "out").exists()
+    _refused(tmp_path / "walk", tmp_path / "out", "colmap", "left_000001.png")
 
 
 def test_frames_of_another_row_need_the_poses_of_rows(tmp_path: Path, data: Path) -> None:
     _corrected(data, tmp_path / "walk", HEIGHT // 2)
-    result = run_here("export", tmp_path / "walk", "--to", "colmap", "--out", tmp_path / "out")
-    assert_refused(result, "of the time of row 24", "--row-poses")
-    assert not (tmp_path / "out").exists()
+    _refused(tmp_path / "walk", tmp_path / "out", "colmap", "of the time of row 24", "--row-poses")
 
 
 def test_cameras_that_read_apart_have_no_pair_of_one_time(tmp_path: Path) -> None:
     data = dataset(tmp_path / "data", frames=FRAMES, right_delay=0.1)
     _corrected(data, tmp_path / "walk")
-    result = run_here("export", tmp_path / "walk", "--to", "colmap", "--out", tmp_path / "out")
-    assert_refused(result, "do not read each row at one time", "--to tum")
+    words = "do not read each row at one time", "--to tum"
+    _refused(tmp_path / "walk", tmp_path / "out", "colmap", *words)
 
 
 def test_two_cameras_that_differ_are_exported_as_they_are(tmp_path: Path) -> None:
@@ -208,24 +205,18 @@ def test_two_cameras_that_differ_are_exported_as_they_are(tmp_path: Path) -> Non
     note = _export(tmp_path / "walk", "colmap", tmp_path / "out")["walk"]
     _export(tmp_path / "walk", "tum", tmp_path / "tum")
     found = _images(tmp_path / "out/walk/sparse/images.txt")
-    for name, (R, t) in found.items():
+    for name, pose in found.items():
         side: Side = "left" if name.startswith("left") else "right"
-        true = sequence.rig.cam_from_world(sequence.motion, float(int(name[-10:-4])), side)
-        np.testing.assert_allclose(R, true.R, atol=_NINE_DIGITS)
-        np.testing.assert_allclose(t, true.t, atol=_NINE_DIGITS)
         read = file_interface.read_tum_trajectory_file(tmp_path / f"tum/walk/{side}.txt")
         camera_from_world = np.linalg.inv(read.poses_se3[int(name[-10:-4])])
-        np.testing.assert_allclose(camera_from_world[:3, :3], true.R, atol=_NINE_DIGITS)
-        np.testing.assert_allclose(camera_from_world[:3, 3], true.t, atol=_NINE_DIGITS)
+        for each in (pose, (camera_from_world[:3, :3], camera_from_world[:3, 3])):
+            _assert_pose(each, sequence, side, float(int(name[-10:-4])))
     points = np.loadtxt(tmp_path / "out/walk/sparse/points3D.txt")
     points = points[points[:, 0] <= note["points"] / (FRAMES - 1)]
     R, t = found["right_000000.png"]
     K = np.array([[75.0, 0.0, 41.0], [0.0, 74.0, 20.5], [0.0, 0.0, 1.0]])
-    x = points[:, 1:4] @ R.T + t
-    pixels = np.round(opencv_pixels(x, K, "fisheye")).astype(int)
-    inside = np.all((pixels >= 0) & (pixels < [80, 45]), axis=1)
-    seen = sequence.image("gs", "right", 0)[pixels[inside, 1], pixels[inside, 0]].astype(float)
-    assert np.median(np.abs(seen - points[inside, 4:7])) < 13.0 and np.count_nonzero(inside) > 300
+    places = opencv_pixels(points[:, 1:4] @ R.T + t, K, "fisheye")
+    _hold_colours(points, places, sequence.image("gs", "right", 0))
     (recording,) = read_colmap(tmp_path / "out/walk/sparse")
     assert recording.rig is not None
     np.testing.assert_allclose(recording.rig.right_from_left.t, PLACE, atol=1e-12)
@@ -249,7 +240,7 @@ def test_a_trajectory_that_is_none_is_one_line(
     _corrected(data, tmp_path / "walk")
     path = tmp_path / "walk/trajectory.csv"
     path.unlink() if text is None else path.write_text(text, newline="\n")
-    assert_refused(run_here("export", tmp_path / "walk", "--to", "tum", "--out", tmp_path / "out"), *words)
+    _refused(tmp_path / "walk", tmp_path / "out", "tum", *words)
 
 
 @pytest.mark.parametrize(
@@ -259,5 +250,4 @@ def test_a_record_that_says_no_rig_is_one_line(tmp_path: Path, data: Path, chang
     _corrected(data, tmp_path / "walk")
     path = tmp_path / "walk/motion.json"
     write_json(path, read_json(path) | change)
-    result = run_here("export", tmp_path / "walk", "--to", "tum", "--out", tmp_path / "out")
-    assert_refused(result, "motion.json")
+    _refused(tmp_path / "walk", tmp_path / "out", "tum", "motion.json")

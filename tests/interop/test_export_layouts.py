@@ -18,11 +18,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import LinearMotion, TwistMotion
 from rsbench.components.rig_tables import RigTables
+from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, StereoRig, views_of
 from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_parts import Calibration
 from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.interop.readers.layouts import read_colmap
+from rsbench.interop.writers.kitti_and_kalibr import disparity_values
 from rsbench.storage.files import read_json, write_json
 
 K = np.array([[60.0, 0.0, 30.5], [0.0, 61.0, 25.0], [0.0, 0.0, 1.0]])
@@ -179,8 +181,6 @@ def _through(P: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def test_disparities_that_a_png_cannot_hold_are_unknown_and_counted(tmp_path: Path) -> None:
-    from rsbench.interop.writers.kitti_and_kalibr import disparity_values
-
     values, lost = disparity_values(np.array([[np.nan, 1e-4, 0.002, 1.0, 255.998, 300.0]]))
     assert values.tolist() == [[0, 0, 1, 256, 65535, 0]] and lost == 2
 
@@ -227,17 +227,11 @@ def test_carla_rs_velocities_and_radial_depth(tmp_path: Path, turning: bool) -> 
         np.testing.assert_allclose(note["largest_row_error_px"], worst, rtol=1e-6)
         assert worst > 0.1 and "up to" in note["told"][0]
     else:
-        assert worst < SAME_PX and note["told"] == [
-            "the two cameras are sequences of their own: the delay of the right one is not written"
-        ]
-    assert sorted(path.name for path in (out / "planes/seq_left").iterdir()) == [
-        *(
-            f"000{k}_{name}"
-            for k in (0, 1)
-            for name in ("gs_f.depth", "gs_f.png", "gs_m.png", "rs.depth", "rs.png")
-        ),
-        "gt_vel.log",
-    ]
+        (words,) = note["told"]
+        assert worst < SAME_PX and words.endswith("the delay of the right one is not written")
+    names = ("gs_f.depth", "gs_f.png", "gs_m.png", "rs.depth", "rs.png")
+    files = {f"000{k}_{name}" for k in (0, 1) for name in names} | {"gt_vel.log"}
+    assert {path.name for path in (out / "planes/seq_left").iterdir()} == files
     middle = data / "planes/gs_twin/0024/left_1.png"
     assert (out / "planes/seq_left/0001_gs_m.png").read_bytes() == middle.read_bytes()
     assert "ROW_READOUT_TIME(ms): 1.63265" in (out / "planes/rs_calib.txt").read_text()  # 80 ms / 49
@@ -246,20 +240,14 @@ def test_carla_rs_velocities_and_radial_depth(tmp_path: Path, turning: bool) -> 
 def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> None:
     data = dataset(tmp_path / "data", frames=3)
     out, note = exported(data, "fastec-rs", tmp_path / "out")
-    sequence = only(data)
     for side in SIDES:
         place = out / f"planes_{side}"
         # As dataset_fastec_rs.py finds them: in folders with a meta.log, NNN_rolling.png from 000 on.
         assert (place / "meta.log").is_file()
-        assert sorted(path.name for path in place.glob("*_rolling.png")) == [
-            f"{i:03d}_rolling.png" for i in range(3)
-        ]
-        for frame in range(3):
-            for name, kind in (("rolling", "rs"), ("global_first", "gs")):
-                shown = cv2.imread(str(place / f"{frame:03d}_{name}.png"))[..., ::-1]
-                np.testing.assert_array_equal(shown, sequence.image(kind, side, frame))
-            middle = data / "planes" / "gs_twin" / "0024" / f"{side}_{frame}.png"
-            assert (place / f"{frame:03d}_global_middle.png").read_bytes() == middle.read_bytes()
+        frames = sorted(place.glob("*_rolling.png"))
+        assert [path.name for path in frames] == [f"{k:03d}_rolling.png" for k in range(3)]
+        for frame, path in enumerate(frames):  # of the twins: test_importing.py
+            np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], only(data).image("rs", side, frame))
     assert note["told"] == ["the readout ratio is 0.8, where those who use the layout assume 1"]
 
 
@@ -269,13 +257,7 @@ def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> No
         ("kitti", "none", {"right": "none"}, None, "rsbench correct --rectify writes rectified pairs"),
         ("kalibr", "none", {"right": "rational"}, None, "the right camera's is rational"),
         ("nerfstudio", "brown", {"right": "fisheye"}, None, "one for all images"),
-        (
-            "nerfstudio",
-            "none",
-            {"right": "none", "right_readout_ratio": 0.5},
-            "rs",
-            "readouts of the cameras differ",
-        ),
+        ("nerfstudio", "none", {"right": "none", "right_readout_ratio": 0.5}, "rs", "readouts of the cameras"),
         ("carla-rs", "none", {"right": "none"}, None, "one size and one readout"),
         ("kalibr", "brown-k3", {}, None, "radtan has k1, k2, p1, p2 but no k3"),
         ("kalibr", "none", {"right_scan": "bottom"}, None, "rows that are read from the top"),
@@ -291,8 +273,6 @@ def test_fastec_rs_has_the_frames_that_its_loader_asks_for(tmp_path: Path) -> No
 def test_what_a_format_cannot_hold_is_refused_by_name(
     tmp_path: Path, name: str, lens: str, scanning: dict[str, Any], images: str | None, words: str
 ) -> None:
-    from rsbench.core.errors import RsbenchError
-
     data = dataset(tmp_path / "data", lens, **scanning)
     with pytest.raises(RsbenchError, match=f"^--to {name}: sequence planes: .*{words}"):
         exported(data, name, tmp_path / "out", images)  # pyrefly: ignore[bad-argument-type]
@@ -307,13 +287,8 @@ def test_a_motion_that_a_format_only_approximates_is_measured(tmp_path: Path) ->
         assert (note["largest_row_error_px"] < SAME_PX) == exact == (not note["told"]), SIDES
 
 
-MODELS = {
-    "rational": "FULL_OPENCV",
-    "none": "PINHOLE",
-    "brown": "OPENCV",
-    "brown-k3": "FULL_OPENCV",
-    "fisheye": "OPENCV_FISHEYE",
-}
+MODELS = {"none": "PINHOLE", "brown": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+"""All others are FULL_OPENCV."""
 
 
 @pytest.fixture(scope="module", params=["none", "brown", "brown-k3", "fisheye", "brown fisheye", "none rational"])
@@ -335,8 +310,9 @@ def test_our_points_fall_on_their_pixels(made: tuple[str, Path, Path]) -> None:
     lens, data, out = made
     left, right = _table(out / "sparse/cameras.txt")
     lenses = dict(zip(SIDES, (lens.split() * 2)[:2], strict=True))
-    assert left[1:4] == [MODELS[lenses["left"]], "64", "49"]
-    assert right[1:4] == [MODELS[lenses["right"]], "80", "45"] if " " in lens else right[1:] == left[1:]
+    models = {side: MODELS.get(each, "FULL_OPENCV") for side, each in lenses.items()}
+    assert left[1:4] == [models["left"], "64", "49"]
+    assert right[1:4] == [models["right"], "80", "45"] if " " in lens else right[1:] == left[1:]
     poses = {row[-1]: np.array(row[1:8], dtype=float) for row in _table(out / "sparse/images.txt")[::2]}
     for side, frame in views_of(2):
         pose, shown = poses[f"{side}_{frame:04d}.png"], seen(only(data), side, frame, "gs")
@@ -454,36 +430,30 @@ def _gsplat_pixels(start: FloatArray, end: FloatArray, world: FloatArray, K: Flo
     return pixels
 
 
+_OPPOSITE = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
+
+
 @pytest.mark.parametrize(
-    ("lens", "scanning", "shutters"),
+    ("lens", "scanning"),
     [
-        ("none", {}, ("TOP_TO_BOTTOM", "TOP_TO_BOTTOM")),
-        (
-            "brown-k3",
-            {"scan": "bottom", "right_scan": "top", "right_delay": 0.1},
-            ("BOTTOM_TO_TOP", "TOP_TO_BOTTOM"),
-        ),
-        ("fisheye", {"scan": "left", "right_scan": "right"}, ("LEFT_TO_RIGHT", "RIGHT_TO_LEFT")),
-        (
-            "brown-k3",
-            {"right": "fisheye", "right_scan": "left", "right_readout_ratio": 0.6},
-            ("TOP_TO_BOTTOM", "LEFT_TO_RIGHT"),
-        ),
-        ("none", {"right": "rational"}, ("TOP_TO_BOTTOM", "TOP_TO_BOTTOM")),
+        ("none", {}),
+        ("brown-k3", {"scan": "bottom", "right_scan": "top", "right_delay": 0.1}),
+        ("fisheye", {"scan": "left", "right_scan": "right"}),
+        ("brown-k3", {"right": "fisheye", "right_scan": "left", "right_readout_ratio": 0.6}),
+        ("none", {"right": "rational"}),
     ],
 )
-def test_gsplat_sees_our_points_in_their_pixels(
-    tmp_path: Path, lens: str, scanning: dict[str, Any], shutters: tuple[str, str]
-) -> None:
+def test_gsplat_sees_our_points_in_their_pixels(tmp_path: Path, lens: str, scanning: dict[str, Any]) -> None:
     data = dataset(tmp_path / "data", lens, **scanning)
     out, note = exported(data, "gsplat", tmp_path / "out")
     assert note["largest_row_error_px"] < SAME_PX and note["told"] == []
     for side, frame in views_of(2):
         own = scanning.get("right", lens) if side == "right" else lens
         with np.load(out / f"planes/{side}.npz") as arrays:
-            loaded = {name: arrays[name] for name in arrays}
+            loaded = dict(arrays)
         about = json.loads((out / f"planes/{side}.json").read_text())
-        assert about["rolling_shutter"] == f"ROLLING_{shutters[SIDES.index(side)]}"
+        scan = scanning.get("right_scan" if side == "right" else "scan", "top")
+        assert about["rolling_shutter"] == f"ROLLING_{scan}_TO_{_OPPOSITE[scan]}".upper()
         assert about["camera_model"] == ("fisheye" if own == "fisheye" else "pinhole")
         assert {name: array.shape[1:] for name, array in loaded.items()} == {
             "viewmats": (4, 4),
@@ -556,11 +526,10 @@ def test_3dgs_deblur_sees_the_middle_row_in_its_pixels_and_the_rows_move_as_the_
         np.testing.assert_allclose(opencv_pixels(x, K, "none"), middle.pixels + 0.5, atol=SAME_PX)
         # Each row's delay, from the poses of the rows around: the error of the difference is below 1e-7 px.
         _, poses = sequence.poses(side, number)
-        ends = (
+        before, after = (
             opencv_pixels(middle.world @ poses.R[k].T + poses.t[k], K, "none")
             for k in (rows // 2 - 1, rows // 2 + 1)
         )
-        before, after = ends
         rates = _pixel_velocities(frame, x, K)
         np.testing.assert_allclose(rates * content["rolling_shutter_time"] / rows, (after - before) / 2, atol=1e-7)
         shown = seen(sequence, side, number, "rs", rows=tuple(range(rows)))
@@ -573,22 +542,13 @@ def test_3dgs_deblur_sees_the_middle_row_in_its_pixels_and_the_rows_move_as_the_
     assert "first order in pixels" in note["told"][0]
 
 
-@pytest.mark.parametrize(
-    ("lens", "model", "right"),
-    [
-        ("none", "OPENCV", ""),
-        ("brown-k3", "OPENCV", ""),
-        ("fisheye", "OPENCV_FISHEYE", ""),
-        ("none", "OPENCV", "brown"),
-    ],
-)
-def test_nerfstudio_sees_global_shutter_twins_in_their_pixels(
-    tmp_path: Path, lens: str, model: str, right: str
-) -> None:
+@pytest.mark.parametrize(("lens", "right"), [("none", ""), ("brown-k3", ""), ("fisheye", ""), ("none", "brown")])
+def test_nerfstudio_sees_global_shutter_twins_in_their_pixels(tmp_path: Path, lens: str, right: str) -> None:
     data = dataset(tmp_path / "data", lens, right=right, scan="right")
     out, note = exported(data, "nerfstudio", tmp_path / "out", "gs")
     content, sequence = json.loads((out / "planes/transforms.json").read_text()), only(data)
-    assert content["camera_model"] == model and note["told"] == []
+    assert content["camera_model"] == ("OPENCV_FISHEYE" if lens == "fisheye" else "OPENCV")
+    assert note["told"] == []
     assert "rolling_shutter_time" not in content and "camera_linear_velocity" not in content["frames"][0]
     for (side, number), frame in zip([(s, k) for k in (0, 1) for s in SIDES], content["frames"], strict=True):
         shown, own, both = seen(sequence, side, number, "gs"), right if side == "right" else "", content | frame
@@ -602,8 +562,6 @@ def test_nerfstudio_sees_global_shutter_twins_in_their_pixels(
 
 
 def test_one_exposure_time_is_written_and_two_are_refused(tmp_path: Path) -> None:
-    from rsbench.core.errors import RsbenchError
-
     data = dataset(tmp_path / "data")
     path, sensor = data / "planes/sequence.json", {"exposure_s": 0.01, "full_well": 6000.0, "gain": 4.0}
     write_json(path, read_json(path) | {"sensor": sensor})

@@ -124,13 +124,13 @@ def read_calibration(path: Path) -> dict[str, Any]:
     return found
 
 
-@pytest.fixture(params=["turned", "vertical", "toed in", "ideal", "lens", "spheres"])
-def made(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[StereoRig, Path]:
-    rig = ALL[request.param]
+@pytest.fixture(scope="module", params=["turned", "vertical", "toed in", "ideal", "lens", "spheres"])
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[StereoRig, Path]:
+    rig, folder = ALL[request.param], tmp_path_factory.mktemp("pair")
     for side in SIDES:
-        write_rectified(tmp_path, f"{side}_0", frame(rig, side), rig, side)
-    write_calibration(tmp_path, rig)
-    return rig, tmp_path / FOLDER
+        write_rectified(folder, f"{side}_0", frame(rig, side), rig, side)
+    write_calibration(folder, rig)
+    return rig, folder / FOLDER
 
 
 def test_opencv_reads_the_pair(made: tuple[StereoRig, Path]) -> None:
@@ -160,11 +160,8 @@ def test_opencv_reads_the_pair(made: tuple[StereoRig, Path]) -> None:
     assert np.mean(np.abs(seen[both].astype(float) - left[inner][both])) < 1.0  # grey levels
     # R1 and R2 turn the cameras' axes into the pair's: R2 (R X + T) = R1 X - (B, 0, 0).
     X_left = exact[inner][::500] @ known["R1"]
-    np.testing.assert_allclose(
-        (X_left @ known["R"].T + known["T"].T) @ known["R2"].T,
-        X_left @ known["R1"].T - [rig.baseline, 0.0, 0.0],
-        atol=1e-9,
-    )
+    in_right = (X_left @ known["R"].T + known["T"].T) @ known["R2"].T
+    np.testing.assert_allclose(in_right, X_left @ known["R1"].T - [rig.baseline, 0.0, 0.0], atol=1e-9)
 
 
 def test_opencv_would_resample_the_sensor_in_the_same_places(made: tuple[StereoRig, Path]) -> None:
@@ -197,9 +194,11 @@ def test_opencv_rectifies_the_same_rig_alike() -> None:
     assert np.trace(R1 @ ours[0].T) == pytest.approx(np.trace(R2 @ ours[1].T), abs=1e-12)
 
 
-def test_colmap_reads_the_cameras(made: tuple[StereoRig, Path]) -> None:
+def test_we_and_colmap_read_the_cameras(made: tuple[StereoRig, Path]) -> None:
     rig, folder = made
     camera = rectified_camera(rig)
+    (folder / "images.txt").write_text("1 1 0 0 0 0 0 0 1 left_0.png\n\n2 1 0 0 0 0 0 0 2 right_0.png\n\n")
+    assert [recording.cameras["left"] for recording in read_colmap(folder, folder)] == [camera] * 2
     pycolmap = pytest.importorskip("pycolmap")
     for name in ("images.txt", "points3D.txt"):
         (folder / name).write_text("")
@@ -208,10 +207,3 @@ def test_colmap_reads_the_cameras(made: tuple[StereoRig, Path]) -> None:
     for each in cameras.values():
         assert (each.model.name, each.width, each.height) == ("PINHOLE", camera.width, camera.height)
         np.testing.assert_allclose(each.params, [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5])
-
-
-def test_our_reader_reads_the_cameras(made: tuple[StereoRig, Path]) -> None:
-    rig, folder = made
-    (folder / "images.txt").write_text("1 1 0 0 0 0 0 0 1 left_0.png\n\n2 1 0 0 0 0 0 0 2 right_0.png\n\n")
-    found = [recording.cameras["left"] for recording in read_colmap(folder, folder)]
-    assert found == [rectified_camera(rig)] * 2

@@ -23,7 +23,7 @@ SUN = Light(sun_direction=(0.4, -0.7, -0.6), up=(0.0, -1.0, 0.0))
 def make_quad(corners: Any, material: Material | None = None, **extra: Any) -> SceneMesh:
     """Rectangle of four corners in order; its uv is (0, 1) at the first, (1, 1) at the second, v up."""
     return SceneMesh(
-        name="quad",
+        name=extra.pop("name", "quad"),
         vertices=np.asarray(corners, dtype=np.float64),
         faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
         material=Material(name="grey") if material is None else material,
@@ -32,7 +32,9 @@ def make_quad(corners: Any, material: Material | None = None, **extra: Any) -> S
     )
 
 
-def _solid(name: str, solid: trimesh.Trimesh, place: Any, smooth: bool, colour: Any) -> SceneMesh:
+def make_solid(
+    name: str, solid: trimesh.Trimesh, place: Any, smooth: bool = False, colour: Any = (0.8, 0.8, 0.8)
+) -> SceneMesh:
     return SceneMesh(
         name=name,
         vertices=np.asarray(solid.vertices) + place,
@@ -42,9 +44,14 @@ def _solid(name: str, solid: trimesh.Trimesh, place: Any, smooth: bool, colour: 
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def quad() -> Quad:
     return make_quad
+
+
+@pytest.fixture(scope="session")
+def solid() -> Callable[..., SceneMesh]:
+    return make_solid
 
 
 @pytest.fixture(scope="session")
@@ -56,13 +63,9 @@ def town() -> Scene:
         Material(name="ground", texture=noise),
         uv=np.array([[0.0, 8.0], [10.0, 8.0], [10.0, 0.0], [0.0, 0.0]]),
     )
-    boxes = [
-        _solid(
-            f"box{i}", trimesh.creation.box((1.0, 2.0, 1.0)), (2.0 * i - 3.0, 0.5, 5.0 + i), False, (0.7, 0.5, 0.3)
-        )
-        for i in range(4)
-    ]
-    sphere = _solid("sphere", trimesh.creation.icosphere(2), (0.3, 0.2, 4.0), True, (0.2, 0.4, 0.8))
+    box = trimesh.creation.box((1.0, 2.0, 1.0))
+    boxes = [make_solid(f"box{i}", box, (2.0 * i - 3.0, 0.5, 5.0 + i), colour=(0.7, 0.5, 0.3)) for i in range(4)]
+    sphere = make_solid("sphere", trimesh.creation.icosphere(2), (0.3, 0.2, 4.0), True, (0.2, 0.4, 0.8))
     return Scene(name="town", meshes=(ground, *boxes, sphere), light=SUN)
 
 
@@ -71,8 +74,9 @@ def room() -> Scene:
     """Closed box around the camera, so that light bounces and no ray misses but those through the missing lid."""
     walls = trimesh.creation.box((6.0, 4.0, 8.0))
     walls.update_faces(walls.face_normals[:, 1] > -0.5)
-    ball = _solid("ball", trimesh.creation.icosphere(1), (0.5, 0.8, 2.0), False, (0.9, 0.9, 0.2))
-    return Scene(name="room", meshes=(_solid("walls", walls, (0, 0, 0), False, (0.8, 0.3, 0.3)), ball), light=SUN)
+    ball = make_solid("ball", trimesh.creation.icosphere(1), (0.5, 0.8, 2.0), colour=(0.9, 0.9, 0.2))
+    inside = make_solid("walls", walls, (0, 0, 0), colour=(0.8, 0.3, 0.3))
+    return Scene(name="room", meshes=(inside, ball), light=SUN)
 
 
 @pytest.fixture(scope="session")

@@ -78,14 +78,6 @@ def test_cameras_and_frames_may_differ() -> None:
     assert abs(seen.var() / expected - 1) < 5 * np.sqrt(2.1 / n)
 
 
-def test_what_all_share_is_recorded_as_ever() -> None:
-    """Sequences of before had no keys for what differs."""
-    assert "right_gain" not in PHONE.record and "brightness" not in PHONE.record
-    assert PHONE.record["gain"] == 4
-    uneven = replace(PHONE, brightness=(1.0, 0.5))
-    assert uneven.record == PHONE.record | {"brightness": [1.0, 0.5]}
-
-
 def test_a_row_has_the_same_bits_by_itself() -> None:
     image = np.random.default_rng(1).random((12, 9, 3), dtype=np.float32)
     sensor = replace(PHONE, vignetting=0.3)
@@ -93,9 +85,8 @@ def test_a_row_has_the_same_bits_by_itself() -> None:
     np.testing.assert_array_equal(expose(image[[3, 8]], sensor, 5, 12, [3, 8]), whole[[3, 8]])
     difference = expose(image, sensor, 6, 12, np.arange(12)) - whole
     light = image * fall_off(sensor, 9, 12, np.arange(12))[..., None]
-    assert difference.var() == pytest.approx(2 * sensor.variance(light).mean(), rel=0.5), (
-        "another seed, other noise"
-    )
+    # Another seed, other noise.
+    assert difference.var() == pytest.approx(2 * sensor.variance(light).mean(), rel=0.5)
 
 
 def test_rows_and_colours_err_independently() -> None:
@@ -163,9 +154,8 @@ def _by_loops(light: NDArray[np.float32], pattern: str) -> NDArray[np.float64]:
             if near(y, x)[0] == wanted:
                 made[y, x, k] = near(y, x)[1]
             elif wanted == "G":
-                made[y, x, k] = np.mean(
-                    [each for _, each in min(sides, key=lambda two: abs(two[0][1] - two[1][1]))]
-                )
+                alike = min(sides, key=lambda two: abs(two[0][1] - two[1][1]))
+                made[y, x, k] = np.mean([each for _, each in alike])
             else:
                 same = [each for colour, each in (*sides[0], *sides[1]) if colour == wanted]
                 made[y, x, k] = np.mean(same or [each for _, each in corners])
@@ -254,12 +244,15 @@ def test_what_cannot_be_is_refused() -> None:
 
 
 def test_cameras_may_differ_and_records_say_what_there_is() -> None:
+    """Sequences of before had no keys for what differs."""
     sensor = replace(NOISY, mosaic="RGGB", right_mosaic="none", right_jpeg_quality=70)
     left, right = sensor.of("left", 1), sensor.of("right", 1)
     assert (left.mosaic, left.jpeg_quality) == ("RGGB", 0) and (right.mosaic, right.jpeg_quality) == ("none", 70)
     assert right.of("left", 0) == right
     assert set(sensor.record) - set(NOISY.record) == {"mosaic", "right_mosaic", "right_jpeg_quality"}
-    assert not {"mosaic", "jpeg_quality"} & set(NOISY.record)
+    assert NOISY.record["gain"] == 4
+    assert not {"mosaic", "jpeg_quality", "brightness", "right_gain"} & set(NOISY.record)
+    assert replace(NOISY, brightness=(1.0, 0.5)).record == NOISY.record | {"brightness": [1.0, 0.5]}
 
 
 @pytest.mark.parametrize("quality", [10, 20, 50, 80])

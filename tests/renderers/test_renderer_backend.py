@@ -50,6 +50,30 @@ def test_scalar_fallback_renders_the_same_frame_and_says_how_to_be_faster(tmp_pa
     assert (slow["depth"] > 0).mean() > 0.2
 
 
+MOVING = """
+import numpy as np
+from rsbench.core.camera import PinholeCamera
+from rsbench.core.se3 import Pose
+from rsbench.renderers.options import RendererOptions
+from rsbench.renderers.render import LinePoses, render
+from rsbench.renderers.scene import MitsubaScene
+from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+
+corners = np.array([[-1.0, -1, 4], [0, -1, 4], [0, 1, 4], [-1, 1, 4]])
+faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+quad = SceneMesh(name="quad", vertices=corners, faces=faces, material=Material(name="m"), mover=1)
+scene = MitsubaScene(Scene(name="one", meshes=(quad,), light=Light(sun_direction=(0, 0, -1), up=(0, -1, 0))))
+still = np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3))
+objects = Pose(*(part[None] for part in still))
+frame = render(scene, PinholeCamera.centred(4, 3, 3.0), LinePoses(*still, objects), RendererOptions(samples=1))
+assert np.argwhere(frame.depth).tolist() == np.argwhere(frame.labels).tolist() == [[1, 1]], frame
+"""
+
+
+def test_the_sky_beside_an_object_that_moves_ends_no_process_without_llvm() -> None:
+    run_child(MOVING, RSBENCH_VARIANT="scalar")
+
+
 AVX2 = "+avx2,+fma,+bmi,+bmi2,+f16c"
 
 

@@ -15,7 +15,7 @@ from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.render import LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.scenes.model import Light, Material, Scene, SceneMesh
+from rsbench.scenes.model import Light, Scene, SceneMesh
 
 FloatArray = NDArray[np.float64]
 CAMERA = PinholeCamera(width=61, height=44, fx=50.0, fy=53.0, cx=28.3, cy=22.9)
@@ -78,15 +78,12 @@ def test_rolling_shutter_depth_of_a_plane_follows_every_row(quad: Any, row_poses
     assert (np.abs(wrong - truth)[near] > (10 * FLOAT32 * truth * grazing)[near]).mean() > 0.9
 
 
-def test_depth_of_a_triangulated_ball_against_float64_intersection(row_poses: Any) -> None:
-    ball = trimesh.creation.icosphere(2)
-    vertices = np.asarray(ball.vertices) + np.array([0.1, -0.1, 4.0])
-    faces = np.asarray(ball.faces, dtype=np.int32)
-    mesh = SceneMesh(name="ball", vertices=vertices, faces=faces, material=Material(name="m"))
+def test_depth_of_a_triangulated_ball_against_float64_intersection(row_poses: Any, solid: Any) -> None:
+    mesh = solid("ball", trimesh.creation.icosphere(2), (0.1, -0.1, 4.0))
     R, t = row_poses(44, w=(0.1, -0.2, 0.3), d=(0.2, 0.1, 0.5))
     depth = render(scene_of(mesh), CAMERA, LinePoses(R, t), QUICK).depth
     origin, direction = rays(CAMERA, R, t)
-    truth, margin = nearest_triangle(origin, direction, vertices[faces])
+    truth, margin = nearest_triangle(origin, direction, mesh.vertices[mesh.faces])
     inside = (truth > 0) & (margin > 1e-5)  # rays through an edge may round to either side of it
     assert inside.mean() > 0.05
     # Triangles at the rim are seen at a grazing angle, which amplifies rounding up to about 100 times.
@@ -115,16 +112,9 @@ def nearest_triangle(
     return np.where(np.isfinite(hit), hit, 0.0), np.abs(barycentric).min(axis=-1)
 
 
-def test_depth_of_a_fine_ball_is_that_of_the_sphere() -> None:
-    ball = trimesh.creation.icosphere(5)
-    centre = np.array([0.2, -0.1, 5.0])
-    mesh = SceneMesh(
-        name="ball",
-        vertices=np.asarray(ball.vertices) + centre,
-        faces=np.asarray(ball.faces, dtype=np.int32),
-        material=Material(name="m"),
-    )
-    depth = render_global(scene_of(mesh), CAMERA, np.eye(3), np.zeros(3), QUICK).depth
+def test_depth_of_a_fine_ball_is_that_of_the_sphere(solid: Any) -> None:
+    ball, centre = trimesh.creation.icosphere(5), np.array([0.2, -0.1, 5.0])
+    depth = render_global(scene_of(solid("ball", ball, centre)), CAMERA, np.eye(3), np.zeros(3), QUICK).depth
     _, d = rays(CAMERA, np.eye(3)[None].repeat(44, 0), np.zeros((44, 3)))
     dd, dc = np.einsum("hwi,hwi->hw", d, d), d @ centre
     discriminant = dc**2 - dd * (centre @ centre - 1.0)
@@ -139,13 +129,11 @@ def test_depth_of_a_fine_ball_is_that_of_the_sphere() -> None:
 
 
 @pytest.mark.parametrize("tiny", [-2e-19, -0.0, 1e-19, -1e-17])
-def test_a_ray_that_runs_along_an_axis_but_for_rounding_harms_no_neighbour(tiny: float) -> None:
+def test_a_ray_that_runs_along_an_axis_but_for_rounding_harms_no_neighbour(tiny: float, solid: Any) -> None:
     """Embree's packets lose what hits rays beside one whose direction has a component between -1e-18 and 0."""
     camera = PinholeCamera.centred(61, 45, 50.0)
     wall = trimesh.creation.box((80.0, 80.0, 2.0)).subdivide().subdivide()
-    wall.apply_translation((0.0, 0.0, 6.0))
-    faces = np.asarray(wall.faces, dtype=np.int32)
-    mesh = SceneMesh(name="wall", vertices=wall.vertices, faces=faces, material=Material(name="grey"))
+    mesh = solid("wall", wall, (0.0, 0.0, 6.0))
     R = np.eye(3)
     R[2, :2] = tiny
     frame = render_global(scene_of(mesh), camera, R, np.array([0.2, 0.3, -0.4]), QUICK)

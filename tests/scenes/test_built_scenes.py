@@ -90,18 +90,20 @@ def test_texels_are_as_fine_as_pixels_need(scene: Scene, name: str) -> None:
         assert 0.0004 < size < largest, mesh.name
 
 
+def triangles(scene: Scene, view: str) -> NDArray[np.float64]:
+    """Corners (n, 3, 3) of all triangles as seen from a viewpoint."""
+    seen = scene.seen_from(scene.viewpoints[view])
+    return np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
+
+
 def nearest_surface(scene: Scene, view: str) -> float:
     """Metres from a viewpoint to the nearest point of any triangle: inside it, or on an edge."""
-    seen = scene.seen_from(scene.viewpoints[view])
-    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
+    corners = triangles(scene, view)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
     corners, normal = corners[length > 0], normal[length > 0] / length[length > 0, None]
-    foot, inside = (
-        normal * np.sum(corners[:, 0] * normal, axis=1, keepdims=True),
-        np.ones(len(corners), dtype=bool),
-    )
-    nearest = np.inf
+    foot = normal * np.sum(corners[:, 0] * normal, axis=1, keepdims=True)
+    inside, nearest = np.ones(len(corners), dtype=bool), np.inf
     for k in range(3):
         start, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
         inside &= np.sum(np.cross(edge, foot - start) * normal, axis=1) >= 0
@@ -117,10 +119,9 @@ def test_no_seed_leads_a_camera_of_these_cards_into_a_wall(scene: Scene, name: s
         dataset = load_dataset_card(card)
         for sequence in dataset.sequence:
             if sequence.scene == name:
-                way = (1 + dataset.shutter_for(sequence).readout_ratio) * np.linalg.norm(
-                    dataset.motion_of(sequence).d
-                )
-                own = dataset.rig_of(sequence).baseline / 2 + float(way)
+                way = float(np.linalg.norm(dataset.motion_of(sequence).d))
+                way *= 1 + dataset.shutter_for(sequence).readout_ratio
+                own = dataset.rig_of(sequence).baseline / 2 + way
                 reach[sequence.viewpoint] = max(own, reach.get(sequence.viewpoint, 0.0))
     for view, farthest in reach.items():
         assert farthest < nearest_surface(scene, view), view
@@ -131,8 +132,7 @@ def first_hits(scene: Scene, view: str, rays: NDArray[np.float64]) -> NDArray[np
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
-    seen = scene.seen_from(scene.viewpoints[view])
-    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in seen.meshes])
+    corners = triangles(scene, view)
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     # Triple products of a ray and two edges are products of the ray with what only the triangle decides.
     by_det, by_u, by_v = np.cross(ac, ab), np.cross(ac, a), np.cross(a, ab)

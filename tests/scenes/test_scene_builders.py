@@ -97,18 +97,15 @@ def test_what_a_builder_does_wrong_is_one_line(tmp_path: Path, name: str, old: s
         load_scene(card)
 
 
+GREY = np.zeros((2, 2), dtype=np.uint8)
 MESH = SceneMesh(
     name="sound",
     vertices=np.eye(3),
     faces=np.array([[0, 1, 2]], dtype=np.int32),
-    material=Material(name="m", texture=np.zeros((2, 2, 3), dtype=np.uint8)),
+    material=Material(name="m", texture=GREY[..., None].repeat(3, axis=2)),
     uv=np.zeros((3, 2)),
     normals=np.eye(3),
 )
-
-
-def test_a_sound_mesh_is_let_through() -> None:
-    _check_meshes((MESH, replace(MESH, name="other")), "here")
 
 
 @pytest.mark.parametrize(
@@ -124,14 +121,12 @@ def test_a_sound_mesh_is_let_through() -> None:
         (lambda mesh: replace(mesh, faces=np.zeros((0, 3), dtype=np.int32)), "faces of shape (0, 3)"),
         (lambda mesh: replace(mesh, faces=np.eye(3)), "whole numbers"),
         (lambda mesh: replace(mesh, faces=np.array([[0, 1, -1]])), "beyond its 3"),
-        (
-            lambda mesh: replace(mesh, material=Material(name="m", texture=np.zeros((2, 2), dtype=np.uint8))),
-            "texture of shape (2, 2)",
-        ),
+        (lambda mesh: replace(mesh, material=Material(name="m", texture=GREY)), "texture of shape (2, 2)"),
         (lambda mesh: replace(mesh, name="sound"), "has the name of another"),
     ],
 )
 def test_an_unsound_mesh_is_refused(spoil: Callable[[SceneMesh], SceneMesh], part: str) -> None:
+    _check_meshes((MESH, replace(MESH, name="other")), "here")
     with refused(part):
         _check_meshes((MESH, spoil(replace(MESH, name="spoilt"))), "here")
 
@@ -150,24 +145,14 @@ def _meshes() -> tuple[SceneMesh, ...]:
     rng = np.random.default_rng(0)
     painted = Material(name="painted", texture=rng.integers(0, 255, (4, 6, 3), dtype=np.uint8))
     faces = np.array([[0, 1, 2], [2, 1, 3]], dtype=np.int32)
-    walls = [
-        SceneMesh(
-            name=f"wall_{k}",
-            vertices=rng.normal(size=(4, 3)),
-            faces=faces,
-            material=painted,
-            uv=rng.random((4, 2)),
-            normals=rng.normal(size=(4, 3)),
+    found = list[SceneMesh]()
+    for name in ("wall_0", "wall_1"):
+        vertices, uv, normals = rng.normal(size=(4, 3)), rng.random((4, 2)), rng.normal(size=(4, 3))
+        found.append(
+            SceneMesh(name=name, vertices=vertices, faces=faces, material=painted, uv=uv, normals=normals)
         )
-        for k in range(2)
-    ]
-    plain = SceneMesh(
-        name="plain",
-        vertices=rng.normal(size=(3, 3)),
-        faces=faces[:1],
-        material=Material(name="m", colour=(0.1, 1.0, 0.3)),
-    )
-    return (*walls, plain)
+    plain = Material(name="m", colour=(0.1, 1.0, 0.3))
+    return (*found, SceneMesh(name="plain", vertices=np.eye(3), faces=faces[:1], material=plain))
 
 
 def test_what_is_kept_is_the_same_to_the_last_bit(cache: Path) -> None:
@@ -271,21 +256,12 @@ def test_vertical_views_are_refused(target: tuple[float, float, float]) -> None:
 def test_seen_from_moves_everything_rigidly() -> None:
     vertices = np.array([[1.0, 2, 3], [4, 5, 6], [-1, 0, 2]])
     normals = np.array([[0.0, 0, 1], [1, 0, 0], [0, 0.6, 0.8]])
-    mesh = SceneMesh(
-        name="m",
-        vertices=vertices,
-        faces=np.array([[0, 1, 2]], np.int32),
-        material=Material(name="a"),
-        normals=normals,
-    )
-    light = Light(sun_direction=(0.6, 0.0, 0.8))
-    scene = Scene(name="s", meshes=(mesh,), light=light, viewpoints={})
+    mesh = replace(MESH, vertices=vertices, normals=normals)
+    scene = Scene(name="s", meshes=(mesh,), light=Light(sun_direction=(0.6, 0.0, 0.8)))
     seen = scene.seen_from(Viewpoint(eye=(3, 3, 3), target=(0, 7, 1)))
     moved = seen.meshes[0]
-    for a in range(3):
-        for b in range(3):
-            before = np.linalg.norm(vertices[a] - vertices[b])
-            assert np.linalg.norm(moved.vertices[a] - moved.vertices[b]) == pytest.approx(before)
+    before, after = (each[:, None] - each for each in (vertices, moved.vertices))
+    assert np.linalg.norm(after, axis=2) == pytest.approx(np.linalg.norm(before, axis=2))
     assert moved.normals is not None
     sun, up = np.asarray(seen.light.sun_direction), np.asarray(seen.light.up)
     assert moved.normals @ sun == pytest.approx(normals @ (0.6, 0.0, 0.8))

@@ -93,10 +93,8 @@ class Parts:
     @property
     def apart(self) -> bool:
         """Whether the files contain the relative pose of the cameras."""
-        return (
-            bool(self.values["rotation"] and self.values["translation"])
-            or {"r1", "r2", "p2"} <= self.values["rectified"].keys()
-        )
+        both = self.values["rotation"] and self.values["translation"]
+        return bool(both) or {"r1", "r2", "p2"} <= self.values["rectified"].keys()
 
 
 def _is_camera_matrix(K: FloatArray) -> bool:
@@ -221,7 +219,7 @@ def read_ros(files: Files) -> Calibration:
         files.only()
     cameras = [Fields(tree, str(path)) for path, tree in files.trees.items()]
     tables = [_ros_camera(camera) for camera in cameras]
-    P = [(_numbers_of(camera, 12, "projection_matrix", "p", "P")).reshape(3, 4) for camera in cameras]
+    P = [each.numbers(each.known("projection_matrix", "p", "P"), 12).reshape(3, 4) for each in cameras]
     if len(cameras) == 1:
         return Calibration(format="ROS camera_info", left=tables[0])
     shift = [p[0, 3] if abs(p[0, 3]) >= abs(p[1, 3]) else p[1, 3] for p in P]
@@ -231,7 +229,7 @@ def read_ros(files: Files) -> Calibration:
             "single cameras; calibrate them as a pair (cameracalibrator)"
         )
     left, right = (0, 1) if abs(shift[0]) <= abs(shift[1]) else (1, 0)
-    R = [_numbers_of(camera, 9, "rectification_matrix", "r", "R") for camera in cameras]
+    R = [each.numbers(each.known("rectification_matrix", "r", "R"), 9) for each in cameras]
     relative = P[right].copy()
     relative[:2, 3] -= P[left][:2, 3]
     return Calibration(
@@ -242,13 +240,8 @@ def read_ros(files: Files) -> Calibration:
     )
 
 
-def _numbers_of(fields: Fields, count: int, *keys: str) -> FloatArray:
-    key = next((key for key in keys if key in fields), keys[0])
-    return fields.numbers(key, count)
-
-
 def _ros_camera(camera: Fields) -> Table:
-    K = _numbers_of(camera, 9, "camera_matrix", "k", "K").reshape(3, 3)
+    K = camera.numbers(camera.known("camera_matrix", "k", "K"), 9).reshape(3, 3)
     if not K[0, 0] > 0.0:
         raise RsbenchError(
             f"{camera.where}: camera_matrix: focal length {K[0, 0]:g}: the camera is not calibrated"
@@ -261,8 +254,8 @@ def _ros_camera(camera: Fields) -> Table:
     roi = camera.get("roi")
     if isinstance(roi, Mapping) and (roi.get("x_offset") or roi.get("y_offset")):
         raise RsbenchError(f"{camera.where}: roi: give a calibration of whole images")
-    key = next((k for k in ("distortion_coefficients", "d", "D") if k in camera), None)
-    d = list[float]() if key is None else camera.numbers(key).tolist()
+    key = camera.known("distortion_coefficients", "d", "D")
+    d = camera.numbers(key).tolist() if key in camera else []
     lens = by_name(camera.text("distortion_model", default="plumb_bob"), d, camera.where) if any(d) else None
     if camera.text("distortion_model") in ("equidistant", "fisheye"):
         lens = lens_of("kannala-brandt", d, camera.where)

@@ -15,7 +15,15 @@ from rsbench.components.rig_tables import CameraTable, Size
 from rsbench.core import so3
 from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens_fit import Profile, continued, kannala_brandt_of
+from rsbench.core.lens_fit import (
+    Profile,
+    continued,
+    fov_profile,
+    kannala_brandt_of,
+    mirror_profile,
+    unified_profile,
+)
+from rsbench.core.rig import Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_trees import Fields
@@ -64,12 +72,20 @@ class Calibration:
     """Assumptions and approximations, one sentence each."""
     files: tuple[Path, ...] = field(default=())
 
+    @property
+    def cameras(self) -> dict[Side, Table]:
+        """Table of each camera."""
+        return {"left": self.left} if self.right is None else {"left": self.left, "right": self.right}
+
+    def with_tables(self, change: Callable[[Table], Table]) -> Calibration:
+        """The calibration with the tables of its cameras changed alike."""
+        return replace(self, **{side: change(table) for side, table in self.cameras.items()})
+
     def tables(self) -> Table:
         """Tables of rig.toml without the readout."""
-        found = {"left": _still(self.left)}
-        if self.right is not None and self.right_from_left is not None:
+        found: Table = {side: _still(table) for side, table in self.cameras.items()}
+        if self.right_from_left is not None:
             R, t = self.right_from_left
-            found["right"] = _still(self.right)
             found["right_from_left"] = {"rotation": R.tolist(), "translation": t.tolist()}
         return found
 
@@ -146,23 +162,40 @@ def brown(coefficients: Iterable[float], where: str) -> Lens | None:
     )
 
 
-def fitted(
-    size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], profile: Profile, name: str, where: str
+_PROFILES: Mapping[str, Callable[..., Profile]] = {
+    "fov": fov_profile,
+    "eucm": unified_profile,
+    "ucm": unified_profile,
+    "omni": mirror_profile,
+}
+"""Radial models that we have not."""
+
+
+def camera_table(
+    size: Sequence[float] | FloatArray | None,
+    intrinsics: Sequence[float],
+    name: str,
+    coefficients: Sequence[float],
+    where: str,
 ) -> tuple[Table, str]:
-    """The Kannala-Brandt camera nearest to one of another radial model, and a note on the error of the fit."""
+    """Camera table, of a lens by the name of its model with us or in other tools.
+
+    Of a model that we have not it is the nearest Kannala-Brandt camera, with a note on the error of the fit.
+    """
+    if name.lower() not in _PROFILES:
+        lens = lens_of(name, coefficients, where) if name in COEFFICIENTS else by_name(name, coefficients, where)
+        return table_of(size, intrinsics, lens), ""
     if size is None:
         raise RsbenchError(f"{where}: {name}: fitting a Kannala-Brandt lens needs the size of the images; add it")
     fx, fy, cx, cy = intrinsics
     try:
         camera = PinholeCamera(width=round(size[0]), height=round(size[1]), fx=fx, fy=fy, cx=cx, cy=cy)
-        fit = kannala_brandt_of(camera, profile)
+        fit = kannala_brandt_of(camera, _PROFILES[name.lower()](*coefficients))
     except ValueError as error:
         raise RsbenchError(f"{where}: {name}: {error}") from error
-    table = table_of(size, (fit.fx, fit.fy, cx, cy), fit.lens)
-    return (
-        table,
-        f"{name} of {where.rsplit(': ', 1)[-1]} became the nearest kannala-brandt, within {fit.error_px:.2g} px",
-    )
+    camera_name = where.rsplit(": ", 1)[-1]
+    words = f"{name} of {camera_name} became the nearest kannala-brandt, within {fit.error_px:.2g} px"
+    return table_of(size, (fit.fx, fit.fy, cx, cy), fit.lens), words
 
 
 def rotation_of(values: FloatArray, where: str) -> FloatArray:
@@ -237,28 +270,29 @@ def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None
 
 def unfolded(found: Calibration, given: Assumptions) -> Calibration:
     """The calibration with monotonic continuations of lens polynomials that fold inside the image."""
-    tables, notes = list[Table | None](), list(found.notes)
-    for side, table in (("left", found.left), ("right", found.right)):
-        size = None if table is None else _size_of(table)
-        if table is not None and size is None and given.frame_size is not None:
-            size = given.frame_size()
-        made = None if table is None or size is None else _continued(table, size)
-        tables.append(table if made is None else made[0])
-        notes += [] if made is None else [f"{side}: {made[1]}"]
-    left, right = tables
-    assert left is not None
-    return replace(found, left=left, right=right, notes=tuple(notes))
+    tables, notes = dict[str, Any](), list(found.notes)
+    for side, table in found.cameras.items():
+        size = _size_of(table) or (None if given.frame_size is None else given.frame_size())
+        made = None if size is None else _continued(table, size)
+        if made is not None:
+            tables[side] = made[0]
+            notes.append(f"{side}: {made[1]}")
+    return replace(found, **tables, notes=tuple(notes))
 
 
 def _size_of(table: Table) -> Size | None:
     return (table["width"], table["height"]) if "width" in table else None
 
 
-def _camera(table: Table, size: Size) -> PinholeCamera:
-    """The camera of a table with images of this size; ValueError where its lens cannot be one of such images."""
-    lens = None if "lens" not in table else Lens(**table["lens"])
-    intrinsics = {name: table[name] for name in ("fx", "fy", "cx", "cy")}
-    return PinholeCamera(width=size[0], height=size[1], lens=lens, **intrinsics)
+def _fault(table: Table, size: Size) -> ValueError | None:
+    """Why a camera cannot have images of this size, above all with its lens; None if it can."""
+    try:
+        lens = None if "lens" not in table else Lens(**table["lens"])
+        intrinsics = {name: table[name] for name in ("fx", "fy", "cx", "cy")}
+        PinholeCamera(width=size[0], height=size[1], lens=lens, **intrinsics)
+    except ValueError as error:
+        return error
+    return None
 
 
 def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
@@ -269,11 +303,9 @@ def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
     if not (fx > 0.0 and fy > 0.0):
         return None
     across, down = (max(c + 0.5, extent - 0.5 - c) / f for c, extent, f in ((cx, size[0], fx), (cy, size[1], fy)))
-    try:
-        _camera(table, size)
+    if _fault(table, size) is None:
         return None
-    except ValueError:
-        made = continued(Lens(**table["lens"]), float(np.hypot(across, down)))
+    made = continued(Lens(**table["lens"]), float(np.hypot(across, down)))
     if made is None:
         return None
     words = (
@@ -285,28 +317,25 @@ def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
 
 def refuse_unseen(found: Calibration, where: object) -> None:
     """Raises RsbenchError, with a crop that helps, where corners of an image show no ray before the camera."""
-    for side, table in (("left", found.left), ("right", found.right)):
-        size = None if table is None else _size_of(table)
-        if table is None or size is None:
+    for side, table in found.cameras.items():
+        size = _size_of(table)
+        error = None if size is None else _fault(table, size)
+        if size is None or error is None:
             continue
-        try:
-            _camera(table, size)
-        except ValueError as error:
-            for share in np.arange(0.98, 0.3, -0.02):
-                width, height = (2 * round(share * extent / 2) for extent in size)
-                crop = f"{width}x{height}+{(size[0] - width) // 2}+{(size[1] - height) // 2}"
-                try:
-                    _camera(
-                        cropped(found, crop).left if side == "left" else cropped(found, crop).right or {},
-                        (width, height),
-                    )
-                except ValueError:
-                    continue
+        for share in np.arange(0.98, 0.3, -0.02):
+            width, height = (2 * round(share * extent / 2) for extent in size)
+            x, y = (size[0] - width) // 2, (size[1] - height) // 2
+            if _fault(_cut(table, x, y), (width, height)) is None:
                 raise RsbenchError(
                     f"{where}: {side}: {error}; or crop the frames to what is seen before the camera, and "
-                    f"rsbench rig --crop {crop} -o rig.toml"
+                    f"rsbench rig --crop {width}x{height}+{x}+{y} -o rig.toml"
                 ) from error
-            raise RsbenchError(f"{where}: {side}: {error}") from error
+        raise RsbenchError(f"{where}: {side}: {error}") from error
+
+
+def _cut(table: Table, x: int, y: int) -> Table:
+    """The camera of images without their first x columns and y rows."""
+    return table | {"cx": table["cx"] - x, "cy": table["cy"] - y}
 
 
 def cropped(found: Calibration, crop: str) -> Calibration:
@@ -321,9 +350,9 @@ def cropped(found: Calibration, crop: str) -> Calibration:
         if whole is None or not (0 < width <= whole[0] - x and 0 < height <= whole[1] - y):
             shown = "whose size is unknown: give --size" if whole is None else f"of {whole[0]} x {whole[1]} px"
             raise RsbenchError(f"--crop {crop}: must lie inside the images, {shown}")
-        return table | {"width": width, "height": height, "cx": table["cx"] - x, "cy": table["cy"] - y}
+        return _cut(table, x, y) | {"width": width, "height": height}
 
-    return replace(found, left=cut(found.left), right=None if found.right is None else cut(found.right))
+    return found.with_tables(cut)
 
 
 def with_size(found: Calibration, size: Size) -> Calibration:
@@ -342,7 +371,7 @@ def with_size(found: Calibration, size: Size) -> Calibration:
             )
         return table | {"width": size[0], "height": size[1]}
 
-    return replace(found, left=sized(found.left), right=None if found.right is None else sized(found.right))
+    return found.with_tables(sized)
 
 
 def resized(found: Calibration, size: Size) -> Calibration:
@@ -362,4 +391,4 @@ def resized(found: Calibration, size: Size) -> Calibration:
             made[f"f{axis}"], made[f"c{axis}"] = by * table[f"f{axis}"], by * (table[f"c{axis}"] + 0.5) - 0.5
         return made if "line_delay_s" not in table else made | {"line_delay_s": table["line_delay_s"] / down}
 
-    return replace(found, left=scaled(found.left), right=None if found.right is None else scaled(found.right))
+    return found.with_tables(scaled)

@@ -99,9 +99,9 @@ def _of_element(element: ElementTree.Element) -> Any:
         return {child.tag: _of_element(child) for child in element}
     words = (element.text or "").split()
     values = [_number(word) for word in words]
-    return (
-        values[0] if len(values) == 1 else values if all(not isinstance(v, str) for v in values) else element.text
-    )
+    if len(values) == 1:
+        return values[0]
+    return element.text if any(isinstance(value, str) for value in values) else values
 
 
 def _of_ini(text: str) -> Any:
@@ -156,9 +156,13 @@ class Fields:
     def __contains__(self, key: str) -> bool:
         return self.tree.get(key) is not None
 
+    def known(self, *keys: str) -> str:
+        """The first key that exists; the first of all if none does."""
+        return next((key for key in keys if key in self), keys[0])
+
     def get(self, *keys: str) -> Any:
         """Value of the first key that exists; None if none does."""
-        return next((self.tree[key] for key in keys if key in self), None)
+        return self.tree.get(self.known(*keys))
 
     def inner(self, key: str) -> Fields:
         """The table under a key."""
@@ -172,6 +176,10 @@ class Fields:
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
         return default if default is not None and key not in self else float(self.numbers(key, 1)[0])
+
+    def each(self, *keys: str) -> list[float]:
+        """A finite number of each key."""
+        return [self.number(key) for key in keys]
 
     def numbers(self, key: str, *counts: int) -> FloatArray:
         """Finite numbers (n,), flattened from nested lists; n must be one of ``counts``, if any are given."""

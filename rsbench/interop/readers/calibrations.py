@@ -17,8 +17,9 @@ from the corner, half a pixel more than here; x_camera = R x_rig + t.
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,6 @@ from rsbench.components.rig_tables import Size
 from rsbench.core import so3
 from rsbench.core.camera import COEFFICIENTS
 from rsbench.core.errors import RsbenchError
-from rsbench.core.lens_fit import fov_profile, mirror_profile, unified_profile
 from rsbench.core.rig import SIDES
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
@@ -50,7 +50,7 @@ from rsbench.interop.readers.calibration_parts import (
     Table,
     brown,
     by_name,
-    fitted,
+    camera_table,
     keyed,
     lens_of,
     pose_of,
@@ -81,11 +81,14 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
     if path.is_dir():
         kind, trees = _of_folder(path)
     else:
-        tree = read_tree(path)
-        kind, trees = _format_of(tree, path), {path: tree}
+        known = _by_format([(path, read_tree(path))])
+        if not known:
+            listed = ", ".join(kind.name for kind in FORMATS)
+            raise RsbenchError(f"{path}: is not a calibration of a supported format: rig.toml, {listed}")
+        ((kind, trees),) = known.items()
         if kind.parts is not None:
             near = [path.parent, *([path.parent.parent] if kind.name == "ROS camera_info" else [])]
-            trees = kind.parts(path, _all_of(kind, [each for folder in near for each in files_in(folder)]) | trees)
+            trees = kind.parts(path, _by_format(_trees_in(*near)).get(kind, {}) | trees)
     try:
         found = kind.read(Files(trees, given))
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, OverflowError) as error:
@@ -96,45 +99,38 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
     return unfolded(replace(_left_first(found, given, str(path)), files=tuple(trees)), given)
 
 
-def _format_of(tree: Any, path: Path) -> Format:
-    for kind in FORMATS:
-        if kind.holds(tree):
-            return kind
-    raise RsbenchError(
-        f"{path}: is not a calibration of a supported format: rig.toml, {', '.join(k.name for k in FORMATS)}"
-    )
+def _trees_in(*folders: Path) -> Iterator[tuple[Path, Any]]:
+    """Files of folders and their contents; those that cannot be read are skipped."""
+    for path in (path for folder in folders for path in files_in(folder)):
+        with contextlib.suppress(RsbenchError):
+            yield path, read_tree(path)
 
 
-def _all_of(kind: Format, paths: Iterable[Path]) -> dict[Path, Any]:
-    """Contents of the files that have this format; other files are skipped."""
-    found = dict[Path, Any]()
-    for path in paths:
-        try:
-            tree = read_tree(path)
-        except RsbenchError:
-            continue
-        if next((each for each in FORMATS if each.holds(tree)), None) is kind:
-            found[path] = tree
-    return found
+def _by_format(files: Iterable[tuple[Path, Any]]) -> dict[Format, dict[Path, Any]]:
+    """The calibrations among files by their formats, in the order of ``FORMATS``."""
+    found = {kind: dict[Path, Any]() for kind in FORMATS}
+    for path, tree in files:
+        kind = next((kind for kind in FORMATS if kind.holds(tree)), None)
+        if kind is not None:
+            found[kind][path] = tree
+    return {kind: trees for kind, trees in found.items() if trees}
 
 
 def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
     """The only format in a folder, and its files; RsbenchError if there is none or more than one."""
-    paths = list(files_in(folder))
-    of_kind = {kind.name: (kind, trees) for kind in FORMATS if (trees := _all_of(kind, paths))}
-    if _RIG_CONFIG in of_kind:  # cameras.txt beside it is a part
-        of_kind.pop("COLMAP", None)
-    if len(of_kind) != 1:
-        listed = "; ".join(f"{next(iter(trees)).name} of {name}" for name, (_, trees) in of_kind.items())
+    found = _by_format(_trees_in(folder))
+    if _RIG_CONFIG in (kind.name for kind in found):  # cameras.txt beside it is a part
+        found = {kind: trees for kind, trees in found.items() if kind.name != "COLMAP"}
+    if len(found) != 1:
+        listed = "; ".join(f"{next(iter(trees)).name} of {kind.name}" for kind, trees in found.items())
         raise RsbenchError(f"{folder}: holds {listed or 'no calibration'}; give one file")
-    return next(iter(of_kind.values()))
+    return next(iter(found.items()))
 
 
 def _left_first(found: Calibration, given: Assumptions, where: str) -> Calibration:
     """The calibration with the left camera first and the transform from left to right."""
     if found.right_from_left is None:
         return found
-    R, t = found.right_from_left
     apart = inverse(found.right_from_left) if given.invert else found.right_from_left
     found = replace(found, right_from_left=apart)
     if given.exchange:
@@ -232,36 +228,28 @@ def kalibr_in_body(path: Path) -> list[tuple[Table, Pose]]:
 
 
 def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:
-    model, distortion = (
-        camera.text("camera_model", default="pinhole"),
-        camera.text("distortion_model", default="none"),
-    )
+    model = camera.text("camera_model", default="pinhole")
+    distortion = camera.text("distortion_model", default="none")
     where, size = camera.where, camera.numbers("resolution", 2)
     known = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}
     if model not in known:
         raise RsbenchError(f"{where}: camera_model = {model!r}: must be one of {', '.join(known)}")
     *own, fx, fy, cx, cy = camera.numbers("intrinsics", known[model]).tolist()
     d = camera.numbers("distortion_coeffs").tolist() if camera.get("distortion_coeffs") else []
-    intrinsics, notes = (fx, fy, cx, cy), tuple[str, ...]()
-    if model == "pinhole" and distortion == "fov":
-        table, note = fitted(size, intrinsics, fov_profile(d[0]), "fov", where)
-        notes = (note,)
-    elif model == "pinhole":
-        table = table_of(size, intrinsics, by_name(distortion, d, where))
-    elif model == "ds":
-        table = table_of(size, intrinsics, lens_of("double-sphere", own, where))
+    if model == "omni" and (distortion not in ("radtan", "none") or any(d[2:])):
+        raise RsbenchError(
+            f"{where}: omni with {distortion} {d}: tangential and other distortion of omni is not supported; "
+            "calibrate as pinhole-equi, ds-none or eucm-none"
+        )
+    intrinsics = (fx, fy, cx, cy)
+    if model == "pinhole" and distortion != "fov":
+        table, note = table_of(size, intrinsics, by_name(distortion, d, where)), ""
     else:
-        if model == "omni" and (distortion not in ("radtan", "none") or any(d[2:])):
-            raise RsbenchError(
-                f"{where}: omni with {distortion} {d}: tangential and other distortion of omni is not supported; "
-                "calibrate as pinhole-equi, ds-none or eucm-none"
-            )
-        profile = mirror_profile(own[0], *d[:2]) if model == "omni" else unified_profile(*own)
-        table, note = fitted(size, intrinsics, profile, model, where)
-        notes = (note,)
+        lenses = {"pinhole": ("fov", d[:1]), "omni": (model, own + d[:2]), "ds": ("double-sphere", own)}
+        table, note = camera_table(size, intrinsics, *lenses.get(model, (model, own)), where)
     if "line_delay" in camera:
         table["line_delay_s"] = camera.number("line_delay")
-    return table, notes
+    return table, (note,) if note else ()
 
 
 # Basalt.
@@ -284,10 +272,8 @@ def _read_basalt(files: Files) -> Calibration:
     poses = []
     for k, each in enumerate((top.get("T_imu_cam") or [])[:2]):
         place = Fields(each, f"{top.where}: T_imu_cam {k}")
-        q = [place.number(key) for key in ("qw", "qx", "qy", "qz")]
-        poses.append(
-            Pose(quaternion_of(q, place.where), np.array([place.number(key) for key in ("px", "py", "pz")]))
-        )
+        q = place.each("qw", "qx", "qy", "qz")
+        poses.append(Pose(quaternion_of(q, place.where), np.array(place.each("px", "py", "pz"))))
     if len(poses) < 2:
         raise RsbenchError(f"{top.where}: T_imu_cam: must be of both cameras")
     apart = compose(inverse(poses[1]), poses[0])
@@ -296,30 +282,24 @@ def _read_basalt(files: Files) -> Calibration:
 
 def _basalt_camera(camera: Fields, size: Sequence[float] | None) -> tuple[Table, str]:
     own, kind = camera.inner("intrinsics"), camera.text("camera_type")
-    intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]
-    if kind in ("eucm", "ucm"):
-        profile = unified_profile(own.number("alpha"), own.number("beta", 1.0))
-        return fitted(size, intrinsics, profile, kind, camera.where)
-    models = {
-        "pinhole": None,
-        "kb4": "kannala-brandt",
-        "ds": "double-sphere",
-        "pinhole-radtan8": "rational",
-        "pinhole-radtan5": "brown-conrady",
-    }
-    if kind not in models:
-        raise RsbenchError(
-            f"{camera.where}: camera_type = {kind!r}: must be one of {', '.join([*models, 'eucm', 'ucm'])}"
-        )
-    model, lens = models[kind], None
-    if model is not None:
-        values = [own.number(key, 0.0 if model == "rational" else None) for key in COEFFICIENTS[model]]  # pyrefly: ignore[bad-index]
-        lens = (
-            brown(values, camera.where)
-            if model in ("rational", "brown-conrady")
-            else lens_of(model, values, camera.where)
-        )
-    return table_of(size, intrinsics, lens), ""
+    if kind not in _BASALT_MODELS:
+        raise RsbenchError(f"{camera.where}: camera_type = {kind!r}: must be one of {', '.join(_BASALT_MODELS)}")
+    name, keys = _BASALT_MODELS[kind]
+    usual = dict.fromkeys(keys, 0.0) if kind == "pinhole-radtan8" else {"beta": 1.0}
+    values = [own.number(key, usual.get(key)) for key in keys]
+    return camera_table(size, own.each("fx", "fy", "cx", "cy"), name, values, camera.where)
+
+
+_BASALT_MODELS: Mapping[str, tuple[str, Sequence[str]]] = {
+    "pinhole": ("none", ()),
+    "kb4": ("kannala-brandt", COEFFICIENTS["kannala-brandt"]),
+    "ds": ("double-sphere", COEFFICIENTS["double-sphere"]),
+    "pinhole-radtan8": ("radtan", COEFFICIENTS["rational"]),
+    "pinhole-radtan5": ("radtan", COEFFICIENTS["brown-conrady"]),
+    "eucm": ("eucm", ("alpha", "beta")),
+    "ucm": ("ucm", ("alpha", "beta")),
+}
+"""Name of the lens model, and keys of its coefficients."""
 
 
 # ZED.
@@ -362,10 +342,10 @@ def _read_zed(files: Files) -> Calibration:
     stereo = top.inner("STEREO")
     turn, shift = list[float](), list[float]()
     for key in ("RX", "CV", "RZ"):
-        own = next((k for k in (f"{key}_{name}", f"R{key[-1:]}_{name}", key) if k in stereo), f"{key}_{name}")
+        own = stereo.known(f"{key}_{name}", f"R{key[-1:]}_{name}", key)
         turn.append(stereo.number(own, None if key != "CV" or own in stereo else 0.0))
     for key in ("Baseline", "TY", "TZ"):
-        own = next((k for k in (f"{key}_{name}", key) if k in stereo), key)
+        own = f"{key}_{name}" if f"{key}_{name}" in stereo else key
         shift.append(stereo.number(own, None if key == "Baseline" else 0.0))
     t = np.array([-shift[0], shift[1], shift[2]]) * (files.given.unit or UNITS["mm"])
     apart = Pose(so3.exp(np.array(turn)), t)
@@ -376,7 +356,7 @@ def _zed_camera(top: Fields, side: str, name: str, size: Size) -> Table:
     section = next((key for key in top.tree if key.upper() == f"{side}_CAM_{name}"), f"{side}_CAM_{name}")
     own = top.inner(section)
     disto = next((top.inner(key) for key in top.tree if key.upper() == f"{side}_DISTO"), own)
-    intrinsics = [own.number(key) for key in ("fx", "fy", "cx", "cy")]
+    intrinsics = own.each("fx", "fy", "cx", "cy")
     if "p1" in disto:
         values = [disto.number(key, 0.0) for key in COEFFICIENTS["rational"]]
         return table_of(size, intrinsics, brown(values, disto.where))
@@ -406,20 +386,15 @@ def _read_depthai(files: Files) -> Calibration:
         raise RsbenchError(f"{top.where}: cameraData: must have the sockets 1 (left) and 2 (right)")
     links = dict[tuple[int, int], Pose]()
     for socket, camera in cameras.items():
-        apart = camera.inner("extrinsics")
-        to = int(apart.number("toCameraSocket", -1.0))
-        if to in cameras and apart.get("rotationMatrix"):
-            R = rotation_of(apart.numbers("rotationMatrix", 9), f"{apart.where}: rotationMatrix")
-            place = apart.inner("translation")
-            unit = _depthai_unit(apart)
-            t = np.array([place.number(key) for key in "xyz"]) * (files.given.unit or unit)
+        own = camera.inner("extrinsics")
+        to = int(own.number("toCameraSocket", -1.0))
+        if to in cameras and own.get("rotationMatrix"):
+            R = rotation_of(own.numbers("rotationMatrix", 9), f"{own.where}: rotationMatrix")
+            place, unit = own.inner("translation"), _depthai_unit(own)
+            t = np.array(place.each(*"xyz")) * (files.given.unit or unit)
             links[socket, to], links[to, socket] = Pose(R, t), inverse(Pose(R, t))
-    return Calibration(
-        format="DepthAI",
-        left=_depthai_camera(cameras[left]),
-        right=_depthai_camera(cameras[right]),
-        right_from_left=_chained(links, left, right, top.where),
-    )
+    tables, apart = [_depthai_camera(cameras[k]) for k in (left, right)], _chained(links, left, right, top.where)
+    return Calibration(format="DepthAI", left=tables[0], right=tables[1], right_from_left=apart)
 
 
 def _depthai_unit(apart: Fields) -> float:
@@ -454,7 +429,7 @@ def _depthai_camera(camera: Fields) -> Table:
     if kind not in (0, 1):
         raise RsbenchError(f"{camera.where}: cameraType = {kind}: must be 0 (perspective) or 1 (fisheye)")
     lens = brown(d, camera.where) if kind == 0 else lens_of("kannala-brandt", d, camera.where)
-    return table_of((camera.number("width"), camera.number("height")), (K[0], K[4], K[2], K[5]), lens)
+    return table_of(camera.each("width", "height"), (K[0], K[4], K[2], K[5]), lens)
 
 
 # RealSense.
@@ -518,25 +493,24 @@ def _realsense_camera(camera: Fields) -> Table:
             "infrared or another stream whose coefficients are 0, or calibrate with OpenCV"
         )
     lens = by_name(model, d, camera.where) if any(d) or model == "kannala_brandt4" else None
-    size = [camera.number(key) for key in ("width", "height")]
-    return table_of(size, [camera.number(key) for key in ("fx", "fy", "ppx", "ppy")], lens)
+    return table_of(camera.each("width", "height"), camera.each("fx", "fy", "ppx", "ppy"), lens)
 
 
 # COLMAP.
 
 
-_COLMAP_MODELS: Mapping[str, tuple[str, str | None]] = {
-    "SIMPLE_PINHOLE": ("f cx cy", None),
-    "PINHOLE": ("fx fy cx cy", None),
-    "SIMPLE_RADIAL": ("f cx cy k1", "brown-conrady"),
-    "RADIAL": ("f cx cy k1 k2", "brown-conrady"),
-    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "brown-conrady"),
-    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational"),
+_COLMAP_MODELS: Mapping[str, tuple[str, str]] = {
+    "SIMPLE_PINHOLE": ("f cx cy", "none"),
+    "PINHOLE": ("fx fy cx cy", "none"),
+    "SIMPLE_RADIAL": ("f cx cy k1", "radtan"),
+    "RADIAL": ("f cx cy k1 k2", "radtan"),
+    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "radtan"),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "radtan"),
     "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "kannala-brandt"),
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "kannala-brandt"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "kannala-brandt"),
-    "FOV": ("fx fy cx cy omega", "fov"),
-    "EUCM": ("fx fy cx cy alpha beta", "eucm"),
+    "FOV": ("fx fy cx cy omega", "FOV"),
+    "EUCM": ("fx fy cx cy alpha beta", "EUCM"),
 }
 """Names of the parameters in their order, and the lens model."""
 
@@ -552,15 +526,7 @@ def colmap_camera(
     values = dict(zip(keys.split(), numbers.tolist(), strict=True))
     fx, fy = values.pop("fx", values.get("f", 0.0)), values.pop("fy", values.pop("f", 0.0))
     intrinsics = (fx, fy, values.pop("cx") - _CORNER, values.pop("cy") - _CORNER)
-    if model == "fov":
-        return fitted(size, intrinsics, fov_profile(values["omega"]), name, where)
-    if model == "eucm":
-        return fitted(size, intrinsics, unified_profile(values["alpha"], values["beta"]), name, where)
-    own = list(values.values())
-    lens = (
-        None if model is None else lens_of(model, own, where) if model == "kannala-brandt" else brown(own, where)
-    )
-    return table_of(size, intrinsics, lens), ""
+    return camera_table(size, intrinsics, model, list(values.values()), where)
 
 
 def colmap_poses(words: Sequence[str], where: str) -> dict[str, Pose]:
@@ -620,10 +586,6 @@ def _colmap_pair(tables: list[Table], poses: list[Pose], notes: list[str], given
     notes.append("lengths of COLMAP are metres only if the rig was given in metres")
     apart = Pose(R, t * (given.unit or 1.0))
     return Calibration(format="COLMAP", left=tables[0], right=tables[1], right_from_left=apart, notes=tuple(notes))
-
-
-def _colmap_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
-    return {each: tree for each, tree in near.items() if each.parent == path.parent}
 
 
 def _colmap_cameras(lines: Iterable[list[str]], where: str) -> dict[str, tuple[Table, str]]:
@@ -688,8 +650,8 @@ def asl_pose(camera: Fields) -> Pose:
     return pose_of(Fields({"T_BS": T}, camera.where), "T_BS")
 
 
-def _asl_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
-    return {path: near[path]}
+def _beside(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
+    return {each: tree for each, tree in near.items() if each.parent == path.parent}
 
 
 FORMATS: tuple[Format, ...] = (
@@ -698,9 +660,9 @@ FORMATS: tuple[Format, ...] = (
     Format("ZED", _is_zed, _read_zed),
     Format("DepthAI", lambda tree: keyed(tree, "cameraData"), _read_depthai),
     Format(_RIG_CONFIG, _is_rig_config, _read_rig_config),
-    Format("COLMAP", lambda tree: keyed(tree, "colmap"), _read_colmap, _colmap_files),
+    Format("COLMAP", lambda tree: keyed(tree, "colmap"), _read_colmap, _beside),
     Format("RealSense", lambda tree: bool(_tables_with(_RS2_INTRINSICS, tree)), _read_realsense),
-    Format("EuRoC", lambda tree: keyed(tree, "T_BS", "intrinsics", "resolution"), _read_asl, _asl_files),
+    Format("EuRoC", lambda tree: keyed(tree, "T_BS", "intrinsics", "resolution"), _read_asl),
     Format("ROS camera_info", is_ros, read_ros, ros_files),
     Format("OpenCV", is_opencv, read_opencv, opencv_files),
 )

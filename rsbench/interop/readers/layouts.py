@@ -121,10 +121,30 @@ def _nanoseconds(stamp: str, where: str) -> int:
     return int(stamp)
 
 
-def _numbered_images(folder: Path, digits: int, kind: str) -> dict[int, Path]:
-    """Image files of one kind by frame, whose number has so many digits."""
+def _fields_of(path: Path, separator: str) -> Fields:
+    """The words after each key of a file; brackets and semicolons of matrices count as blanks."""
+    pairs = (line.partition(separator) for _, line in lines(path))
+    return Fields({key.strip(): re.sub(r"[\[\];]", " ", value).split() for key, _, value in pairs}, str(path))
+
+
+def _holders(folder: Path, pattern: str, wanted: str) -> list[Path]:
+    """Folders below a folder, or itself, with a file of this name; RsbenchError, what was wanted, without one."""
+    found = sorted({path.parent for path in folder.rglob(pattern)})
+    if not found:
+        raise RsbenchError(f"{folder}: holds no {wanted}")
+    return found
+
+
+def _numbered_images(folder: Path, digits: int, kind: str) -> dict[View, Path]:
+    """Image files of one kind by left frame, whose number has so many digits."""
     found = sorted(folder.glob(f"{'[0-9]' * digits}_{kind}.*"))
-    return {int(path.name[:digits]): path for path in found if path.suffix in (".png", ".jpg")}
+    return {("left", int(path.name[:digits])): path for path in found if path.suffix in (".png", ".jpg")}
+
+
+def _numbered_truths(folder: Path, digits: int, rows: Mapping[str, int]) -> dict[tuple[Side, int, int], Path]:
+    """Global-shutter images of each kind, with the row at whose time they were taken."""
+    found = {kind: _numbered_images(folder, digits, kind) for kind in rows}
+    return {(*view, rows[kind]): path for kind, images in found.items() for view, path in images.items()}
 
 
 _CORNER = 0.5
@@ -456,14 +476,12 @@ def read_carla(folder: Path) -> list[Recording]:
     Raises:
         RsbenchError: no gt_vel.log, or a malformed file.
     """
-    found = sorted(path.parent for path in [folder, *folder.glob("**")] for path in path.glob("gt_vel.log"))
-    if not found:
-        raise RsbenchError(f"{folder}: holds no gt_vel.log, as sequences of Carla-RS do")
-    return [_read_carla_sequence(each) for each in dict.fromkeys(found)]
+    found = _holders(folder, "gt_vel.log", "gt_vel.log, as sequences of Carla-RS do")
+    return [_read_carla_sequence(each) for each in found]
 
 
 def _read_carla_sequence(folder: Path) -> Recording:
-    images: dict[View, Path] = {("left", frame): path for frame, path in _numbered_images(folder, 4, "rs").items()}
+    images = _numbered_images(folder, 4, "rs")
     if not images:
         raise RsbenchError(f"{folder}: holds no 0000_rs.png")
     height, width = read_frame(next(iter(images.values()))).shape[:2]
@@ -486,12 +504,8 @@ def _read_carla_sequence(folder: Path) -> Recording:
         frame_period_s=1.0 / fps,
         poses={"left": partial(_carla_pose, w, v)},
         depths=depths,
-        truths={
-            ("left", frame, row): path
-            for kind, row in (("gs_f", 0), ("gs_m", height // 2))
-            for frame, path in _numbered_images(folder, 4, kind).items()
-        },
-        masks={("left", frame): path for frame, path in _numbered_images(folder, 4, "mask").items()},
+        truths=_numbered_truths(folder, 4, {"gs_f": 0, "gs_m": height // 2}),
+        masks=_numbered_images(folder, 4, "mask"),
         notes=() if known else (assumed,),
     )
 
@@ -506,11 +520,8 @@ def _carla_timing(folder: Path, height: int) -> tuple[float, float, bool]:
     """Frames per second, seconds per row, and whether they are from rs_calib.txt, here or one folder up."""
     for path in (folder / "rs_calib.txt", folder.parent / "rs_calib.txt"):
         if path.is_file():
-            fields = dict(line.split(":", 1) for _, line in lines(path) if ":" in line)
-            keys = ("FPS", "ROW_READOUT_TIME(ms)")
-            if not all(key in fields for key in keys):
-                raise RsbenchError(f"{path}: must say {' and '.join(keys)}")
-            fps, row_ms = (float(numbers(fields[key], path, 1)[0]) for key in keys)
+            fields = _fields_of(path, ":")
+            fps, row_ms = fields.number("FPS"), fields.number("ROW_READOUT_TIME(ms)")
             if not fps > 0.0:
                 raise RsbenchError(f"{path}: FPS = {fps}: must be positive")
             return fps, 1e-3 * row_ms, True
@@ -542,29 +553,21 @@ def read_fastec(folder: Path) -> list[Recording]:
     Raises:
         RsbenchError: no frame, or the first one of a sequence is not an image.
     """
-    places = sorted({path.parent for path in folder.rglob("[0-9][0-9][0-9]_rolling.png")})
-    if not places:
-        raise RsbenchError(f"{folder}: holds no 000_rolling.png, as sequences of Fastec-RS do")
+    wanted = "000_rolling.png, as sequences of Fastec-RS do"
+    places = _holders(folder, "[0-9][0-9][0-9]_rolling.png", wanted)
     return [_read_fastec_sequence(place, folder) for place in places]
 
 
 def _read_fastec_sequence(place: Path, folder: Path) -> Recording:
-    images: dict[View, Path] = {
-        ("left", frame): path for frame, path in _numbered_images(place, 3, "rolling").items()
-    }
+    images = _numbered_images(place, 3, "rolling")
     height, width = read_frame(next(iter(images.values()))).shape[:2]
     focal = DEFAULT_FOCAL * width
-    kinds = (("global_first", 0), ("global_middle", height // 2))
     return Recording(
         name=place.name if place == folder else place.relative_to(folder).as_posix(),
         cameras={"left": PinholeCamera.centred(width, height, focal)},
         images=images,
         shutters={"left": RollingShutter(height=height, readout_ratio=1.0)},
-        truths={
-            ("left", frame, row): path
-            for kind, row in kinds
-            for frame, path in _numbered_images(place, 3, kind).items()
-        },
+        truths=_numbered_truths(place, 3, {"global_first": 0, "global_middle": height // 2}),
         notes=(
             f"no calibration: a focal length of {focal:g} px, the width, and a readout ratio of 1 are assumed",
         ),
@@ -583,19 +586,14 @@ def read_middlebury(folder: Path) -> list[Recording]:
 
 
 def _middlebury(folder: Path) -> Recording:
-    path = folder / "calib.txt"
-    fields = {key.strip(): value for _, line in lines(path) for key, _, value in [line.partition("=")]}
-    for key in ("cam0", "cam1", "baseline", "width", "height"):
-        if key not in fields:
-            raise RsbenchError(f"{path}: {key!r} is required")
-    K0, K1 = (numbers(re.sub(r"[\[\];]", " ", fields[key]), path, 9).reshape(3, 3) for key in ("cam0", "cam1"))
-    width, height, baseline = (float(numbers(fields[key], path, 1)[0]) for key in ("width", "height", "baseline"))
-    offset = float(numbers(fields["doffs"], path, 1)[0]) if "doffs" in fields else float(K1[0, 2] - K0[0, 2])
-    left, right = (_pinhole((width, height), K, path) for K in (K0, K1))
-    images: dict[View, Path] = {("left", 0): folder / "im0.png", ("right", 0): folder / "im1.png"}
+    fields = _fields_of(folder / "calib.txt", "=")
+    K0, K1 = (fields.numbers(key, 9).reshape(3, 3) for key in ("cam0", "cam1"))
+    width, height, baseline = (fields.number(key) for key in ("width", "height", "baseline"))
+    offset = fields.number("doffs", float(K1[0, 2] - K0[0, 2]))
+    left, right = (_pinhole((width, height), K, fields.where) for K in (K0, K1))
+    images: dict[View, Path] = {(side, 0): folder / f"im{k}.png" for k, side in enumerate(SIDES)}
     disparities: dict[View, Callable[[], FloatArray]] = {}
-    views: tuple[View, ...] = (("left", 0), ("right", 0))
-    for k, view in enumerate(views):
+    for k, view in enumerate(images):
         named = [folder / f"disp{k}.pfm", folder / f"disp{k}GT.pfm"]  # the second in MiddEval3 and ETH3D
         for path in [each for each in named if each.is_file()][:1]:
             disparities[view] = partial(_middlebury_disparities, path, offset)
@@ -645,22 +643,16 @@ def read_kitti(folder: Path) -> list[Recording]:
 
 
 def _kitti(folder: Path, names: tuple[str, str], truth: str | None, calib: str, number: str) -> Recording:
-    path = only_file(folder / calib, f"{number}.txt")
-    fields = {key.strip(): value for _, line in lines(path) for key, _, value in [line.partition(":")]}
-    matrices = []
-    for name in names:
-        keys = (f"P_rect_0{name[-1]}", f"P{name[-1]}")
-        key = next((each for each in keys if each in fields), None)
-        if key is None:
-            raise RsbenchError(f"{path}: has neither {keys[0]} nor {keys[1]}")
-        matrices.append(numbers(fields[key], path, 12).reshape(3, 4))
+    fields = _fields_of(only_file(folder / calib, f"{number}.txt"), ":")
+    keys = (fields.known(f"P_rect_0{name[-1]}", f"P{name[-1]}") for name in names)
+    matrices = [fields.numbers(key, 12).reshape(3, 4) for key in keys]
     files: dict[View, Path] = {
         (side, frame): folder / name / f"{number}_1{frame}.png"
         for side, name in zip(SIDES, names, strict=True)
         for frame in (0, 1)
     }
     height, width = read_frame(files["left", 0]).shape[:2]
-    left, right = (_pinhole((width, height), P, path) for P in matrices)
+    left, right = (_pinhole((width, height), P, fields.where) for P in matrices)
     baseline = matrices[0][0, 3] / matrices[0][0, 0] - matrices[1][0, 3] / matrices[1][0, 0]
     offset = right.cx - left.cx
     found = folder / (truth or "") / f"{number}_10.png"
@@ -696,7 +688,6 @@ def _kitti_drive(drive: Path) -> Recording:
     if names is None:
         raise RsbenchError(f"{drive}: holds one camera alone; image_02 and image_03, or image_00 and image_01")
     path = only_file(drive if (drive / "calib_cam_to_cam.txt").is_file() else drive.parent, "calib_cam_to_cam.txt")
-    table = {key.strip(): value.split() for _, line in lines(path) for key, _, value in [line.partition(":")]}
     images: dict[View, Path] = {
         (side, int(file.stem)): file
         for side, name in zip(SIDES, names, strict=True)
@@ -705,7 +696,7 @@ def _kitti_drive(drive: Path) -> Recording:
     if not images:
         raise RsbenchError(f"{drive / names[0] / 'data'}: holds no 0000000000.png")
     height, width = read_frame(next(iter(images.values()))).shape[:2]
-    both = [_kitti_camera(Fields(table, str(path)), name[-2:], (width, height)) for name in names]
+    both = [_kitti_camera(_fields_of(path, ":"), name[-2:], (width, height)) for name in names]
     cameras = dict(zip(SIDES, (camera for camera, _ in both), strict=True))
     return Recording(
         name=drive.name,

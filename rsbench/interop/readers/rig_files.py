@@ -86,8 +86,8 @@ def tables_of_calibration(found: Calibration, readout: Readout) -> tuple[Table, 
     """Tables of rig.toml, and a note on each value in seconds that needs the missing frame rate."""
     table, notes = found.tables(), list[str]()
     given = readout.readout_ratio is not None or readout.shutter is not None
-    for side, own in (("left", found.left), ("right", found.right)):
-        delay = None if own is None or given else own.get("line_delay_s")
+    for side, own in found.cameras.items():
+        delay = None if given else own.get("line_delay_s")
         if delay == 0.0:
             table[side]["readout_ratio"] = 0.0
         elif delay is not None and readout.fps is not None:

@@ -13,13 +13,13 @@ import numpy as np
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_parts import Calibration, Table, camera_of
 from rsbench.interop.writers.colmap_and_tum import camera_line
-from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, yaml_transform
-from rsbench.interop.writers.sequence_views import number
+from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, write_chain, yaml_transform
+from rsbench.interop.writers.sequence_views import number, projections
 from rsbench.storage.files import write_bytes
 
 
@@ -36,9 +36,7 @@ def write_calibration(found: Calibration, kind: str, out: Path) -> list[Path]:
 def cameras_of(found: Calibration) -> dict[Side, PinholeCamera]:
     """The cameras by side; RsbenchError where a size is not known."""
     made = dict[Side, PinholeCamera]()
-    for side, table in zip(SIDES, (found.left, found.right), strict=True):
-        if table is None:
-            continue
+    for side, table in found.cameras.items():
         if "width" not in table:
             raise RsbenchError(
                 f"{side}: the size of the images is not known: give --size, such as --size 1280x720"
@@ -75,9 +73,9 @@ def toml_of(found: Calibration) -> str:
     if found.right is not None and found.right_delay_s and period:
         top["right_delay"] = found.right_delay_s / period
     lines += [f"{key} = {_toml(value)}" for key, value in top.items()]
+    delays: dict[str, Any] = {side: own.get("line_delay_s") for side, own in found.cameras.items()}
     for name, table in tables.items():
-        own = found.left if name == "left" else found.right if name == "right" else {}
-        delay = (own or {}).get("line_delay_s")
+        delay = delays.get(name)
         if delay is not None and found.right is not None:
             table |= {"line_delay_s": delay} if period else {"readout_ratio": 0.0} if delay == 0.0 else {}
         lines += ["", f"[{'camera' if found.right is None else name}]"]
@@ -100,8 +98,8 @@ def _toml(value: Any) -> str:
 
 
 def _write_kalibr(found: Calibration, out: Path) -> list[Path]:
-    cameras, text = cameras_of(found), ""
-    for k, (side, camera) in enumerate(cameras.items()):
+    chain = list[list[str]]()
+    for k, (side, camera) in enumerate(cameras_of(found).items()):
         lens = camera.lens
         if lens is not None and (lens.model not in KALIBR_LENSES or any(lens.coefficients[4:])):
             raise RsbenchError(f"{side}: Kalibr has no place for {_name(camera)}: its radtan has k1, k2, p1, p2")
@@ -111,29 +109,25 @@ def _write_kalibr(found: Calibration, out: Path) -> list[Path]:
         if k == 1:
             assert found.right_from_left is not None
             lines += yaml_transform("T_cn_cnm1", Pose(*found.right_from_left))
-        text += f"cam{k}:\n" + "".join(f"  {line}\n" for line in lines)
-    write_bytes(out, text.encode())
+        chain.append(lines)
+    write_chain(out, chain)
     return [out]
 
 
 def _line_delay(found: Calibration, side: Side, camera: PinholeCamera) -> float | None:
     """Seconds from one row to the next; None if unknown."""
-    own = (found.left if side == "left" else found.right or {}).get("line_delay_s")
+    own = found.cameras[side].get("line_delay_s")
     if own is not None:
         return float(own)
     top = found.readout
-    ratio = (
-        top.get("readout_ratio") if side == "left" else top.get("right_readout_ratio", top.get("readout_ratio"))
-    )
+    ratio = top.get("readout_ratio")
+    if side == "right":
+        ratio = top.get("right_readout_ratio", ratio)
     if ratio == 0.0:
         return 0.0
-    if (
-        ratio is None
-        or "frame_period_s" not in top
-        or {top.get("scan", "top"), top.get("right_scan", "top")} != {"top"}
-    ):
-        return None
-    return ratio * top["frame_period_s"] / camera.height
+    downwards = {top.get("scan", "top"), top.get("right_scan", "top")} == {"top"}
+    known = ratio is not None and "frame_period_s" in top and downwards
+    return ratio * top["frame_period_s"] / camera.height if known else None
 
 
 def _name(camera: PinholeCamera) -> str:
@@ -180,8 +174,7 @@ def _write_opencv(found: Calibration, out: Path) -> list[Path]:
 
 def rectifying(rig: StereoRig) -> dict[str, FloatArray]:
     """R1, R2, P1, P2 of the rig's rectified frame, as ``cv2.stereoRectify`` gives them."""
-    ideal = rig.camera.ideal
-    P1, P2 = (np.column_stack([ideal.K, [shift, 0.0, 0.0]]) for shift in (0.0, -ideal.fx * rig.baseline))
+    P1, P2 = projections(rig.camera.ideal, rig.baseline)
     return {"R1": rig.own("left").R.T, "R2": rig.own("right").R.T, "P1": P1, "P2": P2}
 
 

@@ -39,6 +39,7 @@ from rsbench.interop.writers.sequence_views import (
     Surfaces,
     View,
     about_moving_objects,
+    copy_file,
     copy_image,
     first_pose,
     lens_fault,
@@ -49,8 +50,8 @@ from rsbench.interop.writers.sequence_views import (
     views_in_time,
     write_lines,
 )
-from rsbench.storage.files import read_depth, write_bytes
-from rsbench.storage.untrusted_files import check_amount, inside, read_bytes, read_json, read_text
+from rsbench.storage.files import read_depth
+from rsbench.storage.untrusted_files import check_amount, read_json, read_text
 
 _COLMAP_ABOUT = (
     "SEQUENCE/sparse holds cameras.txt, images.txt, points3D.txt and, since COLMAP 3.12, rigs.txt and frames.txt; "
@@ -359,8 +360,8 @@ def _write_corrected_colmap(corrected: Corrected, folder: Path) -> Note:
             pose, stem = _camera_pose(corrected, side, body), f"{side}_{frame:06d}"
             identifier = len(SIDES) * k + number_
             lines += [f"{identifier} {_pose_words(pose)} {number_} {stem}.png", ""]
-            _copy(corrected.folder, f"corrected/{stem}.png", folder / "images" / f"{stem}.png")
-            _copy(corrected.folder, f"mask/{stem}.png", folder / "masks" / f"{stem}.png.png")
+            copy_file(corrected.folder, f"corrected/{stem}.png", folder / "images" / f"{stem}.png")
+            copy_file(corrected.folder, f"mask/{stem}.png", folder / "masks" / f"{stem}.png.png")
         points += _corrected_points(corrected, frame, _camera_pose(corrected, "left", body), step, len(points))
     _write_rig(sparse, corrected.rig, [_camera_pose(corrected, "left", body) for _, body in frames])
     for name, content in (("cameras", _camera_lines(corrected.rig)), ("images", lines), ("points3D", points)):
@@ -421,8 +422,3 @@ def _corrected_points(corrected: Corrected, frame: int, left: Pose, step: int, b
         f"{before + k} {numbers(place)} {' '.join(map(str, colour))} {number(0.0)}"
         for k, (place, colour) in enumerate(zip(world, colours.tolist(), strict=True), start=1)
     ]
-
-
-def _copy(folder: Path, name: str, to: Path) -> None:
-    to.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(to, read_bytes(inside(folder, name)))

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.rig import SIDES, Side
+from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.layout import picture_file
+from rsbench.dataset.layout import SHUTTERS, picture_file
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.sequence_views import (
     CORNER_PX,
@@ -35,6 +35,7 @@ from rsbench.interop.writers.sequence_views import (
     about_moving_objects,
     camera_velocity,
     compare_rows,
+    copy_file,
     first_pose,
     lens_fault,
     number,
@@ -45,7 +46,6 @@ from rsbench.interop.writers.sequence_views import (
     write_lines,
 )
 from rsbench.storage.files import write_bytes
-from rsbench.storage.untrusted_files import inside, read_bytes
 
 _CARLA_ABOUT = (
     "SEQUENCE/seq_left and seq_right, each with NNNN_rs.png, NNNN_gs_f.png (the twin of the first row), "
@@ -74,14 +74,14 @@ def _write_carla(sequence: Sequence, root: Path, images: Images) -> Note:
     for side in SIDES:
         place = folder / f"seq_{side}"
         place.mkdir(parents=True)
-        velocity = " ".join(number(each) for each in np.concatenate(first_velocity(sequence, side)))
+        velocity = numbers(np.concatenate(first_velocity(sequence, side)))
         write_lines(
             place / "gt_vel.log", ["# Ground truth velocity in camera frame", "# wx, wy, wz, x, y, z", velocity]
         )
-        for frame in range(sequence.frames):
-            _write_carla_frame(sequence, View(side, frame), place)
+    views = [View(*view) for view in views_of(sequence.frames)]
+    for view in views:
+        _write_carla_frame(sequence, view, folder / f"seq_{view.side}")
     _write_carla_calibration(sequence, folder)
-    views = [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
     sentences, record = compare_rows(sequence, views, partial(_carla_pixels, sequence), _CARLA_LAW)
     if sequence.frames > _LOADED:
         sentences.append(f"the loader of DeepUnrollNet takes the first {_LOADED} of {sequence.frames} frames")
@@ -99,10 +99,8 @@ def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArr
 def _write_carla_frame(sequence: Sequence, view: View, place: Path) -> None:
     camera = sequence.rig.sensor(view.side)
     _copy_pictures(sequence, view, f"{place}/{view.frame:04d}", ("rs", "gs_f", "gs_m"))
-    for name, depth in (
-        ("rs", sequence.depth("rs", view.side, view.frame)),
-        ("gs_f", sequence.depth("gs", view.side, view.frame)),
-    ):
+    for name, shutter in zip(("rs", "gs_f"), SHUTTERS, strict=True):
+        depth = sequence.depth(shutter, view.side, view.frame)
         write_bytes(place / f"{view.frame:04d}_{name}.depth", _depth_text(radial(camera, depth)))
 
 
@@ -113,7 +111,7 @@ def _copy_pictures(sequence: Sequence, view: View, stem: str, names: tuple[str, 
     if middle in sequence.twins:
         files.append(picture_file("gs", side, frame, middle))
     for name, file in zip(names, files, strict=False):
-        write_bytes(Path(f"{stem}_{name}.png"), read_bytes(inside(sequence.folder, file)))
+        copy_file(sequence.folder, file, Path(f"{stem}_{name}.png"))
 
 
 def radial(camera: PinholeCamera, depth: NDArray[np.float32]) -> FloatArray:

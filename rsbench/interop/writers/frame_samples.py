@@ -32,8 +32,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.dataset.layout import SHUTTERS, picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest
-from rsbench.interop.writers.sequence_views import Format, Images, Note, View, first_second, write_lines
-from rsbench.storage.files import write_bytes
+from rsbench.interop.writers.sequence_views import Format, Images, Note, View, copy_file, first_second, write_lines
 from rsbench.storage.untrusted_files import inside, read_bytes
 
 Part = Literal["rs", "gs", "rs_depth", "gs_depth", "poses"]
@@ -178,13 +177,9 @@ def _sample_files(sequence: Sequence, frame: int) -> dict[str, bytes]:
     """Files of one sample by the part of their names after the first point."""
     fields = dict[str, bytes]()
     for side in SIDES:
-        tau, pose = sequence.poses(side, frame)
-        arrays = {
-            "rs_depth": sequence.depth("rs", side, frame),
-            "gs_depth": sequence.depth("gs", side, frame),
-            "times": sequence.frame_period_s * tau,
-            "poses": np.concatenate([pose.R, pose.t[..., None]], axis=-1),
-        }
+        parts: tuple[Part, ...] = ("rs_depth", "gs_depth", "poses")
+        arrays = {name: array for part in parts for name, array in _read_part(sequence, side, frame, part).items()}
+        arrays["times"] = sequence.frame_period_s * arrays["times"]
         for shutter in SHUTTERS:
             file = inside(sequence.folder, picture_file(shutter, side, frame + sequence.first))
             fields[f"{side}.{shutter}.png"] = read_bytes(file)
@@ -233,9 +228,7 @@ def _write_folder(sequences: list[Sequence], root: Path, images: Images) -> Iter
                 "poses": f"poses/{side}_{frame}.csv",
             }
             for file in own.values():
-                path = root / sequence.name / file
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_bytes(path, read_bytes(inside(sequence.folder, file)))
+                copy_file(sequence.folder, file, root / sequence.name / file)
             paths = {key: f"{sequence.name}/{file}" for key, file in own.items()}
             about = {"sequence": sequence.name, "side": side, "frame": frame}
             lines.append(json.dumps(paths | about | known, allow_nan=False))

@@ -12,7 +12,7 @@ Pixels are ours in both: (0, 0) is the centre of the first one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ from rsbench.interop.writers.sequence_views import (
     number,
     numbers,
     one_by_one,
+    projections,
     reads_from_top,
     world_from_camera,
     write_lines,
@@ -102,10 +103,8 @@ def disparity_values(disparity: FloatArray) -> tuple[NDArray[np.uint16], int]:
 
 def _kitti_calibration(sequence: Sequence) -> list[str]:
     """P0 to P3 (3 x 4) from the frame of the left camera; the grey cameras 0 and 1 stand where 2 and 3 do."""
-    left = np.concatenate([sequence.rig.camera.K, np.zeros((3, 1))], axis=1)
-    right = left.copy()
-    right[0, 3] = -sequence.rig.camera.fx * sequence.rig.baseline
-    return [f"P{k}: {numbers(right if k % 2 else left)}" for k in range(4)]
+    both = projections(sequence.rig.camera, sequence.rig.baseline)
+    return [f"P{k}: {numbers(both[k % 2])}" for k in range(4)]
 
 
 _KALIBR_ABOUT = (
@@ -134,11 +133,7 @@ KALIBR_LENSES: Mapping[LensModel, tuple[str, str]] = {
 def _write_kalibr(sequence: Sequence, root: Path, images: Images) -> Note:
     folder = root / sequence.name
     folder.mkdir(parents=True)
-    blocks = [
-        f"cam{k}:\n" + "".join(f"  {line}\n" for line in _kalibr_camera(sequence, side))
-        for k, side in enumerate(SIDES)
-    ]
-    write_bytes(folder / "camchain.yaml", "".join(blocks).encode())
+    write_chain(folder / "camchain.yaml", [_kalibr_camera(sequence, side) for side in SIDES])
     sentences = list[str]()
     if delay := sequence.shutter.right_delay * sequence.frame_period_s:
         sentences.append(
@@ -162,6 +157,12 @@ def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
         lines += yaml_transform("T_cam_imu", Pose(rig.own(side).R, rig.own(side).R @ rig.offset(side)))
         lines.append(f"timeshift_cam_imu: {number(sequence.imu.time_offset_s)}")
     return lines
+
+
+def write_chain(path: Path, cameras: Iterable[list[str]]) -> None:
+    """A camera chain of the lines of each camera."""
+    lines = [line for k, own in enumerate(cameras) for line in (f"cam{k}:", *(f"  {each}" for each in own))]
+    write_lines(path, lines)
 
 
 def kalibr_camera(camera: PinholeCamera, side: Side, line_delay_s: float | None) -> list[str]:

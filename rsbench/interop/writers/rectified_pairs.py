@@ -21,7 +21,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.corrected_frames import write_origin
 from rsbench.interop.writers.colmap_and_tum import camera_line
 from rsbench.interop.writers.kitti_and_kalibr import disparity_values
-from rsbench.interop.writers.sequence_views import write_lines
+from rsbench.interop.writers.sequence_views import projections, write_lines
 from rsbench.storage.files import write_depth, write_png, write_png16
 from rsbench.vision.fusion import Fused, Origin
 from rsbench.vision.images import resample
@@ -77,12 +77,10 @@ def _inverse_depth(
     return np.where(found >= 0.0, found, np.nan)
 
 
-def projections(rig: StereoRig) -> dict[str, FloatArray]:
+def rectification(rig: StereoRig) -> dict[str, FloatArray]:
     """R1, R2 (3, 3), P1, P2 (3, 4) and Q (4, 4), as OpenCV's stereoRectify names them; metres."""
     camera = rectified_camera(rig)
-    P1 = np.concatenate([camera.K, np.zeros((3, 1))], axis=1)
-    P2 = P1.copy()
-    P2[0, 3] = -camera.fx * rig.baseline
+    P1, P2 = projections(camera, rig.baseline)
     ratio = camera.fx / camera.fy
     Q = np.array(
         [
@@ -124,7 +122,7 @@ def write_calibration(folder: Path, rig: StereoRig) -> None:
         storage.write(f"M{number}", sensor.ideal.K)
         storage.write(f"D{number}", np.array([(0.0,) * 5 if lens is None else lens.coefficients]))
     R, T = rig.right_from_left
-    for key, matrix in {"R": R, "T": T.reshape(3, 1), **projections(rig)}.items():
+    for key, matrix in {"R": R, "T": T.reshape(3, 1), **rectification(rig)}.items():
         storage.write(key, np.ascontiguousarray(matrix))
     storage.release()
     write_lines(place / "cameras.txt", [camera_line(number, camera) for number in (1, 2)])

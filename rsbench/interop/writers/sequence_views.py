@@ -124,9 +124,19 @@ def corner_matrix(camera: PinholeCamera) -> FloatArray:
 
 def copy_image(sequence: Sequence, view: View, images: Images, path: Path) -> None:
     """The PNG of a view, byte for byte."""
-    source = inside(sequence.folder, picture_file(images, view.side, view.frame + sequence.first))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, read_bytes(source))
+    copy_file(sequence.folder, picture_file(images, view.side, view.frame + sequence.first), path)
+
+
+def copy_file(folder: Path, name: str, to: Path) -> None:
+    """A file of a folder, byte for byte."""
+    to.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(to, read_bytes(inside(folder, name)))
+
+
+def projections(camera: PinholeCamera, baseline: float) -> tuple[FloatArray, FloatArray]:
+    """P1, P2 (3, 4) of a rectified pair, as OpenCV's stereoRectify names them; from the left camera's axes."""
+    right = np.column_stack([camera.K, [-camera.fx * baseline, 0.0, 0.0]])
+    return np.column_stack([camera.K, np.zeros(3)]), right
 
 
 def number(value: float) -> str:
@@ -303,26 +313,18 @@ _TRIED = 5_000
 """Pixels of each image that are compared."""
 
 
-def largest_row_error(sequence: Sequence, views: list[View], law: Law) -> float:
-    """The largest distance, px, between points of the depth in frames and by a format's motion model.
+def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> Note:
+    """The largest distance, px, between points of the depth in frames and by a law, and a sentence if it is not 0.
 
-    Each point is projected with the model's pose of the line that saw it. 0 where no image has depth.
+    Each point is projected with the law's pose of the line that saw it. 0 where no image has depth; 1e-6 px is the
+    accuracy to which our own numbers read back.
     """
-    worst = 0.0
+    error = 0.0
     for view in views:
         points = world_points(sequence, view, "rs", step_of(sequence.rig.sensor(view.side), _TRIED))
         away = np.linalg.norm(law(view, points) - points.pixels, axis=-1)
-        if len(away):  # NaN: behind the camera, a large error
-            worst = max(worst, float(np.max(np.nan_to_num(away, nan=math.inf))))
-    return worst
-
-
-def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> Note:
-    """The largest row-motion error of a law and, where it is not exact, a sentence.
-
-    1e-6 px is the accuracy to which our own numbers read back.
-    """
-    error = largest_row_error(sequence, views, law)
+        # NaN: behind the camera, a large error
+        error = max(error, float(np.max(np.nan_to_num(away, nan=math.inf), initial=0.0)))
     sentence = f"the format's motion of the rows ({name}) is up to {error:.2g} px from the true one"
     return [] if error < 1e-6 else [sentence], {"largest_row_error_px": error}
 

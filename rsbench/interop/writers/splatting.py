@@ -208,7 +208,7 @@ def _write_gsplat(sequence: Sequence, root: Path, images: Images) -> Note:
             copy_image(sequence, view, images, folder / "images" / view.name)
     if images == "gs":
         return about_moving_objects(sequence), {}
-    views = [View(side, frame) for side in SIDES for frame in range(sequence.frames)]
+    views = [View(*view) for view in views_of(sequence.frames)]
     sentences, record = compare_rows(sequence, views, partial(_gsplat_pixels, sequence), _GSPLAT_LAW)
     return sentences + about_moving_objects(sequence), record
 
