@@ -277,7 +277,3 @@ def _say(out: Path, first: str, record: dict[str, Any]) -> None:
         if motion["note"]:
             echo(f"note: {motion['note']}")
     echo(f"report: {(out / 'report.html').resolve()}")
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(correct)

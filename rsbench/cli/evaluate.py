@@ -207,7 +207,3 @@ def evaluate_dataset(
     page = write_report(folder, out)
     echo(f"report: {name_of(page)}")
     return page
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(evaluate)

@@ -242,7 +242,3 @@ def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
         f"{dataset.name}: {found.sequences} sequences, {found.files} files, about {size}, about {minutes} in one "
         "process on this machine"
     )
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(generate)

@@ -317,7 +317,3 @@ def _row(answer: dict[str, Any]) -> dict[str, str]:
         "moved (px)": f"{answer['moved_px']:.1f}",
         "note": note,
     }
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(inspect)

@@ -58,7 +58,12 @@ _SHOWN = (
 )
 """Keys of the scores whose medians tables on a terminal have."""
 
-board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
+board_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    epilog=EPILOG,
+    help="Score predictions on tracks and rank them with intervals; predictions come from any language.",
+)
 
 Track = Annotated[
     str,
@@ -603,11 +608,3 @@ def _cells(line: Standing) -> dict[str, str]:
 
 def _number(value: float) -> str:
     return "-" if value != value else f"{value:.3g}"
-
-
-def register(app: typer.Typer) -> None:
-    app.add_typer(
-        board_app,
-        name="leaderboard",
-        help="Score predictions on tracks and rank them with intervals; predictions come from any language.",
-    )

@@ -220,7 +220,3 @@ def images(out: Path, data: Path, seeds: int) -> None:
     options = EvaluationOptions(solvers=tuple(every_solver()), seeds=seeds)
     evaluate_dataset(data / "paper", evaluation, options, "rsbench reproduce images")
     echo(f"published: {publish(evaluation, out / 'images')}")
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(reproduce)

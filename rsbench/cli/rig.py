@@ -257,7 +257,3 @@ def _rows_apart(rig: StereoRig) -> list[float] | None:
         return None
     apart = (seen[good, 1] - pixels[good, 1]).tolist()
     return [min(apart), max(apart)]
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(rig)

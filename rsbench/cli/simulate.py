@@ -153,7 +153,3 @@ def _changes(assignments: list[str]) -> dict[str, object]:
         except (ValueError, RecursionError) as error:  # a number of thousands of digits, or brackets
             raise RsbenchError(f"--set {key}: not a value of TOML: {error}") from error
     return changes
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(simulate)

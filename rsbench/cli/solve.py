@@ -241,7 +241,3 @@ def _degrees(w: list[float]) -> float:
 
 def _vector(values: list[float]) -> str:
     return "[" + ", ".join(f"{value: .6f}" for value in values) + "]"
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(solve)

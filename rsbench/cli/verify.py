@@ -171,7 +171,3 @@ def _verify_others(folder: Path, layout: str) -> None:
         columns = ["recording", "seen", "count", f"within {NEAR_PX:g} px (%)", "typical (px)"]
         print_rows("Features where cameras and poses say", columns, seen, right=columns[2:])
     report_faults(faults, f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(verify)
