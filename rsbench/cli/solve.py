@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.console import echo, is_quiet, late_progress, print_rows
+from rsbench.cli.console import echo, late_progress, print_answers, print_records
 from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
@@ -81,35 +81,14 @@ def solve(
     wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
     entries = load_solver_entries(solver or ["rs-stereo-refined"])
     _check_model(motion_model, entries)
-    code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model or "auto"), json)
-    if code:
-        raise typer.Exit(code)
+    found = _answers(problems, entries, options, seed, wanted, limit, motion_model or "auto")
+    print_answers(found, json, "success", _show)
 
 
 def _print_example() -> None:
     from rsbench.pipeline.problem import EXAMPLE
 
     echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
-
-
-def _tell(found: Iterator[dict[str, Any] | RsbenchError], json: bool) -> int:
-    """Print answers, as they come or as one table, and errors; the exit code."""
-    import json as json_module
-
-    answers: list[dict[str, Any]] = []
-    wrong = failed = 0
-    for answer in found:
-        if isinstance(answer, RsbenchError):
-            wrong += 1
-            echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
-            continue
-        failed += not answer["success"]
-        if json:
-            echo(json_module.dumps(answer, allow_nan=False))
-        else:
-            answers.append(answer)
-    _show(answers)
-    return 2 if wrong else int(failed > 0)
 
 
 def _answers(
@@ -138,14 +117,10 @@ def _answers(
 
 
 def _show(answers: list[dict[str, Any]]) -> None:
-    rows = [_row(answer) for answer in answers]
     if len(answers) == 1:
         _show_one(answers[0])
-    elif is_quiet():
-        for row in rows:
-            echo("\t".join(row.values()))
-    elif rows:
-        print_rows("", list(rows[0]), [list(row.values()) for row in rows], right=("rotation", "inliers", "ms"))
+    else:
+        print_records([_row(answer) for answer in answers], right=("rotation", "inliers", "ms"))
 
 
 def _show_one(answer: dict[str, Any]) -> None:

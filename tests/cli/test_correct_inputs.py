@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
-from rsbench.cli import correct as command
+from rsbench.cli import correct_run
 from rsbench.cli.correct_input import Arranged, arranged
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import write_png
@@ -188,7 +188,7 @@ def test_halves_of_a_frame_are_the_cameras_of_a_rig(tmp_path: Path, monkeypatch:
     write_frames(tmp_path / "a.mkv", both, fps=30.0, times=times)
     (tmp_path / "rig.toml").write_text(RIG)
     calls = list[Any]()
-    monkeypatch.setattr(command, "_correct_given", lambda given, *rest: calls.append(given))
+    monkeypatch.setattr(correct_run, "correct_given", lambda given, *rest: calls.append(given))
     given = ("correct", tmp_path / "a.mkv", "--rig", tmp_path / "rig.toml", "--side-by-side")
     assert run_here(*given, "--out", tmp_path / "out").returncode == 0
     left, right = calls[0].sources()

@@ -11,7 +11,7 @@ import pytest
 import typer
 from commands import assert_refused, run_here
 
-from rsbench.cli import correct as command
+from rsbench.cli import correct_run
 from rsbench.cli.main import app
 from rsbench.storage.files import write_png
 
@@ -67,7 +67,7 @@ def test_options_of_a_rig_are_refused_for_one_camera(option: str, tmp_path: Path
 def given(monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     """What a call of the command would correct, with which options."""
     calls: list[Any] = []
-    monkeypatch.setattr(command, "_correct_given", lambda *known: calls.append(known))
+    monkeypatch.setattr(correct_run, "correct_given", lambda *known: calls.append(known))
 
     def called(*arguments: object) -> str:
         calls.clear()

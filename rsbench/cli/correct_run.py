@@ -1,74 +1,177 @@
-"""``rsbench correct`` of footage of a rig or one camera: a killed run goes on after the frames it wrote."""
+"""``rsbench correct`` of four frames, or of a sequence: a killed run goes on after the frames that it wrote."""
 
 from __future__ import annotations
 
+import hashlib
 import time
+from collections import deque
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import typer
 
-from rsbench.cli.console import echo
-from rsbench.cli.correct_input import target_row
-from rsbench.cli.correct_output import UNIT, camera_facts, listed, readout_words, say_calibration, write_page_of
+from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.cli.compile_ahead import compiling_ahead
+from rsbench.cli.console import echo, progress_bar
+from rsbench.cli.correct_input import CorrectInput, target_row
+from rsbench.cli.correct_output import (
+    SUBTITLE,
+    UNIT,
+    camera_facts,
+    listed,
+    motion_facts,
+    readout_words,
+    say_calibration,
+)
+from rsbench.components.imports import component_key
 from rsbench.core.errors import RsbenchError
-
-if TYPE_CHECKING:
-    from rsbench.cli.correct_input import CorrectInput
-    from rsbench.pipeline.footage import FrameSource
-    from rsbench.pipeline.frame_capture import KnownCapture
-    from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope
+from rsbench.core.rig import SIDES
+from rsbench.core.shutter import Scanning
+from rsbench.core.version import __version__
+from rsbench.dataset import corrected_frames as results
+from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
+from rsbench.pipeline.chain import check_cameras, correct_four
+from rsbench.pipeline.footage import FORECAST, FrameSource, RigCard, read_four
+from rsbench.pipeline.frame_capture import KnownCapture
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.isolated_components import Isolation
+from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope, know_capture, with_found_camera
+from rsbench.pipeline.sequence_correction import correct_sequence, takes_gyro
+from rsbench.report.corrected_page import (
+    card_of,
+    comparison,
+    draw_own_motion,
+    draw_trajectory,
+    most_changed,
+    write_page,
+)
+from rsbench.report.motion_figures import sizes
+from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, upright, write_frames
+from rsbench.vision.corrector import CorrectorEntry, NotCorrectedError, demand_corrected
+from rsbench.vision.correctors import FusionCorrector
+from rsbench.vision.fusion import finished
 
 _PAGE_FRAMES = 6
 
 
-def correct_sequence_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
-    """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
-    from rsbench.cli.console import progress_bar
-    from rsbench.core.shutter import Scanning
-    from rsbench.dataset.corrected_frames import fresh_folder, is_video, video_place, write_record
-    from rsbench.interop.writers.rectified_pairs import write_calibration
-    from rsbench.pipeline.chain import check_cameras
-    from rsbench.pipeline.footage import RigCard
-    from rsbench.pipeline.sequence_capture import know_capture
+def correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
+    """Correct four frames or a sequence; exit 1 if it fails. ``close``: close narrow holes of corrected frames."""
+    try:
+        with nullcontext() if given.one_camera else compiling_ahead(), Isolation() as isolation:
+            options = isolation.chain(options)
+            if given.four:
+                _correct_four(given, target, options, close)
+            else:
+                _correct_sequence(given, target, options, close)
+    except (NoMotionError, NotCorrectedError) as error:
+        echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
 
+
+def without_filling(entry: CorrectorEntry) -> CorrectorEntry:
+    """The built-in corrector without filling from other views; RsbenchError for other correctors."""
+    if not isinstance(entry.component, FusionCorrector):
+        raise RsbenchError(f"--no-fill: has no effect on corrector {entry.name!r}; leave it out")
+    component = replace(entry.component, use_other_views=False)
+    return replace(entry, component=component, key=component_key(component, {}))
+
+
+def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
+    card, out, order = given.card, given.out, (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    assert isinstance(card, RigCard)
+    results.refuse_video(out)
+    images = read_four(dict(zip(order, given.four, strict=True)))  # pyrefly: ignore[bad-argument-type]
+    rig = card.rig_of(images["left", 0], images["right", 0])
+    options = replace(options, target_row=target_row(target, images["left", 0].shape[0]))
+    with results.fresh_folder(out) as folder:
+        rig, focal = with_found_camera(rig, card.sigma, [images], options, card.inputs, progress_bar)
+        with progress_bar("correcting", 4) as advance:
+            result = correct_four(
+                images,
+                rig,
+                card.readout_ratio,
+                options,
+                advance,
+                disparity_offset=card.disparity_offset,
+                scanning=card.scanning,
+            )
+        demand_corrected(result.frames, options.corrector.name)
+        rig = result.rig
+        frames = {view: finished(fused) if close else fused for view, fused in result.frames.items()}
+        for (side, frame), fused in frames.items():
+            results.write_frame(folder, f"{side}_{frame}", fused)
+            if given.rectify:
+                write_rectified(folder, f"{side}_{frame}", fused, rig, side)
+        if given.rectify:
+            write_calibration(folder, rig)
+        calibration = (card.inputs.calibration or NO_ERRORS) if result.found is None else result.found.calibration
+        record = results.rig_record(rig, result.shutter, result.capture, options, calibration, result.rig_found)
+        record["camera_note"] = focal
+        record["motion"] = None if result.found is None else results.motion_record(result.found)
+        record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
+        record["seconds"] = result.seconds
+        results.write_record(folder, record)
+        cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
+        read = readout_words(result.shutter, result.capture, rig)
+        facts = [("readout ratio", read), *motion_facts(record["motion"])]
+        write_page(folder, f"rsbench correct: {out.name}", SUBTITLE, facts, cards)
+    _say_four(out, f"readout ratio {read}", record)
+
+
+def _say_four(out: Path, first: str, record: dict[str, Any]) -> None:
+    motion = record["motion"]
+    echo(first)
+    say_calibration(record)
+    if motion is not None:
+        echo(f"motion in a frame period: {', '.join(sizes(motion))} (+-: one standard deviation)")
+        if motion["model_choice"]:
+            echo(f"motion model: {motion['model_choice']['text']}")
+        if motion["note"]:
+            echo(f"note: {motion['note']}")
+    echo(f"report: {(out / 'report.html').resolve()}")
+
+
+def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
+    """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
     sources, card, out, lines = given.sources(), given.card, given.out, list[str]()
-    video = is_video(out)
-    if given.rectify and video:
+    if given.rectify and given.video:
         raise RsbenchError(f"--rectify: --out {out} is a video; give a folder, for pairs with their calibration")
-    gyro = _gyro(given, sources[0], options)
+    if given.gyro.file is not None and not given.one_camera and not takes_gyro(sources[0], options):
+        raise RsbenchError(
+            "--gyro: is used for the trajectory of four frames and more, with the motion model auto; leave it out"
+        )
+    gyro = given.gyro.read(sources[0], given.one_camera)
     first = [next(iter(source)) for source in sources]
     options = replace(options, target_row=target_row(target, first[0].shape[0]))
     if isinstance(card, RigCard):
         check_cameras(card.rig_of(*first), card.scanning or Scanning(), options, card.disparity_offset)
+        _warn_of_times(sources)
     else:
         _say_input(given, sources[0], first[0].shape, options)
-    _warn_of_times(sources)
     run = _run_key(given, sources, options, close, gyro)
-    with video_place(out, run) if video else fresh_folder(out, run=run) as folder:
+    with results.video_place(out, run) if given.video else results.fresh_folder(out, run=run) as folder:
         known = know_capture(sources, card, options, gyro, progress_bar)
         record = _record(known, options)
         record["frames"] = _correct_into(folder, sources, known, options, close, given)
-        if video:
-            others = _write_page(folder, out, sources[0], record, known)
-            lines = _write_video(out, folder, sources, record, others)
+        if given.video:
+            others = _write_page(folder, given, sources[0], record, known)
+            lines = _write_video(given, folder, sources, record, others)
         else:
             if given.rectify:
                 write_calibration(folder, known.rig)
-            write_record(folder, record)
-            _write_page(folder, out, sources[0], record, known)
-    _say(out, known, record, lines)
+            results.write_record(folder, record)
+            _write_page(folder, given, sources[0], record, known)
+    _say(given, known, record, lines)
 
 
 def _say_input(
     given: CorrectInput, source: FrameSource, shape: tuple[int, ...], options: CorrectionOptions
 ) -> None:
     """What was assumed of one camera's frames, a line each."""
-    from rsbench.pipeline.footage import FORECAST
-    from rsbench.storage.videos import ORIENTATIONS, UPRIGHT
-
     (height, width), timeline = shape[:2], source.timeline
     if given.words:
         echo(given.words)
@@ -88,7 +191,7 @@ def _say_input(
 
 def _warn_of_times(sources: list[FrameSource]) -> None:
     """Name a rig's videos whose frames repeat others or come at other times: they are taken as they come."""
-    for side, source in zip(("left", "right"), sources if len(sources) == 2 else [], strict=False):
+    for side, source in zip(SIDES, sources, strict=True):
         if source.video is None:
             continue
         timeline = source.timeline
@@ -101,24 +204,6 @@ def _warn_of_times(sources: list[FrameSource]) -> None:
             )
 
 
-def _gyro(given: CorrectInput, first: FrameSource, options: CorrectionOptions) -> Gyroscope | None:
-    """The log of a gyroscope, where there is one; RsbenchError where nothing takes it."""
-    from rsbench.pipeline.sequence_capture import Gyroscope
-    from rsbench.pipeline.sequence_correction import takes_gyro
-
-    if given.gyro.file is None:
-        return None
-    if not given.one_camera and not takes_gyro(first, options):
-        raise RsbenchError(
-            "--gyro: is used for the trajectory of four frames and more, with the motion model auto; leave it out"
-        )
-    period = first.timeline.period_s if given.one_camera else None
-    rate = None if period is None else 1.0 / period
-    samples = given.gyro.samples(first, rate)
-    error = given.gyro.farthest(first, rate) if given.one_camera else 0.0
-    return None if samples is None else Gyroscope(samples=samples, clock_error=error)
-
-
 def _run_key(
     given: CorrectInput,
     sources: list[FrameSource],
@@ -127,12 +212,7 @@ def _run_key(
     gyro: Gyroscope | None,
 ) -> str:
     """Hash of all that decides what is written: a run with another key does not resume this one."""
-    import hashlib
-
-    from rsbench.core.version import __version__
-    from rsbench.dataset.corrected_frames import is_video
-
-    flags = close, given.row_poses, is_video(given.out), given.rectify
+    flags = close, given.row_poses, given.video, given.rectify
     parts = [__version__, repr(given.card), repr(options), repr(flags)]
     parts += [each for source in sources for each in source.identity()]
     parts += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.clock_error)]
@@ -141,11 +221,9 @@ def _run_key(
 
 def _record(known: KnownCapture, options: CorrectionOptions) -> dict[str, Any]:
     """What motion.json says of the cameras, as given or estimated, without the frames."""
-    from rsbench.dataset.corrected_frames import camera_alone_record, rig_record
-
     if not known.rig.metric:
-        return camera_alone_record(known, options, UNIT)
-    rig = rig_record(known.rig, known.shutter, known.capture, options, known.calibration, known.rig_found)
+        return results.camera_alone_record(known, options, UNIT)
+    rig = results.rig_record(known.rig, known.shutter, known.capture, options, known.calibration, known.rig_found)
     return {**rig, "camera_note": known.camera_note}
 
 
@@ -161,11 +239,7 @@ def _correct_into(
 
     The matches of frames that are there are found again: the trajectory of the others rests on them.
     """
-    from rsbench.cli.console import progress_bar
-    from rsbench.dataset.corrected_frames import written_entries
-    from rsbench.pipeline.sequence_correction import correct_sequence
-
-    entries = written_entries(folder)
+    entries = results.written_entries(folder)
     twins = sources[0].timeline.twins.tolist() if given.one_camera else []
     with progress_bar("correcting", max(sources[0].count, 1)) as advance:
         for entry in entries:
@@ -188,11 +262,9 @@ def _correct_into(
 
 def _write_copy(folder: Path, number: int, twin: dict[str, Any]) -> dict[str, Any]:
     """A frame of one camera that repeats another one, which has its result."""
-    from rsbench.dataset.corrected_frames import copy_frame, write_entry
-
-    copy_frame(folder, f"{number:06d}", f"{twin['number']:06d}")
+    results.copy_frame(folder, f"{number:06d}", f"{twin['number']:06d}")
     entry = {**twin, "number": number, "copy_of": twin["number"]}
-    write_entry(folder, entry)
+    results.write_entry(folder, entry)
     return entry
 
 
@@ -200,30 +272,24 @@ def _write(
     folder: Path, moment: CorrectedMoment, close: bool, given: CorrectInput, known: KnownCapture, orientation: int
 ) -> dict[str, Any]:
     """Write a corrected time, and then its record: a time with a record is complete."""
-    import numpy as np
-
-    from rsbench.dataset.corrected_frames import is_video, motion_record, write_entry, write_frame, write_poses
-    from rsbench.interop.writers.rectified_pairs import write_rectified
-    from rsbench.vision.fusion import finished
-
     entry: dict[str, Any] = {"number": moment.number}
-    how: dict[str, Any] = {"whole": not is_video(given.out), "orientation": orientation}
+    how: dict[str, Any] = {"whole": not given.video, "orientation": orientation}
     for side, fused in (moment.shown if given.one_camera else moment.frames).items():
         name, fused = _name(side, moment.number, given.one_camera), finished(fused) if close else fused
-        write_frame(folder, name, fused, **how)
+        results.write_frame(folder, name, fused, **how)
         if given.rectify:
             write_rectified(folder, name, fused, known.rig, side)
         entry |= fused.shares() if given.one_camera else {side: fused.shares()}
     if moment.reason:
         entry["skipped" if moment.frames else "reason"] = moment.reason
     if moment.frames and moment.found is not None:
-        entry["motion"] = motion_record(moment.found)
+        entry["motion"] = results.motion_record(moment.found)
     if moment.pose is not None:
-        write_poses(folder, "trajectory", moment.number, [float(moment.number)], moment.pose)
+        results.write_poses(folder, "trajectory", moment.number, [float(moment.number)], moment.pose)
     if given.row_poses and moment.line_poses is not None:
         taus = np.sort(known.shutter.line_times(moment.number, "left"))
-        write_poses(folder, "row_poses", moment.number, taus, moment.line_poses)
-    write_entry(folder, entry)
+        results.write_poses(folder, "row_poses", moment.number, taus, moment.line_poses)
+    results.write_entry(folder, entry)
     return entry
 
 
@@ -232,44 +298,23 @@ def _name(side: str, number: int, one_camera: bool) -> str:
 
 
 def _write_page(
-    folder: Path, out: Path, source: FrameSource, record: dict[str, Any], known: KnownCapture
+    folder: Path, given: CorrectInput, source: FrameSource, record: dict[str, Any], known: KnownCapture
 ) -> list[Path]:
     """The page, of the frames of the left or only camera that changed most; beside a video, one to compare."""
-    from collections import deque
-
-    import numpy as np
-
-    from rsbench.dataset.corrected_frames import (
-        DEFAULT_FPS,
-        comparison_of_video,
-        is_video,
-        join_poses,
-        page_of_video,
-        read_corrected,
-        read_fused,
-    )
-    from rsbench.report.corrected_page import (
-        card_of,
-        comparison,
-        draw_own_motion,
-        draw_trajectory,
-        most_changed,
-    )
-    from rsbench.storage.videos import write_frames
-
-    one, changed, frames = not known.rig.metric, list[float](), record["frames"]
+    one, out, changed, frames = given.one_camera, given.out, list[float](), record["frames"]
     numbers = [each["number"] for each in frames if one or "left" in each]
     names = [_name("left", number, one) for number in numbers]
     pairs = (
-        (before, read_corrected(folder, name)) for name, before in zip(names, source.only(numbers), strict=True)
+        (before, results.read_corrected(folder, name))
+        for name, before in zip(names, source.only(numbers), strict=True)
     )
-    shown, video = comparison(pairs, source.orientation, changed), folder / comparison_of_video(out).name
-    if is_video(out) and numbers:
-        write_frames(video, shown, fps=DEFAULT_FPS, times=source.times if one else None)
+    shown, video = comparison(pairs, source.orientation, changed), folder / results.comparison_of_video(out).name
+    if given.video and numbers:
+        write_frames(video, shown, fps=results.DEFAULT_FPS, times=source.times if one else None)
     else:
         deque(shown, maxlen=0)
-    join_poses(folder, "row_poses")
-    join_poses(folder, "trajectory")
+    results.join_poses(folder, "row_poses")
+    results.join_poses(folder, "trajectory")
     facts = [("readout ratio", readout_words(known.shutter, known.capture, known.rig))]
     facts += [*camera_facts(record).items()] if one else []
     corrected = sum("reason" not in each for each in frames)
@@ -281,51 +326,45 @@ def _write_page(
     shown_frames = source.only(numbers[k] for k in chosen) if chosen else ()
     title, unit = ("frame {}", "") if one else ("left, frame {}", " m")
     cards = [
-        card_of(title.format(numbers[k]), image, read_fused(folder, names[k]), unit, source.orientation)
+        card_of(title.format(numbers[k]), image, results.read_fused(folder, names[k]), unit, source.orientation)
         for k, image in zip(chosen, shown_frames, strict=True)
     ]
     trajectory = folder / "trajectory.csv"
     poses = np.loadtxt(trajectory, ndmin=2) if trajectory.is_file() else np.zeros((0, 8))
     drawn = draw_own_motion(frames) if one else draw_trajectory(poses, frames)
-    page = folder / (page_of_video(out).name if is_video(out) else "report.html")
-    write_page_of(folder, out, facts, None, cards, drawn, page=page, record=record, video=video)
-    return [each for each in (video, page) if is_video(out) and each.is_file()]
+    page = folder / given.page.name
+    title, subtitle = f"rsbench correct: {out.name}", f"{SUBTITLE}; the frames that changed most"
+    beside = video.name if video.is_file() else ""
+    write_page(folder, title, subtitle, facts, cards, drawn, page=page, record=record, video=beside)
+    return [each for each in (video, page) if given.video and each.is_file()]
 
 
 def _write_video(
-    out: Path, folder: Path, sources: list[FrameSource], record: dict[str, Any], others: list[Path]
+    given: CorrectInput, folder: Path, sources: list[FrameSource], record: dict[str, Any], others: list[Path]
 ) -> list[str]:
     """A video, of a rig with both cameras side by side; a time that is not corrected is there as it was read.
 
     Returns notes on what was written.
     """
-    import numpy as np
-
-    from rsbench.core.rig import SIDES
-    from rsbench.dataset.corrected_frames import fps_of, read_corrected, write_video
-    from rsbench.storage.videos import UPRIGHT, upright
-
-    turn = UPRIGHT if len(sources) == 1 else sources[0].orientation  # of both, so that they stay side by side
-    one = len(sources) == 1
+    one, first = given.one_camera, sources[0]
+    turn = UPRIGHT if one else first.orientation  # of both, so that they stay side by side
 
     def shown(side: str, number: int, image: Any) -> Any:
         name = _name(side, number, one)
-        return read_corrected(folder, name) if (folder / "corrected" / f"{name}.png").is_file() else image
+        corrected = (folder / "corrected" / f"{name}.png").is_file()
+        return upright(results.read_corrected(folder, name) if corrected else image, turn)
 
     images = (
-        np.hstack([upright(shown(side, number, image), turn) for side, image in zip(SIDES, moment, strict=False)])
+        np.hstack([shown(side, number, image) for side, image in zip(SIDES, moment, strict=False)])
         for number, moment in enumerate(zip(*sources, strict=True))
     )
-    return write_video(
-        out, folder, images, fps_of(sources[0].path), record, sources[0], others, None if one else UPRIGHT
-    )
+    fps, orientation = results.fps_of(first.path), None if one else UPRIGHT
+    return results.write_video(given.out, folder, images, fps, record, first, others, orientation)
 
 
-def _say(out: Path, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:
+def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:
     """Exit 1 where a time is not corrected; ``lines``: notes on what was written."""
-    from rsbench.dataset.corrected_frames import is_video, page_of_video
-
-    frames, one = record["frames"], not known.rig.metric
+    frames, one = record["frames"], given.one_camera
     failed, skipped = (
         listed((frame["number"], frame[key]) for frame in frames if key in frame) for key in ("reason", "skipped")
     )
@@ -353,9 +392,9 @@ def _say(out: Path, known: KnownCapture, record: dict[str, Any], lines: list[str
         echo(line)
     corrected = sum("reason" not in frame for frame in frames)
     echo(f"{corrected} of {len(frames)} {'frames' if one else 'times'} corrected")
-    if is_video(out):
-        echo(f"video: {out.resolve()}")
-    echo(f"report: {(page_of_video(out) if is_video(out) else out / 'report.html').resolve()}")
+    if given.video:
+        echo(f"video: {given.out.resolve()}")
+    echo(f"report: {given.page.resolve()}")
     if len(used) < len(gyros):
         unlike = listed((number, found) for number, found in gyros if isinstance(found, str))
         echo(f"rsbench: corrected without the gyroscope: {unlike}", err=True)
