@@ -67,39 +67,6 @@ _RIG_ONLY = (
 _MODEL = "Motion model: a name, or auto for the most probable one. Default: auto if the solver supports it"
 
 
-CameraFile = Annotated[
-    Path | None,
-    typer.Option(metavar="CAMERA", help="For one camera, in place of --rig: camera.toml or a calibration."),
-]
-Footage = Annotated[Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")]
-GyroFile = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="LOG.gcsv|LOG.csv",
-        help="Samples of a gyroscope; with a rig for four frames or more. Needs --fps or a video.",
-    ),
-]
-Fps = Annotated[
-    float | None,
-    typer.Option(help="Frames per second, for --gyro, --shutter and a line delay. Default: that of the video."),
-]
-ReadoutRatio = Annotated[
-    float | None, typer.Option(help="Readout time divided by frame period, in place of that in the calibration.")
-]
-ShutterName = Annotated[
-    str | None,
-    typer.Option("--shutter", metavar="NAME", help="Readout time of a camera mode, see rsbench list shutters."),
-]
-GyroOffset = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS",
-        help="Time of --gyro's clock at the first row of the first frame. Default: 0; for one camera, estimated "
-        "within half a second.",
-    ),
-]
-
-
 def correct(
     ctx: typer.Context,
     frames: Annotated[
@@ -132,13 +99,44 @@ def correct(
     rectify: Annotated[bool, typer.Option("--rectify", help=_RECTIFY)] = False,
     side_by_side: Annotated[bool, typer.Option("--side-by-side", help=_SIDES)] = False,
     fov: Annotated[float | None, typer.Option(metavar="DEG", help=_FOV)] = None,
-    camera: CameraFile = None,
-    footage: Footage = None,
-    gyro: GyroFile = None,
-    fps: Fps = None,
-    gyro_offset: GyroOffset = None,
-    readout_ratio: ReadoutRatio = None,
-    shutter: ShutterName = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(metavar="CAMERA", help="For one camera, in place of --rig: camera.toml or a calibration."),
+    ] = None,
+    footage: Annotated[
+        Path | None, typer.Option("--frames", metavar="DIR|VIDEO", help="Frames of one camera.")
+    ] = None,
+    gyro: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG.gcsv|LOG.csv",
+            help="Samples of a gyroscope; with a rig for four frames or more. Needs --fps or a video.",
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames per second, for --gyro, --shutter and a line delay. Default: that of the video."
+        ),
+    ] = None,
+    gyro_offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Time of --gyro's clock at the first row of the first frame. Default: 0; for one camera, "
+            "estimated within half a second.",
+        ),
+    ] = None,
+    readout_ratio: Annotated[
+        float | None,
+        typer.Option(help="Readout time divided by frame period, in place of that in the calibration."),
+    ] = None,
+    shutter: Annotated[
+        str | None,
+        typer.Option(
+            "--shutter", metavar="NAME", help="Readout time of a camera mode, see rsbench list shutters."
+        ),
+    ] = None,
 ) -> None:
     """Correct your own rolling-shutter frames: of a stereo rig or of one camera, two frames or a sequence."""
     from rsbench.cli.correct_input import (

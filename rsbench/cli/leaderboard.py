@@ -84,18 +84,12 @@ Hidden = Annotated[
 
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
-_BoardOrUrl = Annotated[
-    str, typer.Option(metavar="DIR", help="Folder of the board, or a URL such as s3://bucket/folder.")
-]
 _File = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="Predictions: JSON lines; the folder 'pictures' beside it is read too."),
 ]
 _Seed = Annotated[
     Path, typer.Option("--seed-file", metavar="FILE", help="Secret text, 16 characters or more, drawn at random.")
-]
-_Card = Annotated[
-    str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
 ]
 
 
@@ -188,7 +182,9 @@ def run(
             autocompletion=complete("solvers"),
         ),
     ],
-    board: _BoardOrUrl,
+    board: Annotated[
+        str, typer.Option(metavar="DIR", help="Folder of the board, or a URL such as s3://bucket/folder.")
+    ],
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
@@ -445,7 +441,9 @@ def publish(
         Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")
     ],
     out: Annotated[Path, typer.Option(help="Folder of what everybody may see.")],
-    card: _Card = "standard",
+    card: Annotated[
+        str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
+    ] = "standard",
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
 ) -> None:
     """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""

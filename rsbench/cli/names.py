@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from rsbench.cli.console import echo, print_rows, say
+from rsbench.cli.console import print_json, print_rows, say
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -117,8 +117,6 @@ def list_(
     json: Annotated[bool, typer.Option("--json", help="As a JSON list.")] = False,
 ) -> None:
     """List scenes, solvers, datasets and so on, with the cards to copy and edit, and who they come from."""
-    import json as json_module
-
     from rsbench.components.cards import choices
 
     kinds = kind_names()
@@ -126,7 +124,7 @@ def list_(
         raise RsbenchError(f"kind {kind!r} does not exist{choices(kind, kinds)}")
     rows = entries(kind) if kind else [{"kind": each, "names": names_of(each)} for each in kinds]
     if json:
-        echo(json_module.dumps(rows))
+        print_json(rows)
         return
     columns = ("kind", "names") if kind is None else ("name", "origin", "description")
     texts = [[row[column] for column in columns] for row in rows]
@@ -200,11 +198,9 @@ def show(
     json: Annotated[bool, typer.Option("--json", help="As one JSON object.")] = False,
 ) -> None:
     """Print what a solver needs and returns, the parameters of a component with defaults, or a card."""
-    import json as json_module
-
     found = [_about(name, each) for each in _kinds_of(name, kind)]
     if json:
-        echo(json_module.dumps(found[0] if len(found) == 1 else found, default=str))
+        print_json(found[0] if len(found) == 1 else found, default=str)
         return
     for content in found:
         _print(content)

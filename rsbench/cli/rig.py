@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_json
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ transform is X_right = R X_left + t.
 
 Exit codes: 0 done, 2 the file cannot be read or represented.
 More: [bold]rsbench docs calibrations[/bold]"""
-_SUFFIXES = {".toml": "rig.toml"}
 
 
 def rig(
@@ -85,9 +84,7 @@ def rig(
     if out is None and to is not None:
         raise RsbenchError("--to: needs -o PATH, where the converted file goes")
     if json:
-        import json as json_module
-
-        echo(json_module.dumps(_record(found)))
+        print_json(_record(found))
     else:
         for line in _lines(found):
             echo(line)
@@ -149,7 +146,7 @@ def _convert(found: Calibration, to: str | None, out: Path, json: bool) -> None:
     from rsbench.components.cards import choices
     from rsbench.interop.writers.calibrations import WRITERS, write_calibration
 
-    kind = to or _SUFFIXES.get(out.suffix, "")
+    kind = to or ("rig.toml" if out.suffix == ".toml" else "")
     if kind not in WRITERS:
         wrong = f"--to {to!r}: no such format" if to else f"-o {out}: give --to FORMAT"
         raise RsbenchError(f"{wrong}{choices(kind, WRITERS)}")

@@ -30,15 +30,6 @@ their reasons), [bold]trials/*.npz[/bold] (truth and every prediction) and [bold
 Solvers of other packages run in processes of their own: what they do wrong is a failed trial."""
 
 
-_Out = Annotated[
-    str,
-    typer.Option(
-        metavar="DIR",
-        help="Folder of the results, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
-    ),
-]
-
-
 def simulate(
     sweep: Annotated[
         str,
@@ -47,7 +38,13 @@ def simulate(
             autocompletion=complete("sweeps"),
         ),
     ],
-    out: _Out,
+    out: Annotated[
+        str,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the results, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
+        ),
+    ],
     trials: Annotated[int | None, typer.Option(min=1, help="Repetitions per value instead of the card's.")] = None,
     solver: Annotated[
         list[str] | None,

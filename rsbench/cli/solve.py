@@ -72,23 +72,24 @@ def solve(
 ) -> None:
     """Estimate the motion of a stereo rig from your own matches."""
     if example:
-        _print_example()
+        from rsbench.pipeline.problem import EXAMPLE
+
+        echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
         return
     if not problems:
         raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
+    from rsbench.pipeline.frame_motion import check_model
     from rsbench.solvers.engine.base import load_solver_entries
 
-    wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
+    wanted, options = _extras(extras, json), _options(threshold_px)
+    if time_limit is not None and not time_limit > 0.0:
+        raise RsbenchError(f"--time-limit = {time_limit}: must be a positive number of seconds")
     entries = load_solver_entries(solver or ["rs-stereo-refined"])
-    _check_model(motion_model, entries)
-    found = _answers(problems, entries, options, seed, wanted, limit, motion_model or "auto")
+    if motion_model is not None:
+        for entry in entries:
+            check_model(motion_model, entry)
+    found = _answers(problems, entries, options, seed, wanted, time_limit, motion_model or "auto")
     print_answers(found, json, "success", _show)
-
-
-def _print_example() -> None:
-    from rsbench.pipeline.problem import EXAMPLE
-
-    echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
 
 
 def _answers(
@@ -193,19 +194,6 @@ def _options(threshold_px: float | None) -> RobustOptions:
     if not 0.0 < threshold_px < float("inf"):
         raise RsbenchError(f"--threshold-px = {threshold_px}: must be a positive number of pixels")
     return RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
-
-
-def _check_model(motion_model: str | None, entries: list[SolverEntry]) -> None:
-    from rsbench.pipeline.frame_motion import check_model
-
-    for entry in entries if motion_model is not None else []:
-        check_model(str(motion_model), entry)
-
-
-def _limit(seconds: float | None) -> float | None:
-    if seconds is not None and not seconds > 0.0:
-        raise RsbenchError(f"--time-limit = {seconds}: must be a positive number of seconds")
-    return seconds
 
 
 def _degrees(w: list[float]) -> float:
