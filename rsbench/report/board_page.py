@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pandas.api.types import is_numeric_dtype
 
 from rsbench.benchmark.leaderboard.board import Scored, about_split, entries_of, place, splits_of
 from rsbench.benchmark.leaderboard.deviations import LEVELS, named_numbers
@@ -96,14 +97,9 @@ class Board:
             "protocol": self.track.id,
             "split": self.split,
             "primary": self.track.primary.title,
-            "error": self.error,
+            "error": self.track.error_title,
             "problems": "" if self.secret else f"{self.id}--problems.html",
         }
-
-    @property
-    def error(self) -> str:
-        """What figures draw."""
-        return self.track.error_title
 
     def known(self) -> list[tuple[str, pd.Series]]:
         """What is known of the problems, in their order: numbers and words, each with its name, and the scene."""
@@ -422,7 +418,11 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     """Context of the template board_entry.html.j2."""
     header = line.scored.header
     fields = asdict(header)
-    compared = [line, *_best_peer(each, line), *_oracles(each, line)]
+    uses = set(header.uses)
+    # The best of the other entries that use no more, and the oracles.
+    peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
+    oracles = [other for other in each.lines if other.rank is None and other is not line]
+    compared = [line, *(peers[:1] if line.rank else []), *oracles]
     return {
         "header": header,
         "split": each.named,
@@ -434,7 +434,7 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
         ],
         "scores": _entry_scores(line),
         "ties": ", ".join(line.ties),
-        "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],
+        "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if not is_numeric_dtype(kinds)],
         "worst": None if each.secret else _worst(each, line, album),
         "figures_found": each.figures(compared),
         "figures_within": each.figures_within(compared),
@@ -442,31 +442,17 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     }
 
 
-def _words(kinds: pd.Series) -> bool:
-    return not pd.api.types.is_numeric_dtype(kinds)
-
-
-def _best_peer(each: Board, line: Standing) -> list[Standing]:
-    """The best of the other entries that use no more, which the figures show beside it."""
-    uses = set(line.scored.header.uses)
-    peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
-    return peers[:1] if line.rank else []
-
-
-def _oracles(each: Board, line: Standing) -> list[Standing]:
-    return [other for other in each.lines if other.rank is None and other is not line]
-
-
 def _entry_scores(line: Standing) -> list[dict[str, str]]:
     found = [{"title": "rank", "text": line.rank_words, "hint": "among those that use no more"}]
     for score in line.track.scores:
-        if score.kind != "median":
-            text = format_interval(*line.means[score.key])
-        else:
-            value = line.medians[score.key]
-            text = "–" if np.isnan(value) else f"{value:.3g}"
+        median = score.kind == "median"
+        text = _number(line.medians[score.key]) if median else format_interval(*line.means[score.key])
         found.append({"title": score.title, "text": text, "hint": score.hint})
     return found
+
+
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.3g}"
 
 
 def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
@@ -476,8 +462,8 @@ def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, A
         value, low, high = score_interval(primary, list(part["scene"]), track.primary.kind == "share")
         # One scene bounds nothing: an interval of it would only round its value away.
         share = f"{value:.3g}" if part["scene"].nunique() == 1 else format_interval(value, low, high)
-        medians = (part[key].median() for key in track.of_kind("median")[:BRIEF])
-        rows.append([str(kind), len(part), share, *(f"{x:.3g}" for x in medians), int(part["failure"].sum())])
+        medians = (f"{part[key].median():.3g}" for key in track.of_kind("median")[:BRIEF])
+        rows.append([str(kind), len(part), share, *medians, int(part["failure"].sum())])
     return {
         "title": f"By {fact_title(name)}",
         "columns": [fact_title(name), "problems", track.primary.title, *brief_medians(track), "failed"],
@@ -596,12 +582,8 @@ def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str,
 
 
 def _problem_row(each: Board, line: Standing, k: int) -> dict[str, Any]:
-    scores = line.scored.scores.iloc[k]
-    cells = [
-        "–" if np.isnan(value) else f"{value:.3g}"
-        for value in (float(scores[score.key]) for score in each.track.scores)
-    ]
-    method = line.scored.header.method
+    scores, method = line.scored.scores.iloc[k], line.scored.header.method
+    cells = [_number(float(scores[score.key])) for score in each.track.scores]
     return {"method": method, "page": f"../{method}.html", "oracle": line.rank is None, "cells": cells}
 
 
@@ -734,8 +716,7 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
     for key, triple in line.means.items():
         drawn = bar(*triple) if key == primary else None
         cells.append({"value": _value(triple[0]), "text": format_interval(*triple), "bar": drawn})
-    for value in line.medians.values():
-        cells.append({"value": _value(value), "text": "–" if np.isnan(value) else f"{value:.3g}", "bar": None})
+    cells += [{"value": _value(value), "text": _number(value), "bar": None} for value in line.medians.values()]
     if _stated(each):
         for triple in named_numbers(line.calibration, _log_scored(each)).values():
             text = "–" if np.isnan(triple[0]) else format_interval(*triple)
