@@ -17,7 +17,6 @@ from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from rsbench.dataset.sequence import Sequence
     from rsbench.interop.writers.match_colours import Scene
 
 EXPORT_EPILOG = """[bold]Examples[/bold]
@@ -121,6 +120,7 @@ def view(
     Needs the extra of the viewer: pip install 'rsbench\[view]'
     """
     from rsbench.interop.writers.exporter import chosen_sequences
+    from rsbench.interop.writers.match_colours import Scene, found_strips, labelled_strips
     from rsbench.storage.files import check_out
 
     if find_spec("rerun") is None:
@@ -136,7 +136,9 @@ def view(
         check_out(save.parent)
     with late_progress("showing") as advance:
         for each in chosen:
-            _view_one(_view_scene(each, points, features), save, advance)
+            labelled = "matches" in each.channels
+            strips = labelled_strips(each) if labelled else found_strips(each, features)
+            _view_one(Scene(each, tuple(strips), points), save, advance)
     echo(f"{save}: {chosen[0].name}" if save is not None else "sent to the viewer")
 
 
@@ -159,11 +161,3 @@ def _view_one(scene: Scene, save: Path | None, advance: Callable[[str], None]) -
         os.replace(partial, save)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def _view_scene(sequence: Sequence, points: int, features: str) -> Scene:
-    from rsbench.interop.writers.match_colours import Scene, found_strips, labelled_strips
-
-    labelled = "matches" in sequence.channels
-    strips = labelled_strips(sequence) if labelled else found_strips(sequence, features)
-    return Scene(sequence, tuple(strips), points)

@@ -169,7 +169,8 @@ def _lines(found: Calibration) -> list[str]:
             f"centre {own['cx']:.2f}, {own['cy']:.2f}"
         )
         lens = own.get("lens")
-        shown = "none" if lens is None else " ".join([lens["model"], *_shown(lens)])
+        values = [f"{key} {value:.6g}" for key, value in (lens or {}).items() if key != "model" and value]
+        shown = "none" if lens is None else " ".join([lens["model"], *values])
         view = "" if "view_deg" not in own else "; sees {:.1f} x {:.1f} deg".format(*own["view_deg"])
         delay = own.get("line_delay_s")
         read = "" if delay is None else f"; {1e6 * delay:.4g} us a line" if delay else "; global shutter"
@@ -192,10 +193,6 @@ def _lines(found: Calibration) -> list[str]:
         lines.append(f"{key} = {value}")
     lines += [f"missing: {each}" for each in record["missing"]]
     return [*lines, *(f"note: {each}" for each in record["notes"])]
-
-
-def _shown(lens: dict[str, Any]) -> list[str]:
-    return [f"{key} {value:.6g}" for key, value in lens.items() if key != "model" and value]
 
 
 def _record(found: Calibration) -> dict[str, Any]:
