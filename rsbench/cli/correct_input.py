@@ -303,21 +303,15 @@ def given_camera(
     stated = readout.beside(camera, gyro.file is not None, source.path)
     card, notes = read_camera_file(camera, stated, size_of(files))
     say_notes("--camera", notes)
-    card = _with_fov(card, fov)
+    if fov is not None:
+        if not card.focal_unknown:
+            raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
+        try:
+            card = replace(card, fov_deg=fov)
+        except ValueError as error:
+            raise RsbenchError(f"--fov: {error}") from error
     _warn_of_other_rate(card, source, gyro.fps)
     return CorrectInput(card=card, out=out, footage=[files], words=given.words, gyro=gyro)
-
-
-def _with_fov(card: OneCameraCard, fov: float | None) -> OneCameraCard:
-    """The card with the field of view of ``--fov``."""
-    if fov is None:
-        return card
-    if not card.focal_unknown:
-        raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
-    try:
-        return replace(card, fov_deg=fov)
-    except ValueError as error:
-        raise RsbenchError(f"--fov: {error}") from error
 
 
 def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: float | None) -> None:

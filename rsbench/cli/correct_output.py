@@ -25,14 +25,11 @@ def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
     facts = [*zip(names, sizes(motion), strict=True)]
     if motion["model_choice"]:
         facts += [("motion model", motion["model_choice"]["text"])]
-    noise = f"{motion['noise_px'] or float('nan'):.2f} px"
-    return [*facts, ("matches that agree", _agreeing(motion)), ("noise of a match", noise)]
-
-
-def _agreeing(motion: dict[str, Any]) -> str:
-    """Of each set, such as "312 of 340 tracks"; sets that the solver did not use are left out."""
+    # Of each set of matches; those that the solver did not use are left out.
     sets = ((name, inliers, motion["matches"][name]) for name, inliers in motion["inliers"].items())
-    return ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
+    agreeing = ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
+    noise = f"{motion['noise_px'] or float('nan'):.2f} px"
+    return [*facts, ("matches that agree", agreeing), ("noise of a match", noise)]
 
 
 def camera_facts(record: dict[str, Any]) -> dict[str, str]:

@@ -247,8 +247,11 @@ def _correct_into(
 
         def copies() -> None:
             while len(entries) < len(twins) and twins[len(entries)] < len(entries):
-                entries.append(_write_copy(folder, len(entries), entries[twins[len(entries)]]))
-                advance(f"frame {len(entries) - 1}")
+                number, twin = len(entries), twins[len(entries)]
+                results.copy_frame(folder, f"{number:06d}", f"{twin:06d}")
+                entries.append({**entries[twin], "number": number, "copy_of": twin})
+                results.write_entry(folder, entries[-1])
+                advance(f"frame {number}")
 
         copies()
         there, start = len(entries), time.monotonic()
@@ -258,14 +261,6 @@ def _correct_into(
             advance(f"frame {moment.number}, {rate:.2g} frames/s")
             copies()
     return entries
-
-
-def _write_copy(folder: Path, number: int, twin: dict[str, Any]) -> dict[str, Any]:
-    """A frame of one camera that repeats another one, which has its result."""
-    results.copy_frame(folder, f"{number:06d}", f"{twin['number']:06d}")
-    entry = {**twin, "number": number, "copy_of": twin["number"]}
-    results.write_entry(folder, entry)
-    return entry
 
 
 def _write(
@@ -385,7 +380,9 @@ def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines
     used = [found for _, found in gyros if not isinstance(found, str)]
     if used:
         off = max(abs(value - (i == j)) for i, row in enumerate(used[-1]["matrix"]) for j, value in enumerate(row))
-        echo(f"gyroscope: clock {_late(used[-1]['shift'])}, axes and scales off by {off:.1%}: corrected for")
+        shift = used[-1]["shift"]  # above 0 its times are early
+        clock = f"{abs(shift):.3f} frame periods {'behind' if shift > 0.0 else 'ahead'}"
+        echo(f"gyroscope: clock {clock}, axes and scales off by {off:.1%}: corrected for")
     elif known.gyro is not None and not one and record["readout_ratio"] == 0.0:
         echo("rsbench: corrected without the gyroscope: the shutter is global", err=True)
     for line in lines:
@@ -404,8 +401,3 @@ def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines
     if failed:
         echo(f"rsbench: not corrected: {failed}", err=True)
         raise typer.Exit(1)
-
-
-def _late(shift: float) -> str:
-    """Of a clock whose times are early by so many frame periods."""
-    return f"{abs(shift):.3f} frame periods {'behind' if shift > 0.0 else 'ahead'}"

@@ -125,7 +125,8 @@ def view(
 
     if find_spec("rerun") is None:
         raise RsbenchError("the viewer is not installed: pip install 'rsbench[view]'")
-    if save is None and not _has_screen():
+    screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if save is None and not screen:
         raise RsbenchError("there is no screen (DISPLAY and WAYLAND_DISPLAY are empty): give --save FILE.rrd")
     chosen = chosen_sequences(folder, tuple(sequence or ()))[: None if sequence else 1]
     if save is not None:
@@ -140,11 +141,6 @@ def view(
             strips = labelled_strips(each) if labelled else found_strips(each, features)
             _view_one(Scene(each, tuple(strips), points), save, advance)
     echo(f"{save}: {chosen[0].name}" if save is not None else "sent to the viewer")
-
-
-def _has_screen() -> bool:
-    """Whether a window can open: on Linux, if a display variable is set."""
-    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def _view_one(scene: Scene, save: Path | None, advance: Callable[[str], None]) -> None:

@@ -136,6 +136,10 @@ def _of_windows(
 def _record(name: str, found: Capture, given: RollingShutter | None) -> dict[str, Any]:
     """The JSON answer for one rig; what is not determined is null."""
     named, best = (found.likeliest if known else None for known in (found.named, found.determined))
+    said = None
+    if given is not None:
+        scans = scans_of(given)
+        said = {"left": scans.left, "right": scans.right, "readout_ratio": given.readout_ratio}
     return {
         "name": name,
         "told": found.determined,
@@ -154,15 +158,8 @@ def _record(name: str, found: Capture, given: RollingShutter | None) -> dict[str
         "used": found.used,
         "noise_px": found.noise_px if found.used else None,
         "moved_px": found.moved_px,
-        "said": _given_shutter(given),
+        "said": said,
     }
-
-
-def _given_shutter(shutter: RollingShutter | None) -> dict[str, Any] | None:
-    if shutter is None:
-        return None
-    scans = scans_of(shutter)
-    return {"left": scans.left, "right": scans.right, "readout_ratio": shutter.readout_ratio}
 
 
 def row_of(answer: dict[str, Any]) -> dict[str, str]:

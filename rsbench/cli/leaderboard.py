@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -191,9 +192,10 @@ def run(
     problems: Annotated[
         int | None, typer.Option(min=1, help="Only the first ones: a split of its own on the board.")
     ] = None,
-    beside: Annotated[
+    stored: Annotated[
         Path | None,
         typer.Option(
+            "--beside",
             metavar="DIR",
             help="Stored predictions to rank beside, not added to the board. "
             "Default: those of this track in results/*/predictions of the working folder.",
@@ -219,7 +221,11 @@ def run(
 
     processes = chosen_workers(workers, scheduler, os.cpu_count() or 1)
     whole = split_of(track, data, seed_file, secret)
-    split, others = _first(whole, problems), _stored(whole, beside)
+    split, others = whole, _stored(whole, stored)
+    if problems is not None and problems > len(whole.truths):
+        raise RsbenchError(f"--problems {problems}: split {whole.name} has {len(whole.truths)}")
+    if problems is not None and problems < len(whole.truths):
+        split = replace(whole, truths=whole.truths[:problems])
     load_cards(split.track, entry)  # before anything is written
     limits = Limits(time_limit, memory)
     with results_at(board, scheduler) as place:
@@ -241,17 +247,11 @@ def run(
                 workers=processes,
                 step=step,
             )
-        _show(place, split.track.id, split.name, None, beside=_cut(others, split))
-
-
-def _first(split: Split, problems: int | None) -> Split:
-    from dataclasses import replace
-
-    if problems is None or problems == (there := len(split.truths)):
-        return split
-    if problems > there:
-        raise RsbenchError(f"--problems {problems}: split {split.name} has {there}")
-    return replace(split, truths=split.truths[:problems])
+        # The others as if scored on the problems of a part of the split.
+        names = list(split.by_name)
+        parts = [each.scores[each.scores["problem"].isin(names)].reset_index(drop=True) for each in others]
+        beside = [replace(each, scores=part) for each, part in zip(others, parts, strict=True)]
+        _show(place, split.track.id, split.name, None, beside=beside)
 
 
 def _stored(split: Split, folder: Path | None) -> list[Scored]:
@@ -268,17 +268,6 @@ def _stored(split: Split, folder: Path | None) -> list[Scored]:
                 if folder is not None:
                     raise
     return found
-
-
-def _cut(entries: list[Scored], split: Split) -> list[Scored]:
-    """Entries of the whole split as if scored on the problems of a part of it."""
-    from dataclasses import replace
-
-    names = list(split.by_name)
-    return [
-        replace(each, scores=each.scores[each.scores["problem"].isin(names)].reset_index(drop=True))
-        for each in entries
-    ]
 
 
 @board_app.command()
@@ -600,9 +589,6 @@ def _cells(line: Standing) -> dict[str, str]:
         if score.key in ("flip", *line.track.beside):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
         elif score.key in _SHOWN:
-            cells[score.title.removesuffix(" (deg)")] = _number(line.medians[score.key])
+            value = line.medians[score.key]
+            cells[score.title.removesuffix(" (deg)")] = "-" if value != value else f"{value:.3g}"
     return cells
-
-
-def _number(value: float) -> str:
-    return "-" if value != value else f"{value:.3g}"

@@ -273,29 +273,25 @@ def _about(name: str, kind: str) -> dict[str, Any]:
         "origin": _offer(described, entry.name).origin if entry.path is None else None,
         "card": entry.path.as_posix() if entry.path is not None else None,
         **_about_component(entry.component),
-        **{key: value for key, value in vars(entry.options).items()},
+        **vars(entry.options),
         "key": entry.key,
         "parameters": parameters_of(type(entry.component), entry.component),
     }
 
 
 def _about_component(component: object) -> dict[str, Any]:
-    """Its class, and the fields of its ``spec``."""
+    """Its class, and the fields of its ``spec``, as JSON holds them."""
+    from collections.abc import Mapping, Set
+
     cls = type(component)
     about: dict[str, Any] = {"class": f"{cls.__module__}:{cls.__qualname__}"}
     spec = getattr(component, "spec", None)
-    if dataclasses.is_dataclass(spec):
-        about |= {field.name: _plain(getattr(spec, field.name)) for field in dataclasses.fields(spec)}
+    for field in dataclasses.fields(spec) if dataclasses.is_dataclass(spec) else ():
+        value = getattr(spec, field.name)
+        about[field.name] = dict(value) if isinstance(value, Mapping) else value
+        if isinstance(value, Set):
+            about[field.name] = sorted(value)
     return about
-
-
-def _plain(value: object) -> object:
-    """Values of a spec for JSON."""
-    from collections.abc import Mapping, Set
-
-    if isinstance(value, Mapping):
-        return dict(value)
-    return sorted(value) if isinstance(value, Set) else value
 
 
 def _offer(kind: Kind[Any, Any], name: str) -> Offer:

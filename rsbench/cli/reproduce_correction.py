@@ -81,11 +81,8 @@ def fig4_literal(out: Path, data: Path) -> None:
     """The paper's Figure 4 in its scene, by the paper's own solver, matches and correction of a single view."""
     folder = out / "fig4"
     _generate("paper", data)
-    sequence, views, panels = (
-        read_sequence(data / "paper" / _LITERAL_SCENE),
-        list[dict[str, Any]](),
-        list[Panels](),
-    )
+    sequence = read_sequence(data / "paper" / _LITERAL_SCENE)
+    views, panels = list[dict[str, Any]](), list[Panels]()
     with progress_bar("correcting literally", _LITERAL_SEEDS) as advance:
         for scores, panel in correct_literally(sequence, range(_LITERAL_SEEDS)):
             views += scores

@@ -29,7 +29,7 @@ from rsbench.benchmark.leaderboard.pictures import (
     read_answer_frame,
 )
 from rsbench.benchmark.leaderboard.standings import Standing, standings, table
-from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score, Split, Track, Truth
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Split, Track, Truth
 from rsbench.benchmark.leaderboard.tracks import track_of_id
 from rsbench.benchmark.statistics import format_interval, score_interval
 from rsbench.core.errors import RsbenchError
@@ -664,6 +664,7 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         return {"key": key, "title": title, "first": first, "hint": hint, "text": text}
 
     parts, part, primary = each.lines[0].parts, each.track.parting, each.track.primary.title
+    scores = sorted(each.track.scores, key=lambda score: score.kind == "median")  # in the order of the cells
     stated = [
         column("nees_ratio", "NEES", "up", "squared error by the stated covariance: 1 where that is right"),
         *(
@@ -686,18 +687,13 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         column("method", "method", "up", "name of the entry", text=True),
         column("uses", "uses", "up", "what it works on", text=True),
         column("rank", "rank", "up", "among those that use no more, with its interval"),
-        *(column(s.key, s.title, "down" if s.better == "higher" else "up", s.hint) for s in _scores(each)),
+        *(column(s.key, s.title, "down" if s.better == "higher" else "up", s.hint) for s in scores),
         *(stated if _stated(each) else []),
         *(column(f"part_{name}", name, "down", f"{primary} where the {part} is {name}") for name in parts),
         *([column("assumes", "assumes", "up", "motion model that it assumes", text=True)] if parts else []),
         column("ties", "ties", "up", "entries that the data do not distinguish from it", text=True),
         column("tuned_on", "tuned on", "up", "data by which its parameters were chosen", text=True),
     ]
-
-
-def _scores(each: Board) -> list[Score]:
-    """Scores in the order of the cells: shares, then medians."""
-    return sorted(each.track.scores, key=lambda score: score.kind == "median")
 
 
 def _stated(each: Board) -> bool:
