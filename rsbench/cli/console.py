@@ -5,17 +5,18 @@ Texts are printed literally: brackets such as ``[view]`` are not taken for rich'
 
 from __future__ import annotations
 
+import json as json_module
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+import typer
 
 from rsbench.core.errors import RsbenchError, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     import pandas as pd
     from rich.progress import Progress, ProgressColumn
 
@@ -32,8 +33,6 @@ def be_quiet(quiet: bool) -> None:
 
 def echo(text: str | None, err: bool = False, nl: bool = True) -> None:
     """Print results on stdout, or errors and notes on stderr; control characters are escaped."""
-    import typer
-
     typer.echo(printable(text or ""), err=err, nl=nl)
 
 
@@ -45,8 +44,6 @@ def say(note: str) -> None:
 
 def report_faults(faults: Sequence[str], summary: str) -> None:
     """Print each fault on stderr and the summary on stdout; exit code 1 if there is a fault."""
-    import typer
-
     for fault in faults:
         echo(f"fault: {fault}", err=True)
     echo(summary)
@@ -56,9 +53,7 @@ def report_faults(faults: Sequence[str], summary: str) -> None:
 
 def print_json(value: object, **options: Any) -> None:
     """Print a value as one line of JSON."""
-    import json
-
-    echo(json.dumps(value, **options))
+    echo(json_module.dumps(value, **options))
 
 
 def print_answers(
@@ -71,8 +66,6 @@ def print_answers(
 
     Exit code 2 where an input is wrong, 1 where the value of an answer at the key ``good`` is false.
     """
-    import typer
-
     answers, code = list[dict[str, Any]](), 0
     for answer in found:
         if isinstance(answer, RsbenchError):

@@ -24,6 +24,7 @@ from rsbench.cli import (
     solve,
     verify,
 )
+from rsbench.cli.console import be_quiet
 from rsbench.cli.export import EXPORT_EPILOG, VIEW_EPILOG, export, view
 from rsbench.cli.names import LIST_EPILOG, SHOW_EPILOG, list_, show
 from rsbench.cli.small_commands import (
@@ -69,8 +70,6 @@ def _root(
         typer.Option("--quiet", "-q", help="Before a command: no progress, no tables; results and errors only."),
     ] = False,
 ) -> None:
-    from rsbench.cli.console import be_quiet
-
     # Before OpenCV is imported, here and in child processes: our own message says what is wrong with an image.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     be_quiet(quiet)

@@ -8,7 +8,7 @@ import functools
 import inspect
 import itertools
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Set
 from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -281,8 +281,6 @@ def _about(name: str, kind: str) -> dict[str, Any]:
 
 def _about_component(component: object) -> dict[str, Any]:
     """Its class, and the fields of its ``spec``, as JSON holds them."""
-    from collections.abc import Mapping, Set
-
     cls = type(component)
     about: dict[str, Any] = {"class": f"{cls.__module__}:{cls.__qualname__}"}
     spec = getattr(component, "spec", None)
@@ -326,33 +324,25 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
     """
     meanings = field_docstrings(cls)
     required = inspect.Parameter.empty
+    fields = dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ()
+    factories = {each.name: each.default_factory for each in fields}
     rows = []
     for name, parameter in inspect.signature(cls).parameters.items():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        kind, default = parameter.annotation, _default_of(cls, name, parameter.default)
+        kind, make = parameter.annotation, factories.get(name, dataclasses.MISSING)
+        default = parameter.default if make is dataclasses.MISSING else make()
+        kind = "" if kind is required else kind if isinstance(kind, str) else getattr(kind, "__name__", str(kind))
         rows.append(
             {
                 "parameter": name,
-                "type": kind
-                if isinstance(kind, str)
-                else ""
-                if kind is required
-                else getattr(kind, "__name__", str(kind)),
+                "type": kind,
                 "value": value_in_a_card(getattr(component, name)) if hasattr(component, name) else "",
                 "default": "required" if default is required else value_in_a_card(default),
                 "meaning": meanings.get(name, ""),
             }
         )
     return rows
-
-
-def _default_of(cls: type, name: str, given: object) -> object:
-    """The default in the signature, or the value that a factory makes."""
-    for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
-        if field.name == name and field.default_factory is not dataclasses.MISSING:
-            return field.default_factory()
-    return given
 
 
 def value_in_a_card(value: object) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -136,8 +137,6 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
 
 def _changes(assignments: list[str]) -> dict[str, object]:
     """FIELD=VALUE pairs; values as in a card, plain words may lack their quotes."""
-    import tomllib
-
     changes: dict[str, object] = {}
     for text in assignments:
         key, equals, value = text.partition("=")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,8 +13,6 @@ from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rsbench.pipeline.answer import Extra
     from rsbench.solvers.engine.base import SolverEntry
     from rsbench.solvers.engine.robust_motion import RobustOptions
