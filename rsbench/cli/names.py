@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -62,11 +63,12 @@ def names_of(kind: str) -> list[str]:
     return plugins.list_names(described) if described is not None else list(list_cards(kind))  # pyrefly: ignore[bad-argument-type]
 
 
-def complete(kind: str) -> Callable[[str], list[str]]:
-    """Shell completion of the names of one kind, from cards and entry points only, to be quick."""
+def complete(kind: str = "") -> Callable[[str], list[str]]:
+    """Shell completion of the names of one kind, or of all, from cards and entry points only, to be quick."""
 
     def names(incomplete: str) -> list[str]:
-        return [name for name in _quick_names(kind) if name.startswith(incomplete)]
+        found = {name for each in ([kind] if kind else kind_names()) for name in _quick_names(each)}
+        return sorted(name for name in found if name.startswith(incomplete))
 
     return names
 
@@ -81,24 +83,17 @@ def complete_kind(incomplete: str) -> list[str]:
     return [name for name in kind_names() if name.startswith(incomplete)]
 
 
-def complete_any(incomplete: str) -> list[str]:
-    """Shell completion of a name of any kind."""
-    names = {name for kind in kind_names() for name in _quick_names(kind)}
-    return sorted(name for name in names if name.startswith(incomplete))
-
-
-def _quick_names(kind: str) -> list[str]:
+def _quick_names(kind: str) -> set[str]:
     """Names of one kind without imports; classes of rsbench without a card are left out."""
     from rsbench.components.cards import CardKind, list_cards
 
     names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # pyrefly: ignore[bad-argument-type]
     if kind in COMPONENTS:
-        try:
+        # Metadata of a package may be unreadable: ``rsbench list`` reports it.
+        with contextlib.suppress(Exception):
             group = _GROUPS.get(kind, f"rsbench.{kind}")
             names |= {point.name for point in metadata.entry_points(group=group)}
-        except Exception:  # metadata of a package that cannot be read: ``rsbench list`` reports it
-            return sorted(names)
-    return sorted(names)
+    return names
 
 
 LIST_EPILOG = """[bold]Examples[/bold]
@@ -187,7 +182,7 @@ SHOW_EPILOG = """[bold]Examples[/bold]
 def show(
     name: Annotated[
         str,
-        typer.Argument(metavar="NAME|CARD", help="A name, or the path of a card.", autocompletion=complete_any),
+        typer.Argument(metavar="NAME|CARD", help="A name, or the path of a card.", autocompletion=complete()),
     ],
     kind: Annotated[
         str | None,

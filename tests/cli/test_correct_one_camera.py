@@ -18,6 +18,7 @@ from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.dataset import corrected_frames
+from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
 from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.storage.files import read_png, write_png
@@ -57,10 +58,12 @@ def _correct(folder: Path, *arguments: Any) -> Any:
     return run_here("correct", *arguments, "--camera", camera, "--out", folder / "out", "--target", 60)
 
 
-def _moments(frames: list[np.ndarray], scan: Scan = "top") -> list[CorrectedMoment]:
+def _moments(
+    frames: list[np.ndarray], scan: Scan = "top", options: CorrectionOptions | None = None
+) -> list[CorrectedMoment]:
     height, width = frames[0].shape[:2]
     shutter = RollingShutter(height=height, width=width, readout_ratio=1.0, scan=scan)
-    return list(correct_frames(frames, PinholeCamera.centred(width, height, 160.0), shutter))
+    return list(correct_frames(frames, PinholeCamera.centred(width, height, 160.0), shutter, options))
 
 
 def test_two_frames_become_upright(folder: Path) -> None:
@@ -249,10 +252,7 @@ def _place(tau: np.ndarray) -> np.ndarray:
 
 def _second(frames: list[np.ndarray], place: int, row: float) -> Fused:
     """One of the frames at the time of a row, bare."""
-    options = options_of_camera(False, 0, row)
-    shutter = RollingShutter(height=SIZE[0], width=SIZE[1], readout_ratio=1.0)
-    camera = PinholeCamera.centred(SIZE[1], SIZE[0], 160.0)
-    return list(correct_frames(frames, camera, shutter, options))[place].shown["left"]
+    return _moments(frames, options=options_of_camera(False, 0, row))[place].shown["left"]
 
 
 def _accelerated(row: float) -> tuple[list[np.ndarray], np.ndarray]:
