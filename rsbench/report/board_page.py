@@ -303,15 +303,6 @@ _MOST_BYTES = 11_000_000
 """Largest size of all pictures of a site, which stays below 15 MB."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """A picture of a page."""
-
-    title: str
-    file: str
-    """Below the folder of the problem's pictures."""
-
-
 class Album:
     """Writes the pictures of a split's problems into ``<id>/pictures/<problem>``."""
 
@@ -336,11 +327,14 @@ class Album:
         """Path from the folder of the index, or nothing."""
         return f"{self.prefix}/{problem}/thumb.jpg" if problem in self._sequences else ""
 
-    def pictures(self, problem: str) -> list[Shown]:
-        """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room."""
+    def pictures(self, problem: str) -> list[dict[str, str]]:
+        """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room.
+
+        Returns the ``title`` of each, and its ``file`` below the folder of the problem's pictures.
+        """
         if problem not in self._sequences:
             return []
-        left, found = self.allowance, list[Shown]()
+        left, found = self.allowance, list[dict[str, str]]()
         for group in self._groups(problem):
             pictures = [
                 (stem, words, encode_jpeg(shrink(image, _LONGEST), _QUALITY)) for stem, words, image in group
@@ -349,7 +343,7 @@ class Album:
             if left < 0:
                 break
             for stem, words, data in pictures:
-                found.append(Shown(title=words, file=f"{stem}.jpg"))
+                found.append({"title": words, "file": f"{stem}.jpg"})
                 self._write(problem, f"{stem}.jpg", data)
         return found
 
