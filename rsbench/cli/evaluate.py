@@ -56,8 +56,7 @@ def evaluate(
     features: Annotated[str, named("features", "Feature matcher, a name or a card.")] = "sift",
     corrector: Annotated[str, named("correctors", "Corrector, a name or a card.")] = _OF_A_RIG,
     metric: Annotated[
-        list[str] | None,
-        named("metrics", "Metric that adds columns, a name or a card; repeatable."),
+        list[str] | None, named("metrics", "Metric that adds columns, a name or a card; repeatable.")
     ] = None,
     only: Annotated[
         list[str] | None,

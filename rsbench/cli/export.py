@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.console import echo, late_progress, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -110,10 +110,7 @@ def view(
         Path | None, typer.Option(metavar="FILE.rrd", help="Write this file instead; of one sequence.")
     ] = None,
     points: Annotated[int, typer.Option(min=1, help="Points of each depth map, at most.")] = 100_000,
-    features: Annotated[
-        str,
-        typer.Option(help="Matches of data without the channel matches.", autocompletion=complete("features")),
-    ] = "sift",
+    features: Annotated[str, named("features", "Matches of data without the channel matches.")] = "sift",
 ) -> None:
     r"""Show a dataset in the Rerun viewer: rig, row poses, depth as points, images and matches over time.
 

@@ -14,7 +14,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo, print_rows, progress_bar
-from rsbench.cli.names import complete
+from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -178,9 +178,9 @@ def run(
     track: Track,
     entry: Annotated[
         list[str],
-        typer.Option(
-            help="Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
-            autocompletion=complete("solvers"),
+        named(
+            "solvers",
+            "Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
         ),
     ],
     board: Annotated[
@@ -368,9 +368,8 @@ def smoke(
     track: Annotated[list[str] | None, typer.Option(help="Only this track; repeatable. Default: all.")] = None,
     entry: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Only this entry; repeatable. Default: all of our solvers on points, a few of the others.",
-            autocompletion=complete("solvers"),
+        named(
+            "solvers", "Only this entry; repeatable. Default: all of our solvers on points, a few of the others."
         ),
     ] = None,
     problems: Annotated[

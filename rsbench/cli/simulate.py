@@ -11,7 +11,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo, print_table, progress_bar, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ def simulate(
     ],
     trials: Annotated[int | None, typer.Option(min=1, help="Repetitions per value instead of the card's.")] = None,
     solver: Annotated[
-        list[str] | None,
-        typer.Option(help="Solver card instead of the sweep's; repeatable.", autocompletion=complete("solvers")),
+        list[str] | None, named("solvers", "Solver card instead of the sweep's; repeatable.")
     ] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="FIELD=VALUE to replace in the card's setting; repeatable.")

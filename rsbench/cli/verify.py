@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rsbench.cli.console import echo, late_progress, print_rows, print_table, progress_bar, report_faults, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import named
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -46,10 +46,7 @@ def verify(
         Rerender, typer.Option(help="Rows to render again where the scene can be built here: auto takes seconds.")
     ] = Rerender.AUTO,
     scene: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Card, or moving mesh, that is not rsbench's own; repeatable.", autocompletion=complete("scenes")
-        ),
+        list[str] | None, named("scenes", "Card, or moving mesh, that is not rsbench's own; repeatable.")
     ] = None,
     fast: Annotated[
         bool,
