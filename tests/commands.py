@@ -10,6 +10,7 @@ import contextlib
 import functools
 import io
 import json
+import os
 import subprocess
 import sys
 import tomllib
@@ -47,6 +48,17 @@ def run_here(*arguments: object, text: str = "", **environment: str) -> subproce
         finally:
             console.be_quiet(False)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def run_apart(
+    *arguments: object, path: Path | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run ``rsbench`` in a new process, which finds the packages in ``path``."""
+    variables = os.environ | environment
+    if path is not None:
+        variables["PYTHONPATH"] = os.pathsep.join([str(path), *filter(None, [variables.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", "rsbench", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=variables)
 
 
 @functools.cache

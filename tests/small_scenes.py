@@ -9,6 +9,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from rsbench.core.rig import StereoRig
+
 SCENE = """
 name = "{name}"
 builder = "mesh"
@@ -59,3 +61,11 @@ def write_small_card(folder: Path, scenes: Sequence[Path]) -> Path:
     card = folder / "small.toml"
     card.write_text("\n".join([DATASET, *sequences]))
     return card
+
+
+def write_rig(path: Path, rig: StereoRig, readout_ratio: float | None = None, more: str = "") -> Path:
+    """Write a rig of two equal aligned cameras as rig.toml; ``more`` is appended to the table of its camera."""
+    ratio = "" if readout_ratio is None else f"readout_ratio = {readout_ratio}\n"
+    camera = "".join(f"{name} = {getattr(rig.camera, name)}\n" for name in ("fx", "fy", "cx", "cy"))
+    path.write_text(f"baseline = {rig.baseline}\n{ratio}[camera]\n{camera}{more}", "utf-8")
+    return path

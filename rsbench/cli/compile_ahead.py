@@ -126,10 +126,8 @@ def parts() -> list[Callable[[], object]]:
     from rsbench.pipeline.frame_motion import solve_frames
 
     rig = StereoRig(camera=PinholeCamera.centred(_WIDTH, _HEIGHT, 150.0), baseline=0.3)
-    shutter, motion = (
-        RollingShutter(height=_HEIGHT, readout_ratio=0.8),
-        LinearMotion([0.0, 0.02, 0.0], [0.1, 0.0, 0.2]),
-    )
+    shutter = RollingShutter(height=_HEIGHT, readout_ratio=0.8)
+    motion = LinearMotion([0.0, 0.02, 0.0], [0.1, 0.0, 0.2])
     options, images = CorrectionOptions(motion_model="auto"), _images()
     known = KnownInputs(readout_ratio=shutter.readout_ratio)
     few = SimulationOptions(pairs=80, tracks=80, noise_px=0.1)

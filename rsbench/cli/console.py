@@ -5,17 +5,18 @@ Texts are printed literally: brackets such as ``[view]`` are not taken for rich'
 
 from __future__ import annotations
 
+import json as json_module
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rsbench.core.errors import printable
+import typer
+
+from rsbench.core.errors import RsbenchError, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     import pandas as pd
     from rich.progress import Progress, ProgressColumn
 
@@ -30,15 +31,8 @@ def be_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
-def is_quiet() -> bool:
-    """Whether ``--quiet`` was given, for a command whose result is a table."""
-    return _quiet
-
-
 def echo(text: str | None, err: bool = False, nl: bool = True) -> None:
     """Print results on stdout, or errors and notes on stderr; control characters are escaped."""
-    import typer
-
     typer.echo(printable(text or ""), err=err, nl=nl)
 
 
@@ -50,13 +44,42 @@ def say(note: str) -> None:
 
 def report_faults(faults: Sequence[str], summary: str) -> None:
     """Print each fault on stderr and the summary on stdout; exit code 1 if there is a fault."""
-    import typer
-
     for fault in faults:
         echo(f"fault: {fault}", err=True)
     echo(summary)
     if faults:
         raise typer.Exit(1)
+
+
+def print_json(value: object, **options: Any) -> None:
+    """Print a value as one line of JSON."""
+    echo(json_module.dumps(value, **options))
+
+
+def print_answers(
+    found: Iterable[dict[str, Any] | RsbenchError],
+    json: bool,
+    good: str,
+    show: Callable[[list[dict[str, Any]]], None],
+) -> None:
+    """Print an answer for each input: as JSON when it comes, or all together by ``show``; errors on stderr.
+
+    Exit code 2 where an input is wrong, 1 where the value of an answer at the key ``good`` is false.
+    """
+    answers, code = list[dict[str, Any]](), 0
+    for answer in found:
+        if isinstance(answer, RsbenchError):
+            code = 2
+            echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
+            continue
+        code = code or int(not answer[good])
+        if json:
+            print_json(answer, allow_nan=False)
+        else:
+            answers.append(answer)
+    show(answers)
+    if code:
+        raise typer.Exit(code)
 
 
 def _progress(
@@ -117,6 +140,15 @@ def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None =
         for row in frame.itertuples(index=False)
     ]
     print_rows(title, [str(column) for column in frame.columns], rows, numeric)
+
+
+def print_records(rows: Sequence[dict[str, str]], right: Iterable[str] = ()) -> None:
+    """The table that is a command's result; with ``--quiet`` its rows alone, with tabs between the cells."""
+    if _quiet:
+        for row in rows:
+            echo("\t".join(row.values()))
+    elif rows:
+        print_rows("", list(rows[0]), [list(row.values()) for row in rows], right)
 
 
 def print_rows(

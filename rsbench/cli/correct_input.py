@@ -2,56 +2,28 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rsbench.core.so3 import FloatArray
-    from rsbench.interop.readers.rig_files import Readout
-    from rsbench.pipeline.footage import FrameSource, Part, RigCard
-    from rsbench.pipeline.mono_camera import OneCameraCard
+from rsbench.cli.console import echo
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES
+from rsbench.dataset.corrected_frames import is_video, page_of_video, said_fps
+from rsbench.dataset.layout import picture_file
+from rsbench.dataset.sequence import Sequence, read_dataset_manifest, read_sequence
+from rsbench.interop.readers.gyro_log import read_gyro_log
+from rsbench.interop.readers.rig_files import Readout, read_camera_file, read_rig_file
+from rsbench.pipeline.footage import IMAGE_SUFFIXES, FrameSource, Part, RigCard, rig_card_of
+from rsbench.pipeline.mono_camera import OneCameraCard
+from rsbench.pipeline.mono_gyro import FARTHEST_S
+from rsbench.pipeline.sequence_capture import Gyroscope
+from rsbench.storage.files import check_out as can_be_written
 
 _MOST = 1e9
 _SAME_RATE = 0.01
 """Relative difference of frame rates, up to which they are one, as 29.97 and 30."""
-
-EPILOG = """[bold]Examples[/bold]
-
-  rsbench correct video.mp4     [dim](of one camera; writes video-corrected.mp4 and a report)[/dim]
-
-  rsbench correct a.png b.png c.png --shutter gopro-hero6-4k30 --out corrected
-
-  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected
-
-  rsbench correct --left left.mp4 --right right.mp4 --rig rig.toml --out corrected --target middle
-
-  rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model twist
-
-  rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
-
-RIG is a calibration of Kalibr, OpenCV, ROS, ZED, DepthAI, RealSense, COLMAP, Basalt or OpenVINS as it is, a file
-or a folder of files that belong together ([bold]rsbench rig RIG[/bold] shows what is understood), or rig.toml,
-here of two equal aligned cameras (pixels, metres; without readout_ratio and scan both are found):
-
-  baseline = 0.12
-  readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
-                             # camera's mode (rsbench list shutters)[/dim]
-  \\[camera]
-  fx = 812.3                 [dim]# focal_sigma = 8 beside it: not sure (812 +- 8), so it is found[/dim]
-  fy = 812.3
-  cx = 479.5
-  cy = 269.5
-  lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt, rational, double-sphere[/dim]
-  k1_sigma = 0.02            [dim]# k1 = -0.2 +- 0.02, likewise[/dim]
-
-Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
-
-DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
-(of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
-the other camera, 64 from the other frame, 32 a narrow hole closed from around it, 0 seen by nobody) and
-[bold]motion.json[/bold]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,23 +35,19 @@ class GyroscopeOptions:
     offset_s: float | None
 
     def __post_init__(self) -> None:
-        from rsbench.core.errors import RsbenchError
-
         if self.file is None and self.offset_s is not None:
             raise RsbenchError("--gyro-offset: needs --gyro, a gyroscope's log")
 
-    def samples(self, source: FrameSource, rate: float | None = None) -> FloatArray | None:
-        """(n, 4) tau, w; None without a log. ``rate``: frames per second by the frames' own times.
+    def read(self, source: FrameSource, one_camera: bool) -> Gyroscope | None:
+        """The samples, and how far their clock may be off; None without a log.
 
         Raises:
             RsbenchError: a log that cannot be read, is of another time, or frames without a known rate.
         """
-        from rsbench.core.errors import RsbenchError
-        from rsbench.interop.readers.gyro_log import read_gyro_log
-
         if self.file is None:
             return None
-        fps, offset_s = self._fps(source, rate), self.offset_s or 0.0
+        period = source.timeline.period_s if one_camera else None
+        fps, offset_s = self._fps(source, None if period is None else 1.0 / period), self.offset_s or 0.0
         if not abs(offset_s) < _MOST:
             raise RsbenchError(f"--gyro-offset {offset_s:g}: must lie within {_MOST:g} seconds")
         samples = read_gyro_log(self.file).samples(fps, offset_s)
@@ -89,19 +57,11 @@ class GyroscopeOptions:
                 f"{self.file}: lasts from {samples[0, 0] / fps:.3g} to {samples[-1, 0] / fps:.3g} s after the "
                 f"first frame, and the frames {last / fps:.3g} s: give --gyro-offset"
             )
-        return samples
+        unsure = one_camera and self.offset_s is None
+        return Gyroscope(samples=samples, clock_error=FARTHEST_S * fps if unsure else 0.0)
 
-    def farthest(self, source: FrameSource, rate: float | None = None) -> float:
-        """Frame periods within which its clock may be off; 0 where the offset is given."""
-        from rsbench.pipeline.mono_gyro import FARTHEST_S
-
-        return FARTHEST_S * self._fps(source, rate) if self.offset_s is None else 0.0
-
-    def _fps(self, source: FrameSource, rate: float | None = None) -> float:
-        """Raises RsbenchError where neither `--fps` nor the video gives it."""
-        from rsbench.core.errors import RsbenchError
-        from rsbench.dataset.corrected_frames import said_fps
-
+    def _fps(self, source: FrameSource, rate: float | None) -> float:
+        """``--fps``, or the rate by the frames' own times; RsbenchError where there is none."""
         fps = (rate or said_fps(source.path)) if self.fps is None else self.fps
         if fps is None:
             raise RsbenchError("--fps: is required with --gyro and images, which have no frame rate")
@@ -129,10 +89,6 @@ class ReadoutOptions:
         Raises:
             RsbenchError: options that exclude each other, or ``--fps`` that nothing needs.
         """
-        from rsbench.core.errors import RsbenchError
-        from rsbench.dataset.corrected_frames import said_fps
-        from rsbench.interop.readers.rig_files import Readout
-
         tables = path is None or path.suffix == ".toml"
         if tables and not gyro and self.fps is not None and self.shutter is None:
             raise RsbenchError("--fps: needs --gyro or --shutter; a .toml file says its own seconds")
@@ -146,22 +102,19 @@ def size_of(frames: list[Path] | Path, part: Part = "whole") -> Callable[[], tup
     """A function that gives the (width, height) of the first of some frames, a folder's or a video's."""
 
     def size() -> tuple[int, int]:
-        height, width = next(iter(_source(frames, part))).shape[:2]
+        height, width = next(iter(frame_source(frames, part))).shape[:2]
         return width, height
 
     return size
 
 
-def _source(frames: list[Path] | Path, part: Part = "whole") -> FrameSource:
-    from rsbench.pipeline.footage import FrameSource
-
+def frame_source(frames: list[Path] | Path, part: Part = "whole") -> FrameSource:
+    """Images, or a folder or video."""
     return FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames, part)
 
 
 def say_notes(option: str, notes: tuple[str, ...]) -> None:
     """What was assumed of a calibration, a line each, on stderr."""
-    from rsbench.cli.console import echo
-
     for note in notes:
         echo(f"rsbench: note: {option}: {note}", err=True)
 
@@ -199,8 +152,6 @@ def arranged(
     Raises:
         RsbenchError: files that do not exist or do not go together.
     """
-    from rsbench.core.errors import RsbenchError
-
     files = frames or []
     for path in files:
         if not path.exists():
@@ -224,8 +175,6 @@ def arranged(
 
 
 def _arranged_films(films: list[Path], files: list[Path], rig: Path | None, side_by_side: bool) -> Arranged:
-    from rsbench.core.errors import RsbenchError
-
     kind, rigged = "folder" if films[0].is_dir() else "video", rig is not None
     if len(films) < len(files) or len(films) > 2 or (side_by_side and len(films) == 2):
         raise RsbenchError(
@@ -251,8 +200,6 @@ def _arranged_films(films: list[Path], files: list[Path], rig: Path | None, side
 
 
 def _arranged_images(files: list[Path], rig: Path | None) -> Arranged:
-    from rsbench.core.errors import RsbenchError
-
     if len(files) == 1:
         raise RsbenchError(
             f"{files[0]}: one image does not show how its camera moved; give two, a folder or a video"
@@ -269,15 +216,11 @@ def _arranged_images(files: list[Path], rig: Path | None) -> Arranged:
 
 
 def _is_image(path: Path) -> bool:
-    from rsbench.pipeline.footage import IMAGE_SUFFIXES
-
     return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def _nearest(path: Path) -> str:
     """The names beside a path that are like it, for a message."""
-    import difflib
-
     folder = path.parent
     names = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
     near = difflib.get_close_matches(path.name, names, 3)
@@ -295,10 +238,6 @@ def check_out(out: Path) -> None:
     Raises:
         RsbenchError: the ending of an image or of a video that is not written, or a file where a folder has to be.
     """
-    from rsbench.core.errors import RsbenchError
-    from rsbench.dataset.corrected_frames import is_video
-    from rsbench.storage.files import check_out as can_be_written
-
     video = is_video(out)
     if _is_image(out):
         raise RsbenchError(f"--out {out}: several frames are no image; give a folder, or a video (.mp4)")
@@ -334,12 +273,20 @@ class CorrectInput:
         """Whether one camera took all frames."""
         return len(self.footage) == 1
 
+    @property
+    def video(self) -> bool:
+        """Whether the result is a video."""
+        return is_video(self.out)
+
+    @property
+    def page(self) -> Path:
+        """Where the page will be."""
+        return page_of_video(self.out) if self.video else self.out / "report.html"
+
     def sources(self) -> list[FrameSource]:
         """The frames of each camera."""
-        from rsbench.core.rig import SIDES
-
         parts: tuple[Part, ...] = SIDES if self.side_by_side else ("whole",) * len(self.footage)
-        return [_source(each, part) for each, part in zip(self.footage, parts, strict=True)]
+        return [frame_source(each, part) for each, part in zip(self.footage, parts, strict=True)]
 
 
 def given_camera(
@@ -351,39 +298,24 @@ def given_camera(
     readout: ReadoutOptions,
 ) -> CorrectInput:
     """The frames of one camera; RsbenchError for options that do not go together."""
-    from rsbench.interop.readers.rig_files import read_camera_file
-
     files: list[Path] | Path = given.frames if given.frames is not None else given.left or Path()
-    source = _source(files)
+    source = frame_source(files)
     stated = readout.beside(camera, gyro.file is not None, source.path)
     card, notes = read_camera_file(camera, stated, size_of(files))
     say_notes("--camera", notes)
-    card = _with_fov(card, fov)
+    if fov is not None:
+        if not card.focal_unknown:
+            raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
+        try:
+            card = replace(card, fov_deg=fov)
+        except ValueError as error:
+            raise RsbenchError(f"--fov: {error}") from error
     _warn_of_other_rate(card, source, gyro.fps)
     return CorrectInput(card=card, out=out, footage=[files], words=given.words, gyro=gyro)
 
 
-def _with_fov(card: OneCameraCard, fov: float | None) -> OneCameraCard:
-    """The card with the field of view of ``--fov``."""
-    from dataclasses import replace
-
-    from rsbench.core.errors import RsbenchError
-
-    if fov is None:
-        return card
-    if not card.focal_unknown:
-        raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
-    try:
-        return replace(card, fov_deg=fov)
-    except ValueError as error:
-        raise RsbenchError(f"--fov: {error}") from error
-
-
 def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: float | None) -> None:
     """Warn if the card's readout ratio assumes another frame rate than the frames have."""
-    from rsbench.cli.console import echo
-    from rsbench.dataset.corrected_frames import said_fps
-
     fps = said_fps(source.path) if fps_option is None else fps_option
     if card.frame_period_s is None or card.readout_ratio is None or fps is None or not fps > 0.0:
         return
@@ -400,28 +332,22 @@ def _warn_of_other_rate(card: OneCameraCard, source: FrameSource, fps_option: fl
 
 
 def given_frames(
-    frames: list[Path] | None,
+    given: Arranged,
     rig: Path | None,
-    out: Path | None,
-    left: Path | None,
-    right: Path | None,
+    out: Path,
     gyro: GyroscopeOptions,
     readout: ReadoutOptions,
-    row_poses: bool = False,
-    side_by_side: bool = False,
+    row_poses: bool,
+    side_by_side: bool,
 ) -> CorrectInput:
-    """Raises RsbenchError for another combination of arguments."""
-    from rsbench.core.errors import RsbenchError
-    from rsbench.interop.readers.rig_files import read_rig_file
-
-    rendered = frames is not None and len(frames) == 1 and is_rendered(frames[0])
-    if out is None or (rig is None and not rendered):
-        raise RsbenchError(f"--{'out' if rig is not None or rendered else 'rig'}: is required")
-    if frames and rendered:
+    """The frames of a rig; RsbenchError for options that do not go together."""
+    frames, left, right = given.frames, given.left, given.right
+    if frames is not None and len(frames) == 1 and is_rendered(frames[0]):
         if rig or left or right or readout.any:
             raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
         return _of_sequence(frames[0], out, gyro, row_poses)
-    assert rig is not None
+    if rig is None:
+        raise RsbenchError("--rig: is required")
     for option, wanted in (("--row-poses", row_poses), ("--gyro", gyro.file is not None)):
         if wanted and frames:
             raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
@@ -430,45 +356,40 @@ def given_frames(
     say_notes("--rig", notes)
     if frames is not None and len(frames) == 4 and not (left or right):
         return CorrectInput(card=card, out=out, four=frames, gyro=gyro)
-    if side_by_side and left and not (frames or right):
-        return CorrectInput(
-            card=card, out=out, footage=[left, left], gyro=gyro, row_poses=row_poses, side_by_side=True
-        )
-    if frames or not (left and right):
+    other = left if side_by_side and not right else right
+    if frames or not (left and other):
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(
             f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
         )
-    return CorrectInput(card=card, out=out, footage=[left, right], gyro=gyro, row_poses=row_poses)
+    halves = side_by_side and not right
+    return CorrectInput(
+        card=card, out=out, footage=[left, other], gyro=gyro, row_poses=row_poses, side_by_side=halves
+    )
 
 
 def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> CorrectInput:
     """The rolling-shutter frames of a sequence of a dataset."""
-    from rsbench.core.errors import RsbenchError
-    from rsbench.core.rig import SIDES
-    from rsbench.dataset.layout import picture_file
-    from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
-    from rsbench.pipeline.footage import rig_card_of
-
     if not (folder / "sequence.json").is_file():
         names = read_dataset_manifest(folder).sequences
         if len(names) > 1:
             raise RsbenchError(f"{folder}: is a dataset; give one of its sequences: {', '.join(names)}")
         folder = folder / names[0]
     sequence = read_sequence(folder)
-    footage: list[list[Path] | Path] = [
-        [folder / picture_file("rs", side, frame) for frame in range(sequence.frames)] for side in SIDES
-    ]
     card = rig_card_of(sequence.rig, sequence.shutter)
     if gyro.file is not None and gyro.fps is None:
         gyro = replace(gyro, fps=1.0 / sequence.frame_period_s)
-    return CorrectInput(card=card, out=out, footage=footage, gyro=gyro, row_poses=row_poses)
+    return CorrectInput(card=card, out=out, footage=sequence_files(sequence), gyro=gyro, row_poses=row_poses)
+
+
+def sequence_files(sequence: Sequence) -> list[list[Path] | Path]:
+    """The rolling-shutter frames of the left and the right camera of a rendered sequence."""
+    frames = range(sequence.frames)
+    return [[sequence.folder / picture_file("rs", side, frame) for frame in frames] for side in SIDES]
 
 
 def target_row(target: str, height: int) -> float:
     """The row that ``--target`` names; RsbenchError where there is none."""
-    from rsbench.core.errors import RsbenchError
-
     named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
     if target in named:
         return named[target]

@@ -3,53 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.cli.console import echo
-
-if TYPE_CHECKING:
-    from rsbench.capture.two_frame_estimate import Capture
-    from rsbench.core.rig import StereoRig
-    from rsbench.core.shutter import RollingShutter
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import RollingShutter
+from rsbench.report.motion_figures import sizes
 
 _MOST_LISTED = 8
+SUBTITLE = "Rolling shutter to global shutter"
 UNIT = "length of the translation over one frame period"
 """Unit of the depth of one camera's frames."""
 
 
-def write_page_of(
-    folder: Path,
-    out: Path,
-    facts: list[tuple[str, str]],
-    motion: dict[str, Any] | None,
-    cards: list[Any],
-    trajectory: dict[str, Any] | None = None,
-    *,
-    page: Path | None = None,
-    record: dict[str, Any] | None = None,
-    video: Path | None = None,
-) -> None:
-    """The page; arguments as of ``write_page``, ``motion``: of four frames."""
-    from rsbench.report.corrected_page import write_page
-    from rsbench.report.motion_figures import sizes
-
-    if motion is not None:
-        names = "rotation in a frame period", "translation in a frame period"
-        facts += zip(names, sizes(motion), strict=True)
-        if motion["model_choice"]:
-            facts += [("motion model", motion["model_choice"]["text"])]
-        facts += [("matches that agree", _agreeing(motion))]
-        facts += [("noise of a match", f"{motion['noise_px'] or float('nan'):.2f} px")]
-    title, shown = f"rsbench correct: {out.name}", video.name if video is not None and video.is_file() else ""
-    subtitle = "Rolling shutter to global shutter" + ("" if record is None else "; the frames that changed most")
-    write_page(folder, title, subtitle, facts, cards, trajectory, page=page, record=record, video=shown)
-
-
-def _agreeing(motion: dict[str, Any]) -> str:
-    """Of each set, such as "312 of 340 tracks"; sets that the solver did not use are left out."""
+def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """What the page of four frames says of their motion."""
+    if motion is None:
+        return []
+    names = "rotation in a frame period", "translation in a frame period"
+    facts = [*zip(names, sizes(motion), strict=True)]
+    if motion["model_choice"]:
+        facts += [("motion model", motion["model_choice"]["text"])]
+    # Of each set of matches; those that the solver did not use are left out.
     sets = ((name, inliers, motion["matches"][name]) for name, inliers in motion["inliers"].items())
-    return ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
+    agreeing = ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
+    noise = f"{motion['noise_px'] or float('nan'):.2f} px"
+    return [*facts, ("matches that agree", agreeing), ("noise of a match", noise)]
 
 
 def camera_facts(record: dict[str, Any]) -> dict[str, str]:

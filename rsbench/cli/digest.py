@@ -51,7 +51,3 @@ def digest(
         return
     faults = differences(found, known)
     report_faults(faults, f"{folder}: {len(found)} sequences, {len(faults)} faults")
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(digest)

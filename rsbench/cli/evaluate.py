@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,8 +14,6 @@ from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import pandas as pd
 
     from rsbench.benchmark.images.plan import EvaluationOptions
@@ -34,54 +33,45 @@ DIR gets [bold]predictions/[/bold], [bold]scores/*.csv[/bold] (rsbench docs scor
 components, is kept and scored; nothing is deleted."""
 
 
-_Out = Annotated[
-    str,
-    typer.Option(
-        metavar="DIR",
-        help="Folder for predictions, scores, pictures and the report, or a URL such as s3://bucket/folder.",
-    ),
-]
-_Solvers = Annotated[
-    list[str] | None,
-    named("solvers", "Solver to score, a name or a card; repeatable. Default: all that come with rsbench."),
-]
-_CorrectWith = Annotated[str, named("solvers", "Solver whose motion the correction uses; it is scored too.")]
-_Matcher = Annotated[str, named("matchers", "Stereo matcher, a name or a card.")]
-_Features = Annotated[str, named("features", "Feature matcher, a name or a card.")]
-_Corrector = Annotated[str, named("correctors", "Corrector, a name or a card.")]
 _OF_A_RIG = "fusion"
-_Metrics = Annotated[
-    list[str] | None,
-    named("metrics", "Metric that adds columns, a name or a card; repeatable."),
-]
-_Only = Annotated[
-    list[str] | None,
-    typer.Option(metavar="SOLVER|SEQUENCE", help="Predict nothing else; repeatable. All is scored."),
-]
-
-_Workers = Annotated[
-    int | None,
-    typer.Option(min=1, help="Processes of one thread that predict and score a sequence each. Default: 1."),
-]
 
 
 def evaluate(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
-    out: _Out,
-    solver: _Solvers = None,
-    correct_with: _CorrectWith = "rs-stereo-refined",
-    matcher: _Matcher = "sgm",
-    features: _Features = "sift",
-    corrector: _Corrector = _OF_A_RIG,
-    metric: _Metrics = None,
-    only: _Only = None,
+    out: Annotated[
+        str,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for predictions, scores, pictures and the report, or a URL such as s3://bucket/folder.",
+        ),
+    ],
+    solver: Annotated[
+        list[str] | None,
+        named("solvers", "Solver to score, a name or a card; repeatable. Default: all that come with rsbench."),
+    ] = None,
+    correct_with: Annotated[
+        str, named("solvers", "Solver whose motion the correction uses; it is scored too.")
+    ] = "rs-stereo-refined",
+    matcher: Annotated[str, named("matchers", "Stereo matcher, a name or a card.")] = "sgm",
+    features: Annotated[str, named("features", "Feature matcher, a name or a card.")] = "sift",
+    corrector: Annotated[str, named("correctors", "Corrector, a name or a card.")] = _OF_A_RIG,
+    metric: Annotated[
+        list[str] | None, named("metrics", "Metric that adds columns, a name or a card; repeatable.")
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SOLVER|SEQUENCE", help="Predict nothing else; repeatable. All is scored."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     rehash: Annotated[
         bool, typer.Option("--rehash", help="Read all data and score it again, not only what changed.")
     ] = False,
-    workers: _Workers = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes of one thread that predict and score a sequence each. Default: 1."),
+    ] = None,
     scheduler: Scheduler = None,
     layout: Annotated[
         str | None,
@@ -184,19 +174,15 @@ def every_solver() -> list[str]:
 
 
 def evaluate_dataset(
-    folder: Path, out: Path, options: EvaluationOptions | None, command: str, workers: Workers = 1
+    folder: Path, out: Path, options: EvaluationOptions, command: str, workers: Workers = 1
 ) -> Path:
-    """Evaluate with a progress bar, print the tables, and return the path of the report.
-
-    ``options`` None takes every solver.
-    """
+    """Evaluate with a progress bar, print the tables, and return the path of the report."""
     from rsbench.benchmark.images.evaluation import open_evaluation
-    from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.report.evaluation_page import summary_tables, write_report
     from rsbench.storage.mirror import name_of
 
-    evaluation = open_evaluation(folder, out, options or EvaluationOptions(solvers=tuple(every_solver())))
+    evaluation = open_evaluation(folder, out, options)
     with compiling_ahead(), progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:
         stale = evaluation.run(command, advance, workers)
     for table in summary_tables(out):
@@ -207,7 +193,3 @@ def evaluate_dataset(
     page = write_report(folder, out)
     echo(f"report: {name_of(page)}")
     return page
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(evaluate)

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.console import echo, late_progress, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from rsbench.dataset.sequence import Sequence
     from rsbench.interop.writers.match_colours import Scene
 
 EXPORT_EPILOG = """[bold]Examples[/bold]
@@ -111,21 +110,20 @@ def view(
         Path | None, typer.Option(metavar="FILE.rrd", help="Write this file instead; of one sequence.")
     ] = None,
     points: Annotated[int, typer.Option(min=1, help="Points of each depth map, at most.")] = 100_000,
-    features: Annotated[
-        str,
-        typer.Option(help="Matches of data without the channel matches.", autocompletion=complete("features")),
-    ] = "sift",
+    features: Annotated[str, named("features", "Matches of data without the channel matches.")] = "sift",
 ) -> None:
     r"""Show a dataset in the Rerun viewer: rig, row poses, depth as points, images and matches over time.
 
     Needs the extra of the viewer: pip install 'rsbench\[view]'
     """
     from rsbench.interop.writers.exporter import chosen_sequences
+    from rsbench.interop.writers.match_colours import Scene, found_strips, labelled_strips
     from rsbench.storage.files import check_out
 
     if find_spec("rerun") is None:
         raise RsbenchError("the viewer is not installed: pip install 'rsbench[view]'")
-    if save is None and not _has_screen():
+    screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if save is None and not screen:
         raise RsbenchError("there is no screen (DISPLAY and WAYLAND_DISPLAY are empty): give --save FILE.rrd")
     chosen = chosen_sequences(folder, tuple(sequence or ()))[: None if sequence else 1]
     if save is not None:
@@ -136,13 +134,10 @@ def view(
         check_out(save.parent)
     with late_progress("showing") as advance:
         for each in chosen:
-            _view_one(_view_scene(each, points, features), save, advance)
+            labelled = "matches" in each.channels
+            strips = labelled_strips(each) if labelled else found_strips(each, features)
+            _view_one(Scene(each, tuple(strips), points), save, advance)
     echo(f"{save}: {chosen[0].name}" if save is not None else "sent to the viewer")
-
-
-def _has_screen() -> bool:
-    """Whether a window can open: on Linux, if a display variable is set."""
-    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def _view_one(scene: Scene, save: Path | None, advance: Callable[[str], None]) -> None:
@@ -159,11 +154,3 @@ def _view_one(scene: Scene, save: Path | None, advance: Callable[[str], None]) -
         os.replace(partial, save)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def _view_scene(sequence: Sequence, points: int, features: str) -> Scene:
-    from rsbench.interop.writers.match_colours import Scene, found_strips, labelled_strips
-
-    labelled = "matches" in sequence.channels
-    strips = labelled_strips(sequence) if labelled else found_strips(sequence, features)
-    return Scene(sequence, tuple(strips), points)

@@ -39,114 +39,111 @@ EPILOG = """[bold]Examples[/bold]
   rsbench generate standard --out data/test --seed 20271 [dim](a split of the same card that nobody has seen)[/dim]
 
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
-
-
-_Card = Annotated[
-    str,
-    typer.Argument(
-        help="Name of a dataset card (see: rsbench list datasets) or path to one.",
-        autocompletion=complete("datasets"),
-    ),
-]
-_Out = Annotated[
-    str,
-    typer.Option(
-        metavar="DIR",
-        help="Folder of the dataset, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
-    ),
-]
-_Only = Annotated[
-    list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable.")
-]
-_Shard = Annotated[
-    str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences: one machine's.")
-]
-_FullFrames = Annotated[
-    bool, typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow).")
-]
 _Channels = Annotated[
     str | None,
     typer.Option(
-        help="Channels of truth in place of the card's, with commas between: disparity, flow, gs_flow, timing, "
-        "normals, instances, imu, tracks, affine, hdr, matches; or all; or none."
-    ),
-]
-_Trajectory = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE", help="Poses (TUM format) along which the rig moves, in place of the card's motion."
-    ),
-]
-_Seed = Annotated[
-    list[int] | None,
-    typer.Option(min=0, help="In place of the card's seeds: other motions and noise. Repeatable."),
-]
-_Split = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Another split of the card, such as train: each sequence with a scene, motion and noise of its own, "
-        "drawn from this name. Cards of its scenes go to DIR-scenes.",
-    ),
-]
-_Sequences = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=100_000,
-        help="With --split: how many, in place of as many as the card has; beyond these it is drawn again, with "
-        "other scenes.",
-    ),
-]
-_Rehash = Annotated[
-    bool, typer.Option("--rehash", help="Read all that is there again, not only what has another size or time.")
-]
-_Estimate = Annotated[
-    bool,
-    typer.Option("--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."),
-]
-_Backend = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="What renders: llvm, cuda or scalar; default: the environment's RSBENCH_VARIANT, else the first that "
-        "works. Pixels of two backends differ by rounding.",
+        help="Channels of truth in place of the card's, with commas between: disparity, flow, gs_flow, "
+        "timing, normals, instances, imu, tracks, affine, hdr, matches; or all; or none."
     ),
 ]
 
 
 def generate(
-    card: _Card,
-    out: _Out,
-    sequence: _Only = None,
-    shard: _Shard = None,
+    card: Annotated[
+        str,
+        typer.Argument(
+            help="Name of a dataset card (see: rsbench list datasets) or path to one.",
+            autocompletion=complete("datasets"),
+        ),
+    ],
+    out: Annotated[
+        str,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the dataset, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
+        ),
+    ],
+    sequence: Annotated[
+        list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences: one machine's.")
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes; each renders whole sequences. Default: 1.")
     ] = None,
     scheduler: Scheduler = None,
-    full_frames: _FullFrames = False,
+    full_frames: Annotated[
+        bool,
+        typer.Option("--full-frames", help="The paper's recipe: render and keep a whole image per row (slow)."),
+    ] = False,
     channels: _Channels = None,
-    trajectory: _Trajectory = None,
-    seed: _Seed = None,
-    split: _Split = None,
-    sequences: _Sequences = None,
-    rehash: _Rehash = False,
-    estimate: _Estimate = False,
-    backend: _Backend = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Poses (TUM format) along which the rig moves, in place of the card's motion."
+        ),
+    ] = None,
+    seed: Annotated[
+        list[int] | None,
+        typer.Option(min=0, help="In place of the card's seeds: other motions and noise. Repeatable."),
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Another split of the card, such as train: each sequence with a scene, motion and noise of its "
+            "own, drawn from this name. Cards of its scenes go to DIR-scenes.",
+        ),
+    ] = None,
+    sequences: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=100_000,
+            help="With --split: how many, in place of as many as the card has; beyond these it is drawn again, "
+            "with other scenes.",
+        ),
+    ] = None,
+    rehash: Annotated[
+        bool,
+        typer.Option("--rehash", help="Read all that is there again, not only what has another size or time."),
+    ] = False,
+    estimate: Annotated[
+        bool,
+        typer.Option(
+            "--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."
+        ),
+    ] = False,
+    backend: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="What renders: llvm, cuda or scalar; default: the environment's RSBENCH_VARIANT, else the first "
+            "that works. Pixels of two backends differ by rounding.",
+        ),
+    ] = None,
 ) -> None:
     """Render a dataset: rolling-shutter stereo frames, exact depth, row poses and global-shutter twins."""
+    from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.destinations import store_for
     from rsbench.dataset.generation import generate_dataset, steps_of
-    from rsbench.renderers.backend import start_backend
+    from rsbench.renderers.backend import ask_for, start_backend
     from rsbench.storage.files import check_out
     from rsbench.storage.object_store import path_or_url, shown
 
     processes, place = chosen_workers(workers, scheduler), shared_path(path_or_url(out), scheduler)
-    whole = _whole(card, trajectory, tuple(seed or ()), place, split, sequences)
+    whole = load_dataset_card(card, trajectory, tuple(seed or ()))
+    if split is not None:
+        whole = _split(card, split, place, bool(trajectory or seed), sequences)
+    elif sequences is not None:
+        raise RsbenchError("--sequences: goes with --split; --sequence and --shard give a part of the card")
     dataset = _chosen(whole, sequence, shard, channels)
     if not estimate:
         _ = check_out(place) if isinstance(place, Path) else store_for(place, processes)
-    _ask_for(backend, scheduler)
+    if backend is not None and scheduler is not None:
+        raise RsbenchError("--backend: not with --scheduler: set RSBENCH_VARIANT where its workers start")
+    ask_for(backend)  # of this process and of those that it starts, which the workers of a cluster are not
     if (started := start_backend()).message:
         echo(started.message, err=True)
     if estimate:
@@ -157,36 +154,7 @@ def generate(
         rendered = generate_dataset(
             dataset, place, workers=processes, full_frames=full_frames, rehash=rehash, progress=advance
         )
-    words = f"{len(dataset.sequence)} sequences, {len(rendered)} rendered now"
-    echo(f"{shown(str(place))}: {words}")
-
-
-def _ask_for(backend: str | None, scheduler: str | None) -> None:
-    """The backend of this process and of those that it starts, which the workers of a cluster are not."""
-    from rsbench.renderers.backend import ask_for
-
-    if backend is not None and scheduler is not None:
-        raise RsbenchError("--backend: not with --scheduler: set RSBENCH_VARIANT where its workers start")
-    ask_for(backend)
-
-
-def _whole(
-    card: str,
-    trajectory: Path | None,
-    seeds: tuple[int, ...],
-    place: Path | str,
-    split: str | None,
-    sequences: int | None,
-) -> DatasetCard:
-    """A card, or a split of it, with all of its sequences."""
-    from rsbench.dataset.card import load_dataset_card
-
-    own = load_dataset_card(card, trajectory, seeds)
-    if split is not None:
-        return _split(card, split, place, bool(trajectory or seeds), sequences)
-    if sequences is not None:
-        raise RsbenchError("--sequences: goes with --split; --sequence and --shard give a part of the card")
-    return own
+    echo(f"{shown(str(place))}: {len(dataset.sequence)} sequences, {len(rendered)} rendered now")
 
 
 def _split(card: str, name: str, place: Path | str, changed: bool, count: int | None) -> DatasetCard:
@@ -215,16 +183,11 @@ def _chosen(
     if sequence:
         dataset = dataset.only(sequence)
     if shard is not None:
-        dataset = dataset.shard(*_part(shard))
+        part, slash, parts = shard.partition("/")
+        if not (slash and part.isdecimal() and parts.isdecimal()):
+            raise RsbenchError(f"--shard {shard}: must be I/N, such as 1/4")
+        dataset = dataset.shard(int(part), int(parts))
     return dataset if channels is None else dataset.with_channels(named_channels(channels))
-
-
-def _part(word: str) -> tuple[int, int]:
-    """The two numbers of a shard I/N: 2 and 5 for ``2/5``."""
-    part, slash, parts = word.partition("/")
-    if not (slash and part.isdecimal() and parts.isdecimal()):
-        raise RsbenchError(f"--shard {word}: must be I/N, such as 1/4")
-    return int(part), int(parts)
 
 
 def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
@@ -242,7 +205,3 @@ def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
         f"{dataset.name}: {found.sequences} sequences, {found.files} files, about {size}, about {minutes} in one "
         "process on this machine"
     )
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(generate)

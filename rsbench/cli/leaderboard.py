@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,11 +14,10 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo, print_rows, progress_bar
-from rsbench.cli.names import complete
+from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from rsbench.benchmark.leaderboard.board import Scored
@@ -58,7 +59,12 @@ _SHOWN = (
 )
 """Keys of the scores whose medians tables on a terminal have."""
 
-board_app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", epilog=EPILOG)
+board_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    epilog=EPILOG,
+    help="Score predictions on tracks and rank them with intervals; predictions come from any language.",
+)
 
 Track = Annotated[
     str,
@@ -79,18 +85,12 @@ Hidden = Annotated[
 
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
 _Board = Annotated[Path, typer.Option(help="Folder of the board.")]
-_BoardOrUrl = Annotated[
-    str, typer.Option(metavar="DIR", help="Folder of the board, or a URL such as s3://bucket/folder.")
-]
 _File = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="Predictions: JSON lines; the folder 'pictures' beside it is read too."),
 ]
 _Seed = Annotated[
     Path, typer.Option("--seed-file", metavar="FILE", help="Secret text, 16 characters or more, drawn at random.")
-]
-_Card = Annotated[
-    str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
 ]
 
 
@@ -178,21 +178,24 @@ def run(
     track: Track,
     entry: Annotated[
         list[str],
-        typer.Option(
-            help="Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
-            autocompletion=complete("solvers"),
+        named(
+            "solvers",
+            "Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
         ),
     ],
-    board: _BoardOrUrl,
+    board: Annotated[
+        str, typer.Option(metavar="DIR", help="Folder of the board, or a URL such as s3://bucket/folder.")
+    ],
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
     problems: Annotated[
         int | None, typer.Option(min=1, help="Only the first ones: a split of its own on the board.")
     ] = None,
-    beside: Annotated[
+    stored: Annotated[
         Path | None,
         typer.Option(
+            "--beside",
             metavar="DIR",
             help="Stored predictions to rank beside, not added to the board. "
             "Default: those of this track in results/*/predictions of the working folder.",
@@ -218,7 +221,11 @@ def run(
 
     processes = chosen_workers(workers, scheduler, os.cpu_count() or 1)
     whole = split_of(track, data, seed_file, secret)
-    split, others = _first(whole, problems), _stored(whole, beside)
+    split, others = whole, _stored(whole, stored)
+    if problems is not None and problems > len(whole.truths):
+        raise RsbenchError(f"--problems {problems}: split {whole.name} has {len(whole.truths)}")
+    if problems is not None and problems < len(whole.truths):
+        split = replace(whole, truths=whole.truths[:problems])
     load_cards(split.track, entry)  # before anything is written
     limits = Limits(time_limit, memory)
     with results_at(board, scheduler) as place:
@@ -240,17 +247,11 @@ def run(
                 workers=processes,
                 step=step,
             )
-        _show(place, split.track.id, split.name, None, beside=_cut(others, split))
-
-
-def _first(split: Split, problems: int | None) -> Split:
-    from dataclasses import replace
-
-    if problems is None or problems == (there := len(split.truths)):
-        return split
-    if problems > there:
-        raise RsbenchError(f"--problems {problems}: split {split.name} has {there}")
-    return replace(split, truths=split.truths[:problems])
+        # The others as if scored on the problems of a part of the split.
+        names = list(split.by_name)
+        parts = [each.scores[each.scores["problem"].isin(names)].reset_index(drop=True) for each in others]
+        beside = [replace(each, scores=part) for each, part in zip(others, parts, strict=True)]
+        _show(place, split.track.id, split.name, None, beside=beside)
 
 
 def _stored(split: Split, folder: Path | None) -> list[Scored]:
@@ -267,17 +268,6 @@ def _stored(split: Split, folder: Path | None) -> list[Scored]:
                 if folder is not None:
                     raise
     return found
-
-
-def _cut(entries: list[Scored], split: Split) -> list[Scored]:
-    """Entries of the whole split as if scored on the problems of a part of it."""
-    from dataclasses import replace
-
-    names = list(split.by_name)
-    return [
-        replace(each, scores=each.scores[each.scores["problem"].isin(names)].reset_index(drop=True))
-        for each in entries
-    ]
 
 
 @board_app.command()
@@ -378,9 +368,8 @@ def smoke(
     track: Annotated[list[str] | None, typer.Option(help="Only this track; repeatable. Default: all.")] = None,
     entry: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Only this entry; repeatable. Default: all of our solvers on points, a few of the others.",
-            autocompletion=complete("solvers"),
+        named(
+            "solvers", "Only this entry; repeatable. Default: all of our solvers on points, a few of the others."
         ),
     ] = None,
     problems: Annotated[
@@ -440,7 +429,9 @@ def publish(
         Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")
     ],
     out: Annotated[Path, typer.Option(help="Folder of what everybody may see.")],
-    card: _Card = "standard",
+    card: Annotated[
+        str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
+    ] = "standard",
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
 ) -> None:
     """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
@@ -597,17 +588,6 @@ def _cells(line: Standing) -> dict[str, str]:
         if score.key in ("flip", *line.track.beside):
             cells[score.title] = f"{100.0 * line.means[score.key][0]:.1f} %"
         elif score.key in _SHOWN:
-            cells[score.title.removesuffix(" (deg)")] = _number(line.medians[score.key])
+            value = line.medians[score.key]
+            cells[score.title.removesuffix(" (deg)")] = "-" if value != value else f"{value:.3g}"
     return cells
-
-
-def _number(value: float) -> str:
-    return "-" if value != value else f"{value:.3g}"
-
-
-def register(app: typer.Typer) -> None:
-    app.add_typer(
-        board_app,
-        name="leaderboard",
-        help="Score predictions on tracks and rank them with intervals; predictions come from any language.",
-    )

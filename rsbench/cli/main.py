@@ -24,6 +24,7 @@ from rsbench.cli import (
     solve,
     verify,
 )
+from rsbench.cli.console import be_quiet
 from rsbench.cli.export import EXPORT_EPILOG, VIEW_EPILOG, export, view
 from rsbench.cli.names import LIST_EPILOG, SHOW_EPILOG, list_, show
 from rsbench.cli.small_commands import (
@@ -69,8 +70,6 @@ def _root(
         typer.Option("--quiet", "-q", help="Before a command: no progress, no tables; results and errors only."),
     ] = False,
 ) -> None:
-    from rsbench.cli.console import be_quiet
-
     # Before OpenCV is imported, here and in child processes: our own message says what is wrong with an image.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     be_quiet(quiet)
@@ -83,27 +82,31 @@ def _show_warning(message: Warning | str, category: type[Warning], *where: objec
         typer.echo(f"rsbench: note: {printable(str(message))}", err=True)
 
 
-# In the order of the help.
-app.command(epilog="[bold]Example[/bold]  rsbench demo --scene old-town --out out/demo")(demo)
-app.command("list", epilog=LIST_EPILOG)(list_)
-app.command(epilog=SHOW_EPILOG)(show)
-app.command(epilog="[bold]Example[/bold]  rsbench doctor")(doctor)
-app.command("compile", epilog=COMPILE_EPILOG)(compile_)
-generate.register(app)
-verify.register(app)
-digest.register(app)
-app.command(epilog=VIEW_EPILOG)(view)
-app.command(epilog=EXPORT_EPILOG)(export)
-solve.register(app)
-inspect.register(app)
-rig.register(app)
-app.command("check-solver", epilog=CHECK_SOLVER_EPILOG)(check_solver)
-evaluate.register(app)
-correct.register(app)
-simulate.register(app)
-leaderboard.register(app)
-reproduce.register(app)
-app.command(epilog=DOCS_EPILOG)(docs)
+_COMMANDS = (
+    ("demo", demo, "[bold]Example[/bold]  rsbench demo --scene old-town --out out/demo"),
+    ("list", list_, LIST_EPILOG),
+    ("show", show, SHOW_EPILOG),
+    ("doctor", doctor, "[bold]Example[/bold]  rsbench doctor"),
+    ("compile", compile_, COMPILE_EPILOG),
+    ("generate", generate.generate, generate.EPILOG),
+    ("verify", verify.verify, verify.EPILOG),
+    ("digest", digest.digest, digest.EPILOG),
+    ("view", view, VIEW_EPILOG),
+    ("export", export, EXPORT_EPILOG),
+    ("solve", solve.solve, solve.EPILOG),
+    ("inspect", inspect.inspect, inspect.EPILOG),
+    ("rig", rig.rig, rig.EPILOG),
+    ("check-solver", check_solver, CHECK_SOLVER_EPILOG),
+    ("evaluate", evaluate.evaluate, evaluate.EPILOG),
+    ("correct", correct.correct, correct.EPILOG),
+    ("simulate", simulate.simulate, simulate.EPILOG),
+    ("reproduce", reproduce.reproduce, reproduce.EPILOG),
+    ("docs", docs, DOCS_EPILOG),
+)
+"""Name, function and epilog of each command, in the order of the help."""
+for _name, _function, _epilog in _COMMANDS:
+    app.command(_name, epilog=_epilog)(_function)
+app.add_typer(leaderboard.board_app, name="leaderboard")
 
 _NAMELESS = {
     errno.ENOSPC: "standard output",

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
 import itertools
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Set
 from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from rsbench.cli.console import echo, print_rows, say
+from rsbench.cli.console import print_json, print_rows, say
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -62,11 +63,12 @@ def names_of(kind: str) -> list[str]:
     return plugins.list_names(described) if described is not None else list(list_cards(kind))  # pyrefly: ignore[bad-argument-type]
 
 
-def complete(kind: str) -> Callable[[str], list[str]]:
-    """Shell completion of the names of one kind, from cards and entry points only, to be quick."""
+def complete(kind: str = "") -> Callable[[str], list[str]]:
+    """Shell completion of the names of one kind, or of all, from cards and entry points only, to be quick."""
 
     def names(incomplete: str) -> list[str]:
-        return [name for name in _quick_names(kind) if name.startswith(incomplete)]
+        found = {name for each in ([kind] if kind else kind_names()) for name in _quick_names(each)}
+        return sorted(name for name in found if name.startswith(incomplete))
 
     return names
 
@@ -81,24 +83,17 @@ def complete_kind(incomplete: str) -> list[str]:
     return [name for name in kind_names() if name.startswith(incomplete)]
 
 
-def complete_any(incomplete: str) -> list[str]:
-    """Shell completion of a name of any kind."""
-    names = {name for kind in kind_names() for name in _quick_names(kind)}
-    return sorted(name for name in names if name.startswith(incomplete))
-
-
-def _quick_names(kind: str) -> list[str]:
+def _quick_names(kind: str) -> set[str]:
     """Names of one kind without imports; classes of rsbench without a card are left out."""
     from rsbench.components.cards import CardKind, list_cards
 
     names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # pyrefly: ignore[bad-argument-type]
     if kind in COMPONENTS:
-        try:
+        # Metadata of a package may be unreadable: ``rsbench list`` reports it.
+        with contextlib.suppress(Exception):
             group = _GROUPS.get(kind, f"rsbench.{kind}")
             names |= {point.name for point in metadata.entry_points(group=group)}
-        except Exception:  # metadata of a package that cannot be read: ``rsbench list`` reports it
-            return sorted(names)
-    return sorted(names)
+    return names
 
 
 LIST_EPILOG = """[bold]Examples[/bold]
@@ -117,8 +112,6 @@ def list_(
     json: Annotated[bool, typer.Option("--json", help="As a JSON list.")] = False,
 ) -> None:
     """List scenes, solvers, datasets and so on, with the cards to copy and edit, and who they come from."""
-    import json as json_module
-
     from rsbench.components.cards import choices
 
     kinds = kind_names()
@@ -126,7 +119,7 @@ def list_(
         raise RsbenchError(f"kind {kind!r} does not exist{choices(kind, kinds)}")
     rows = entries(kind) if kind else [{"kind": each, "names": names_of(each)} for each in kinds]
     if json:
-        echo(json_module.dumps(rows))
+        print_json(rows)
         return
     columns = ("kind", "names") if kind is None else ("name", "origin", "description")
     texts = [[row[column] for column in columns] for row in rows]
@@ -189,7 +182,7 @@ SHOW_EPILOG = """[bold]Examples[/bold]
 def show(
     name: Annotated[
         str,
-        typer.Argument(metavar="NAME|CARD", help="A name, or the path of a card.", autocompletion=complete_any),
+        typer.Argument(metavar="NAME|CARD", help="A name, or the path of a card.", autocompletion=complete()),
     ],
     kind: Annotated[
         str | None,
@@ -200,11 +193,9 @@ def show(
     json: Annotated[bool, typer.Option("--json", help="As one JSON object.")] = False,
 ) -> None:
     """Print what a solver needs and returns, the parameters of a component with defaults, or a card."""
-    import json as json_module
-
     found = [_about(name, each) for each in _kinds_of(name, kind)]
     if json:
-        echo(json_module.dumps(found[0] if len(found) == 1 else found, default=str))
+        print_json(found[0] if len(found) == 1 else found, default=str)
         return
     for content in found:
         _print(content)
@@ -277,29 +268,23 @@ def _about(name: str, kind: str) -> dict[str, Any]:
         "origin": _offer(described, entry.name).origin if entry.path is None else None,
         "card": entry.path.as_posix() if entry.path is not None else None,
         **_about_component(entry.component),
-        **{key: value for key, value in vars(entry.options).items()},
+        **vars(entry.options),
         "key": entry.key,
         "parameters": parameters_of(type(entry.component), entry.component),
     }
 
 
 def _about_component(component: object) -> dict[str, Any]:
-    """Its class, and the fields of its ``spec``."""
+    """Its class, and the fields of its ``spec``, as JSON holds them."""
     cls = type(component)
     about: dict[str, Any] = {"class": f"{cls.__module__}:{cls.__qualname__}"}
     spec = getattr(component, "spec", None)
-    if dataclasses.is_dataclass(spec):
-        about |= {field.name: _plain(getattr(spec, field.name)) for field in dataclasses.fields(spec)}
+    for field in dataclasses.fields(spec) if dataclasses.is_dataclass(spec) else ():
+        value = getattr(spec, field.name)
+        about[field.name] = dict(value) if isinstance(value, Mapping) else value
+        if isinstance(value, Set):
+            about[field.name] = sorted(value)
     return about
-
-
-def _plain(value: object) -> object:
-    """Values of a spec for JSON."""
-    from collections.abc import Mapping, Set
-
-    if isinstance(value, Mapping):
-        return dict(value)
-    return sorted(value) if isinstance(value, Set) else value
 
 
 def _offer(kind: Kind[Any, Any], name: str) -> Offer:
@@ -334,33 +319,25 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
     """
     meanings = field_docstrings(cls)
     required = inspect.Parameter.empty
+    fields = dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ()
+    factories = {each.name: each.default_factory for each in fields}
     rows = []
     for name, parameter in inspect.signature(cls).parameters.items():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        kind, default = parameter.annotation, _default_of(cls, name, parameter.default)
+        kind, make = parameter.annotation, factories.get(name, dataclasses.MISSING)
+        default = parameter.default if make is dataclasses.MISSING else make()
+        kind = "" if kind is required else kind if isinstance(kind, str) else getattr(kind, "__name__", str(kind))
         rows.append(
             {
                 "parameter": name,
-                "type": kind
-                if isinstance(kind, str)
-                else ""
-                if kind is required
-                else getattr(kind, "__name__", str(kind)),
+                "type": kind,
                 "value": value_in_a_card(getattr(component, name)) if hasattr(component, name) else "",
                 "default": "required" if default is required else value_in_a_card(default),
                 "meaning": meanings.get(name, ""),
             }
         )
     return rows
-
-
-def _default_of(cls: type, name: str, given: object) -> object:
-    """The default in the signature, or the value that a factory makes."""
-    for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
-        if field.name == name and field.default_factory is not dataclasses.MISSING:
-            return field.default_factory()
-    return given
 
 
 def value_in_a_card(value: object) -> Any:

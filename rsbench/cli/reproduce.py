@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Self
 
 import typer
 
@@ -46,29 +46,6 @@ EPILOG = """[bold]Examples[/bold]
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
 
-class Target(StrEnum):
-    """What can be reproduced."""
-
-    images = "images"
-    fig3 = "fig3"
-    claims = "claims"
-    image_claims = "image-claims"
-    readings = "readings"
-    sweeps = "sweeps"
-    fig4 = "fig4"
-    fig4_literal = "fig4-literal"
-    correction = "correction"
-    laws_correction = "laws-correction"
-    sgm = "sgm"
-    real = "real"
-    leaderboard = "leaderboard"
-    laws = "laws"
-    boards = "boards"
-    handheld = "handheld"
-    footage = "footage"
-    everything = "everything"
-
-
 class _Recipe(NamedTuple):
     """How a target is made."""
 
@@ -80,30 +57,46 @@ class _Recipe(NamedTuple):
     rendered: tuple[str, ...] = ()
     """Folders of datasets below ``--data`` that it reads, and renders first where they are missing."""
     folders: tuple[str, ...] = ()
-    """Where it writes below ``--out``, if not in the folder of its name."""
+    """Where it writes below ``--out``, if not in the folder of its name: they are there when it is called."""
     seeds: int = 1
     """Runs of each solver in the committed results."""
 
 
-_RECIPES = {
-    Target.images: _Recipe("reproduce:images", 3, ("paper",), seeds=20),
-    Target.fig3: _Recipe("reproduce_simulated:fig3", 4),
-    Target.claims: _Recipe("reproduce_simulated:claims", 15, folders=("fig3", "claims")),
-    Target.image_claims: _Recipe("reproduce_simulated:image_claims", 1, folders=("claims",)),
-    Target.readings: _Recipe("reproduce_simulated:readings", 8),
-    Target.sweeps: _Recipe("reproduce_simulated:sweeps", 9),
-    Target.fig4: _Recipe("reproduce_correction:fig4", 9, ("paper", "moderate", "aggressive")),
-    Target.fig4_literal: _Recipe("reproduce_correction:fig4_literal", 1, ("paper",), ("fig4",)),
-    Target.correction: _Recipe("reproduce_correction:correction", 67, ("mild", "moderate", "aggressive", "poles")),
-    Target.laws_correction: _Recipe("reproduce_correction:laws_correction", 30, ("laws-frames",)),
-    Target.sgm: _Recipe("reproduce_correction:sgm", 1, ("mild", "moderate")),
-    Target.real: _Recipe("reproduce_correction:real", 19, ("real-ideal", "real"), seeds=10),
-    Target.leaderboard: _Recipe("reproduce_leaderboard:leaderboard", 20),
-    Target.laws: _Recipe("reproduce_leaderboard:laws", 240, ("laws-frames",)),
-    Target.boards: _Recipe("reproduce_leaderboard:boards", 180, ("standard",), ("leaderboard",)),
-    Target.handheld: _Recipe("reproduce_leaderboard:handheld", 45, ("handheld",)),
-    Target.footage: _Recipe("reproduce_leaderboard:footage", 110, ("footage", "standard")),
-}
+class Target(StrEnum):
+    """What can be reproduced, and how."""
+
+    recipe: _Recipe
+
+    def __new__(cls, name: str, recipe: _Recipe | None = None) -> Self:
+        """A name with its recipe."""
+        made = str.__new__(cls, name)
+        made._value_ = name
+        made.recipe = recipe or _Recipe("", 0)
+        return made
+
+    images = "images", _Recipe("reproduce:images", 3, ("paper",), seeds=20)
+    fig3 = "fig3", _Recipe("reproduce_simulated:fig3", 4)
+    claims = "claims", _Recipe("reproduce_simulated:claims", 15, folders=("fig3", "claims"))
+    image_claims = "image-claims", _Recipe("reproduce_simulated:image_claims", 1, folders=("claims",))
+    readings = "readings", _Recipe("reproduce_simulated:readings", 8)
+    sweeps = "sweeps", _Recipe("reproduce_simulated:sweeps", 9)
+    fig4 = "fig4", _Recipe("reproduce_correction:fig4", 9, ("paper", "moderate", "aggressive"))
+    fig4_literal = "fig4-literal", _Recipe("reproduce_correction:fig4_literal", 1, ("paper",), ("fig4",))
+    correction = (
+        "correction",
+        _Recipe("reproduce_correction:correction", 67, ("mild", "moderate", "aggressive", "poles")),
+    )
+    laws_correction = "laws-correction", _Recipe("reproduce_correction:laws_correction", 30, ("laws-frames",))
+    sgm = "sgm", _Recipe("reproduce_correction:sgm", 1, ("mild", "moderate"))
+    real = "real", _Recipe("reproduce_correction:real", 19, ("real-ideal", "real"), seeds=10)
+    leaderboard = "leaderboard", _Recipe("reproduce_leaderboard:leaderboard", 20)
+    laws = "laws", _Recipe("reproduce_leaderboard:laws", 240, ("laws-frames",))
+    boards = "boards", _Recipe("reproduce_leaderboard:boards", 180, ("standard",), ("leaderboard",))
+    handheld = "handheld", _Recipe("reproduce_leaderboard:handheld", 45, ("handheld",))
+    footage = "footage", _Recipe("reproduce_leaderboard:footage", 110, ("footage", "standard"))
+    everything = "everything"
+
+
 _ORDER = (
     *(each for each in Target if each not in ("fig3", "fig4-literal", "image-claims", "everything")),
     Target.image_claims,
@@ -158,7 +151,7 @@ def reproduce(
         for each in Target:
             of = _ORDER if each is Target.everything else (each,)
             needs = [_first(each, data)] if each is not Target.everything else []
-            echo(f"{each}: about {sum(_RECIPES[one].minutes for one in of)} minutes on two cores{''.join(needs)}")
+            echo(f"{each}: about {sum(one.recipe.minutes for one in of)} minutes on two cores{''.join(needs)}")
         return
     check_out(out)
     _make(_ORDER if target is Target.everything else (target,), out, data, workers, seeds, width)
@@ -173,9 +166,9 @@ def _make(
         start = time.monotonic()
         whole = f"[{number + 1} of {len(targets)}] " if len(targets) > 1 else ""
         say(f"{whole}{each}: {_left(targets[number:], paces)}{_first(each, data)}")
-        _reproduce(each, out, data, workers, seeds or _RECIPES[each].seeds, width)
-        paces.append((time.monotonic() - start) / 60.0 / _RECIPES[each].minutes)
-        echo(f"{each}: {paces[-1] * _RECIPES[each].minutes:.1f} minutes")
+        _reproduce(each, out, data, workers, seeds or each.recipe.seeds, width)
+        paces.append((time.monotonic() - start) / 60.0 / each.recipe.minutes)
+        echo(f"{each}: {paces[-1] * each.recipe.minutes:.1f} minutes")
     if len(targets) > 1:
         echo(f"{Target.everything}: {(time.monotonic() - begin) / 60.0:.1f} minutes")
 
@@ -183,7 +176,7 @@ def _make(
 def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
     """About how long the next target, and all of them, take by the pace of those that were made so far."""
     made = [pace for pace in paces if pace > _KEPT]
-    minutes = [_RECIPES[each].minutes * (statistics.median(made) if made else 1.0) for each in targets]
+    minutes = [each.recipe.minutes * (statistics.median(made) if made else 1.0) for each in targets]
     begin = f"about {minutes[0]:.0f} minutes on two cores"
     return begin if len(targets) == 1 else f"{begin}; with what follows {sum(minutes) / 60.0:.1f} hours"
 
@@ -192,13 +185,13 @@ def _first(target: Target, data: Path) -> str:
     """What is rendered or needed before a target is made."""
     if target is Target.image_claims:
         return "; judges what the other targets have written: make them first"
-    places = [data / name for name in _RECIPES[target].rendered]
+    places = [data / name for name in target.recipe.rendered]
     missing = [str(place) for place in places if not (place / "dataset.json").is_file()]
     return f"; renders first what is missing: {', '.join(missing)}" if missing else ""
 
 
 def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds: int, width: int | None) -> None:
-    recipe = _RECIPES[target]
+    recipe = target.recipe
     module, _, name = recipe.maker.partition(":")
     maker = getattr(import_module(f"rsbench.cli.{module}"), name)
     given = {"out": out, "data": data, "workers": workers, "seeds": seeds, "width": width}
@@ -220,7 +213,3 @@ def images(out: Path, data: Path, seeds: int) -> None:
     options = EvaluationOptions(solvers=tuple(every_solver()), seeds=seeds)
     evaluate_dataset(data / "paper", evaluation, options, "rsbench reproduce images")
     echo(f"published: {publish(evaluation, out / 'images')}")
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(reproduce)

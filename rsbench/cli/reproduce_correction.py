@@ -60,7 +60,6 @@ def fig4(out: Path, data: Path) -> None:
     That by the paper's own components comes first, see ``fig4_literal``.
     """
     folder = out / "fig4"
-    folder.mkdir(parents=True, exist_ok=True)
     fig4_literal(out, data)
     numbers: list[dict[str, Any]] = []
     for card, ending in _FIG4:
@@ -81,13 +80,9 @@ def fig4(out: Path, data: Path) -> None:
 def fig4_literal(out: Path, data: Path) -> None:
     """The paper's Figure 4 in its scene, by the paper's own solver, matches and correction of a single view."""
     folder = out / "fig4"
-    folder.mkdir(parents=True, exist_ok=True)
     _generate("paper", data)
-    sequence, views, panels = (
-        read_sequence(data / "paper" / _LITERAL_SCENE),
-        list[dict[str, Any]](),
-        list[Panels](),
-    )
+    sequence = read_sequence(data / "paper" / _LITERAL_SCENE)
+    views, panels = list[dict[str, Any]](), list[Panels]()
     with progress_bar("correcting literally", _LITERAL_SEEDS) as advance:
         for scores, panel in correct_literally(sequence, range(_LITERAL_SEEDS)):
             views += scores
@@ -102,7 +97,6 @@ def fig4_literal(out: Path, data: Path) -> None:
 def correction(out: Path, data: Path, workers: int | None = None) -> None:
     """Baselines, ours and oracles on the strata; ``workers`` processes, one per core for None."""
     folder = out / "correction"
-    folder.mkdir(parents=True, exist_ok=True)
     studies = [_studied(card, card, data, workers) for card in STRATA]
     images, bands, motions = (pd.concat(table, ignore_index=True) for table in zip(*studies, strict=True))
     write_table(folder / "views.csv", images)
@@ -120,7 +114,6 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
 def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
     """The same methods where motions follow five laws, on the sequences of ``laws`` without a sensor's noise."""
     folder = out / "laws-correction"
-    folder.mkdir(parents=True, exist_ok=True)
     images, _, motions = _studied("laws", LAWS_FRAMES, data, workers, lambda name: "-ideal-" in name)
     write_table(folder / "sequences.csv", by_sequence(images))
     write_table(folder / "motions.csv", motions)
@@ -147,7 +140,6 @@ def _studied(
 def sgm(out: Path, data: Path) -> None:
     """Semi-global matching when the right camera reads its rows at other times."""
     folder = out / "sgm"
-    folder.mkdir(parents=True, exist_ok=True)
     cards = list(dict.fromkeys(card for card, _ in _SGM))
     for card in cards:
         _generate(card, data)
@@ -177,7 +169,6 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
     folder, card = out / "real", load_dataset_card("real")
     card = card if width is None else real_cameras.sized(card, width)
     cards = {"ideal": real_cameras.ideal_card(card), "real": card}
-    folder.mkdir(parents=True, exist_ok=True)
     start_backend()
     places = {camera: data / each.name for camera, each in cards.items()}
     for camera, each in cards.items():

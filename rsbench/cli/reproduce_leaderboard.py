@@ -135,11 +135,8 @@ def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboar
 
     What is there of protocols that the board does not have stays: their tables do too.
     """
-    page, path, splits = (
-        build_site(board, out / "site", problem_pages=False),
-        out / "provenance.json",
-        splits_of(board),
-    )
+    page = build_site(board, out / "site", problem_pages=False)
+    path, splits = out / "provenance.json", splits_of(board)
     made = {
         f"{protocol}/{split}/{entry.header.method}": read_json(entry.folder / "entry.json").get("made")
         for protocol, split in splits

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.simulated.run_sweep import errors_of_rows
-from rsbench.benchmark.simulated.sweep_card import SweepCard, load_sweep
+from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.studies.claims import (
     APART,
     GLOBAL,
@@ -37,13 +37,12 @@ _OTHER_SWEEPS = ("solvers", "limit", "degenerate", "planar", "outliers", "wrong-
 
 def fig3(out: Path, data: Path, workers: int | None) -> None:
     folder = out / "fig3"
-    folder.mkdir(parents=True, exist_ok=True)
     command = "rsbench reproduce fig3"
     errors: dict[str, NDArray[np.float32]] = {}
     cards = {name: load_sweep(name) for name in SWEEPS}
     for name, card in cards.items():
         home = data / "simulated" / name
-        table = _summary(card, home, workers, command)
+        table = run_and_summarise(card, home, workers, command)
         write_table(folder / f"{name}.csv", table)
         found = errors_of_rows(table, home)
         errors |= {f"{name}_{measure}": values for measure, values in found.items()}
@@ -59,12 +58,11 @@ def fig3(out: Path, data: Path, workers: int | None) -> None:
 
 def sweeps(out: Path, data: Path, workers: int | None) -> None:
     folder = out / "sweeps"
-    folder.mkdir(parents=True, exist_ok=True)
     command = "rsbench reproduce sweeps"
     cards = [load_sweep(name) for name in _OTHER_SWEEPS]
     tables = {}
     for card in cards:
-        tables[card.name] = _summary(card, data / "simulated" / card.name, workers, command)
+        tables[card.name] = run_and_summarise(card, data / "simulated" / card.name, workers, command)
         write_table(folder / f"{card.name}.csv", tables[card.name])
     write_bytes(folder / "README.md", sweeps_page(cards, tables).encode())
     write_json(folder / "provenance.json", provenance(command, sweeps=list(_OTHER_SWEEPS)))
@@ -75,11 +73,10 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
     """Every claim, in every reading of the paper's solver."""
     fig3(out, data, workers)
     folder, home, command = out / "claims", data / "simulated", "rsbench reproduce claims"
-    folder.mkdir(parents=True, exist_ok=True)
     tables = _claim_tables(out / "fig3", folder, home, workers, command)
     (literal,) = write_cards(home / "readings", (LITERAL,))
     exact = replace(load_sweep("degenerate").with_setting(points=9), solvers=(literal,))
-    tables["9 + 9"]["degenerate"] = _summary(exact, home / "degenerate-9", workers, command)
+    tables["9 + 9"]["degenerate"] = run_and_summarise(exact, home / "degenerate-9", workers, command)
     readings = {reading.name: reading for name in SWEEPS for n in (9, 100) for reading in readings_of(name, n)}
     verdicts = judge_claims(tables, readings)
     write_table(folder / "claims.csv", verdicts)
@@ -103,8 +100,8 @@ def _claim_tables(
         more = _with_readings(name, 100, home, workers, command)
         write_table(folder / f"{name}-readings.csv", more)
         apart = more.solver.isin([reading.name for reading in APART])
-        tables["100 + 100"][name] = _joined(hundred[name], more[~apart])
-        tables["9 + 9"][name] = _joined(nine, more[apart])
+        tables["100 + 100"][name] = pd.concat([hundred[name], more[~apart]], ignore_index=True)
+        tables["9 + 9"][name] = pd.concat([nine, more[apart]], ignore_index=True)
     points = _with_readings("points", None, home, workers, command)
     write_table(folder / "points.csv", points)
     return {**tables, "9 + 9 and more": {"points": points}}
@@ -116,17 +113,20 @@ def _with_readings(name: str, points: int | None, home: Path, workers: int | Non
     others = () if points == 100 else (OURS, GLOBAL)
     card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
     folder = home / (f"{name}-readings" if points is None else f"{name}-{points}-readings")
-    return _summary(card if points is None else card.with_setting(points=points), folder, workers, command)
+    return run_and_summarise(
+        card if points is None else card.with_setting(points=points), folder, workers, command
+    )
 
 
 def readings(out: Path, data: Path, workers: int | None) -> None:
     """The claims in settings that the paper does not state."""
     folder, home, command = out / "readings", data / "simulated", "rsbench reproduce readings"
-    folder.mkdir(parents=True, exist_ok=True)
     chosen = (LITERAL, replace(LITERAL, extraction="symmetric"))
     solvers = (*write_cards(home / "readings", chosen), GLOBAL)
     tables = {
-        name: _summary(settings_card(load_sweep(name), solvers), home / f"{name}-settings", workers, command)
+        name: run_and_summarise(
+            settings_card(load_sweep(name), solvers), home / f"{name}-settings", workers, command
+        )
         for name in SWEEPS
     }
     judged = judge_settings(tables, {reading.name: reading for reading in chosen})
@@ -140,15 +140,5 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
 def image_claims(out: Path) -> None:
     """The claims about images, from the results that ``out`` holds."""
     text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"
-    page.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(page, text.encode())
     echo(f"claims: {page}")
-
-
-def _summary(card: SweepCard, folder: Path, workers: int | None, command: str) -> pd.DataFrame:
-    """Summary of a sweep whose trials stay in ``folder``; one draw of all its rows, whatever comes out."""
-    return run_and_summarise(card, folder, workers, command)
-
-
-def _joined(*tables: pd.DataFrame) -> pd.DataFrame:
-    return pd.concat(tables, ignore_index=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.console import echo
+from rsbench.cli.console import echo, print_json
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ transform is X_right = R X_left + t.
 
 Exit codes: 0 done, 2 the file cannot be read or represented.
 More: [bold]rsbench docs calibrations[/bold]"""
-_SUFFIXES = {".toml": "rig.toml"}
 
 
 def rig(
@@ -85,9 +84,7 @@ def rig(
     if out is None and to is not None:
         raise RsbenchError("--to: needs -o PATH, where the converted file goes")
     if json:
-        import json as json_module
-
-        echo(json_module.dumps(_record(found)))
+        print_json(_record(found))
     else:
         for line in _lines(found):
             echo(line)
@@ -149,7 +146,7 @@ def _convert(found: Calibration, to: str | None, out: Path, json: bool) -> None:
     from rsbench.components.cards import choices
     from rsbench.interop.writers.calibrations import WRITERS, write_calibration
 
-    kind = to or _SUFFIXES.get(out.suffix, "")
+    kind = to or ("rig.toml" if out.suffix == ".toml" else "")
     if kind not in WRITERS:
         wrong = f"--to {to!r}: no such format" if to else f"-o {out}: give --to FORMAT"
         raise RsbenchError(f"{wrong}{choices(kind, WRITERS)}")
@@ -172,7 +169,8 @@ def _lines(found: Calibration) -> list[str]:
             f"centre {own['cx']:.2f}, {own['cy']:.2f}"
         )
         lens = own.get("lens")
-        shown = "none" if lens is None else " ".join([lens["model"], *_shown(lens)])
+        values = [f"{key} {value:.6g}" for key, value in (lens or {}).items() if key != "model" and value]
+        shown = "none" if lens is None else " ".join([lens["model"], *values])
         view = "" if "view_deg" not in own else "; sees {:.1f} x {:.1f} deg".format(*own["view_deg"])
         delay = own.get("line_delay_s")
         read = "" if delay is None else f"; {1e6 * delay:.4g} us a line" if delay else "; global shutter"
@@ -195,10 +193,6 @@ def _lines(found: Calibration) -> list[str]:
         lines.append(f"{key} = {value}")
     lines += [f"missing: {each}" for each in record["missing"]]
     return [*lines, *(f"note: {each}" for each in record["notes"])]
-
-
-def _shown(lens: dict[str, Any]) -> list[str]:
-    return [f"{key} {value:.6g}" for key, value in lens.items() if key != "model" and value]
 
 
 def _record(found: Calibration) -> dict[str, Any]:
@@ -257,7 +251,3 @@ def _rows_apart(rig: StereoRig) -> list[float] | None:
         return None
     apart = (seen[good, 1] - pixels[good, 1]).tolist()
     return [min(apart), max(apart)]
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(rig)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,7 @@ import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo, print_table, progress_bar, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
@@ -30,15 +31,6 @@ their reasons), [bold]trials/*.npz[/bold] (truth and every prediction) and [bold
 Solvers of other packages run in processes of their own: what they do wrong is a failed trial."""
 
 
-_Out = Annotated[
-    str,
-    typer.Option(
-        metavar="DIR",
-        help="Folder of the results, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
-    ),
-]
-
-
 def simulate(
     sweep: Annotated[
         str,
@@ -47,11 +39,16 @@ def simulate(
             autocompletion=complete("sweeps"),
         ),
     ],
-    out: _Out,
+    out: Annotated[
+        str,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the results, or a URL such as s3://bucket/folder; an interrupted run resumes there.",
+        ),
+    ],
     trials: Annotated[int | None, typer.Option(min=1, help="Repetitions per value instead of the card's.")] = None,
     solver: Annotated[
-        list[str] | None,
-        typer.Option(help="Solver card instead of the sweep's; repeatable.", autocompletion=complete("solvers")),
+        list[str] | None, named("solvers", "Solver card instead of the sweep's; repeatable.")
     ] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="FIELD=VALUE to replace in the card's setting; repeatable.")
@@ -139,8 +136,6 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
 
 def _changes(assignments: list[str]) -> dict[str, object]:
     """FIELD=VALUE pairs; values as in a card, plain words may lack their quotes."""
-    import tomllib
-
     changes: dict[str, object] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
@@ -153,7 +148,3 @@ def _changes(assignments: list[str]) -> dict[str, object]:
         except (ValueError, RecursionError) as error:  # a number of thousands of digits, or brackets
             raise RsbenchError(f"--set {key}: not a value of TOML: {error}") from error
     return changes
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(simulate)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rsbench.cli.console import echo, print_table, progress_bar, say
+from rsbench.cli.console import echo, print_json, print_table, progress_bar, say
 from rsbench.cli.names import complete
 from rsbench.core.errors import RsbenchError
 
@@ -139,8 +139,6 @@ def check_solver(
     json: Annotated[bool, typer.Option("--json", help="Findings as one JSON object.")] = False,
 ) -> None:
     """Check the contract of a solver: exact data solved, equal results of equal runs, failures as values."""
-    import json as json_module
-
     import pandas as pd
 
     from rsbench.benchmark.simulated.contract import check_solver as find
@@ -148,12 +146,12 @@ def check_solver(
 
     entry = load_solver_entry(solver)
     findings = find(entry, time_limit_s=time_limit)
+    checks = [asdict(each) for each in findings]
     failed = sum(finding.verdict == "failed" for finding in findings)
     if json:
-        content = {"solver": entry.name, "passed": not failed, "checks": [asdict(each) for each in findings]}
-        echo(json_module.dumps(content))
+        print_json({"solver": entry.name, "passed": not failed, "checks": checks})
     else:
-        print_table(f"{entry.name} and the contract of solvers", pd.DataFrame([asdict(each) for each in findings]))
+        print_table(f"{entry.name} and the contract of solvers", pd.DataFrame(checks))
         say(f"{entry.name}: {failed} of {len(findings)} checks failed")
     if failed:
         raise typer.Exit(1)

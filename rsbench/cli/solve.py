@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsbench.cli.console import echo, is_quiet, late_progress, print_rows
+from rsbench.cli.console import echo, late_progress, print_answers, print_records
 from rsbench.cli.names import named
 from rsbench.core.errors import RsbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rsbench.pipeline.answer import Extra
     from rsbench.solvers.engine.base import SolverEntry
     from rsbench.solvers.engine.robust_motion import RobustOptions
@@ -72,44 +71,24 @@ def solve(
 ) -> None:
     """Estimate the motion of a stereo rig from your own matches."""
     if example:
-        _print_example()
+        from rsbench.pipeline.problem import EXAMPLE
+
+        echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
         return
     if not problems:
         raise RsbenchError("PROBLEM: none given; give files, folders or -, or have a sample made by --example")
+    from rsbench.pipeline.frame_motion import check_model
     from rsbench.solvers.engine.base import load_solver_entries
 
-    wanted, options, limit = _extras(extras, json), _options(threshold_px), _limit(time_limit)
+    wanted, options = _extras(extras, json), _options(threshold_px)
+    if time_limit is not None and not time_limit > 0.0:
+        raise RsbenchError(f"--time-limit = {time_limit}: must be a positive number of seconds")
     entries = load_solver_entries(solver or ["rs-stereo-refined"])
-    _check_model(motion_model, entries)
-    code = _tell(_answers(problems, entries, options, seed, wanted, limit, motion_model or "auto"), json)
-    if code:
-        raise typer.Exit(code)
-
-
-def _print_example() -> None:
-    from rsbench.pipeline.problem import EXAMPLE
-
-    echo(EXAMPLE.read_text(encoding="utf-8"), nl=False)
-
-
-def _tell(found: Iterator[dict[str, Any] | RsbenchError], json: bool) -> int:
-    """Print answers, as they come or as one table, and errors; the exit code."""
-    import json as json_module
-
-    answers: list[dict[str, Any]] = []
-    wrong = failed = 0
-    for answer in found:
-        if isinstance(answer, RsbenchError):
-            wrong += 1
-            echo(f"rsbench: error: {' '.join(str(answer).split())}", err=True)
-            continue
-        failed += not answer["success"]
-        if json:
-            echo(json_module.dumps(answer, allow_nan=False))
-        else:
-            answers.append(answer)
-    _show(answers)
-    return 2 if wrong else int(failed > 0)
+    if motion_model is not None:
+        for entry in entries:
+            check_model(motion_model, entry)
+    found = _answers(problems, entries, options, seed, wanted, time_limit, motion_model or "auto")
+    print_answers(found, json, "success", _show)
 
 
 def _answers(
@@ -138,14 +117,10 @@ def _answers(
 
 
 def _show(answers: list[dict[str, Any]]) -> None:
-    rows = [_row(answer) for answer in answers]
     if len(answers) == 1:
         _show_one(answers[0])
-    elif is_quiet():
-        for row in rows:
-            echo("\t".join(row.values()))
-    elif rows:
-        print_rows("", list(rows[0]), [list(row.values()) for row in rows], right=("rotation", "inliers", "ms"))
+    else:
+        print_records([_row(answer) for answer in answers], right=("rotation", "inliers", "ms"))
 
 
 def _show_one(answer: dict[str, Any]) -> None:
@@ -220,19 +195,6 @@ def _options(threshold_px: float | None) -> RobustOptions:
     return RobustOptions(threshold_px=threshold_px, adapt_threshold=False)
 
 
-def _check_model(motion_model: str | None, entries: list[SolverEntry]) -> None:
-    from rsbench.pipeline.frame_motion import check_model
-
-    for entry in entries if motion_model is not None else []:
-        check_model(str(motion_model), entry)
-
-
-def _limit(seconds: float | None) -> float | None:
-    if seconds is not None and not seconds > 0.0:
-        raise RsbenchError(f"--time-limit = {seconds}: must be a positive number of seconds")
-    return seconds
-
-
 def _degrees(w: list[float]) -> float:
     import numpy as np
 
@@ -241,7 +203,3 @@ def _degrees(w: list[float]) -> float:
 
 def _vector(values: list[float]) -> str:
     return "[" + ", ".join(f"{value: .6f}" for value in values) + "]"
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(solve)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rsbench.cli.console import echo, late_progress, print_rows, print_table, progress_bar, report_faults, say
-from rsbench.cli.names import complete
+from rsbench.cli.names import named
 
 EPILOG = """[bold]Examples[/bold]
 
@@ -47,10 +46,7 @@ def verify(
         Rerender, typer.Option(help="Rows to render again where the scene can be built here: auto takes seconds.")
     ] = Rerender.AUTO,
     scene: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Card, or moving mesh, that is not rsbench's own; repeatable.", autocompletion=complete("scenes")
-        ),
+        list[str] | None, named("scenes", "Card, or moving mesh, that is not rsbench's own; repeatable.")
     ] = None,
     fast: Annotated[
         bool,
@@ -79,43 +75,20 @@ def verify(
     """Check a dataset: files, poses, depth maps and images against each other and against rows rendered again."""
     if layout is not None:
         _verify_others(folder, layout)
-    else:
-        more = _reference_faults(folder) if reference else []
-        stride, rerender = (max(stride, _FAST_STRIDE), Rerender.NO) if fast else (stride, rerender)
-        left_out = _LEFT_OUT.format(stride=stride) if fast else ""
-        _verify_ours(folder, stride, rerender, [Path(each) for each in scene or []], workers or 1, left_out, more)
-
-
-def _reference_faults(folder: Path) -> list[str]:
-    """What differs from the reference copy, after telling what does not."""
-    from rsbench.verification.digests import against_reference
-
-    found = list(against_reference(folder))
-    same = sum(each.same for each in found)
-    faults = [f"{each.name}: {each.fault}" for each in found if each.fault]
-    alike = len(found) - same - len(faults)
-    echo(f"reference copy: {same} of {len(found)} sequences have its bytes, {alike} are alike")
-    return faults
-
-
-def _verify_ours(
-    folder: Path,
-    stride: int,
-    rerender: Rerender,
-    scenes: Sequence[Path],
-    workers: int,
-    left_out: str,
-    more: list[str],
-) -> None:
-    """Each channel against all others, and rows rendered again; ``more``: faults that were found before."""
+        return
     import pandas as pd
 
     from rsbench.dataset.manifest import DATASET
     from rsbench.storage.files import read_json
     from rsbench.verification import verification_steps, verify_dataset
 
+    faults = _reference_faults(folder) if reference else []
+    stride, rerender = (max(stride, _FAST_STRIDE), Rerender.NO) if fast else (stride, rerender)
+    scenes = [Path(each) for each in scene or []]
     with progress_bar("verifying", verification_steps(read_json(folder / "dataset.json"))) as advance:
-        reports = verify_dataset(folder, stride, advance, rerender=rerender.value, scenes=scenes, workers=workers)
+        reports = verify_dataset(
+            folder, stride, advance, rerender=rerender.value, scenes=scenes, workers=workers or 1
+        )
     rows = [
         {
             "sequence": report.name,
@@ -130,13 +103,25 @@ def _verify_ours(
     ]
     if rows:
         print_table("Depth agreement between frames (relative tolerance 1e-4)", pd.DataFrame(rows))
-    for note in [f"{report.name}: {note}" for report in reports for note in report.notes] + (
-        [left_out] if left_out else []
-    ):
+    for note in [f"{report.name}: {note}" for report in reports for note in report.notes]:
         say(note)
-    faults = more + [f"{report.name}: {fault}" for report in reports for fault in report.faults]
+    if fast:
+        say(_LEFT_OUT.format(stride=stride))
+    faults += [f"{report.name}: {fault}" for report in reports for fault in report.faults]
     count = sum(report.name != DATASET for report in reports)
     report_faults(faults, f"{folder}: {count} sequences, {len(faults)} faults")
+
+
+def _reference_faults(folder: Path) -> list[str]:
+    """What differs from the reference copy, after telling what does not."""
+    from rsbench.verification.digests import against_reference
+
+    found = list(against_reference(folder))
+    same = sum(each.same for each in found)
+    faults = [f"{each.name}: {each.fault}" for each in found if each.fault]
+    alike = len(found) - same - len(faults)
+    echo(f"reference copy: {same} of {len(found)} sequences have its bytes, {alike} are alike")
+    return faults
 
 
 def _verify_others(folder: Path, layout: str) -> None:
@@ -171,7 +156,3 @@ def _verify_others(folder: Path, layout: str) -> None:
         columns = ["recording", "seen", "count", f"within {NEAR_PX:g} px (%)", "typical (px)"]
         print_rows("Features where cameras and poses say", columns, seen, right=columns[2:])
     report_faults(faults, f"{folder}: {len(recordings)} recordings, {len(faults)} faults")
-
-
-def register(app: typer.Typer) -> None:
-    app.command(epilog=EPILOG)(verify)

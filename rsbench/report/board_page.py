@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pandas.api.types import is_numeric_dtype
 
 from rsbench.benchmark.leaderboard.board import Scored, about_split, entries_of, place, splits_of
 from rsbench.benchmark.leaderboard.deviations import LEVELS, named_numbers
@@ -28,7 +29,7 @@ from rsbench.benchmark.leaderboard.pictures import (
     read_answer_frame,
 )
 from rsbench.benchmark.leaderboard.standings import Standing, standings, table
-from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Score, Split, Track, Truth
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Split, Track, Truth
 from rsbench.benchmark.leaderboard.tracks import track_of_id
 from rsbench.benchmark.statistics import format_interval, score_interval
 from rsbench.core.errors import RsbenchError
@@ -96,14 +97,9 @@ class Board:
             "protocol": self.track.id,
             "split": self.split,
             "primary": self.track.primary.title,
-            "error": self.error,
+            "error": self.track.error_title,
             "problems": "" if self.secret else f"{self.id}--problems.html",
         }
-
-    @property
-    def error(self) -> str:
-        """What figures draw."""
-        return self.track.error_title
 
     def known(self) -> list[tuple[str, pd.Series]]:
         """What is known of the problems, in their order: numbers and words, each with its name, and the scene."""
@@ -307,15 +303,6 @@ _MOST_BYTES = 11_000_000
 """Largest size of all pictures of a site, which stays below 15 MB."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """A picture of a page."""
-
-    title: str
-    file: str
-    """Below the folder of the problem's pictures."""
-
-
 class Album:
     """Writes the pictures of a split's problems into ``<id>/pictures/<problem>``."""
 
@@ -340,11 +327,14 @@ class Album:
         """Path from the folder of the index, or nothing."""
         return f"{self.prefix}/{problem}/thumb.jpg" if problem in self._sequences else ""
 
-    def pictures(self, problem: str) -> list[Shown]:
-        """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room."""
+    def pictures(self, problem: str) -> list[dict[str, str]]:
+        """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room.
+
+        Returns the ``title`` of each, and its ``file`` below the folder of the problem's pictures.
+        """
         if problem not in self._sequences:
             return []
-        left, found = self.allowance, list[Shown]()
+        left, found = self.allowance, list[dict[str, str]]()
         for group in self._groups(problem):
             pictures = [
                 (stem, words, encode_jpeg(shrink(image, _LONGEST), _QUALITY)) for stem, words, image in group
@@ -353,7 +343,7 @@ class Album:
             if left < 0:
                 break
             for stem, words, data in pictures:
-                found.append(Shown(title=words, file=f"{stem}.jpg"))
+                found.append({"title": words, "file": f"{stem}.jpg"})
                 self._write(problem, f"{stem}.jpg", data)
         return found
 
@@ -422,7 +412,11 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     """Context of the template board_entry.html.j2."""
     header = line.scored.header
     fields = asdict(header)
-    compared = [line, *_best_peer(each, line), *_oracles(each, line)]
+    uses = set(header.uses)
+    # The best of the other entries that use no more, and the oracles.
+    peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
+    oracles = [other for other in each.lines if other.rank is None and other is not line]
+    compared = [line, *(peers[:1] if line.rank else []), *oracles]
     return {
         "header": header,
         "split": each.named,
@@ -434,7 +428,7 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
         ],
         "scores": _entry_scores(line),
         "ties": ", ".join(line.ties),
-        "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if _words(kinds)],
+        "tables": [_by(each, line, name, kinds) for name, kinds in each.known() if not is_numeric_dtype(kinds)],
         "worst": None if each.secret else _worst(each, line, album),
         "figures_found": each.figures(compared),
         "figures_within": each.figures_within(compared),
@@ -442,31 +436,17 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     }
 
 
-def _words(kinds: pd.Series) -> bool:
-    return not pd.api.types.is_numeric_dtype(kinds)
-
-
-def _best_peer(each: Board, line: Standing) -> list[Standing]:
-    """The best of the other entries that use no more, which the figures show beside it."""
-    uses = set(line.scored.header.uses)
-    peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
-    return peers[:1] if line.rank else []
-
-
-def _oracles(each: Board, line: Standing) -> list[Standing]:
-    return [other for other in each.lines if other.rank is None and other is not line]
-
-
 def _entry_scores(line: Standing) -> list[dict[str, str]]:
     found = [{"title": "rank", "text": line.rank_words, "hint": "among those that use no more"}]
     for score in line.track.scores:
-        if score.kind != "median":
-            text = format_interval(*line.means[score.key])
-        else:
-            value = line.medians[score.key]
-            text = "–" if np.isnan(value) else f"{value:.3g}"
+        median = score.kind == "median"
+        text = _number(line.medians[score.key]) if median else format_interval(*line.means[score.key])
         found.append({"title": score.title, "text": text, "hint": score.hint})
     return found
+
+
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.3g}"
 
 
 def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, Any]:
@@ -476,8 +456,8 @@ def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, A
         value, low, high = score_interval(primary, list(part["scene"]), track.primary.kind == "share")
         # One scene bounds nothing: an interval of it would only round its value away.
         share = f"{value:.3g}" if part["scene"].nunique() == 1 else format_interval(value, low, high)
-        medians = (part[key].median() for key in track.of_kind("median")[:BRIEF])
-        rows.append([str(kind), len(part), share, *(f"{x:.3g}" for x in medians), int(part["failure"].sum())])
+        medians = (f"{part[key].median():.3g}" for key in track.of_kind("median")[:BRIEF])
+        rows.append([str(kind), len(part), share, *medians, int(part["failure"].sum())])
     return {
         "title": f"By {fact_title(name)}",
         "columns": [fact_title(name), "problems", track.primary.title, *brief_medians(track), "failed"],
@@ -596,12 +576,8 @@ def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str,
 
 
 def _problem_row(each: Board, line: Standing, k: int) -> dict[str, Any]:
-    scores = line.scored.scores.iloc[k]
-    cells = [
-        "–" if np.isnan(value) else f"{value:.3g}"
-        for value in (float(scores[score.key]) for score in each.track.scores)
-    ]
-    method = line.scored.header.method
+    scores, method = line.scored.scores.iloc[k], line.scored.header.method
+    cells = [_number(float(scores[score.key])) for score in each.track.scores]
     return {"method": method, "page": f"../{method}.html", "oracle": line.rank is None, "cells": cells}
 
 
@@ -682,6 +658,7 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         return {"key": key, "title": title, "first": first, "hint": hint, "text": text}
 
     parts, part, primary = each.lines[0].parts, each.track.parting, each.track.primary.title
+    scores = sorted(each.track.scores, key=lambda score: score.kind == "median")  # in the order of the cells
     stated = [
         column("nees_ratio", "NEES", "up", "squared error by the stated covariance: 1 where that is right"),
         *(
@@ -704,18 +681,13 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         column("method", "method", "up", "name of the entry", text=True),
         column("uses", "uses", "up", "what it works on", text=True),
         column("rank", "rank", "up", "among those that use no more, with its interval"),
-        *(column(s.key, s.title, "down" if s.better == "higher" else "up", s.hint) for s in _scores(each)),
+        *(column(s.key, s.title, "down" if s.better == "higher" else "up", s.hint) for s in scores),
         *(stated if _stated(each) else []),
         *(column(f"part_{name}", name, "down", f"{primary} where the {part} is {name}") for name in parts),
         *([column("assumes", "assumes", "up", "motion model that it assumes", text=True)] if parts else []),
         column("ties", "ties", "up", "entries that the data do not distinguish from it", text=True),
         column("tuned_on", "tuned on", "up", "data by which its parameters were chosen", text=True),
     ]
-
-
-def _scores(each: Board) -> list[Score]:
-    """Scores in the order of the cells: shares, then medians."""
-    return sorted(each.track.scores, key=lambda score: score.kind == "median")
 
 
 def _stated(each: Board) -> bool:
@@ -734,8 +706,7 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
     for key, triple in line.means.items():
         drawn = bar(*triple) if key == primary else None
         cells.append({"value": _value(triple[0]), "text": format_interval(*triple), "bar": drawn})
-    for value in line.medians.values():
-        cells.append({"value": _value(value), "text": "–" if np.isnan(value) else f"{value:.3g}", "bar": None})
+    cells += [{"value": _value(value), "text": _number(value), "bar": None} for value in line.medians.values()]
     if _stated(each):
         for triple in named_numbers(line.calibration, _log_scored(each)).values():
             text = "–" if np.isnan(triple[0]) else format_interval(*triple)

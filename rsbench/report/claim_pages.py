@@ -149,9 +149,6 @@ those statistics of Gaussian errors at the bound, and `unobservable` names what 
 Translations of solvers of the left camera are scored against that camera's own. Every row is one draw of its
 trials and none was drawn again: of the ratios of a solver at its bound one in forty lies below 1 with its
 interval, and rows that share scenes and noise, as all noises of one number of matches do, lie there together.
-
-| table | what | varies | noise (px) | trials | RANSAC |
-|---|---|---|---|---|---|
 """
 SHOWN_NOISE_PX = 0.3
 
@@ -160,15 +157,15 @@ def sweeps_page(cards: list[SweepCard], tables: Mapping[str, pd.DataFrame]) -> s
     """Markdown that says what each table holds, with the figures that README shows."""
     lines = [*_solvers(tables["solvers"]), "", *_bound(tables["limit"]), "", *_wrong(tables["wrong-readout"])]
     lines += ["", *_wrong_motion(tables["wrong-motion"])]
-    return _INTRODUCTION + "".join(_row(card) for card in cards) + "\n" + "\n".join(lines) + "\n"
+    head = ("table", "what", "varies", "noise (px)", "trials", "RANSAC")
+    return "\n".join([_INTRODUCTION, *table_lines(head, map(_row, cards)), "", *lines, ""])
 
 
-def _row(card: SweepCard) -> str:
+def _row(card: SweepCard) -> tuple[str, ...]:
     noises = sorted({cell.setting.noise_px for cell in card.cells()})
     noise = f"{noises[0]:g}" if len(noises) == 1 else f"{noises[0]:g} to {noises[-1]:g}"
     ransac = "yes" if card.robust else "no"
-    cells = (f"[{card.name}]({card.name}.csv)", card.description, card.axis, noise, str(card.trials), ransac)
-    return f"| {' | '.join(cells)} |\n"
+    return (f"[{card.name}]({card.name}.csv)", card.description, card.axis, noise, str(card.trials), ransac)
 
 
 def _solvers(table: pd.DataFrame) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -307,5 +306,4 @@ def _eight_bit(image: NDArray[Any]) -> Image:
 
 
 def _uri(image: Image) -> str:
-    data = pictures.encode_jpeg(pictures.shrink(image, _LONGEST))
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+    return pictures.jpeg_uri(pictures.encode_jpeg(pictures.shrink(image, _LONGEST)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -25,6 +27,9 @@ from rsbench.benchmark.studies.sgm_timing import DELAYS
 from rsbench.report import pictures
 from rsbench.report.markup import rendered, table_lines
 from rsbench.storage.files import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
@@ -162,39 +167,28 @@ def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
     return "\n".join(found[0]), "\n".join(found[1])
 
 
+_COLUMNS: dict[str, Callable[[pd.Series], str]] = {
+    "PSNR covered (dB)": lambda row: _with_interval(row, "psnr_covered", 2),
+    "ours + (dB)": lambda row: "" if row["method"] == "ours" else _with_interval(row, "gain", 2),
+    "SSIM covered": lambda row: _with_interval(row, "ssim_covered", 3),
+    "PSNR all (dB)": lambda row: _with_interval(row, "psnr_all", 2),
+    "SSIM all": lambda row: f"{row['ssim_all']:.3f}",
+    "flow, median (px)": lambda row: _with_interval(row, "flow_median_px", 3),
+    "flow, mean (px)": lambda row: f"{row['flow_mean_px']:.3f}",
+    "FLIP covered": lambda row: _with_interval(row, "flip_covered", 4),
+    "own pixels": lambda row: f"{100 * row['coverage']:.1f} %",
+}
+"""Columns of the table over all sequences, after the method's."""
+
+
 def _correction_table(summary: pd.DataFrame) -> str:
-    names = (
-        "method",
-        "PSNR covered (dB)",
-        "ours + (dB)",
-        "SSIM covered",
-        "PSNR all (dB)",
-        "SSIM all",
-        "flow, median (px)",
-        "flow, mean (px)",
-        "FLIP covered",
-        "own pixels",
-    )
     rows = []
     for _, row in summary.iterrows():
-        cells = [
-            _TITLES[str(row["method"])],
-            _with_interval(row, "psnr_covered", 2),
-            "" if row["method"] == "ours" else _with_interval(row, "gain", 2),
-            _with_interval(row, "ssim_covered", 3),
-            _with_interval(row, "psnr_all", 2),
-            f"{row['ssim_all']:.3f}",
-            _with_interval(row, "flow_median_px", 3),
-            f"{row['flow_mean_px']:.3f}",
-            _with_interval(row, "flip_covered", 4),
-            f"{100 * row['coverage']:.1f} %",
-        ]
-        if row["failures"]:
-            cells[0] += f" ({row['failures']:.0f} failed)"
+        name = _TITLES[str(row["method"])] + (f" ({row['failures']:.0f} failed)" if row["failures"] else "")
         if row["method"] == "ours":
-            cells[0] = f"**{cells[0]}**"  # the name alone: bold figures would read as the best ones
-        rows.append(cells)
-    return "\n".join(table_lines(names, rows))
+            name = f"**{name}**"  # the name alone: bold figures would read as the best ones
+        rows.append([name, *(cell(row) for cell in _COLUMNS.values())])
+    return "\n".join(table_lines(["method", *_COLUMNS], rows))
 
 
 def _with_interval(row: pd.Series, name: str, digits: int) -> str:
@@ -235,14 +229,22 @@ def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def _draw_rows(rows: pd.DataFrame, path: Path) -> Path:
+@contextmanager
+def _drawn(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
+    """A figure to draw on, which is then written: SVG with text, equal bytes for equal data."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
+    with rc_context({"font.size": 8, "svg.hashsalt": "rsbench", "svg.fonttype": "none"}):
+        figure = Figure(figsize=size, layout="constrained")
+        yield figure
+        figure.savefig(path, metadata={"Date": None})
+
+
+def _draw_rows(rows: pd.DataFrame, path: Path) -> Path:
     strata = list(dict.fromkeys(rows["stratum"]))
     middle = (np.arange(ROW_BANDS) + 0.5) / ROW_BANDS
-    with rc_context({"font.size": 8, "svg.hashsalt": "rsbench", "svg.fonttype": "none"}):
-        figure = Figure(figsize=(2.6 * len(strata), 3.0), layout="constrained")
+    with _drawn(path, (2.6 * len(strata), 3.0)) as figure:
         panels = figure.subplots(1, len(strata), sharey=True, squeeze=False)[0]
         for axes, stratum in zip(panels, strata, strict=True):
             own = rows[rows["stratum"] == stratum]
@@ -255,7 +257,6 @@ def _draw_rows(rows: pd.DataFrame, path: Path) -> Path:
             axes.grid(True, which="major", linewidth=0.3)
         panels[0].set_ylabel("mean flow error (px)")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-        figure.savefig(path, metadata={"Date": None})
     return path
 
 
@@ -400,27 +401,19 @@ def _markdown(table: pd.DataFrame) -> str:
 
 
 def _draw(table: pd.DataFrame, path: Path) -> Path:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     delayed = table[~table["opposite"]]
-    with rc_context({"font.size": 8, "svg.hashsalt": "rsbench", "svg.fonttype": "none"}):
-        figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+    with _drawn(path, (5.2, 3.2)) as figure:
         axes = figure.add_subplot()
         for (stratum, sequence), rows in delayed.groupby(["stratum", "sequence"], sort=False):
             colour, marker = _STYLES[str(stratum)]
             floor = float(rows[rows["delay"] == 0.0]["error_px"].iloc[0])
             later = rows[rows["delay"] > 0.0]
-            filled = str(sequence).startswith("castle")
-            label = f"{stratum}, {sequence}"
             axes.plot(later["delay"], (later["predicted_px"] ** 2 + floor**2) ** 0.5, color=colour, linewidth=0.9)
             style: dict[str, Any] = {"color": colour, "marker": marker, "linestyle": "none", "markersize": 4}
-            axes.plot(
-                later["delay"], later["error_px"], label=label, fillstyle="full" if filled else "none", **style
-            )
+            style["fillstyle"] = "full" if str(sequence).startswith("castle") else "none"
+            axes.plot(later["delay"], later["error_px"], label=f"{stratum}, {sequence}", **style)
         axes.set(xscale="log", yscale="log", xlabel="delay of the right camera (frame periods)")
         axes.set_ylabel("median disparity error (px)")
         axes.grid(True, which="major", linewidth=0.3)
         axes.legend(fontsize=7, frameon=False)
-        figure.savefig(path, metadata={"Date": None})
     return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,20 +65,20 @@ def write_pictures(sequence: Sequence, out: Path, chosen: dict[str, str], hash_o
         data=hash_of_data(sequence, SCORED, hash_of),
         predictions=hash_of_prediction(_files_drawn(predictions, chosen)),
     )
+
+    def jpegs(names: Iterable[str]) -> str:
+        return hash_of_prediction([folder / f"{name}.jpg" for name in names])
+
     there = kept(record, identity)
-    if there is not None and there["pictures"] == hash_of_prediction(_jpegs(folder, there["captions"])):
+    if there is not None and there["pictures"] == jpegs(there["captions"]):
         return there["captions"]
     drawn = draw_sequence(sequence, predictions, chosen)
     folder.mkdir(parents=True, exist_ok=True)
     for name, (image, _) in drawn.items():
         write_bytes(folder / f"{name}.jpg", pictures.encode_jpeg(pictures.shrink(image, _LONGEST)))
     captions = {name: caption for name, (_, caption) in drawn.items()}
-    keep(record, identity, {"pictures": hash_of_prediction(_jpegs(folder, captions)), "captions": captions})
+    keep(record, identity, {"pictures": jpegs(captions), "captions": captions})
     return captions
-
-
-def _jpegs(folder: Path, names: Any) -> list[Path]:
-    return [folder / f"{name}.jpg" for name in names]
 
 
 def _corrected_stem(folder: Path, chosen: dict[str, str]) -> Path:
@@ -395,11 +396,11 @@ def _section(sequence: Sequence, folder: Path, captions: dict[str, str]) -> dict
     angle, length = np.rad2deg(np.linalg.norm(sequence.motion.w)), np.linalg.norm(sequence.motion.d)
     rig = sequence.rig
     cameras = [rig.sensor(side) for side in (SIDES[:1] if rig.aligned else SIDES)]
-    hover = {"rolling": "global", "corrected": "global"}
+    uris = {name: pictures.jpeg_uri((folder / f"{name}.jpg").read_bytes()) for name in captions}
     shown = [
         {
-            "uri": pictures.data_uri(folder / f"{name}.jpg"),
-            "other": pictures.data_uri(folder / f"{hover[name]}.jpg") if name in hover else None,
+            "uri": uris[name],
+            "other": uris["global"] if name in ("rolling", "corrected") else None,
             "caption": caption,
         }
         for name, caption in captions.items()

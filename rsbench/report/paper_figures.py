@@ -215,26 +215,21 @@ def setting_table(cards: list[SweepCard]) -> pd.DataFrame:
     rows = []
     for card in cards:
         s: Setting = card.setting
+        fixed = {
+            "points": ("points per camera", f"{s.points}"),
+            "depth": ("depth (m)", f"{s.depth[0]:g} to {s.depth[1]:g}, uniform"),
+            "rotation_deg": ("rotation (deg)", f"{s.rotation_deg:g}, random axis"),
+            "translation": ("translation (m)", f"{s.translation:g}, random direction"),
+            "baseline": ("baseline (m)", f"{s.baseline:g}"),
+            "readout_ratio": ("readout ratio", f"{s.readout_ratio:g}"),
+        }
         row = {
             "sweep": card.name,
             "varies": f"{card.axis}: {', '.join(f'{value:g}' for value in card.values)}",
             "image": f"{s.width} x {s.height}, f = {s.focal:g} px",
-            "points per camera": str(s.points),
-            "depth (m)": f"{s.depth[0]:g} to {s.depth[1]:g}, uniform",
-            "rotation (deg)": f"{s.rotation_deg:g}, random axis",
-            "translation (m)": f"{s.translation:g}, random direction",
-            "baseline (m)": f"{s.baseline:g}",
-            "readout ratio": f"{s.readout_ratio:g}",
-            "trials": str(card.trials),
         }
-        varying = {
-            "rotation_deg": "rotation (deg)",
-            "translation": "translation (m)",
-            "baseline": "baseline (m)",
-            "readout_ratio": "readout ratio",
-            "points": "points per camera",
-        }.get(card.axis)
-        rows.append(row | ({varying: "varies"} if varying else {}))
+        row |= {title: "varies" if card.axis == key else text for key, (title, text) in fixed.items()}
+        rows.append(row | {"trials": str(card.trials)})
     return pd.DataFrame(rows)
 
 

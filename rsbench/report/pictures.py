@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -80,7 +79,6 @@ def encode_jpeg(image: Image, quality: int = 88) -> bytes:
     return data.tobytes()
 
 
-def data_uri(path: Path) -> str:
-    """Picture file as a URI that needs no network and no second file."""
-    kind = "jpeg" if path.suffix in (".jpg", ".jpeg") else path.suffix[1:]
-    return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+def jpeg_uri(data: bytes) -> str:
+    """A JPEG file as a URI that needs no network and no second file."""
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

@@ -7,16 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from rsbench.core.rig import SIDES, StereoRig
-from rsbench.core.so3 import FloatArray
 
 _COLOURS = {"left": "#3b82f6", "right": "#ea580c"}
-
-
-def corners(rig: StereoRig, side: str) -> FloatArray:
-    """Rays (5, 3) to the corners of a camera's image, the first one twice, with z = 1 in its own axes."""
-    camera = rig.sensor(side)  # pyrefly: ignore[bad-argument-type]
-    w, h = camera.width - 0.5, camera.height - 0.5
-    return camera.unproject([(-0.5, -0.5), (w, -0.5), (w, h), (-0.5, h), (-0.5, -0.5)])
 
 
 def draw_rig(rig: StereoRig, path: Path) -> None:
@@ -29,7 +21,10 @@ def draw_rig(rig: StereoRig, path: Path) -> None:
         for side in SIDES:
             place = -rig.offset(side)
             own = rig.own(side).R
-            far = place + 0.6 * rig.baseline * corners(rig, side) @ own
+            camera = rig.sensor(side)
+            w, h = camera.width - 0.5, camera.height - 0.5
+            corners = camera.unproject([(-0.5, -0.5), (w, -0.5), (w, h), (-0.5, h), (-0.5, -0.5)])
+            far = place + 0.6 * rig.baseline * corners @ own
             for corner in far[:4]:
                 axes.plot(*np.stack([place, corner])[:, [across, up]].T, color=_COLOURS[side], lw=0.8)
             axes.fill(*far[:, [across, up]].T, color=_COLOURS[side], alpha=0.15)

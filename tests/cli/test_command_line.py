@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import errno
-import os
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
-from commands import assert_refused, run_here, sweep_card
+from commands import assert_refused, run_apart, run_here, sweep_card
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.cli import exits, main
@@ -28,8 +28,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 def test_unknown_card_is_refused_with_the_names_that_exist(tmp_path: Path) -> None:
     # In a process of its own: exit code and line are those of the program, not of a function.
-    command = [sys.executable, "-m", "rsbench", "generate", "papre", "--out", str(tmp_path / "x")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    result = run_apart("generate", "papre", "--out", tmp_path / "x")
     assert_refused(result, "papre", "paper")
     assert result.stdout == ""
     assert not (tmp_path / "x").exists()
@@ -103,19 +102,6 @@ def test_an_unknown_error_is_one_line_with_a_log(
     assert [path.name for path in cache.parent.iterdir()] == ["cache"]
 
 
-@pytest.mark.parametrize(
-    ("number", "place"),
-    [(errno.ENOSPC, "standard output: "), (errno.ENOENT, "the working folder, which must exist: ")],
-)
-def test_what_has_no_name_is_named(
-    number: int, place: str, cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A full disk behind standard output, or a working folder that was removed: a user's, and no log."""
-    code, line = run_failing(monkeypatch, capsys, OSError(number, os.strerror(number)))
-    assert (code, line) == (2, f"rsbench: error: {place}{os.strerror(number)}")
-    assert not cache.exists()
-
-
 def test_logs_do_not_pile_up(cache: Path) -> None:
     for _ in range(25):
         exits.describe(ValueError())
@@ -137,6 +123,9 @@ def test_without_a_place_for_a_log_the_line_stays(
         (MemoryError(), 1, "not enough memory"),
         (PermissionError(errno.EACCES, "Permission denied", "/x"), 2, "rsbench: error: /x: Permission denied"),
         (OSError(errno.EBADF, "Bad file descriptor"), 70, "the system refused: OSError: [Errno 9] Bad file"),
+        # Without a name: a full disk behind standard output, and a working folder that was removed.
+        (OSError(errno.ENOSPC, "No space left"), 2, "rsbench: error: standard output: No space left"),
+        (OSError(errno.ENOENT, "No such file"), 2, "error: the working folder, which must exist: No such file"),
     ],
 )
 def test_errors_of_the_system(
@@ -149,6 +138,7 @@ def test_errors_of_the_system(
 ) -> None:
     found, line = run_failing(monkeypatch, capsys, error)
     assert found == code and words in line and "file system:" not in line
+    assert cache.exists() == (code == 70)  # faults of users have no log
 
 
 def test_a_long_message_keeps_its_file_and_its_remedy(capsys: pytest.CaptureFixture[str]) -> None:
@@ -212,6 +202,8 @@ def test_a_users_own_sweep(tmp_path: Path) -> None:
     ]
 
 
+DASK = find_spec("distributed") is not None
+
 # Refusals of all commands: {card} is a dataset card of a camera with a lens, {out} must stay absent.
 
 SOLVE = f"solve {EXAMPLE}"
@@ -245,6 +237,8 @@ REFUSED = {
     f"{GENERATE} --only b": ["no sequence 'b'"],
     f"{GENERATE} --estimate --full-frames": ["--estimate: not with --full-frames"],
     "simulate nois --out {out}": ["did you mean 'noise'?"],
+    f"{SIMULATE} --workers 2 --scheduler tcp://127.0.0.1:1": ["give one of the two"],
+    f"{SIMULATE} --scheduler {{folder}}/none.json": ["--scheduler", "no such file" if DASK else "pip install"],
     f"{SIMULATE} --trials x": ["Invalid value for '--trials'"],
     f"{SIMULATE} --set pints=9": ["unknown key 'pints'", "did you mean 'points'?"],
     f"{SIMULATE} --set points": ["--set points", "FIELD=VALUE"],

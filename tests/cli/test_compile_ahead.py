@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_scenes import write_rig
 
 from rsbench.cli import compile_ahead
 from rsbench.dataset.sequence import read_dataset
@@ -36,11 +37,7 @@ assert loaded == ahead, loaded - ahead
 @pytest.mark.slow
 def test_everything_that_correct_compiles_is_compiled_ahead(tmp_path: Path, smoke_dataset: Path) -> None:
     castle = read_dataset(smoke_dataset)[0]
-    c, rig = castle.rig.camera, tmp_path / "rig.toml"
-    rig.write_text(
-        f"baseline = {castle.rig.baseline}\nreadout_ratio = {castle.shutter.readout_ratio}\n"
-        f"camera = {{fx = {c.fx}, fy = {c.fy}, cx = {c.cx}, cy = {c.cy}}}\n"
-    )
+    rig = write_rig(tmp_path / "rig.toml", castle.rig, castle.shutter.readout_ratio)
     frames = [str(castle.folder / f"rs/{side}_{frame}.png") for frame in (0, 1) for side in ("left", "right")]
     words = ["correct", *frames, "--rig", str(rig), "--out", str(tmp_path / "out")]
     done = subprocess.run([sys.executable, "-c", _LOADED, *words], capture_output=True, text=True)

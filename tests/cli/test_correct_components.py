@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import assert_refused, run_here
+from small_scenes import write_rig
 
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS
@@ -88,14 +86,6 @@ class Exits(Solver):
         print("last words")
         os._exit(3)
 """
-ENTRY_POINTS = """
-[rsbench.matchers]
-flat = strange_matcher:Flat
-[rsbench.features]
-known = strange_features:Known
-[rsbench.correctors]
-negative = strange_corrector:Negative
-"""
 
 
 @pytest.fixture(scope="module")
@@ -112,38 +102,29 @@ def strangers(tmp_path_factory: pytest.TempPathFactory, castle: Sequence) -> Pat
         (folder / f"{name}.toml").write_text(f'class = "strange_{name}:{cls}"\n')
     points = np.random.default_rng(0).uniform((-2, -1.5, 6.0), (2, 1.5, 12.0), (400, 3))
     seen = [rs_project(castle.rig, castle.shutter, castle.motion, side, frame, points) for side, frame in VIEWS]
+    size = np.array([castle.rig.camera.width, castle.rig.camera.height])
     left_0, left_1, right_0, right_1 = (each.pixels for each in seen)
-    size = castle.rig.camera.width, castle.rig.camera.height
-    inside = [np.all((pixels > 0) & (pixels < np.array(size) - 1), axis=1) for pixels in (left_0, left_1, right_0)]
-    inside.append(np.all((right_1 > 0) & (right_1 < np.array(size) - 1), axis=1))
-    tracks = np.concatenate([left_0, right_0, left_1, right_1], axis=1)[np.all(inside, axis=0)]
+    inside = np.all([(each.pixels > 0) & (each.pixels < size - 1) for each in seen], axis=(0, 2))
+    tracks = np.concatenate([left_0, right_0, left_1, right_1], axis=1)[inside]
     assert len(tracks) > 50
     np.save(folder / "tracks.npy", tracks)
     return folder
 
 
-def correct(
-    castle: Sequence, tmp_path: Path, *arguments: object, path: Path | None = None
-) -> subprocess.CompletedProcess[str]:
-    """Run the command on the castle's frames, into ``tmp_path / "out"``; with ``path``, in a new process."""
-    c = castle.rig.camera
-    rig = tmp_path / "rig.toml"
-    rig.write_text(
-        f"baseline = {castle.rig.baseline}\nreadout_ratio = {castle.shutter.readout_ratio}\n"
-        f"[camera]\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
-    )
+def correct(castle: Sequence, tmp_path: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command on the castle's frames, into ``tmp_path / "out"``."""
+    rig = write_rig(tmp_path / "rig.toml", castle.rig, castle.shutter.readout_ratio)
     frames = [castle.folder / "rs" / f"{name}.png" for name in ORDER]
-    words = ["correct", *frames, "--rig", rig, "--out", tmp_path / "out", *arguments]
-    if path is None:
-        return run_here(*words)
-    command = [sys.executable, "-m", "rsbench", *map(str, words)]
-    search = os.pathsep.join([str(path), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
-    environment = {**os.environ, "PYTHONPATH": search}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    return run_here("correct", *frames, "--rig", rig, "--out", tmp_path / "out", *arguments)
 
 
-def check_strange_results(castle: Sequence, out: Path) -> None:
-    """Each of the three components has left its mark."""
+def test_single_files_with_their_cards_beside_them(castle: Sequence, strangers: Path, tmp_path: Path) -> None:
+    names = {"matcher": "matcher", "features": "features", "corrector": "corrector"}
+    cards = [word for name in names for word in (f"--{name}", strangers / f"{name}.toml")]
+    result = correct(castle, tmp_path, *cards, "--no-sky")
+    assert result.returncode == 0, result.stderr
+    assert "print what it likes" not in result.stdout
+    out = tmp_path / "out"
     record = json.loads((out / "motion.json").read_text("utf-8"))
     # Exact tracks: the motion is known as well as the descent of the solver ends.
     np.testing.assert_allclose(record["motion"]["w"], castle.motion.w, atol=1e-6)
@@ -154,31 +135,7 @@ def check_strange_results(castle: Sequence, out: Path) -> None:
         np.testing.assert_array_equal(read_png(out / "corrected" / f"{name}.png"), 255 - given)
         depth = castle.rig.camera.fx * castle.rig.baseline / DISPARITY
         np.testing.assert_allclose(read_depth(out / "depth" / f"{name}.exr"), depth, rtol=1e-6)
-
-
-def test_single_files_with_their_cards_beside_them(castle: Sequence, strangers: Path, tmp_path: Path) -> None:
-    names = {"matcher": "matcher", "features": "features", "corrector": "corrector"}
-    cards = [word for name in names for word in (f"--{name}", strangers / f"{name}.toml")]
-    result = correct(castle, tmp_path, *cards, "--no-sky")
-    assert result.returncode == 0, result.stderr
-    assert "print what it likes" not in result.stdout
-    check_strange_results(castle, tmp_path / "out")
-    record = json.loads((tmp_path / "out" / "motion.json").read_text("utf-8"))
     assert {name: record["components"][name]["name"] for name in names} == names
-
-
-@pytest.mark.slow
-def test_an_installed_package(castle: Sequence, strangers: Path, tmp_path: Path) -> None:
-    # A copy, for this process has the other folder on its path, where later tests would find the package.
-    site = Path(shutil.copytree(strangers, tmp_path / "site"))
-    info = site / "strange-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: strange\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    names = ("--matcher", "flat", "--features", "known", "--corrector", "negative", "--no-sky")
-    result = correct(castle, tmp_path, *names, path=site)
-    assert result.returncode == 0, result.stderr
-    check_strange_results(castle, tmp_path / "out")
 
 
 def test_a_component_that_answers_nonsense_is_one_line(castle: Sequence, strangers: Path, tmp_path: Path) -> None:

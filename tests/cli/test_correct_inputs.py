@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_here
 
-from rsbench.cli import correct as command
+from rsbench.cli import correct_run
 from rsbench.cli.correct_input import Arranged, arranged
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.files import write_png
 from rsbench.storage.videos import Times, write_frames
 
 SIZE, SPEED = (96, 128), 8.0
@@ -99,17 +98,6 @@ def test_a_phone_s_video_becomes_an_upright_one_with_sound_and_a_page(
 
 
 @pytest.mark.slow
-def test_two_images_of_one_camera_need_no_card(tmp_path: Path) -> None:
-    paths = [tmp_path / f"{number}.png" for number in (9, 10)]
-    for path, tau in zip(paths, (0.0, 1.0), strict=True):
-        write_png(path, _seen(tau + ROWS))
-    out = tmp_path / "out"
-    result = run_here("correct", *paths, "--readout-ratio", "1", "--fov", "53", "--out", out)
-    assert result.returncode == 0, result.stderr
-    assert "2 images: taken as one camera's" in result.stdout and (out / "report.html").is_file()
-
-
-@pytest.mark.slow
 def test_a_still_video_is_told_once(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     still = [np.clip(_seen(ROWS) + rng.normal(0, 1, (*SIZE, 3)), 0, 255).astype(np.uint8) for _ in range(4)]
@@ -158,19 +146,14 @@ def test_what_is_given_is_one_camera_s_unless_there_is_a_rig(
         ("a.mp4", False, True, "--rig: is required with --side-by-side"),
         ("a.mp4 0.png", False, False, "2 inputs"),
         ("", False, False, "give a video, a folder or images"),
+        ("clip_a.mp4", False, False, r"clip_a\.mp4: does not exist; nearest here: a\.mp4"),
     ],
 )
 def test_what_does_not_go_together_is_told(tmp_path: Path, given: str, rig: bool, sides: bool, words: str) -> None:
-    names = _films(tmp_path)
+    _films(tmp_path)
     card = tmp_path / "rig.toml" if rig else None
     with pytest.raises(RsbenchError, match=words):
-        arranged([names[each] for each in given.split()], card, None, None, None, None, sides)
-
-
-def test_a_missing_file_names_the_nearest_ones(tmp_path: Path) -> None:
-    _films(tmp_path)
-    with pytest.raises(RsbenchError, match=r"clip_a\.mp4: does not exist; nearest here: a\.mp4"):
-        arranged([tmp_path / "clip_a.mp4"], None, None, None, None, None, False)
+        arranged([tmp_path / each for each in given.split()], card, None, None, None, None, sides)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +171,7 @@ def test_halves_of_a_frame_are_the_cameras_of_a_rig(tmp_path: Path, monkeypatch:
     write_frames(tmp_path / "a.mkv", both, fps=30.0, times=times)
     (tmp_path / "rig.toml").write_text(RIG)
     calls = list[Any]()
-    monkeypatch.setattr(command, "_correct_given", lambda given, *rest: calls.append(given))
+    monkeypatch.setattr(correct_run, "correct_given", lambda given, *rest: calls.append(given))
     given = ("correct", tmp_path / "a.mkv", "--rig", tmp_path / "rig.toml", "--side-by-side")
     assert run_here(*given, "--out", tmp_path / "out").returncode == 0
     left, right = calls[0].sources()

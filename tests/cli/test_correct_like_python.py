@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import run_here
+from small_scenes import write_rig
 
 import rsbench
 from rsbench.dataset.sequence import Sequence
@@ -30,20 +31,18 @@ def _run(out: Path, *arguments: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("sigmas", [{}, {"focal_sigma": 20.0, "k1_sigma": 0.02}], ids=["exact", "unsure"])
 @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_of_a_rig(known: bool, sigmas: dict[str, Any], castle: Sequence, tmp_path: Path) -> None:
-    c, ratio = castle.rig.camera, castle.shutter.readout_ratio
-    lines = [f"baseline = {castle.rig.baseline}", *([f"readout_ratio = {ratio}"] if known else []), "[camera]"]
-    lines += [f"{name} = {getattr(c, name)}" for name in ("fx", "fy", "cx", "cy")]
-    lines += [f"{name} = {value}" for name, value in sigmas.items()]
-    (tmp_path / "rig.toml").write_text("\n".join(lines))
+    ratio, rig = castle.shutter.readout_ratio, tmp_path / "rig.toml"
+    write_rig(rig, castle.rig, ratio if known else None, "".join(f"{name} = {x}\n" for name, x in sigmas.items()))
     paths = [castle.folder / "rs" / f"{name}.png" for name in ORDER]
     images = [read_png(path) for path in paths]
     if not known:  # these frames do not determine it, and both refuse for the same reason
-        result = run_here("correct", *paths, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out")
+        result = run_here("correct", *paths, "--rig", rig, "--out", tmp_path / "out")
         with pytest.raises(rsbench.RsbenchError, match="cannot tell the readout ratio") as refused:
             rsbench.correct(images, castle.rig, None, **sigmas)
         assert result.returncode == 1 and str(refused.value) in result.stderr
+        assert not (tmp_path / "out").exists()
         return
-    record = _run(tmp_path / "out", *paths, "--rig", tmp_path / "rig.toml")
+    record = _run(tmp_path / "out", *paths, "--rig", rig)
     found = rsbench.correct(images, castle.rig, ratio, **sigmas)
     assert found.motion is not None
     # JSON keeps every digit of a number: the same steps on the same inputs leave no difference.

@@ -11,7 +11,7 @@ import pytest
 import typer
 from commands import assert_refused, run_here
 
-from rsbench.cli import correct as command
+from rsbench.cli import correct_run
 from rsbench.cli.main import app
 from rsbench.storage.files import write_png
 
@@ -67,7 +67,7 @@ def test_options_of_a_rig_are_refused_for_one_camera(option: str, tmp_path: Path
 def given(monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     """What a call of the command would correct, with which options."""
     calls: list[Any] = []
-    monkeypatch.setattr(command, "_correct_given", lambda *known: calls.append(known))
+    monkeypatch.setattr(correct_run, "correct_given", lambda *known: calls.append(known))
 
     def called(*arguments: object) -> str:
         calls.clear()
@@ -97,11 +97,19 @@ def test_options_of_a_rig_reach_its_correction(option: str, tmp_path: Path, give
     assert given(*frames, *right) != given(*other, *OTHER[option])
 
 
-@pytest.mark.parametrize("option", ["row_poses", "gyro", "fps", "gyro_offset"])
-def test_options_of_a_sequence_are_refused_for_two_times(option: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("row_poses", "no trajectory"),
+        ("gyro", "no trajectory"),
+        ("fps", "needs --gyro or --shutter"),
+        ("gyro_offset", "needs --gyro"),
+    ],
+)
+def test_options_of_a_sequence_are_refused_for_two_times(option: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(RIG)
     four = [tmp_path / f"{name}.png" for name in ("l0", "r0", "l1", "r1")]
     for each in four:
         each.touch()
     result = run_here("correct", *four, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out", *OTHER[option])
-    assert_refused(result, OTHER[option][0])
+    assert_refused(result, OTHER[option][0], words)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -48,19 +50,16 @@ def test_every_command_and_option_says_what_it_does(path: tuple[str, ...]) -> No
     assert not [option.name for option in command.params if not option.help]
 
 
-def test_the_extra_that_the_viewer_needs_is_named() -> None:
-    assert "'rsbench[view]'" in run_here("view", "--help", COLUMNS="200").stdout
-
-
 _bracketed = st.text("[]/ab=#", min_size=1, max_size=12).map(lambda text: f"[{text}]")
 
 
 @given(_bracketed, _bracketed, _bracketed)
 def test_tables_print_brackets_as_they_are(title: str, column: str, cell: str) -> None:
-    with pytest.MonkeyPatch.context() as patch:
+    out = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
         patch.setenv("COLUMNS", "200")
-        out = _captured(lambda: print_rows(title, ["first", column], [["wider-than-any-title", cell]]))
-    assert all(text in out for text in (title, column, cell))
+        print_rows(title, ["first", column], [["wider-than-any-title", cell]])
+    assert all(text in out.getvalue() for text in (title, column, cell))
 
 
 def test_progress_prints_brackets_as_they_are(
@@ -72,16 +71,6 @@ def test_progress_prints_brackets_as_they_are(
         advance("[/bold]")
     printed = capsys.readouterr().err
     assert "my[view]" in printed and "[/bold]" in printed
-
-
-def _captured(action: Any) -> str:
-    import contextlib
-    import io
-
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        action()
-    return out.getvalue()
 
 
 COLUMNS = [

@@ -7,13 +7,12 @@ import json
 import os
 import re
 import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from commands import install_package, run_here
+from commands import install_package, run_apart, run_here
 
 from rsbench.cli import console
 from rsbench.cli.main import app
@@ -26,27 +25,13 @@ def rsbench(*arguments: str, path: Path | None = None, **environment: str) -> su
     """In this process, or in a new one that finds the packages in ``path``."""
     if path is None:
         return run_here(*arguments, **environment)
-    env = os.environ | environment
-    env["PYTHONPATH"] = f"{path}{os.pathsep}{env.get('PYTHONPATH', '')}"
-    command = [sys.executable, "-m", "rsbench", *arguments]
-    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+    return run_apart(*arguments, path=path, **environment)
 
 
-def answer(*arguments: str, path: Path | None = None) -> Any:
-    result = rsbench(*arguments, "--json", path=path)
+def answer(*arguments: str) -> Any:
+    result = rsbench(*arguments, "--json")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
-
-
-def rows(kind: str, path: Path | None = None) -> list[dict[str, Any]]:
-    found = answer("list", kind, path=path)
-    assert isinstance(found, list)
-    return found
-
-
-def install(folder: Path, name: str, points: str, module: str = "") -> None:
-    install_package(folder, name, points)
-    (folder / f"{name}.py").write_text(module, "utf-8")
 
 
 # list
@@ -54,7 +39,7 @@ def install(folder: Path, name: str, points: str, module: str = "") -> None:
 
 @pytest.mark.parametrize("kind", kind_names())
 def test_every_kind_is_listed(kind: str) -> None:
-    listed = rows(kind)
+    listed = answer("list", kind)
     assert [row["name"] for row in listed] == names_of(kind) and listed
     for row in listed:
         assert row["description"] and row["broken"] is None
@@ -66,26 +51,6 @@ def test_the_kinds_are_listed_without_one() -> None:
     assert isinstance(found, list)
     assert {row["kind"] for row in found} == set(kind_names())
     assert set(COMPONENTS) <= set(kind_names())
-
-
-def test_others_are_listed_with_their_package_and_what_is_wrong_with_them(tmp_path: Path) -> None:
-    module = "from rsbench.solvers.linear import LinearSolver as Base\n\n\nclass Mine(Base):\n    '''My own.'''\n"
-    points = "[rsbench.solvers]\nmine = good_package:Mine\ngs-8pt = good_package:Mine\n"
-    install(tmp_path, "good_package", points, module)
-    install(tmp_path, "bad_package", "[rsbench.solvers]\nworse = bad_package:Mine\n", "raise OSError('no disk')")
-    install(tmp_path, "mad_package", "[rsbench.solvers\nno header", "")
-    listed = rows("solvers", tmp_path)
-    mine = [row for row in listed if row["name"] == "mine"]
-    assert [(row["origin"], row["description"], row["card"]) for row in mine] == [
-        ("good_package", "My own.", None)
-    ]
-    (worse,) = [row for row in listed if row["name"] == "worse"]
-    assert worse["origin"] == "bad_package" and "no disk" in worse["broken"]
-    both = [row for row in listed if row["name"] == "gs-8pt"]
-    assert {row["origin"] for row in both} == {"rsbench", "good_package"}
-    assert any("rename one of them" in (row["broken"] or "") for row in both)
-    assert len(listed) == len(list_solvers()) + 3
-    assert "broken: " in rsbench("list", "solvers", path=tmp_path, COLUMNS="200").stdout
 
 
 # show
@@ -250,7 +215,7 @@ def test_a_shell_completes_names(words: str, expected: set[str]) -> None:
 
 
 def test_completion_offers_what_packages_offer(tmp_path: Path) -> None:
-    install(tmp_path, "some_package", "[rsbench.solvers]\nzz-mine = nowhere:Nothing\n")
+    install_package(tmp_path, "some_package", "[rsbench.solvers]\nzz-mine = nowhere:Nothing\n")
     environment = {"_RSBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "rsbench show zz-", "COMP_CWORD": "2"}
     assert rsbench(path=tmp_path, **environment).stdout.split() == ["zz-mine"]
     # Which shell this is cannot be found out where there is none, as in CI: it is named instead.

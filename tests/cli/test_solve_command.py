@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, run_apart, run_here
 
 import rsbench
 from rsbench.components.motion_models import TwistMotion
@@ -143,8 +143,7 @@ def test_a_solver_that_misbehaves_fails_alone_and_leaves_the_answers_clean(tmp_p
     cards.append(odd_card(tmp_path, "hang", "time_limit_s = 1.0"))
     options = [part for card in cards for part in ("--solver", card)]
     # In a process of its own: what its children print would not pass through this one's standard output.
-    command = [sys.executable, "-m", "rsbench", "solve", EXAMPLE, *options, "--solver", "gs-8pt", "--json"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    result = run_apart("solve", EXAMPLE, *options, "--solver", "gs-8pt", "--json")
     assert result.returncode == 1, result.stderr
     fine, left, crashed, hung, ours = answers(result)  # every line is an answer, whatever was printed
     assert fine["success"] and fine["w"] == ours["w"] and fine["inliers"] == ours["inliers"]

@@ -43,20 +43,6 @@ def test_two_processes_evaluate_to_the_same_bytes(smoke_dataset: Path, tmp_path:
     assert len(one) > 20 and one == two
 
 
-def test_processes_and_a_cluster_are_not_both_taken(smoke_dataset: Path, tmp_path: Path) -> None:
-    run = run_here(
-        "evaluate", smoke_dataset, "--out", tmp_path / "out", "--workers", 2, "--scheduler", "tcp://127.0.0.1:1"
-    )
-    assert run.returncode == 2 and "give one of the two" in run.stderr and run.stderr.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    run = run_here("simulate", "noise", "--out", tmp_path / "out", "--scheduler", str(tmp_path / "none.json"))
-    assert run.returncode == 2 and "--scheduler" in run.stderr and run.stderr.count("\n") == 1
-    assert ("no such file" in run.stderr) == (find_spec("distributed") is not None)
-
-
 @pytest.mark.slow
 @NEEDS_DASK
 def test_a_cluster_generates_evaluates_and_simulates_the_same_bytes(

@@ -65,15 +65,19 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
+def _with_an_entry(board: Path, split: Split) -> Path:
+    """The truth of a split as an entry of a board."""
+    lines = named(truth_lines(split), "mine", ("left",))
+    add(board, write(board.with_name("x.jsonl"), lines), split, {})
+    return board
+
+
 def test_of_a_secret_split_no_problem_is_told(tmp_path: Path) -> None:
     """From a few exact errors of one problem its truth could be computed."""
-    split = replace(SPLIT, public=False)
-    truth = truth_lines(split)
-    add(tmp_path / "board", write(tmp_path / "x.jsonl", named(truth, "mine", ("left",))), split, {})
-    page = build_site(tmp_path / "board", tmp_path / "out")
+    page = build_site(_with_an_entry(tmp_path / "board", replace(SPLIT, public=False)), tmp_path / "out")
     pages = list((tmp_path / "out").rglob("*.html"))
     assert sorted(path.name for path in pages) == ["index.html", "mine.html"] and page in pages
-    names = [each.name for each in split.truths]
+    names = [each.name for each in SPLIT.truths]
     for path in (tmp_path / "out").rglob("*.*"):
         text = path.read_text("utf-8")
         assert "problems.html" not in text and not any(re.search(rf"\b{name}\b", text) for name in names)
@@ -81,32 +85,22 @@ def test_of_a_secret_split_no_problem_is_told(tmp_path: Path) -> None:
 
 
 def test_where_there_is_a_secret_split_it_comes_first_and_ranks(tmp_path: Path) -> None:
-    words = "Secret: it ranks.", "Its truth is public: for practice."
-
-    def page(split: Split) -> str:
-        add(
-            tmp_path / "board",
-            write(tmp_path / "x.jsonl", named(truth_lines(split), "mine", ("left",))),
-            split,
-            {},
-        )
-        return build_site(tmp_path / "board", tmp_path / "out").read_text("utf-8")
-
-    text = page(SPLIT)
+    words, board = ("Secret: it ranks.", "Its truth is public: for practice."), tmp_path / "board"
+    text = build_site(_with_an_entry(board, SPLIT), tmp_path / "out").read_text("utf-8")
     assert not any(word in text for word in words)
-    text = page(replace(SPLIT, public=False, label="secret", seed=12))
+    _with_an_entry(board, replace(SPLIT, public=False, label="secret", seed=12))
+    text = build_site(board, tmp_path / "out").read_text("utf-8")
     assert 0 < text.index(words[0]) < text.index(words[1])
 
 
 def test_tables_that_the_folder_has_already_stay_on_the_first_page(site: Path, tmp_path: Path) -> None:
-    out, split = tmp_path / "out", replace(SPLIT, label="other", seed=12)
+    out, board = tmp_path / "out", _with_an_entry(tmp_path / "board", replace(SPLIT, label="other", seed=12))
     shutil.copytree(site, out)
-    add(tmp_path / "board", write(tmp_path / "x.jsonl", named(truth_lines(split), "mine", ("left",))), split, {})
     for _ in range(2):  # written again, the page is the same
-        text = build_site(tmp_path / "board", out).read_text("utf-8")
+        text = build_site(board, out).read_text("utf-8")
         assert text.count("<section ") == 2 and text.count(f'href="#{ID}"') == 1 and "best_one" in text
     (out / f"{ID}.csv").unlink()
-    assert build_site(tmp_path / "board", out).read_text("utf-8").count("<section ") == 1
+    assert build_site(board, out).read_text("utf-8").count("<section ") == 1
 
 
 class _Cells(HTMLParser):
@@ -320,12 +314,8 @@ def rendered_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutter = RollingShutter(height=72, readout_ratio=0.8)
     write_analytic_dataset(folder / "data", rig, shutter, motion, twins=(36,))
     splits = {track: TRACKS[track].split(folder / "data") for track in ("pose", "depth", "correction")}
-    add(
-        folder / "board",
-        write(folder / "x.jsonl", truth_lines(splits["pose"])),
-        splits["pose"],
-        {"command": ORACLES},
-    )
+    truth = write(folder / "x.jsonl", truth_lines(splits["pose"]))
+    add(folder / "board", truth, splits["pose"], {"command": ORACLES})
     for track in ("depth", "correction"):
         path = write_truth(splits[track], folder / track)
         lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]

@@ -1,0 +1,403 @@
+"""``rsbench correct`` of four frames, or of a sequence: a killed run goes on after the frames that it wrote."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import deque
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from rsbench.capture.calibration import NO_ERRORS
+from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.cli.compile_ahead import compiling_ahead
+from rsbench.cli.console import echo, progress_bar
+from rsbench.cli.correct_input import CorrectInput, target_row
+from rsbench.cli.correct_output import (
+    SUBTITLE,
+    UNIT,
+    camera_facts,
+    listed,
+    motion_facts,
+    readout_words,
+    say_calibration,
+)
+from rsbench.components.imports import component_key
+from rsbench.core.errors import RsbenchError
+from rsbench.core.rig import SIDES
+from rsbench.core.shutter import Scanning
+from rsbench.core.version import __version__
+from rsbench.dataset import corrected_frames as results
+from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
+from rsbench.pipeline.chain import check_cameras, correct_four
+from rsbench.pipeline.footage import FORECAST, FrameSource, RigCard, read_four
+from rsbench.pipeline.frame_capture import KnownCapture
+from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.isolated_components import Isolation
+from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope, know_capture, with_found_camera
+from rsbench.pipeline.sequence_correction import correct_sequence, takes_gyro
+from rsbench.report.corrected_page import (
+    card_of,
+    comparison,
+    draw_own_motion,
+    draw_trajectory,
+    most_changed,
+    write_page,
+)
+from rsbench.report.motion_figures import sizes
+from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, upright, write_frames
+from rsbench.vision.corrector import CorrectorEntry, NotCorrectedError, demand_corrected
+from rsbench.vision.correctors import FusionCorrector
+from rsbench.vision.fusion import finished
+
+_PAGE_FRAMES = 6
+
+
+def correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
+    """Correct four frames or a sequence; exit 1 if it fails. ``close``: close narrow holes of corrected frames."""
+    try:
+        with nullcontext() if given.one_camera else compiling_ahead(), Isolation() as isolation:
+            options = isolation.chain(options)
+            if given.four:
+                _correct_four(given, target, options, close)
+            else:
+                _correct_sequence(given, target, options, close)
+    except (NoMotionError, NotCorrectedError) as error:
+        echo(f"rsbench: not corrected: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+def without_filling(entry: CorrectorEntry) -> CorrectorEntry:
+    """The built-in corrector without filling from other views; RsbenchError for other correctors."""
+    if not isinstance(entry.component, FusionCorrector):
+        raise RsbenchError(f"--no-fill: has no effect on corrector {entry.name!r}; leave it out")
+    component = replace(entry.component, use_other_views=False)
+    return replace(entry, component=component, key=component_key(component, {}))
+
+
+def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
+    card, out, order = given.card, given.out, (("left", 0), ("right", 0), ("left", 1), ("right", 1))
+    assert isinstance(card, RigCard)
+    results.refuse_video(out)
+    images = read_four(dict(zip(order, given.four, strict=True)))  # pyrefly: ignore[bad-argument-type]
+    rig = card.rig_of(images["left", 0], images["right", 0])
+    options = replace(options, target_row=target_row(target, images["left", 0].shape[0]))
+    with results.fresh_folder(out) as folder:
+        rig, focal = with_found_camera(rig, card.sigma, [images], options, card.inputs, progress_bar)
+        with progress_bar("correcting", 4) as advance:
+            result = correct_four(
+                images,
+                rig,
+                card.readout_ratio,
+                options,
+                advance,
+                disparity_offset=card.disparity_offset,
+                scanning=card.scanning,
+            )
+        demand_corrected(result.frames, options.corrector.name)
+        rig = result.rig
+        frames = {view: finished(fused) if close else fused for view, fused in result.frames.items()}
+        for (side, frame), fused in frames.items():
+            results.write_frame(folder, f"{side}_{frame}", fused)
+            if given.rectify:
+                write_rectified(folder, f"{side}_{frame}", fused, rig, side)
+        if given.rectify:
+            write_calibration(folder, rig)
+        calibration = (card.inputs.calibration or NO_ERRORS) if result.found is None else result.found.calibration
+        record = results.rig_record(rig, result.shutter, result.capture, options, calibration, result.rig_found)
+        record["camera_note"] = focal
+        record["motion"] = None if result.found is None else results.motion_record(result.found)
+        record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
+        record["seconds"] = result.seconds
+        results.write_record(folder, record)
+        cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
+        read = readout_words(result.shutter, result.capture, rig)
+        facts = [("readout ratio", read), *motion_facts(record["motion"])]
+        write_page(folder, f"rsbench correct: {out.name}", SUBTITLE, facts, cards)
+    _say_four(out, f"readout ratio {read}", record)
+
+
+def _say_four(out: Path, first: str, record: dict[str, Any]) -> None:
+    motion = record["motion"]
+    echo(first)
+    say_calibration(record)
+    if motion is not None:
+        echo(f"motion in a frame period: {', '.join(sizes(motion))} (+-: one standard deviation)")
+        if motion["model_choice"]:
+            echo(f"motion model: {motion['model_choice']['text']}")
+        if motion["note"]:
+            echo(f"note: {motion['note']}")
+    echo(f"report: {(out / 'report.html').resolve()}")
+
+
+def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
+    """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
+    sources, card, out, lines = given.sources(), given.card, given.out, list[str]()
+    if given.rectify and given.video:
+        raise RsbenchError(f"--rectify: --out {out} is a video; give a folder, for pairs with their calibration")
+    if given.gyro.file is not None and not given.one_camera and not takes_gyro(sources[0], options):
+        raise RsbenchError(
+            "--gyro: is used for the trajectory of four frames and more, with the motion model auto; leave it out"
+        )
+    gyro = given.gyro.read(sources[0], given.one_camera)
+    first = [next(iter(source)) for source in sources]
+    options = replace(options, target_row=target_row(target, first[0].shape[0]))
+    if isinstance(card, RigCard):
+        check_cameras(card.rig_of(*first), card.scanning or Scanning(), options, card.disparity_offset)
+        _warn_of_times(sources)
+    else:
+        _say_input(given, sources[0], first[0].shape, options)
+    run = _run_key(given, sources, options, close, gyro)
+    with results.video_place(out, run) if given.video else results.fresh_folder(out, run=run) as folder:
+        known = know_capture(sources, card, options, gyro, progress_bar)
+        record = _record(known, options)
+        record["frames"] = _correct_into(folder, sources, known, options, close, given)
+        if given.video:
+            others = _write_page(folder, given, sources[0], record, known)
+            lines = _write_video(given, folder, sources, record, others)
+        else:
+            if given.rectify:
+                write_calibration(folder, known.rig)
+            results.write_record(folder, record)
+            _write_page(folder, given, sources[0], record, known)
+    _say(given, known, record, lines)
+
+
+def _say_input(
+    given: CorrectInput, source: FrameSource, shape: tuple[int, ...], options: CorrectionOptions
+) -> None:
+    """What was assumed of one camera's frames, a line each."""
+    (height, width), timeline = shape[:2], source.timeline
+    if given.words:
+        echo(given.words)
+    if source.orientation != UPRIGHT:
+        echo(
+            f"shown {ORIENTATIONS[source.orientation]}: rows, --target, --fov and scan refer to frames as they "
+            "are stored, and the result is shown alike"
+        )
+    for line in timeline.words:
+        echo(line)
+    rate = "" if timeline.period_s is None else f" at {1.0 / timeline.period_s:.4g} frames/s"
+    forecast = FORECAST.words(len(timeline.starts), width * height)
+    echo(f"{len(timeline.twins)} frames of {width} x {height}{rate}: {forecast}")
+    row = "the middle row" if options.target_row == (height - 1) / 2 else f"row {options.target_row:g}"
+    echo(f"output: {given.out}, each frame at the time of {row} (--target)")
+
+
+def _warn_of_times(sources: list[FrameSource]) -> None:
+    """Name a rig's videos whose frames repeat others or come at other times: they are taken as they come."""
+    for side, source in zip(SIDES, sources, strict=True):
+        if source.video is None:
+            continue
+        timeline = source.timeline
+        copies = len(timeline.twins) - len(timeline.starts)
+        if copies:
+            echo(f"rsbench: {side}: {copies} of {len(timeline.twins)} frames repeat the one before", err=True)
+        elif not timeline.even:
+            echo(
+                f"rsbench: {side}: frames do not follow each other evenly, and are taken as if they did", err=True
+            )
+
+
+def _run_key(
+    given: CorrectInput,
+    sources: list[FrameSource],
+    options: CorrectionOptions,
+    close: bool,
+    gyro: Gyroscope | None,
+) -> str:
+    """Hash of all that decides what is written: a run with another key does not resume this one."""
+    flags = close, given.row_poses, given.video, given.rectify
+    parts = [__version__, repr(given.card), repr(options), repr(flags)]
+    parts += [each for source in sources for each in source.identity()]
+    parts += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.clock_error)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _record(known: KnownCapture, options: CorrectionOptions) -> dict[str, Any]:
+    """What motion.json says of the cameras, as given or estimated, without the frames."""
+    if not known.rig.metric:
+        return results.camera_alone_record(known, options, UNIT)
+    rig = results.rig_record(known.rig, known.shutter, known.capture, options, known.calibration, known.rig_found)
+    return {**rig, "camera_note": known.camera_note}
+
+
+def _correct_into(
+    folder: Path,
+    sources: list[FrameSource],
+    known: KnownCapture,
+    options: CorrectionOptions,
+    close: bool,
+    given: CorrectInput,
+) -> list[dict[str, Any]]:
+    """Write every frame that is not there yet; returns what motion.json says of each.
+
+    The matches of frames that are there are found again: the trajectory of the others rests on them.
+    """
+    entries = results.written_entries(folder)
+    twins = sources[0].timeline.twins.tolist() if given.one_camera else []
+    with progress_bar("correcting", max(sources[0].count, 1)) as advance:
+        for entry in entries:
+            advance(f"frame {entry['number']}")
+
+        def copies() -> None:
+            while len(entries) < len(twins) and twins[len(entries)] < len(entries):
+                number, twin = len(entries), twins[len(entries)]
+                results.copy_frame(folder, f"{number:06d}", f"{twin:06d}")
+                entries.append({**entries[twin], "number": number, "copy_of": twin})
+                results.write_entry(folder, entries[-1])
+                advance(f"frame {number}")
+
+        copies()
+        there, start = len(entries), time.monotonic()
+        for moment in correct_sequence(sources, known, options, there):
+            entries.append(_write(folder, moment, close, given, known, sources[0].orientation))
+            rate = (len(entries) - there) / max(time.monotonic() - start, 1e-9)
+            advance(f"frame {moment.number}, {rate:.2g} frames/s")
+            copies()
+    return entries
+
+
+def _write(
+    folder: Path, moment: CorrectedMoment, close: bool, given: CorrectInput, known: KnownCapture, orientation: int
+) -> dict[str, Any]:
+    """Write a corrected time, and then its record: a time with a record is complete."""
+    entry: dict[str, Any] = {"number": moment.number}
+    how: dict[str, Any] = {"whole": not given.video, "orientation": orientation}
+    for side, fused in (moment.shown if given.one_camera else moment.frames).items():
+        name, fused = _name(side, moment.number, given.one_camera), finished(fused) if close else fused
+        results.write_frame(folder, name, fused, **how)
+        if given.rectify:
+            write_rectified(folder, name, fused, known.rig, side)
+        entry |= fused.shares() if given.one_camera else {side: fused.shares()}
+    if moment.reason:
+        entry["skipped" if moment.frames else "reason"] = moment.reason
+    if moment.frames and moment.found is not None:
+        entry["motion"] = results.motion_record(moment.found)
+    if moment.pose is not None:
+        results.write_poses(folder, "trajectory", moment.number, [float(moment.number)], moment.pose)
+    if given.row_poses and moment.line_poses is not None:
+        taus = np.sort(known.shutter.line_times(moment.number, "left"))
+        results.write_poses(folder, "row_poses", moment.number, taus, moment.line_poses)
+    results.write_entry(folder, entry)
+    return entry
+
+
+def _name(side: str, number: int, one_camera: bool) -> str:
+    return f"{number:06d}" if one_camera else f"{side}_{number:06d}"
+
+
+def _write_page(
+    folder: Path, given: CorrectInput, source: FrameSource, record: dict[str, Any], known: KnownCapture
+) -> list[Path]:
+    """The page, of the frames of the left or only camera that changed most; beside a video, one to compare."""
+    one, out, changed, frames = given.one_camera, given.out, list[float](), record["frames"]
+    numbers = [each["number"] for each in frames if one or "left" in each]
+    names = [_name("left", number, one) for number in numbers]
+    pairs = (
+        (before, results.read_corrected(folder, name))
+        for name, before in zip(names, source.only(numbers), strict=True)
+    )
+    shown, video = comparison(pairs, source.orientation, changed), folder / results.comparison_of_video(out).name
+    if given.video and numbers:
+        write_frames(video, shown, fps=results.DEFAULT_FPS, times=source.times if one else None)
+    else:
+        deque(shown, maxlen=0)
+    results.join_poses(folder, "row_poses")
+    results.join_poses(folder, "trajectory")
+    facts = [("readout ratio", readout_words(known.shutter, known.capture, known.rig))]
+    facts += [*camera_facts(record).items()] if one else []
+    corrected = sum("reason" not in each for each in frames)
+    facts += [("frames corrected" if one else "times corrected", f"{corrected} of {len(frames)}")]
+    if changed:
+        facts += [("change of a frame", f"{max(changed):.1f} grey levels at most, mean over its pixels")]
+    facts += [("unit of depth", UNIT)] if one else []
+    chosen = most_changed(changed, _PAGE_FRAMES) if changed else []
+    shown_frames = source.only(numbers[k] for k in chosen) if chosen else ()
+    title, unit = ("frame {}", "") if one else ("left, frame {}", " m")
+    cards = [
+        card_of(title.format(numbers[k]), image, results.read_fused(folder, names[k]), unit, source.orientation)
+        for k, image in zip(chosen, shown_frames, strict=True)
+    ]
+    trajectory = folder / "trajectory.csv"
+    poses = np.loadtxt(trajectory, ndmin=2) if trajectory.is_file() else np.zeros((0, 8))
+    drawn = draw_own_motion(frames) if one else draw_trajectory(poses, frames)
+    page = folder / given.page.name
+    title, subtitle = f"rsbench correct: {out.name}", f"{SUBTITLE}; the frames that changed most"
+    beside = video.name if video.is_file() else ""
+    write_page(folder, title, subtitle, facts, cards, drawn, page=page, record=record, video=beside)
+    return [each for each in (video, page) if given.video and each.is_file()]
+
+
+def _write_video(
+    given: CorrectInput, folder: Path, sources: list[FrameSource], record: dict[str, Any], others: list[Path]
+) -> list[str]:
+    """A video, of a rig with both cameras side by side; a time that is not corrected is there as it was read.
+
+    Returns notes on what was written.
+    """
+    one, first = given.one_camera, sources[0]
+    turn = UPRIGHT if one else first.orientation  # of both, so that they stay side by side
+
+    def shown(side: str, number: int, image: Any) -> Any:
+        name = _name(side, number, one)
+        corrected = (folder / "corrected" / f"{name}.png").is_file()
+        return upright(results.read_corrected(folder, name) if corrected else image, turn)
+
+    images = (
+        np.hstack([shown(side, number, image) for side, image in zip(SIDES, moment, strict=False)])
+        for number, moment in enumerate(zip(*sources, strict=True))
+    )
+    fps, orientation = results.fps_of(first.path), None if one else UPRIGHT
+    return results.write_video(given.out, folder, images, fps, record, first, others, orientation)
+
+
+def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:
+    """Exit 1 where a time is not corrected; ``lines``: notes on what was written."""
+    frames, one = record["frames"], given.one_camera
+    failed, skipped = (
+        listed((frame["number"], frame[key]) for frame in frames if key in frame) for key in ("reason", "skipped")
+    )
+    reasons = {frame.get("reason") for frame in frames}
+    if len(reasons) == 1 and None not in reasons:
+        failed = f"all {len(frames)} {'frames' if one else 'times'}: {reasons.pop()}"
+    remedy = ": --readout-ratio or --shutter gives it" if one and known.capture is not None else ""
+    echo(f"readout ratio {readout_words(known.shutter, known.capture, known.rig)}{remedy}")
+    if one:
+        facts = camera_facts(record)
+        remedy = "" if known.focal is None else ": --fov or --camera gives it"
+        echo(f"focal length {facts.pop('focal length')}{remedy}")
+        for name, words in facts.items():
+            echo(f"{name}: {words}")
+    else:
+        say_calibration(record)
+    gyros = [(each["number"], each["motion"]["gyro"]) for each in frames if "gyro" in each.get("motion", {})]
+    used = [found for _, found in gyros if not isinstance(found, str)]
+    if used:
+        off = max(abs(value - (i == j)) for i, row in enumerate(used[-1]["matrix"]) for j, value in enumerate(row))
+        shift = used[-1]["shift"]  # above 0 its times are early
+        clock = f"{abs(shift):.3f} frame periods {'behind' if shift > 0.0 else 'ahead'}"
+        echo(f"gyroscope: clock {clock}, axes and scales off by {off:.1%}: corrected for")
+    elif known.gyro is not None and not one and record["readout_ratio"] == 0.0:
+        echo("rsbench: corrected without the gyroscope: the shutter is global", err=True)
+    for line in lines:
+        echo(line)
+    corrected = sum("reason" not in frame for frame in frames)
+    echo(f"{corrected} of {len(frames)} {'frames' if one else 'times'} corrected")
+    if given.video:
+        echo(f"video: {given.out.resolve()}")
+    echo(f"report: {given.page.resolve()}")
+    if len(used) < len(gyros):
+        unlike = listed((number, found) for number, found in gyros if isinstance(found, str))
+        echo(f"rsbench: corrected without the gyroscope: {unlike}", err=True)
+    if skipped:
+        how = "the frame after them" if one else "the motion of the frames around"
+        echo(f"rsbench: corrected with {how}: {skipped}", err=True)
+    if failed:
+        echo(f"rsbench: not corrected: {failed}", err=True)
+        raise typer.Exit(1)
