@@ -419,6 +419,7 @@ class _Matches(TruthChannel):
             make_matches(whole.geometry, first, images, matching, whole.rays).save(folder / matches_file(first))
 
 
+NORMALS, INSTANCES, RADIANCE = _Normals(), _Instances(), _Radiance()
 OBJECTS: dict[str, TruthChannel] = {
     each.name: each
     for each in (
@@ -426,12 +427,12 @@ OBJECTS: dict[str, TruthChannel] = {
         _Flow(),
         _CorrectionFlow(),
         _Timing(),
-        _Normals(),
-        _Instances(),
+        NORMALS,
+        INSTANCES,
         _Inertial(),
         _Tracks(),
         _Affine(),
-        _Radiance(),
+        RADIANCE,
         _Matches(),
     )
 }
@@ -502,17 +503,9 @@ def pair_values(channel: PairChannel, source: ImageView, offset: FloatArray) -> 
     return (values + 0.0).astype(np.float32)  # no -0
 
 
-def surface_file(channel: Literal["normals", "instances"], side: str, frame: int) -> str:
-    return f"{channel}/{side}_{frame}.{'exr' if channel == 'normals' else 'png'}"
-
-
 def matches_file(first: int) -> str:
     """File of the matches of frame ``first`` and the next, below the folder of a sequence."""
     return f"matches/{first}.npz"
-
-
-def radiance_file(side: str, frame: int) -> str:
-    return f"hdr/{side}_{frame}.exr"
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:
@@ -579,11 +572,11 @@ class ChannelReader:
 
         RsbenchError as of ``channel_values``.
         """
-        return self.channel_values("normals", surface_file("normals", side, frame + self.first))
+        return self.channel_values("normals", NORMALS.file(side, frame + self.first))
 
     def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
         """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``channel_values``."""
-        return self.channel_values("instances", surface_file("instances", side, frame + self.first))
+        return self.channel_values("instances", INSTANCES.file(side, frame + self.first))
 
     def instance_table(self) -> list[dict[str, str]]:
         """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``channel_values``, or another
@@ -619,7 +612,7 @@ class ChannelReader:
         Times the renderer's ``exposure``, 1 is white. Rounded to float16 on disk. RsbenchError as of
         ``channel_values``.
         """
-        return self.channel_values("hdr", radiance_file(side, frame + self.first))
+        return self.channel_values("hdr", RADIANCE.file(side, frame + self.first))
 
     def tracks(self) -> Tracks:
         """Surface points and where the frames see them; RsbenchError as of ``channel_values``."""

@@ -17,15 +17,16 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import (
     INSTANCE_TABLE,
+    INSTANCES,
+    NORMALS,
     PAIR_CHANNELS,
+    RADIANCE,
     STEP_PX,
     FrameTruth,
     Layer,
     known,
     pair_layers,
     pair_values,
-    radiance_file,
-    surface_file,
 )
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, SeenSurfaces, numbers_of, times_at
@@ -117,7 +118,7 @@ def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
 def channels_again(
     sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
 ) -> Iterator[Again]:
-    """Make rows of the channels of a frame again: each file, its fault or None, and whether its bits are equal.
+    """Make rows of the channels of a frame again, and compare each file.
 
     Args:
         sequence: holds them.
@@ -151,7 +152,7 @@ def channels_again(
                 np.arange(sequence.rig.sensor(view.side).height), np.asarray(rows)[np.any(wrong, axis=1)]
             )
             same = np.array_equal(stored, made.astype(stored.dtype), equal_nan=stored.dtype.kind == "f")
-            yield file, Finding(file, what, rows_of(in_rows)) if bad else None, same
+            yield Again(file, Finding(file, what, rows_of(in_rows)) if bad else None, same)
 
 
 def _pair_faults(
@@ -314,10 +315,10 @@ def surface_faults(
         if view not in maps or view.depth in reported:
             continue
         try:
-            file = surface_file("normals", side, frame)
+            file = NORMALS.file(side, frame)
             if "normals" in sequence.channels and file not in reported and frame in new:
                 yield from _normal_faults(sequence, maps[view], file, sequence.normals(side, frame))
-            file = surface_file("instances", side, frame)
+            file = INSTANCES.file(side, frame)
             if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(reported):
                 instances[view] = sequence.instances(side, frame)
                 if frame in new:
@@ -408,7 +409,7 @@ def _agreement_faults(
     other = np.zeros(same.shape, dtype=np.bool_)
     other[same] = ~np.any(np.equal(around, instances[view][same]), axis=0)
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
-        file, there = (surface_file("instances", each.side, each.frame) for each in (view, partner))
+        file, there = (INSTANCES.file(each.side, each.frame) for each in (view, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
         yield Finding(file, f"{share} see another instance than {there}", rows_with_most(other))
 
@@ -426,7 +427,7 @@ def hdr_faults(
     if "hdr" not in sequence.channels or not isinstance(exposure, float):
         return
     for view, picture in pictures.items():
-        file, image = radiance_file(view.side, view.frame), clean_picture(sequence, view)
+        file, image = RADIANCE.file(view.side, view.frame), clean_picture(sequence, view)
         if view.shutter != "rs" or {file, image} & set(reported):
             continue
         try:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from rsbench.verification.reprojection import (
     by_bands,
     reproject,
     seen_in,
+    stride_for,
 )
 
 Bits = NDArray[np.uint8]
@@ -373,7 +375,7 @@ def _changed_maps(
 
 def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: BoolArray) -> NDArray[np.float32]:
     """(n,) relative differences of pixels in these rows that meet a flat surface of a partner, or -inf."""
-    stride = max(1, int(np.sqrt(np.sum(rows) * source.depth.shape[1] / _TRIED_PIXELS)))
+    stride = stride_for(np.sum(rows) * source.depth.shape[1], _TRIED_PIXELS)
     if not np.any(rows[::stride]):
         stride = 1
     relative = reproject(sequence, source, partner, stride).relative
@@ -433,7 +435,7 @@ def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: 
 
 
 def _roughly_alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
-    stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+    stride = stride_for(source.depth.size, _TRIED_PIXELS)
     pixels, x_in_cam = seen_in(geometry, source, target, range(0, len(source.depth), stride), stride)
     inside = np.isfinite(pixels[..., 0]) & (source.depth[::stride, ::stride] > 0)
     middle, z = np.rint(pixels[inside]).astype(np.int64), x_in_cam[inside][:, 2]
@@ -495,8 +497,7 @@ class _MapsOverTime:
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
-        self._read: dict[int, DepthMap | None] = {}
-        self._found: dict[tuple[int, int, int], tuple[float, int]] = {}
+        self._map, self._share = cache(self._read), cache(self._compare)
 
     def near(self, frame: int) -> list[int]:
         """Other frames, the nearest first."""
@@ -512,28 +513,20 @@ class _MapsOverTime:
         """Whether another one near it sees what it sees."""
         return any(self._share(frame, frame, other)[1] >= _LEAST for other in self.near(frame))
 
-    def _share(self, frame: int, time: int, other: int) -> tuple[float, int]:
-        key = frame, time, other
-        if key not in self._found:
-            self._found[key] = self._compare(*key)
-        return self._found[key]
-
     def _compare(self, frame: int, time: int, other: int) -> tuple[float, int]:
+        """Share of the comparable pixels that agree, and how many these are."""
         source, target = self._map(frame), self._map(other)
         if source is None or target is None:
             return 0.0, 0
         moved = replace(source, view=source.view._replace(frame=time))
-        stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+        stride = stride_for(source.depth.size, _TRIED_PIXELS)
         relative = reproject(self.sequence, moved, target, stride).relative
         near = relative[(source.depth[::stride, ::stride] > 0) & (relative < 0.01)]
         near = near[np.isfinite(near)]
         return (float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if near.size else 0.0), near.size
 
-    def _map(self, frame: int) -> DepthMap | None:
-        if frame not in self._read:
-            view = ImageView("rs", "left", frame)
-            try:
-                self._read[frame] = DepthMap(view, self.sequence.depth(*view), self.sequence.rig.sensor("left"))
-            except RsbenchError:  # reported already
-                self._read[frame] = None
-        return self._read[frame]
+    def _read(self, frame: int) -> DepthMap | None:
+        view = ImageView("rs", "left", frame)
+        with suppress(RsbenchError):  # reported already
+            return DepthMap(view, self.sequence.depth(*view), self.sequence.rig.sensor("left"))
+        return None

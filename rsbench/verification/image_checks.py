@@ -23,6 +23,7 @@ from rsbench.verification.reprojection import (
     Reprojection,
     by_bands,
     reproject,
+    stride_for,
     without_changing_light,
 )
 
@@ -386,8 +387,7 @@ def _image_cause(
     for name, colours in others:
         if np.array_equal(image[1:], colours[1:]):
             return f"the same as {name}"
-    height, width = image.shape[:2]
-    stride = max(1, int(np.sqrt(height * width / _TRIED_PIXELS)))
+    stride = stride_for(image.size / 3, _TRIED_PIXELS)
     reprojection = reproject(sequence, maps[view], maps[partner], stride)
     reprojection = without_changing_light(sequence, maps[view], maps[partner], reprojection, stride)
     y, x, shown = show(maps[view], pictures[partner], reprojection, stride)

@@ -16,7 +16,7 @@ from rsbench.core.version import __version__
 from rsbench.dataset.views import ImageView, numbers_of, view_pairs
 from rsbench.verification.content import Content, shared_line, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
+from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject, stride_for
 from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8
@@ -145,7 +145,7 @@ def _contradicted(content: Content) -> Iterator[tuple[ImageView, Finding]]:
 def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolArray:
     """(H,) rows of a map in which even surfaces are marked, or not, as another map has it not."""
     source, target = content.maps[one], content.maps[other]
-    stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+    stride = stride_for(source.depth.size, _TRIED_PIXELS)
     reprojection = reproject(content.sequence, source, target, stride)
     with np.errstate(invalid="ignore"):
         alike = (np.abs(reprojection.relative) <= DEPTH_TOLERANCE) & source.flat[::stride, ::stride]
@@ -206,7 +206,7 @@ def _on_nothing(each: DepthMap) -> Finding | None:
 def _misplaced(content: Content, own: DepthMap) -> Finding | None:
     """Surfaces through which partners see where their labels take them, and which they see where another would."""
     sequence, view = content.sequence, own.view
-    stride = max(1, int(np.sqrt(own.depth.size / _TRIED_PIXELS)))
+    stride = stride_for(own.depth.size, _TRIED_PIXELS)
     numbers = numbers_of(_mask_of(own, "labels"))
     elsewhere = np.zeros(own.depth[::stride, ::stride].shape, dtype=np.bool_)
     # The other camera sees all of them at about the same time, which shows no movement.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -40,6 +41,7 @@ from rsbench.dataset.matches import (
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import (
     AffineFrames,
+    ArrayFile,
     Tracks,
     jacobians_of,
     look_for,
@@ -53,6 +55,9 @@ from rsbench.verification.findings import Again, Finding, reports_unreadable, sk
 from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, relative_depth
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher
+
+if TYPE_CHECKING:
+    from rsbench.renderers.visibility import SceneRays
 
 _SAME, _SAME_PX = 1e-9, 1e-6
 """Tolerances for equal points, relative, and equal pixels, px: rounding, and 1e-9 px at a small slope."""
@@ -160,18 +165,27 @@ def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[Float
     return np.min(around, axis=0, initial=np.inf), np.max(around, axis=0, initial=0.0)
 
 
+def points_again(sequence: Sequence, rays: SceneRays, compared: Callable[[str], bool]) -> Iterator[Again]:
+    """``channel_checks.channels_again`` for the channels of points; ``compared``: whether a file is."""
+    if "tracks" in sequence.channels and compared(TRACKS):
+        yield from _tracks_again(sequence, rays)
+    if "affine" in sequence.channels and compared(AFFINE):
+        yield from _affine_again(sequence, rays)
+    if "matches" in sequence.channels:
+        for first in filter(lambda each: compared(matches_file(each)), range(sequence.frames - 1)):
+            yield from _matches_again(sequence, rays, first)
+
+
 @skips_unreadable
-def tracks_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
-    """``channel_checks.channels_again`` for tracks: compute the visibility in each frame again by ray casting."""
-    if "tracks" not in sequence.channels or TRACKS in reported:
-        return
+def _tracks_again(sequence: Sequence, rays: Rays) -> Iterator[Again]:
+    """Compute the visibility of tracks in each frame again by ray casting."""
     tracks = sequence.tracks()
     views = enumerate(track_views(sequence.frames))
     wrong: list[BoolArray] = [_classes_unlike(sequence, tracks, k, view, rays) for k, view in views]
     share = float(np.mean(wrong)) if len(tracks.points) else 0.0
     bad = np.sum(wrong) > max(_FEW_AGAIN * np.size(wrong), _LEAST)
     what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from ray casting"
-    yield TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong)
+    yield Again(TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong))
 
 
 def _classes_unlike(sequence: Sequence, tracks: Tracks, k: int, view: View, rays: Rays) -> BoolArray:
@@ -268,18 +282,14 @@ def _normal_faults(
 
 
 @skips_unreadable
-def affine_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
-    """``channel_checks.channels_again`` for affine frames: compute normals of tracks by ray casting."""
-    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
-        return
+def _affine_again(sequence: Sequence, rays: Rays) -> Iterator[Again]:
+    """Compute the normals of affine frames again by ray casting."""
     stored, tracks = sequence.affine(), sequence.tracks()
     made = make_affine(sequence, tracks, rays)
     wrong = np.any(np.abs(made.normals - stored.normals) > 10 * _UNIT, axis=1)
     bad = np.sum(wrong) > max(_FEW_AGAIN * len(wrong), _LEAST)
     what = f"{np.sum(wrong)} of {len(wrong)} normals differ from ray casting"
-    names = ("normals", "jacobians")
-    same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield AFFINE, Finding(AFFINE, what) if bad else None, same
+    yield Again(AFFINE, Finding(AFFINE, what) if bad else None, _same_bits(made, stored, "normals", "jacobians"))
 
 
 _BESIDE_ALL, _FEW_BESIDE = 1e-2, 0.15
@@ -466,11 +476,9 @@ def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Itera
 
 
 @skips_unreadable
-def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Collection[str]) -> Iterator[Again]:
-    """``channel_checks.channels_again`` for matches of frame ``first`` and the next: label them by ray casting."""
-    if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
-        return
-    stored = sequence.matches(first)
+def _matches_again(sequence: Sequence, rays: MatchRays, first: int) -> Iterator[Again]:
+    """Label the matches of frame ``first`` and the next again by ray casting."""
+    stored, file = sequence.matches(first), matches_file(first)
     as_given = Arranged(stored.sets, stored.tracks, stored.pixels)
     made = labelled(sequence, first, as_given, (sequence.matching or Matching()).bound_px, rays)
     with np.errstate(invalid="ignore"):
@@ -478,6 +486,10 @@ def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Col
     alike = (made.classes == stored.classes) & (near | (np.isnan(made.error) & np.isnan(stored.error)))
     wrong = int(np.sum(~alike))
     what = f"{wrong} of {len(alike)} labels differ from ray casting"
-    names = ("depth", "truth", "classes")
-    same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield file, Finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else None, same
+    bad = wrong > max(_FEW_OTHERS * len(alike), _LEAST)
+    same = _same_bits(made, stored, "depth", "truth", "classes")
+    yield Again(file, Finding(file, what) if bad else None, same)
+
+
+def _same_bits(made: ArrayFile, stored: ArrayFile, *names: str) -> bool:
+    return all(np.array_equal(getattr(made, name), getattr(stored, name), equal_nan=True) for name in names)

@@ -188,6 +188,11 @@ def reproject(geometry: Geometry, source: DepthMap, target: DepthMap, stride: in
     return found
 
 
+def stride_for(pixels: float, tried: int) -> int:
+    """Stride in both directions at which about ``tried`` of so many pixels are left."""
+    return max(1, int(np.sqrt(pixels / tried)))
+
+
 def seen_in(
     geometry: Geometry, source: DepthMap, target: DepthMap, rows: range, stride: int
 ) -> tuple[FloatArray, FloatArray]:
