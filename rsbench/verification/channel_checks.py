@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.rig import SIDES
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import (
@@ -31,7 +31,7 @@ from rsbench.dataset.channels import (
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, SeenSurfaces, numbers_of, times_at
 from rsbench.renderers.image import linear_of_codes, to_srgb8
-from rsbench.verification.content import clean_picture
+from rsbench.verification.content import Content, clean_picture
 from rsbench.verification.findings import Again, Finding, cheapest_cause, rows_of, rows_with_most
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.reprojection import BoolArray, DepthMap, reproject
@@ -79,18 +79,14 @@ class _Derived(NamedTuple):
 
 
 def channel_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    stride: int = 1,
-    times: tuple[int, ...] = FRAMES,
-    new: tuple[int, ...] = FRAMES,
+    content: Content, reported: Collection[str], new: tuple[int, ...], stride: int = 1
 ) -> Iterator[Finding]:
     """What the channels of a sequence show that its depth maps and motion cannot have made.
 
     Files that are ``reported`` already, missing or wrong, are left out; a wrong depth map would accuse others. Of
-    channels between two frames of these ``times``, or within one, at least one of which is ``new``.
+    channels between two frames of the content, or within one, at least one of which is ``new``.
     """
+    sequence, maps, times = content.sequence, content.maps_without(reported), content.times
     for layer in pair_layers(sequence.channels, sequence.twins, sequence.frames):
         stored: dict[ImageView, _Stored] = {}
         for side, frame in layer.views(sequence.frames):
@@ -102,10 +98,8 @@ def channel_faults(
             except RsbenchError as error:
                 yield Finding.of(error)
         for view in stored:
-            there = layer.target(view, sequence.frames)
-            used = {each for each in (view, there) if each in maps and each.depth not in reported}
-            if len(used) == 2:
-                yield from _pair_faults(sequence, maps, layer, view, stored, stride)
+            if {view, layer.target(view, sequence.frames)} <= maps.keys():
+                yield from _pair_faults(content, layer, view, stored, stride)
 
 
 def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
@@ -156,14 +150,9 @@ def channels_again(
 
 
 def _pair_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    layer: Layer,
-    view: ImageView,
-    stored: Mapping[ImageView, _Stored],
-    stride: int,
+    content: Content, layer: Layer, view: ImageView, stored: Mapping[ImageView, _Stored], stride: int
 ) -> Iterator[Finding]:
-    derived = _derived(sequence, maps, layer, view, stride)
+    derived = _derived(content, layer, view, stride)
     values, classes = stored[view].values[::stride, ::stride], stored[view].classes[::stride, ::stride]
     file = layer.values(view.side, view.frame)
     known = ~np.isin(classes, _NO_VALUE)
@@ -178,7 +167,7 @@ def _pair_faults(
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
         yield Finding(file, f"{what}, by {layer.mask(view.side, view.frame)}")
-    there, sky = layer.target(view, sequence.frames), maps[view].depth[::stride, ::stride] == 0
+    there, sky = layer.target(view, content.sequence.frames), content.maps[view].depth[::stride, ::stride] == 0
     yield from _mask_faults(layer, view, there, classes, sky, derived, stride)
 
 
@@ -210,10 +199,9 @@ def _mask_faults(
             yield Finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
 
-def _derived(
-    sequence: Sequence, maps: Mapping[ImageView, DepthMap], layer: Layer, view: ImageView, stride: int
-) -> _Derived:
+def _derived(content: Content, layer: Layer, view: ImageView, stride: int) -> _Derived:
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
+    sequence, maps = content.sequence, content.maps
     depth = maps[view].depth
     filled = replace(maps[view], depth=np.where(depth > 0, depth, np.float32(FAR)))
     reprojection = reproject(sequence, filled, maps[layer.target(view, sequence.frames)], stride)
@@ -298,21 +286,16 @@ _FEW_OTHERS = 0.02
 four that see something else."""
 
 
-def surface_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    times: tuple[int, ...] = FRAMES,
-    new: tuple[int, ...] = FRAMES,
-) -> Iterator[Finding]:
+def surface_faults(content: Content, reported: Collection[str], new: tuple[int, ...]) -> Iterator[Finding]:
     """What normals and instances show that the surfaces of the depth maps are not, but for files ``reported``.
 
-    Of frames at these ``times``, and of pairs of them with one that is ``new``.
+    Of frames that are ``new``, and of pairs with one that is.
     """
+    sequence, maps = content.sequence, content.maps_without(reported)
     instances: dict[ImageView, NDArray[np.uint16]] = {}
-    for side, frame in product(SIDES, times):
+    for side, frame in product(SIDES, content.times):
         view = ImageView("rs", side, frame)
-        if view not in maps or view.depth in reported:
+        if view not in maps:
             continue
         try:
             file = NORMALS.file(side, frame)
@@ -328,7 +311,7 @@ def surface_faults(
     for view in instances:
         for partner in view.partners():
             if partner in instances and {view.frame, partner.frame} & {*new}:
-                yield from _agreement_faults(sequence, maps, instances, view, partner)
+                yield from _agreement_faults(content, instances, view, partner)
 
 
 def _normal_faults(
@@ -389,13 +372,9 @@ def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], 
 
 
 def _agreement_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    instances: Mapping[ImageView, NDArray[np.uint16]],
-    view: ImageView,
-    partner: ImageView,
+    content: Content, instances: Mapping[ImageView, NDArray[np.uint16]], view: ImageView, partner: ImageView
 ) -> Iterator[Finding]:
-    reprojection = reproject(sequence, maps[view], maps[partner])
+    reprojection = reproject(content.sequence, content.maps[view], content.maps[partner])
     with np.errstate(invalid="ignore"):
         same = np.abs(reprojection.relative) < _SURFACE
     # One of the four pixels around must see the same: between them, things that touch change.
@@ -418,15 +397,14 @@ _CODE = 0.54
 """Codes by which light may differ from a code: its rounding, and that of half floats by 2^-12 of a value."""
 
 
-def hdr_faults(
-    sequence: Sequence, pictures: Mapping[ImageView, Picture], reported: Collection[str]
-) -> Iterator[Finding]:
+def hdr_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]:
     """What linear images show otherwise than the clean images, but for files ``reported``."""
+    sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     exposure = renderer.get("exposure") if isinstance(renderer, dict) else None
     if "hdr" not in sequence.channels or not isinstance(exposure, float):
         return
-    for view, picture in pictures.items():
+    for view, picture in content.pictures.items():
         file, image = RADIANCE.file(view.side, view.frame), clean_picture(sequence, view)
         if view.shutter != "rs" or {file, image} & set(reported):
             continue

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView
 from rsbench.verification.compiled_comparison import Shown, costs_of_changes, every_nth, vote_rows
 from rsbench.verification.findings import Finding, rows_of
@@ -26,6 +26,9 @@ from rsbench.verification.reprojection import (
     stride_for,
     without_changing_light,
 )
+
+if TYPE_CHECKING:
+    from rsbench.verification.content import Content
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0
@@ -342,27 +345,25 @@ _NOISY, _NOISIER = 15.0, 3.0
 
 
 def colour_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    pictures: Mapping[ImageView, Picture],
-    agreements: list[ColourAgreement],
-    other_images: OtherImages,
+    content: Content, agreements: list[ColourAgreement], other_images: OtherImages
 ) -> Iterator[tuple[ImageView, Finding]]:
     """A finding for each image that the others contradict."""
     wrong = list(wrong_images(agreements))
     suspects = {view for view, _ in wrong}
     for view, pairs in wrong:
-        bands = band_of_row(sequence.rig.sensor(view.side).height)
+        bands = band_of_row(content.sequence.rig.sensor(view.side).height)
         unlike = np.any([_of_bands(each.unlike, int(bands[-1]) + 1) for each in pairs], axis=0)
         others = sorted({(each.target if each.source == view else each.source).image for each in pairs})
         beyond = 100 * max(float(np.max(each.beyond[each.unlike])) for each in pairs)
         what = (
             f"shows other colours than {', '.join(others)} at the same surface, on up to {beyond:.3g} % of pixels"
         )
-        partners = sorted((each for each in view.partners() if each in maps), key=lambda each: each in suspects)
-        cause = "looks like noise" if _is_noise(pictures, view, unlike[bands]) else ""
+        partners = sorted(
+            (each for each in view.partners() if each in content.maps), key=lambda each: each in suspects
+        )
+        cause = "looks like noise" if _is_noise(content.pictures, view, unlike[bands]) else ""
         if partners and not cause:
-            cause = _image_cause(sequence, maps, pictures, view, partners[0], agreements, other_images)
+            cause = _image_cause(content, view, partners[0], agreements, other_images)
         yield view, Finding(view.image, what, rows_of(unlike[bands]), cause)
 
 
@@ -372,15 +373,14 @@ def _of_bands(unlike: BoolArray, count: int) -> BoolArray:
 
 
 def _image_cause(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    pictures: Mapping[ImageView, Picture],
+    content: Content,
     view: ImageView,
     partner: ImageView,
     agreements: list[ColourAgreement],
     other_images: OtherImages,
 ) -> str:
     """What turns the image into what the partner shows, as well as sound images are like each other."""
+    sequence, maps, pictures = content.sequence, content.maps, content.pictures
     others = [(other.image, picture.colours) for other, picture in pictures.items() if other != view]
     others += [(name, image.astype(np.float32)) for name, image in other_images(view)]
     image = pictures[view].colours

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple, TypeVar, get_args
@@ -34,7 +34,7 @@ from rsbench.renderers.image import (
     srgb_of,
 )
 from rsbench.storage.untrusted_files import inside
-from rsbench.verification.content import png_fault
+from rsbench.verification.content import Content, png_fault
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.reprojection import BoolArray, DepthMap
@@ -199,13 +199,9 @@ _UNCLIPPED = (0.03, 0.75)
 _WHITE = 255.0
 
 
-def sensor_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    pictures: Mapping[ImageView, Picture],
-    missing: Collection[str],
-) -> Iterator[Finding]:
+def sensor_faults(content: Content, missing: Collection[str]) -> Iterator[Finding]:
     """What the frames of a sequence show that their sensor cannot have made of the clean twins."""
+    sequence, maps, pictures = content.sequence, content.maps, content.pictures
     sensor = sequence.sensor
     for view in pictures:
         camera = sequence.rig.sensor(view.side)
