@@ -16,7 +16,7 @@ from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
 from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.tracks import AffineFrames, jacobians_of
-from rsbench.dataset.views import PixelClass
+from rsbench.dataset.views import NUMBER, PixelClass
 from rsbench.renderers.image import to_srgb8
 from rsbench.storage.files import (
     read_depth,
@@ -63,13 +63,21 @@ def mask_of(file: str, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]])
     return plant
 
 
-def exchanged(one: str, other: str) -> Callable[[Path], None]:
+def exchanged(*files: str) -> Callable[[Path], None]:
+    """The first file with the second, the third with the fourth, ..."""
+
     def plant(folder: Path) -> None:
-        kept = (folder / one).read_bytes()
-        (folder / one).write_bytes((folder / other).read_bytes())
-        (folder / other).write_bytes(kept)
+        for one, other in zip(files[::2], files[1::2], strict=True):
+            kept = (folder / one).read_bytes()
+            shutil.copyfile(folder / other, folder / one)
+            (folder / other).write_bytes(kept)
 
     return plant
+
+
+def other_object(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Labels of two objects with their numbers exchanged."""
+    return np.where((labels & NUMBER) > 0, labels ^ 3, labels).astype(np.uint8)
 
 
 def copied(one: str, other: str) -> Callable[[Path], None]:

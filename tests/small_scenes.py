@@ -29,6 +29,8 @@ seed = 1
 width = 96
 height = 64
 focal = 80
+"""
+MOTION = """
 [motion]
 rotation_deg = 1.5
 rotation_axis = [0.4, 1.0, -0.6]
@@ -57,5 +59,12 @@ def write_small_card(folder: Path, scenes: Sequence[Path]) -> Path:
     """Write small.toml: a dataset of one sequence for each of these scene cards, named as they are."""
     sequences = [f'[[sequence]]\nname = "{scene.stem}"\nscene = "{scene}"\n' for scene in scenes]
     card = folder / "small.toml"
-    card.write_text("\n".join([DATASET, *sequences]))
+    card.write_text("\n".join([DATASET + MOTION, *sequences]))
+    return card
+
+
+def write_box_card(folder: Path, head: str, more: str = "") -> Path:
+    """Write box-card.toml: this head, the motion of small.toml, a sequence in a box, and ``more``."""
+    scene, card = write_box_scene(folder, "box"), folder / "box-card.toml"
+    card.write_text(f'{head}{MOTION}[[sequence]]\nname = "box"\nscene = "{scene}"\n{more}')
     return card

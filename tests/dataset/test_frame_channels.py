@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from analytic_dataset import PLANES, card_of, write_analytic_dataset
-from attack.planting import rehash
+from attack.planting import named, rehash, spoilt
 from frame_faults import FAULTS
 from numpy.typing import NDArray
 
@@ -110,9 +109,6 @@ def test_tracks_are_where_rays_from_every_frame_meet_them(sound: Path) -> None:
 @pytest.mark.parametrize("name", SAMPLE)
 def test_a_fault_beyond_the_first_two_frames_is_named(sound: Path, tmp_path: Path, name: str) -> None:
     plant, words = FAULTS[name]
-    shutil.copytree(sound, tmp_path / "data")
-    plant(tmp_path / "data/planes")
-    rehash(tmp_path / "data")
-    faults = verify_dataset(tmp_path / "data", 3)[-1].faults
-    assert any(all(word in fault for word in words) for fault in faults), faults
+    faults = verify_dataset(spoilt(sound, tmp_path / "data", plant, sequence="planes"), 3)[-1].faults
+    assert named(faults, words), faults
     assert not any(fault.startswith(("sequence.json", "rs", "gs", "poses")) for fault in faults), faults

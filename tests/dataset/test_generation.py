@@ -24,6 +24,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
 from rsbench.dataset.generation import estimate_dataset, generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset
+from rsbench.renderers.image import Sensor
 from rsbench.storage.files import read_png, sha256, write_png
 from rsbench.storage.work_folder import HIDDEN
 from rsbench.verification import verify_dataset
@@ -215,6 +216,20 @@ def test_the_estimate_counts_files_and_bytes(small: Small) -> None:
     # One camera at one time stands for four.
     assert found.bytes == pytest.approx(sum(path.stat().st_size for path in made), rel=0.1)
     assert 0.0 < found.seconds < 60.0
+
+
+def test_every_sensor_of_a_scene_is_tried_for_an_estimate(small: Small) -> None:
+    """Files have the same bytes in each run, so that an estimate for two sensors is the sum of two estimates."""
+    card = load_dataset_card(str(small.card)).only(["a"])
+    (ideal,), noise = card.sequence, Sensor(photon_noise=True, full_well=6000)
+    noisy = replace(ideal, name="noisy", sensor=noise)
+    one, other, both = (
+        estimate_dataset(replace(card, sequence=sequences), lambda scene: None)
+        for sequences in ((ideal,), (noisy,), (ideal, noisy))
+    )
+    # dataset.json and croissant.json, which list each file in 200 bytes, are there once.
+    assert (both.sequences, both.files) == (2, one.files + other.files - 2)
+    assert both.bytes == one.bytes + other.bytes - 2 * 200 and other.bytes > 1.2 * one.bytes
 
 
 def test_a_frame_without_any_surface_is_an_error(tmp_path: Path) -> None:

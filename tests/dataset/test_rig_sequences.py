@@ -14,7 +14,7 @@ import pytest
 from commands import refused
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from small_scenes import write_box_scene
+from small_scenes import write_box_card
 from traced_truth import axis_of, first_hit, grid_of, line_of, line_times, rays
 
 from rsbench.components.cards import load_card
@@ -35,7 +35,6 @@ LEFT: dict[str, Any] = {"width": 96, "height": 72, "fx": 80.0, "fy": 81.0, "cx":
 LEFT |= {"lens": {"model": "brown-conrady", "k1": -0.2, "k2": 0.03, "p1": 1e-3}}
 RIGHT: dict[str, Any] = {"width": 120, "height": 64, "fx": 85.0, "fy": 84.0, "cx": 61.0, "cy": 30.0}
 RIGHT |= {"lens": {"model": "kannala-brandt", "k1": 0.02}}
-W, D = np.array([0.012, 0.03, -0.02]), np.array([-0.12, 0.05, -0.1])
 RIGS: dict[str, dict[str, Any]] = {
     "two-sizes": {"right": RIGHT, "w": (0.03, -0.06, 0.05), "t": (-0.3, 0.02, -0.03)},
     "vertical": {"right": LEFT | {"fx": 83.0}, "w": (0.02, 0.01, 0.01), "t": (0.01, -0.25, 0.02)},
@@ -59,32 +58,19 @@ def _toml(value: Any) -> str:
 
 def write_card(folder: Path, name: str, more: str = "") -> Path:
     """A dataset card of a rig of ``RIGS`` in a textured box."""
-    scene, rig = write_box_scene(folder, "box"), RIGS[name]
+    rig = RIGS[name]
     matrix = Rotation.from_rotvec(rig["w"]).as_matrix().tolist()
-    card = folder / f"{name}.toml"
-    card.write_text(
-        f"""
+    head = f"""
 name = "{name}"
 readout_ratio = 0.8
 renderer = "preview"
 left = {_toml(LEFT)}
 right = {_toml(rig["right"])}
+right_from_left = {_toml({"rotation": matrix, "translation": rig["t"]})}
 frame_period_s = 0.1
 {more}
-[right_from_left]
-rotation = {_toml(matrix)}
-translation = {_toml(rig["t"])}
-[motion]
-rotation_deg = {np.rad2deg(np.linalg.norm(W))}
-rotation_axis = {_toml(W.tolist())}
-translation = {np.linalg.norm(D)}
-translation_axis = {_toml(D.tolist())}
-[[sequence]]
-name = "box"
-scene = "{scene}"
 """
-    )
-    return card
+    return write_box_card(folder, head)
 
 
 @pytest.fixture(scope="module", params=RIGS)
@@ -174,10 +160,7 @@ def test_rows_have_the_bits_of_global_images_at_their_poses(
 
 
 def test_rigs_of_sequences_and_grids_are_those_that_the_card_names(tmp_path: Path) -> None:
-    scene = write_box_scene(tmp_path, "box")
-    path = tmp_path / "many.toml"
-    path.write_text(
-        f"""
+    head = """
 name = "many"
 readout_ratio = 0.7
 scan = "bottom"
@@ -185,22 +168,16 @@ rig = "zed2"
 [grid.rig.same]
 [grid.rig.phone]
 rig = "tum-rsvi"
-[motion]
-rotation_deg = 1
-rotation_axis = [0, 1, 0]
-translation = 0.1
-translation_axis = [1, 0, 0]
-[[sequence]]
-name = "box"
-scene = "{scene}"
+"""
+    near = f"""
 [[sequence]]
 name = "near"
-scene = "{scene}"
+scene = "{tmp_path / "box.toml"}"
 scale = 2.0
 rig = "euroc"
 readout_ratio = 0.4
 """
-    )
+    path = write_box_card(tmp_path, head, near)
     card = load_dataset_card(path)
     found = {each.name: (card.rig_of(each), card.shutter_for(each), each) for each in card.sequence}
     rig, shutter, _ = found["box-same"]
@@ -215,7 +192,7 @@ readout_ratio = 0.4
     rig, shutter, sequence = found["near-same"]
     assert shutter.readout_ratio == 0.4  # a sequence's own goes first
     np.testing.assert_allclose(rig.right_from_left.t, 2.0 * load_rig("euroc").rig().right_from_left.t)
-    assert np.linalg.norm(card.motion_of(sequence).d) == pytest.approx(0.2)
+    assert np.linalg.norm(card.motion_of(sequence).d) == pytest.approx(0.4)
     assert read_dataset_card(path).rig == load_rig("zed2") and card.manifest_of(sequence)["format"] == 2
 
 
