@@ -533,10 +533,14 @@ class ChannelReader:
     folder: Path
     rig: StereoRig
     shutter: RollingShutter
-    channels: tuple[str, ...]
-    frames: int
-    first: int
+    channels: tuple[str, ...] = ()
+    """Names of channels in addition to images, depth and poses; later versions may have more."""
+    frames: int = len(FRAMES)
+    """Number of frames of each camera."""
+    first: int = 0
+    """Number in the folder of the frame that is frame 0 here; above 0 only for a pair."""
     manifest: dict[str, Any]
+    """Content of sequence.json."""
 
     def channel_values(self, channel: str, file: str) -> NDArray[Any]:
         """(H, W, ...) of a file below the folder, one that the channel has for each frame.

@@ -22,12 +22,12 @@ from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_views, nearby_vi
 from rsbench.storage.files import read_png
 from rsbench.storage.untrusted_files import inside, open_regular
 from rsbench.verification import depth_checks, image_checks
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.depth_checks import likely_cause, roughly_agree
 from rsbench.verification.findings import DepthAgreement, Finding, rows_of
 from rsbench.verification.image_checks import OtherImages as OtherImages
 from rsbench.verification.image_checks import colour_faults
 from rsbench.verification.reprojection import (
-    DEPTH_TOLERANCE,
     BoolArray,
     DepthMap,
     reproject,

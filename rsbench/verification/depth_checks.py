@@ -19,10 +19,9 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView, Times, nearby_views
-from rsbench.verification.compiled_comparison import Evidence, Limits, weigh_rows
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE, Evidence, weigh_rows
 from rsbench.verification.findings import DepthAgreement, Finding
 from rsbench.verification.reprojection import (
-    DEPTH_TOLERANCE,
     BoolArray,
     DepthMap,
     Reprojection,
@@ -34,8 +33,6 @@ from rsbench.verification.reprojection import (
 
 Bits = NDArray[np.uint8]
 
-NEAR_MISS = 1e-3
-"""A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
 _SPARE_PIXELS, _SPARE_SHARE = 30, 0.3
 """Pixels of a pair that may disagree: what is thinner than a pixel lies before what is flat. A wrong geometry
 shows in the median too."""
@@ -56,10 +53,7 @@ _OVER_TIME = "motion, readout_ratio and scan"
 """Keys of sequence.json on which pairs of one camera depend; ``_across`` has those of pairs of both."""
 _TILE, _BAD_IN_TILE = 5, 12
 """A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
-_LEAST_WIDTH = 0.5
 _HOLE, _HITS_IN_HOLE = 7, 8
-_CENTRED = 0.3
-"""Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
 
 
 @dataclass(eq=False)
@@ -125,7 +119,6 @@ def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojec
         Evidence(source.confirmed, source.contradicted, source.near, source.hidden, source.difference),
         (target.holes, target.map.depth),
         (int(source.bit(target.map.view)), int(target.bit(source.map.view))),
-        Limits(DEPTH_TOLERANCE, NEAR_MISS, _LEAST_WIDTH, _CENTRED),
         apart,
     )
     by_bands(work, len(apart))

@@ -17,7 +17,6 @@ from rsbench.dataset.views import ImageView
 from rsbench.verification.compiled_comparison import Shown, costs_of_changes, every_nth, vote_rows
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.reprojection import (
-    DEPTH_TOLERANCE,
     BoolArray,
     DepthMap,
     Reprojection,
@@ -202,16 +201,23 @@ def band_of_row(height: int) -> NDArray[np.int64]:
     return np.arange(height) * bands // height
 
 
-def show(
-    surface: DepthMap, target: Picture, reprojection: Reprojection, stride: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
-    """Rows and columns (n,) of the source that see one flat surface, or the sky, as the target does, and its
-    colours (n, 3) there; ``reprojection`` has every ``stride``-th pixel."""
+def shown_by(source: Picture, surface: DepthMap, reprojection: Reprojection, stride: int) -> Shown:
+    """A source for compiled loops; ``reprojection`` has every ``stride``-th pixel."""
     even = surface.flat | (surface.depth == 0)
-    y, x = np.nonzero(even[::stride, ::stride] & (np.abs(reprojection.relative) <= DEPTH_TOLERANCE))
-    places = np.nan_to_num(reprojection.pixels)
-    shown = cv2.remap(target.colours, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return y * stride, x * stride, shown[y, x]
+    return Shown(source.colours, even, reprojection.pixels, reprojection.relative, stride)
+
+
+def sampled(
+    shown: Shown, target: Picture, count: int, every: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
+    """Places in a source that see one surface, or the sky, as the target does: every ``every``-th of ``count``.
+
+    Returns:
+        Their rows and columns (n,), and the target's colours (n, 3) there.
+    """
+    places = np.zeros((count // every + 1, 2), dtype=np.int64)
+    y, x = places[: every_nth(shown, every, places)].T
+    return y, x, _interpolated(target.colours, shown.pixels[y // shown.stride, x // shown.stride])
 
 
 def _interpolated(colours: Colours, places: NDArray[np.float32]) -> Colours:
@@ -242,9 +248,8 @@ def compare(
     stride: int = 1,
 ) -> ColourAgreement:
     """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th."""
-    even = surface.flat | (surface.depth == 0)
-    shown = Shown(source.colours, even, reprojection.pixels, reprojection.relative, DEPTH_TOLERANCE, stride)
-    bands = band_of_row(len(even))
+    shown = shown_by(source, surface, reprojection, stride)
+    bands = band_of_row(len(shown.even))
     count = int(bands[-1]) + 1
     span, shape = (target.low, target.high, target.beyond), np.zeros((2, count), np.int64)
     by_rows = partial(vote_rows, shown, span, (votes.seen, votes.against), (bands, shape))
@@ -263,11 +268,8 @@ def _costs(
     """Of the capped difference from what the target shows, means over pixels of each band: (C, B) of each change,
     (C, B) standard errors of its gain over none, (B,) of the band's middle colour. Some of the ``pixels`` do."""
     every, count = max(1, pixels // _SAMPLES), int(bands[-1]) + 1
-    places = np.zeros((pixels // every + 1, 2), dtype=np.int64)
-    places = places[: every_nth(shown, every, places)]
-    y, x = places.T
-    seen = _interpolated(target.colours, shown.pixels[y // shown.stride, x // shown.stride])
-    of = bands[y]
+    y, x, seen = sampled(shown, target, pixels, every)
+    of, places = bands[y], np.stack([y, x], axis=1)
     size = np.maximum(np.bincount(of, minlength=count), 1)
     sums = np.zeros((2, len(CHANGES), count))
     costs_of_changes(shown.colours, places, seen, of, _TABLE, _CAP, sums)
@@ -390,7 +392,8 @@ def _image_cause(
     stride = stride_for(image.size / 3, _TRIED_PIXELS)
     reprojection = reproject(sequence, maps[view], maps[partner], stride)
     reprojection = without_changing_light(sequence, maps[view], maps[partner], reprojection, stride)
-    y, x, shown = show(maps[view], pictures[partner], reprojection, stride)
+    source = shown_by(pictures[view], maps[view], reprojection, stride)
+    y, x, shown = sampled(source, pictures[partner], reprojection.relative.size, 1)
     if len(y) == 0:
         return ""
     own = image[y, x]

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.views import ImageView, numbers_of, view_pairs
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.content import Content, shared_line, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject, stride_for
+from rsbench.verification.reprojection import BoolArray, DepthMap, reproject, stride_for
 from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8

@@ -51,9 +51,10 @@ from rsbench.dataset.tracks import (
 )
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays
 from rsbench.verification.channel_checks import FEW_BENT, LEVEL
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.content import Content
 from rsbench.verification.findings import Again, Finding, reports_unreadable, skips_unreadable
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, relative_depth
+from rsbench.verification.reprojection import BoolArray, DepthMap, relative_depth
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher
 

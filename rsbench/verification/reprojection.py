@@ -48,8 +48,6 @@ def by_bands(work: Callable[[int, int], T], height: int) -> list[T]:
 ROUNDING_PX = 1e-9
 """A place so far before a pixel's centre counts as on it: the two cameras see whole rows in whole rows."""
 
-DEPTH_TOLERANCE = 1e-4
-"""Relative difference of two depths of one surface point that still agree."""
 FLATNESS = 2e-5
 """Largest relative second difference of inverse depth (linear on planes by ideal pixels) of a locally flat
 surface: bilinear interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends

@@ -256,7 +256,7 @@ class RerenderedRows:
     def add(self, content: Content, reported: set[str]) -> None:
         """Render again what was read, but for channels that are ``reported`` already."""
         if not self._refusal:
-            self._take(_row_checks(content, self._scene, self._options, self._rows, reported))
+            self._take(self._row_checks(content, reported))
 
     def _take(self, checks: Iterator[Again]) -> None:
         start = time.perf_counter()
@@ -285,6 +285,69 @@ class RerenderedRows:
         same = all(check.same_bits for check in checks)
         done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
         return [check.fault for check in wrong if check.fault and check.file not in reported], done
+
+    def _row_checks(self, content: Content, reported: set[str]) -> Iterator[Again]:
+        scene, options = self._scene, self._options
+        own = image_views(content.times)
+        twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
+        for view in (*own, *twins):
+            if view not in content.maps and view not in content.pictures:
+                continue
+            rows = self._rows[view.side]
+            frame = _render(content, scene, options, view, rows)
+            if view in content.maps:
+                yield depth_check(content.maps[view], frame.depth, rows)
+                yield from label_checks(content.maps[view], frame.labels, rows)
+            if view in content.pictures:
+                yield _picture_check(content, frame, options, view, rows)
+            rays = _rays(scene, content.sequence.objects)
+            yield from channels_again(content.sequence, view, rows, frame, rays, reported)
+            yield from self._sensed_check(content, view, reported)
+            if view.shutter == "rs" and whole_frames(content.sequence.manifest):
+                with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+                    yield self._stack_check(content, view)
+
+    def _sensed_check(self, content: Content, view: ImageView, reported: set[str]) -> Iterator[Again]:
+        """What the sensor makes of a rolling-shutter frame, or shows of a global-shutter picture without noise.
+
+        Each row of a sensor has random numbers of its own, so it can be made alone with the same bits; a row of an
+        image that was interpolated or compressed is made with the rows around it.
+        """
+        from rsbench.renderers.render import sensed_rows
+
+        sequence, rows, rolling = content.sequence, self._rows[view.side], view.shutter == "rs"
+        file = view.image if rolling else view.exposed
+        if sequence.sensor is None or file in reported or not (rolling or sequence.exposed_twins):
+            return
+        with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+            image = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
+            seen, sensor = Picture.of(view, image, noisy=False), sequence.sensor.of(view.side, view.frame)
+            sensor, twin = (sensor, None) if rolling else (sensor.noiseless, view.row)
+            few = rolling and sensor.jpeg_quality and len(rows) < len(seen.colours)
+            some, chosen = rows[::_COMPRESSED] if few else rows, _of_image(content, self._options, view)
+            place, period = (view.side, view.frame), sequence.frame_period_s
+            made = sensed_rows(self._scene, sequence, place, sensor, period, chosen, some, twin)
+            yield image_check(file, seen, made, some, not _made_here(content), _by_gpu(content))
+
+    def _stack_check(self, content: Content, view: ImageView) -> Again:
+        """Rows of the stack at other rows' poses: row i of the image that is rendered at the pose of row j."""
+        from rsbench.renderers.image import to_srgb8
+        from rsbench.renderers.render import LinePoses, render
+
+        sequence, rows, chosen = content.sequence, self._rows[view.side], _of_image(content, self._options, view)
+        of = rows[::-1]
+        seen = Picture.of(view, stack_rows(sequence, view, rows, of), noisy=False)
+        R, t = (
+            each.copy()
+            for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
+        )
+        tau = sequence.shutter.line_times(view.frame, view.side).copy()
+        R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
+        poses = LinePoses(R, t, poses_of(sequence.objects, tau))
+        frame = render(self._scene, sequence.rig.sensor(view.side), poses, chosen, rows=rows)
+        rendered = to_srgb8(frame.image, chosen.exposure)
+        noisy = chosen.integrator == "path" and not _made_here(content)
+        return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy, _by_gpu(content))
 
 
 def _rays(scene: MitsubaScene, objects: Many[MovingObject] = ()) -> SceneRays:
@@ -330,33 +393,6 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
     return table
 
 
-def _row_checks(
-    content: Content,
-    scene: MitsubaScene,
-    options: RendererOptions,
-    rows_of_sides: Mapping[Side, list[int]],
-    reported: set[str],
-) -> Iterator[Again]:
-    own = image_views(content.times)
-    twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
-    for view in (*own, *twins):
-        if view not in content.maps and view not in content.pictures:
-            continue
-        rows = rows_of_sides[view.side]
-        frame = _render(content, scene, options, view, rows)
-        if view in content.maps:
-            yield depth_check(content.maps[view], frame.depth, rows)
-            yield from label_checks(content.maps[view], frame.labels, rows)
-        if view in content.pictures:
-            yield _picture_check(content, frame, options, view, rows)
-        rays = _rays(scene, content.sequence.objects)
-        yield from channels_again(content.sequence, view, rows, frame, rays, reported)
-        yield from _sensed_check(content, scene, options, view, rows, reported)
-        if view.shutter == "rs" and whole_frames(content.sequence.manifest):
-            with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
-                yield _stack_check(content, scene, _of_image(content, options, view), view, rows)
-
-
 def _picture_check(
     content: Content, frame: Frame, options: RendererOptions, view: ImageView, rows: list[int]
 ) -> Again:
@@ -366,57 +402,6 @@ def _picture_check(
     rendered = to_srgb8(frame.image, options.exposure)
     file, stored = clean_picture(content.sequence, view), content.pictures[view]
     return image_check(file, stored, rendered, rows, noisy, _by_gpu(content))
-
-
-def _sensed_check(
-    content: Content,
-    scene: MitsubaScene,
-    options: RendererOptions,
-    view: ImageView,
-    rows: list[int],
-    reported: set[str],
-) -> Iterator[Again]:
-    """What the sensor makes of a rolling-shutter frame, or shows of a global-shutter picture without noise.
-
-    Each row of a sensor has random numbers of its own, so it can be made alone with the same bits; a row of an
-    image that was interpolated or compressed is made with the rows around it.
-    """
-    from rsbench.renderers.render import sensed_rows
-
-    sequence, rolling = content.sequence, view.shutter == "rs"
-    file = view.image if rolling else view.exposed
-    if sequence.sensor is None or file in reported or not (rolling or sequence.exposed_twins):
-        return
-    with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
-        image = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
-        seen, sensor = Picture.of(view, image, noisy=False), sequence.sensor.of(view.side, view.frame)
-        sensor, twin = (sensor, None) if rolling else (sensor.noiseless, view.row)
-        few = rolling and sensor.jpeg_quality and len(rows) < len(seen.colours)
-        some, chosen = rows[::_COMPRESSED] if few else rows, _of_image(content, options, view)
-        place, period = (view.side, view.frame), sequence.frame_period_s
-        made = sensed_rows(scene, sequence, place, sensor, period, chosen, some, twin)
-        yield image_check(file, seen, made, some, not _made_here(content), _by_gpu(content))
-
-
-def _stack_check(
-    content: Content, scene: MitsubaScene, chosen: RendererOptions, view: ImageView, rows: list[int]
-) -> Again:
-    """Rows of the stack at other rows' poses: row i of the image that is rendered at the pose of row j."""
-    from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.render import LinePoses, render
-
-    sequence, of = content.sequence, rows[::-1]
-    seen = Picture.of(view, stack_rows(sequence, view, rows, of), noisy=False)
-    R, t = (
-        each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
-    )
-    tau = sequence.shutter.line_times(view.frame, view.side).copy()
-    R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
-    poses = LinePoses(R, t, poses_of(sequence.objects, tau))
-    frame = render(scene, sequence.rig.sensor(view.side), poses, chosen, rows=rows)
-    rendered = to_srgb8(frame.image, chosen.exposure)
-    noisy = chosen.integrator == "path" and not _made_here(content)
-    return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy, _by_gpu(content))
 
 
 def _by_gpu(content: Content) -> bool:
