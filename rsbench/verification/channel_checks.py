@@ -34,7 +34,7 @@ from rsbench.renderers.image import linear_of_codes, to_srgb8
 from rsbench.verification.content import Content, clean_picture
 from rsbench.verification.findings import Again, Finding, cheapest_cause, rows_of, rows_with_most
 from rsbench.verification.image_checks import Picture
-from rsbench.verification.reprojection import BoolArray, DepthMap, reproject
+from rsbench.verification.reprojection import BoolArray, DepthMap, around, reproject
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
@@ -378,19 +378,13 @@ def _agreement_faults(
     with np.errstate(invalid="ignore"):
         same = np.abs(reprojection.relative) < _SURFACE
     # One of the four pixels around must see the same: between them, things that touch change.
-    height, width = same.shape
-    x, y = np.floor(reprojection.pixels[same]).astype(int).T
-    around = [
-        instances[partner][np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
-        for down in (0, 1)
-        for across in (0, 1)
-    ]
+    there = around(instances[partner], reprojection.pixels[same], (0, 1))
     other = np.zeros(same.shape, dtype=np.bool_)
-    other[same] = ~np.any(np.equal(around, instances[view][same]), axis=0)
+    other[same] = ~np.any(there == instances[view][same], axis=0)
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
-        file, there = (INSTANCES.file(each.side, each.frame) for each in (view, partner))
+        file, other_file = (INSTANCES.file(each.side, each.frame) for each in (view, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
-        yield Finding(file, f"{share} see another instance than {there}", rows_with_most(other))
+        yield Finding(file, f"{share} see another instance than {other_file}", rows_with_most(other))
 
 
 _CODE = 0.54

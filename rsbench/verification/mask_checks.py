@@ -17,7 +17,7 @@ from rsbench.dataset.views import ImageView, numbers_of, view_pairs
 from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.content import Content, shared_line, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.reprojection import BoolArray, DepthMap, reproject, stride_for
+from rsbench.verification.reprojection import BoolArray, DepthMap, nearest, reproject, stride_for
 from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8
@@ -150,14 +150,10 @@ def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolAr
     reprojection = reproject(content.sequence, source, target, stride)
     with np.errstate(invalid="ignore"):
         alike = (np.abs(reprojection.relative) <= DEPTH_TOLERANCE) & source.flat[::stride, ::stride]
-    x, y = np.rint(np.nan_to_num(reprojection.pixels)).astype(np.int64).reshape(-1, 2).T
-    height, width = target.depth.shape
-    place = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-    (least, most), there = _span(source), _span(target)
-    least, most = least[::stride, ::stride], most[::stride, ::stride]
-    low, high = (each[place].reshape(least.shape) for each in there)
+    least, most = (each[::stride, ::stride] for each in _span(source))
+    low, high = (nearest(each, reprojection.pixels) for each in _span(target))
     wrong = alike & ((least & ~high) | (~most & low))
-    rows = np.zeros(height, dtype=np.bool_)
+    rows = np.zeros(len(source.depth), dtype=np.bool_)
     if np.sum(wrong) > max(_FEW, _OTHER * np.sum(alike)):
         rows[::stride][np.any(wrong, axis=1)] = True
     return rows

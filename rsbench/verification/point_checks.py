@@ -54,7 +54,7 @@ from rsbench.verification.channel_checks import FEW_BENT, LEVEL
 from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.content import Content
 from rsbench.verification.findings import Again, Finding, reports_unreadable, skips_unreadable
-from rsbench.verification.reprojection import BoolArray, DepthMap, relative_depth
+from rsbench.verification.reprojection import BoolArray, DepthMap, around, relative_depth
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher
 
@@ -152,15 +152,8 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
 def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest depth (n,) of the 4 x 4 pixels around pixels (n, 2); sky is infinitely far."""
     far = np.where(depth > 0, depth.astype(np.float64), np.inf)
-    x, y = np.floor(pixels).astype(np.int64).T
-    height, width = depth.shape
-    steps = range(-1, 3)
-    around = [
-        far[np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
-        for down in steps
-        for across in steps
-    ]
-    return np.min(around, axis=0, initial=np.inf), np.max(around, axis=0, initial=0.0)
+    found = around(far, pixels, range(-1, 3))
+    return np.min(found, axis=0, initial=np.inf), np.max(found, axis=0, initial=0.0)
 
 
 def points_again(sequence: Sequence, rays: SceneRays, compared: Callable[[str], bool]) -> Iterator[Again]:

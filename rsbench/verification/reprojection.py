@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple, TypeVar
+from itertools import product
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView, SeenSurfaces, carry, numbers_of
 
 T = TypeVar("T")
+S = TypeVar("S", bound=np.generic)
 _LEAST_ROWS = 64
 """Fewest rows of a band: starting a thread costs as much as some rows."""
 _threads = os.cpu_count() or 1
@@ -207,6 +209,21 @@ def seen_in(
     return found.landed.pixels, x_in_cam
 
 
+def nearest(values: NDArray[S], pixels: NDArray[Any]) -> NDArray[S]:
+    """Values (...) of a map (H, W) at the pixels nearest to places (..., 2); of any pixel for NaN."""
+    height, width = values.shape
+    x, y = np.moveaxis(np.rint(np.nan_to_num(pixels)).astype(np.int64), -1, 0)
+    return values[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+
+
+def around(values: NDArray[S], pixels: NDArray[Any], steps: Iterable[int]) -> NDArray[S]:
+    """Values (k, n) of a map (H, W) by all these steps, down and across, from places (n, 2) rounded down."""
+    height, width = values.shape
+    x, y = np.floor(pixels).astype(np.int64).T
+    down, across = np.array(list(product(steps, repeat=2))).T[..., None]
+    return values[np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
+
+
 def without_changing_light(
     sequence: Sequence, source: DepthMap, target: DepthMap, reprojection: Reprojection, stride: int
 ) -> Reprojection:
@@ -218,9 +235,7 @@ def without_changing_light(
         return reprojection
     own = cv2.dilate(changing[0], np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
     other = cv2.dilate(changing[1], np.ones((5, 5), np.uint8)) > 0
-    x, y = np.rint(np.nan_to_num(reprojection.pixels)).astype(np.int64).reshape(-1, 2).T
-    height, width = other.shape
-    there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].reshape(own.shape)
+    there = nearest(other, reprojection.pixels)
     return reprojection._replace(relative=np.where(own | there, np.float32(np.nan), reprojection.relative))
 
 
