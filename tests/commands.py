@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import itertools
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -102,3 +104,17 @@ def install_package(folder: Path, name: str, points: str) -> None:
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", "utf-8")
     (info / "entry_points.txt").write_text(points, "utf-8")
+
+
+def rename_failing(
+    fails: Callable[[int], bool], error: BaseException | None = None
+) -> Callable[[Path, Path], None]:
+    """``os.rename``, which raises an error at some calls, counted from 1; by default that of a disk."""
+    real, calls = os.rename, itertools.count(1)
+
+    def rename(source: Path, target: Path) -> None:
+        if fails(next(calls)):
+            raise error or OSError(5, "Input/output error")
+        real(source, target)
+
+    return rename

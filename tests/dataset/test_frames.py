@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_dataset import PLANES, write_analytic_dataset
+from analytic_dataset import PLANES, add_channels, card_of, write_analytic_dataset
 from attack.planting import named, rehash, spoilt
 from channel_faults import copied, depth_of, exchanged, mask_of, values_of
 from numpy.typing import NDArray
+from yard_dataset import boxes_card
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
@@ -27,7 +28,7 @@ from rsbench.core.se3 import compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.card import DatasetCard, MotionCard
 from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers, write_channels
 from rsbench.dataset.sequence import files_of, is_of_sequence, read_dataset, read_pairs
 from rsbench.dataset.views import ImageView
@@ -216,21 +217,16 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("flow") / "data"
     shutil.copytree(sound, out)
     (whole,) = read_dataset(out)
-    for name in channel_files(["flow"], (), COUNT):
-        (whole.folder / name).parent.mkdir(exist_ok=True)
-    for view in views_of(COUNT):
-        image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
-        gloss = np.zeros(labels.shape, np.bool_)
-        seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
-        with background_writer() as later:
-            write_channels(whole.folder, ["flow"], whole, ImageView("rs", *view), seen, Open(), later)
-    own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
-    own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")
-    (whole.folder / "sequence.json").write_text(json.dumps(own))
-    manifest = json.loads((out / "dataset.json").read_text())
-    manifest["card"]["channels"] = ["flow"]
-    (out / "dataset.json").write_text(json.dumps(manifest))
-    rehash(out)
+
+    def write(folder: Path) -> None:
+        for view in views_of(COUNT):
+            image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
+            gloss = np.zeros(labels.shape, np.bool_)
+            seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
+            with background_writer() as later:
+                write_channels(folder, ["flow"], whole, ImageView("rs", *view), seen, Open(), later)
+
+    add_channels(out, replace(card_of(RIG, SHUTTER, MOTION, COUNT), channels=("flow",)), write)
     return out
 
 
@@ -294,15 +290,7 @@ def card(**fields: object) -> DatasetCard:
     motion = MotionCard(
         model="spline", rotation_deg=1.0, rotation_axis=(0, 1, 0), translation=0.1, translation_axis=(1, 0, 0)
     )
-    own = {
-        "name": "card",
-        "camera": CameraCard(width=64, height=48, focal=60.0),
-        "baseline": 0.3,
-        "readout_ratio": 0.5,
-        "motion": motion,
-        "sequence": (SequenceCard(name="one", scene="castle"),),
-    }
-    return DatasetCard(**own | fields)  # pyrefly: ignore[bad-argument-type]
+    return boxes_card("castle", **({"readout_ratio": 0.5, "motion": motion} | fields))
 
 
 def test_a_card_lets_the_shake_last_as_long_as_its_frames() -> None:

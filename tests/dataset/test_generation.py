@@ -74,6 +74,18 @@ def test_same_card_gives_the_same_bytes_whatever_the_workers(small: Small, tmp_p
     assert bytes_of(tmp_path / "again") == bytes_of(small.dataset)
 
 
+def child(card: Path, out: Path, progress: str) -> list[str]:
+    """A command that generates a dataset, and runs ``progress`` after each step of the sequence ``name``."""
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from rsbench.dataset.card import load_dataset_card\n"
+        "from rsbench.dataset.generation import generate_dataset\n"
+        f"def step(name): {progress}\n"
+        "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=step)"
+    )
+    return [sys.executable, "-c", code, str(card), str(out)]
+
+
 def _frames(folder: Path) -> int:
     """Images and depths below a folder from which others move them meanwhile."""
     return sum(name.endswith((".png", ".exr")) for _, _, names in os.walk(folder) for name in names)
@@ -85,13 +97,7 @@ def test_killed_run_resumes_to_the_bytes_of_an_undisturbed_one(small: Small, tmp
     """Killed in its first sequence, of 8 images and 8 depths, and in its second."""
     out = tmp_path / "killed"
     # A child that waits after each step is killed between the files that the test waits for and the end.
-    code = (
-        "import sys, time; from pathlib import Path\n"
-        "from rsbench.dataset.card import load_dataset_card\n"
-        "from rsbench.dataset.generation import generate_dataset\n"
-        "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=lambda _: time.sleep(0.1))"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code, str(small.card), str(out)])
+    process = subprocess.Popen(child(small.card, out, "time.sleep(0.1)"))
     deadline = time.monotonic() + 120
     while _frames(out) < files and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -120,14 +126,7 @@ def test_memory_does_not_grow_with_the_scenes(tmp_path: Path) -> None:
         pytest.skip("reads the memory of a process from /proc")
     scenes = [write_box_scene(tmp_path, name, (1536 + 64 * k, 2048 - 64 * k)) for k, name in enumerate("abcd")]
     card = write_small_card(tmp_path, scenes)
-    code = (
-        "import sys; from pathlib import Path\n"
-        "from rsbench.dataset.card import load_dataset_card\n"
-        "from rsbench.dataset.generation import generate_dataset\n"
-        "def say(name): print(name, int(open('/proc/self/statm').read().split()[1]) * 4096 / 2**20)\n"
-        "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=say)"
-    )
-    command = [sys.executable, "-c", code, str(card), str(tmp_path / "out")]
+    command = child(card, tmp_path / "out", "print(name, int(open('/proc/self/statm').read().split()[1]) / 256)")
     # The C library keeps freed blocks of some MB for itself unless told to map each one anew.
     environ = {**os.environ, "MALLOC_MMAP_THRESHOLD_": "1000000"}
     done = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=300, check=False)

@@ -17,6 +17,7 @@ from channel_faults import mask_of, other_object
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from traced_truth import Array, Thing, World, agreement, axis_of, first_hit, grid_of, line_times, rays
+from yard_dataset import boxes_card, write_boxes
 
 from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import LinearMotion
@@ -42,18 +43,10 @@ from rsbench.verification import verify_dataset
 from rsbench.verification.content import read_content, read_twins
 from rsbench.verification.mask_checks import label_faults
 
-SCENE = """
-name = "lot"
-builder = "mesh"
+LIGHT = """
 [light]
 sun_azimuth_deg = 300
 sun_elevation_deg = 50
-[parameters]
-file = "lot.glb"
-up_axis = "z"
-[viewpoints.default]
-eye = [0.0, -4.0, 1.2]
-target = [0.2, 3.0, 0.9]
 """
 CART = MovingCard(
     instance="cart",
@@ -73,36 +66,20 @@ BOX = MovingCard(
 
 def write_lot(folder: Path) -> Path:
     """Ground, a wall, and a cart that will move."""
-    parts = {}
-    for name, size, place in (
-        ("ground", (14.0, 12.0, 0.1), (0.0, 3.0, -0.05)),
-        ("wall", (7.0, 0.3, 2.2), (2.0, 6.0, 1.1)),
-        ("cart", (0.9, 0.7, 1.0), (-0.6, 0.5, 0.55)),
-    ):
-        parts[name] = trimesh.creation.box(size)
-        parts[name].apply_transform(trimesh.transformations.rotation_matrix(0.3, (0, 0, 1)))
-        parts[name].apply_translation(place)
-    trimesh.Scene(parts).export(folder / "lot.glb")
-    (folder / "lot.toml").write_text(SCENE)
-    return folder / "lot.toml"
+    ground, wall = ((14.0, 12.0, 0.1), (0.0, 3.0, -0.05)), ((7.0, 0.3, 2.2), (2.0, 6.0, 1.1))
+    boxes = {"ground": ground, "wall": wall, "cart": ((0.9, 0.7, 1.0), (-0.6, 0.5, 0.55))}
+    return write_boxes(folder, "lot", boxes, LIGHT)
 
 
 def lot_card(folder: Path, **fields: object) -> DatasetCard:
     kept = {
-        "name": "lot",
         "camera": CameraCard(width=80, height=60, focal=75.0),
-        "baseline": 0.3,
-        "readout_ratio": 0.9,
-        "motion": MotionCard(
-            rotation_deg=4.0, rotation_axis=(0.5, 1.0, -0.6), translation=0.3, translation_axis=(-0.7, 0.3, -0.6)
-        ),
-        "renderer": "preview",
         "channels": TAKEN,
         "twins": (24,),
         "sensor": Sensor(exposure_s=0.02, full_well=6000, photon_noise=True, read_noise=2.5),
         "sequence": (SequenceCard(name="lot", scene=str(folder / "lot.toml"), moving=(CART, BOX)),),
     }
-    return DatasetCard(**(kept | fields)).expanded()  # pyrefly: ignore[bad-argument-type]
+    return boxes_card(folder / "lot.toml", **(kept | fields)).expanded()
 
 
 @pytest.fixture(scope="module")
