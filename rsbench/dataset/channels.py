@@ -85,6 +85,8 @@ INSTANCE_TABLE, TRACKS, AFFINE = "instances.json", "tracks.npz", "affine.npz"
 MATCHER = "matches/matcher.json"
 STEP_PX = 2.0**-10
 """Values are rounded to multiples of it, which makes the files four times smaller."""
+SAME_PX = 1.5 * STEP_PX
+"""A step, where both were rounded, and what rounding of depth and pixels to float32 adds in images of 4000 px."""
 _BRIGHTEST = float(np.finfo(np.float16).max)
 
 
@@ -259,8 +261,7 @@ class TruthChannel:
 
 class _Pairs(TruthChannel):
     of_pairs = True
-    rounding = 1.5 * STEP_PX
-    """A step, where both were rounded, and what float32 of depth and pixels adds in images of 4000 px."""
+    rounding = SAME_PX
 
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
         layers = pair_layers([self.name], twins, frames)

@@ -21,7 +21,7 @@ from rsbench.dataset.channels import (
     NORMALS,
     PAIR_CHANNELS,
     RADIANCE,
-    STEP_PX,
+    SAME_PX,
     FrameTruth,
     Layer,
     known,
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
 
 Float32Array = NDArray[np.float32]
-_SAME_PX = 1.5 * STEP_PX
-"""A step, where both were rounded, and what rounding of depth and pixels to float32 adds in images of 4000 px."""
 _FEW, _OF_A_ROW = 1e-3, 0.25
 """Shares of pixels that may differ: in the image, those at its borders that rounding moves across; in a row."""
 _SURFACE, _BEHIND = 5e-5, 3e-4
@@ -157,7 +155,7 @@ def _pair_faults(
     file = layer.values(view.side, view.frame)
     known = ~np.isin(classes, _NO_VALUE)
     both = known & np.isfinite(derived.values[..., 0])
-    wrong = np.any(~(np.abs(values - derived.values) <= _SAME_PX), axis=-1)
+    wrong = np.any(~(np.abs(values - derived.values) <= SAME_PX), axis=-1)
     if _many(wrong & both, both):
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
@@ -267,12 +265,12 @@ def _pair_cause(
             return f"the same as {layer.values(other.side, other.frame)}"
     ratio = float(np.nanmedian(sampled / np.where(np.abs(derived.values) < 1, np.nan, derived.values)))
     spread = np.nanmedian(np.abs(sampled - ratio * derived.values))
-    return f"looks scaled by {ratio:.5g}" if abs(ratio - 1) > 1e-4 and spread < 2 * _SAME_PX else ""
+    return f"looks scaled by {ratio:.5g}" if abs(ratio - 1) > 1e-4 and spread < 2 * SAME_PX else ""
 
 
 def _explains(candidate: Float32Array, derived: _Derived) -> bool:
     both = np.isfinite(candidate[..., 0]) & np.isfinite(derived.values[..., 0])
-    near = np.all(np.abs(candidate - derived.values) <= _SAME_PX, axis=-1)
+    near = np.all(np.abs(candidate - derived.values) <= SAME_PX, axis=-1)
     return bool(np.any(both) and np.mean(near[both]) > _EXPLAINS)
 
 

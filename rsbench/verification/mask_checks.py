@@ -78,9 +78,7 @@ def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
         return
     for each in (*fresh.maps.values(), *twins.maps.values()):
         yield from _gloss_by_itself(each)
-    for part in (content, twins):
-        what = "pixels at the same pose"
-        yield from _dropped(part, {v: _unlike_twin(content, each, "gloss", what) for v, each in part.maps.items()})
+    yield from _unlike_twins(content, twins, "gloss", "pixels at the same pose")
     yield from _dropped(content, dict(_contradicted(content)))
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
@@ -104,6 +102,15 @@ def _gloss_by_itself(each: DepthMap) -> Iterator[Finding]:
     if np.any(solid) and left < _LEAST_LEFT:
         what = f"leaves {100 * left:.2g} % of the surfaces to be compared; its scene was not built (see --scene)"
         yield Finding(each.view.gloss, what)
+
+
+def _unlike_twins(
+    content: Content, twins: Content, kind: Literal["gloss", "labels"], what: str
+) -> Iterator[Finding]:
+    for part in (content, twins):
+        yield from _dropped(
+            part, {view: _unlike_twin(content, each, kind, what) for view, each in part.maps.items()}
+        )
 
 
 def _unlike_twin(content: Content, own: DepthMap, kind: Literal["gloss", "labels"], what: str) -> Finding | None:
@@ -182,11 +189,7 @@ def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
     for part in (content, twins):
         faults = {view: _on_nothing(each) or _misplaced(content, each) for view, each in part.maps.items()}
         yield from _dropped(part, faults)
-    for part in (content, twins):
-        what = "labels at the same time"
-        yield from _dropped(
-            part, {v: _unlike_twin(content, each, "labels", what) for v, each in part.maps.items()}
-        )
+    yield from _unlike_twins(content, twins, "labels", "labels at the same time")
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
 
