@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_here
+from general_rigs import LENSES
 from numpy.typing import NDArray
 
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
@@ -34,8 +35,6 @@ from rsbench.vision.quality import psnr
 
 BARREL = Lens(model="brown-conrady", k1=-0.22, k2=0.05, p1=0.001)
 FISHEYE = Lens(model="kannala-brandt", k1=-0.03, k2=0.01)
-RATIONAL = Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006)
-SPHERES = Lens(model="double-sphere", xi=-0.18, alpha=0.59)
 CARDS = {
     "barrel": (BARREL, {"channels": ("flow", "gs_flow")}),
     "late": (
@@ -43,8 +42,8 @@ CARDS = {
         {"scan": "bottom", "right_delay": 0.1, "channels": ("timing", "flow", "gs_flow", "normals", "tracks")},
     ),
     "columns": (FISHEYE, {"scan": "left", "right_scan": "right", "channels": ("flow", "gs_flow", "instances")}),
-    "rational": (RATIONAL, {"channels": ("flow",)}),
-    "spheres": (SPHERES, {"channels": ("flow",)}),
+    "rational": (LENSES["rational"], {"channels": ("flow",)}),
+    "spheres": (LENSES["double-sphere"], {"channels": ("flow",)}),
 }
 
 

@@ -6,6 +6,7 @@ Global shutters, and motions that no table of poses follows: tests/verification/
 from __future__ import annotations
 
 import numpy as np
+from general_rigs import LENSES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,13 +22,6 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.views import ImageView, find
 
-LENSES = (
-    None,
-    Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.001, p2=-0.002),
-    Lens(model="kannala-brandt", k1=-0.03, k2=0.01),
-    Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006),
-    Lens(model="double-sphere", xi=-0.18, alpha=0.59),
-)
 MODELS = (LinearMotion, TwistMotion, AcceleratedMotion, lambda w, d: SplineMotion(w, d, preset="drone", seed=3))
 NEAR_PX = 5e-6
 """The residual at which the search stops, 1e-8 px, and where a spline ends between two rows, the table's error of
@@ -50,7 +44,7 @@ def _points(geometry: FixedGeometry, source: ImageView, rng: np.random.Generator
 
 @settings(max_examples=15)
 @given(
-    lens=st.sampled_from(LENSES),
+    lens=st.sampled_from((None, *LENSES.values())),
     model=st.sampled_from(MODELS),
     scan=st.sampled_from(("top", "bottom", "left", "right")),
     right=st.sampled_from((None, "top", "right")),
