@@ -22,6 +22,7 @@ from rsbench.storage.files import (
     read_depth,
     read_exr,
     read_grey_png,
+    read_png,
     save_arrays,
     write_depth,
     write_exr,
@@ -61,6 +62,10 @@ def mask_of(file: str, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]])
         write_png(folder / file, np.ascontiguousarray(change(read_grey_png(folder / file))))
 
     return plant
+
+
+def image_of(file: str, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Callable[[Path], None]:
+    return lambda folder: write_png(folder / file, np.ascontiguousarray(change(read_png(folder / file))))
 
 
 def exchanged(*files: str) -> Callable[[Path], None]:

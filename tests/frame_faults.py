@@ -85,7 +85,7 @@ FAULTS: dict[str, tuple[Plant, Words]] = {
     ),
     "matches with a tenth of the error": (
         matches_of(1, "error", lambda error: 0.1 * error),
-        (matches_file(1), "not the distance from the true place"),
+        (matches_file(1), "not the distance from the true pixel"),
     ),
     "matches that are all hidden": (
         matches_of(2, "classes", lambda classes: np.where(classes == 1, 2, classes).astype(np.uint8)),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from analytic_dataset import PLANES, add_channels, card_of, write_analytic_dataset
 from attack.planting import named, rehash, spoilt
-from channel_faults import copied, depth_of, exchanged, mask_of, values_of
+from channel_faults import copied, depth_of, exchanged, image_of, mask_of, values_of
 from numpy.typing import NDArray
 from yard_dataset import boxes_card
 
@@ -35,7 +35,7 @@ from rsbench.dataset.views import ImageView
 from rsbench.renderers.image import Sensor
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
-from rsbench.storage.files import background_writer, read_png, write_png
+from rsbench.storage.files import background_writer
 from rsbench.verification import verification_steps, verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(64, 54, 74.0), baseline=0.3)
@@ -77,11 +77,6 @@ def all_of(one: int, other: int) -> list[str]:
     return [f"{kind}/{side}_{frame}.{end}" for kind, end in kinds for side in SIDES for frame in (one, other)]
 
 
-def moved(folder: Path) -> None:
-    path = folder / "rs/left_2.png"
-    write_png(path, np.roll(read_png(path), 1, axis=0))
-
-
 FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "all pictures of frames 1 and 2 exchanged": (exchanged(*all_of(1, 2)), ("left_2.exr", "looks like frame 1")),
     "depth maps of frames 1 and 3 exchanged": (
@@ -92,7 +87,10 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
         exchanged("gs/right_2.png", "gs/right_3.png"),
         ("gs/right_2.png", "looks like gs/right_3.png"),
     ),
-    "an image of frame 2 shifted": (moved, ("rs/left_2.png", "shifted by one row")),
+    "an image of frame 2 shifted": (
+        image_of("rs/left_2.png", lambda image: np.roll(image, 1, axis=0)),
+        ("rs/left_2.png", "shifted by one row"),
+    ),
     "a depth map of frame 3 scaled": (
         depth_of("rs_depth/left_3.exr", 1.002),
         ("rs_depth/left_3.exr", "scaled by 1.002"),

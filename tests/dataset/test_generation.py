@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from attack.planting import rehash
-from commands import refused
+from commands import bytes_below, refused
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core.errors import RsbenchError
@@ -25,14 +25,9 @@ from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_datas
 from rsbench.dataset.generation import estimate_dataset, generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset
 from rsbench.renderers.image import Sensor
-from rsbench.storage.files import read_png, sha256, write_png
+from rsbench.storage.files import read_png, write_png
 from rsbench.storage.work_folder import HIDDEN
 from rsbench.verification import verify_dataset
-
-
-def bytes_of(folder: Path) -> dict[str, str]:
-    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and HIDDEN not in path.parts)
-    return {str(path.relative_to(folder)): sha256(path) for path in paths}
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ def test_manifest_states_the_paper_conventions(smoke_dataset: Path) -> None:
 
 def test_same_card_gives_the_same_bytes_whatever_the_workers(small: Small, tmp_path: Path) -> None:
     generate_dataset(load_dataset_card(str(small.card)), tmp_path / "again", workers=2)
-    assert bytes_of(tmp_path / "again") == bytes_of(small.dataset)
+    assert bytes_below(tmp_path / "again", HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 def child(card: Path, out: Path, progress: str) -> list[str]:
@@ -107,7 +102,7 @@ def test_killed_run_resumes_to_the_bytes_of_an_undisturbed_one(small: Small, tmp
     with pytest.raises(RsbenchError, match="not a dataset"):
         read_dataset(out)
     assert generate_dataset(load_dataset_card(str(small.card)), out) == (["a", "b"] if files < 16 else ["b"])
-    assert bytes_of(out) == bytes_of(small.dataset)
+    assert bytes_below(out, HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 def test_damaged_sequence_is_rendered_again_and_sound_ones_are_kept(small: Small, tmp_path: Path) -> None:
@@ -116,7 +111,7 @@ def test_damaged_sequence_is_rendered_again_and_sound_ones_are_kept(small: Small
     assert generate_dataset(card, out) == []
     (out / "b/rs/left_0.png").write_bytes(b"damaged")
     assert generate_dataset(card, out) == ["b"]
-    assert bytes_of(out) == bytes_of(small.dataset)
+    assert bytes_below(out, HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 @pytest.mark.slow
@@ -204,16 +199,16 @@ def test_shards_brought_together_are_the_dataset(small: Small, tmp_path: Path) -
         (made,) = generate_dataset(card.shard(part, 2), tmp_path / str(part))
         shutil.copytree(tmp_path / str(part) / made, tmp_path / "both" / made)
     assert generate_dataset(card, tmp_path / "both") == []
-    assert bytes_of(tmp_path / "both") == bytes_of(small.dataset)
+    assert bytes_below(tmp_path / "both", HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 def test_the_estimate_counts_files_and_bytes(small: Small) -> None:
     words: list[str] = []
     found = estimate_dataset(load_dataset_card(str(small.card)), words.append)
-    made = [path for path in small.dataset.rglob("*") if path.is_file() and HIDDEN not in path.parts]
+    made = bytes_below(small.dataset, HIDDEN).values()
     assert len(words) == 2 and (found.sequences, found.files) == (2, len(made))
     # One camera at one time stands for four.
-    assert found.bytes == pytest.approx(sum(path.stat().st_size for path in made), rel=0.1)
+    assert found.bytes == pytest.approx(sum(map(len, made)), rel=0.1)
     assert 0.0 < found.seconds < 60.0
 
 
@@ -265,7 +260,7 @@ def test_a_camera_through_a_wall_is_refused(small: Small, tmp_path: Path) -> Non
 
 def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
     manifest = json.loads((smoke_dataset / "dataset.json").read_text())
-    assert set(manifest["files"]) == set(bytes_of(smoke_dataset)) - {"dataset.json", "croissant.json"}
+    assert set(manifest["files"]) == set(bytes_below(smoke_dataset, HIDDEN)) - {"dataset.json", "croissant.json"}
 
 
 @pytest.mark.slow

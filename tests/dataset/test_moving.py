@@ -14,6 +14,7 @@ import pytest
 import trimesh
 from attack.planting import spoilt
 from channel_faults import mask_of, other_object
+from commands import bytes_below
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from traced_truth import Array, Thing, World, agreement, axis_of, first_hit, grid_of, line_times, rays
@@ -88,8 +89,9 @@ def lot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_lot(folder)
     generate_dataset(lot_card(folder), folder / "data")
     assert generate_dataset(lot_card(folder), folder / "data") == [], "a second run has nothing to do"
-    files = [path for path in (folder / "data").rglob("*") if path.is_file() and HIDDEN not in path.parts]
-    assert estimate_dataset(lot_card(folder), lambda scene: None).files == len(files)
+    assert estimate_dataset(lot_card(folder), lambda scene: None).files == len(
+        bytes_below(folder / "data", HIDDEN)
+    )
     return folder / "data"
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from attack.planting import rehash
+from attack.planting import spoilt
+from channel_faults import image_of
 from numpy.typing import NDArray
 from small_scenes import write_box_scene, write_small_card
 
@@ -149,14 +150,12 @@ def test_rows_of_a_sensor_are_made_again(made: dict[str, Path], tmp_path: Path) 
     for name in ("exposed", "camera"):
         (report,) = verify_dataset(made[name].parent, 4, rerender="auto")
         assert report.faults == () and report.notes[0].endswith("the same bits")
-    copy = tmp_path / "dataset"
-    shutil.copytree(made["exposed"].parent, copy)
-    sequence = read_sequence(copy / "room-twist")
+    sequence = read_sequence(made["exposed"])
     light = _linear(sequence.clean_image("left", 1).astype(np.float64))
     noise = np.random.default_rng(3).normal(0.0, 1.0, light.shape) * np.sqrt(NOISY.variance(light))
     forged = np.round(255.0 * _srgb(np.clip(light + noise, 0.0, 1.0))).astype(np.uint8)
-    write_png(copy / "room-twist/rs/left_1.png", forged)
-    rehash(copy)
+    plant = image_of("rs/left_1.png", lambda seen: forged)
+    copy = spoilt(made["exposed"].parent, tmp_path / "data", plant, sequence="room-twist")
     (report,) = verify_dataset(copy, 4, rerender="auto")
     assert any(fault.startswith("rs/left_1.png: ") and "new rendering" in fault for fault in report.faults)
 
@@ -209,14 +208,10 @@ def test_exposed_twins_are_verified(twins: Path, tmp_path: Path) -> None:
     (report,) = verify_dataset(twins, 4, rerender="auto")
     assert report.faults == () and report.notes[0].endswith("the same bits")
     for number, file in enumerate(("gs_exposed/left_1.png", "gs_twin_exposed/0036/right_0.png")):
-        copy = tmp_path / str(number) / "data"
-        shutil.copytree(twins, copy)
-        path = copy / "room-twist" / file
-        write_png(path, np.ascontiguousarray(read_png(path)[::-1]))
-        rehash(copy)
+        copy = spoilt(twins, tmp_path / str(number), image_of(file, np.flipud), sequence="room-twist")
         (report,) = verify_dataset(copy)
         assert any(fault.startswith(f"{file}: ") and "beyond 5 sigma" in fault for fault in report.faults)
-        path.unlink()
+        (copy / "room-twist" / file).unlink()
         (report,) = verify_dataset(copy)
         assert any(file in fault for fault in report.faults)
 
