@@ -110,11 +110,8 @@ def test_a_built_in_scene_is_not_built_again_to_know_it(tmp_path: Path) -> None:
 
     for _ in range(2):
         known = SceneHashes(tmp_path / "scenes.json", build)
-        assert [known.of("castle"), known.of("room"), known.of("castle")] == [
-            "hash of castle",
-            "hash of room",
-            "hash of castle",
-        ]
+        for name in ("castle", "room", "castle"):
+            assert known.of(name) == f"hash of {name}"
     assert built == ["castle", "room"]
 
 
