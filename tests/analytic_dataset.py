@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from attack.planting import rehash
 from numpy.typing import NDArray
 
 import rsbench
@@ -19,10 +21,11 @@ from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.channels import channel_files
 from rsbench.dataset.layout import Shutter, picture_file, relative_files
 from rsbench.dataset.sequence import UNITS, sequence_manifest
 from rsbench.renderers.options import RendererOptions
-from rsbench.storage.files import sha256, write_depth, write_json, write_png, write_poses
+from rsbench.storage.files import read_json, sha256, write_depth, write_json, write_png, write_poses
 
 PLANES = ((np.array([0.05, 1.0, -0.15]), 1.2), (np.array([0.1, 0.05, 1.0]), 9.0))
 """Normal n and offset c of n . X = c, world frame."""
@@ -75,6 +78,20 @@ def card_of(rig: StereoRig, shutter: RollingShutter, motion: Motion, frames: int
         ),
         sequence=(SequenceCard(name="planes", scene="planes.toml"),),
     )
+
+
+def add_channels(out: Path, card: DatasetCard, write: Callable[[Path], None]) -> None:
+    """Add what ``write`` writes of a card's channels into the sequence's folder, with manifests that fit."""
+    folder, files = out / "planes", channel_files(card.channels, (), card.frames)
+    for name in files:
+        (folder / name).parent.mkdir(exist_ok=True)
+    write(folder)
+    own, made = read_json(folder / "sequence.json"), card.manifest_of(card.sequence[0])
+    own |= {key: made[key] for key in ("channels", "imu", "matches") if key in made}
+    own["files"] |= dict.fromkeys(files, "")
+    write_json(folder / "sequence.json", own)
+    write_json(out / "dataset.json", read_json(out / "dataset.json") | {"card": asdict(card)})
+    rehash(out)
 
 
 def write_analytic_dataset(

@@ -15,9 +15,9 @@ from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
 from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.tracks import AffineFrames, jacobians_of
-from rsbench.dataset.views import PixelClass
+from rsbench.dataset.views import NUMBER, PixelClass
 from rsbench.renderers.image import to_srgb8
-from rsbench.storage.files import read_exr, read_grey_png, save_arrays, write_exr, write_png, write_png16
+from rsbench.storage.files import read_exr, read_grey_png, read_png, save_arrays, write_exr, write_png, write_png16
 from rsbench.storage.untrusted_files import load_arrays
 
 Arrays = dict[str, NDArray[Any]]
@@ -48,6 +48,11 @@ def mask_of(file: str, change: Change) -> Plant:
             write_png(folder / file, np.ascontiguousarray(change(read_grey_png(folder / file)), dtype=np.uint8))
 
     return plant
+
+
+def image_of(file: str, change: Change) -> Plant:
+    """``change`` takes and gives the pixels (H, W, 3) of a PNG file."""
+    return lambda folder: write_png(folder / file, np.ascontiguousarray(change(read_png(folder / file))))
 
 
 def arrays_of(file: str, change: Callable[[Arrays], object]) -> Plant:
@@ -93,6 +98,11 @@ def classes(old: int, new: int, name: str = "classes") -> Change:
 def swapped_numbers(numbers: NDArray[Any]) -> NDArray[Any]:
     """1 and 2 exchanged."""
     return np.where(numbers == 1, 2, np.where(numbers == 2, 1, numbers))
+
+
+def other_object(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Labels of two objects with their numbers exchanged."""
+    return np.where((labels & NUMBER) > 0, labels ^ 3, labels).astype(np.uint8)
 
 
 def one_row(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import itertools
 import json
 import os
 import subprocess
@@ -125,3 +126,17 @@ def install_project(folder: Path) -> None:
         for group, points in project["entry-points"].items()
     ]
     install_package(folder, project.get("name", "documented"), "\n".join(tables) + "\n")
+
+
+def rename_failing(
+    fails: Callable[[int], bool], error: BaseException | None = None
+) -> Callable[[Path, Path], None]:
+    """``os.rename``, which raises an error at some calls, counted from 1; by default that of a disk."""
+    real, calls = os.rename, itertools.count(1)
+
+    def rename(source: Path, target: Path) -> None:
+        if fails(next(calls)):
+            raise error or OSError(5, "Input/output error")
+        real(source, target)
+
+    return rename

@@ -85,7 +85,7 @@ FAULTS: dict[str, Fault] = {
         matches_file(2), array("pixels", lambda pixels: pixels + 0.5), "not those of the point in their row"
     ),
     "matches with a tenth of the error": fault(
-        matches_file(1), array("error", lambda error: 0.1 * error), "not the distance from the true place"
+        matches_file(1), array("error", lambda error: 0.1 * error), "not the distance from the true pixel"
     ),
     "matches that are all hidden": fault(
         matches_file(2),

@@ -28,6 +28,15 @@ def rig_of(w: tuple[float, float, float], t: tuple[float, float, float] = (-0.25
     return StereoRig.of_cameras(LEFT, RIGHT, so3.exp(np.array(w)), t)
 
 
+LENSES = {
+    "brown-conrady": Lens(model="brown-conrady", k1=-0.25, k2=0.06, p1=0.004, p2=-0.003),
+    "kannala-brandt": Lens(model="kannala-brandt", k1=-0.06, k2=0.01),
+    "rational": Lens(
+        model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006
+    ),
+    "double-sphere": Lens(model="double-sphere", xi=-0.18, alpha=0.59),
+}
+"""One of each model, for cameras of some 60 degrees."""
 RIGS = {
     "turned": rig_of((0.01, -0.03, 0.02)),
     "vertical": rig_of((0.01, 0.0, 0.02), (0.01, -0.25, 0.01)),

@@ -196,8 +196,7 @@ class DatasetCard(Scanning):
         if not len(FRAMES) <= self.frames <= MOST_FRAMES:
             raise ValueError(f"frames = {self.frames}: must lie in [{len(FRAMES)}, {MOST_FRAMES}]")
         for sequence in self.sequence:
-            self._check_cameras(sequence)
-            self._check_times(sequence)
+            self._check_sequence(sequence)
             check_moving(sequence.moving, self.channels)
         low, high = self.readout_range or (0.0, 1.0)
         if not 0.0 <= low < high <= 1.0:
@@ -216,20 +215,17 @@ class DatasetCard(Scanning):
             if count > 1:
                 raise ValueError(f"two sequences are named {name!r}")
 
-    def _check_cameras(self, sequence: SequenceCard) -> None:
+    def _check_sequence(self, sequence: SequenceCard) -> None:
         rig, shutter = self.rig_of(sequence), self.shutter_for(sequence)
         check_sizes(rig)
         check_channels(self.channels, not rig.rectified, shutter.plain)
-
-    def _check_times(self, sequence: SequenceCard) -> None:
-        self.shutter_for(sequence)
         self.twins_of(sequence)
         period, sensor = self.period_of(sequence), self.sensor_of(sequence)
         if not period > 0:
             raise ValueError(f"frame_period_s must be positive, got {period}")
-        if sensor is not None and sensor.longest_s > period:
-            raise ValueError(f"sensor exposure_s = {sensor.longest_s}: longer than frame_period_s = {period}")
         if sensor is not None:
+            if sensor.longest_s > period:
+                raise ValueError(f"sensor exposure_s = {sensor.longest_s}: longer than frame_period_s = {period}")
             check_brightness(sensor, self.frames)
 
     def _check_motions(self) -> None:

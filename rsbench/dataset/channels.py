@@ -85,6 +85,8 @@ INSTANCE_TABLE, TRACKS, AFFINE = "instances.json", "tracks.npz", "affine.npz"
 MATCHER = "matches/matcher.json"
 STEP_PX = 2.0**-10
 """Values are rounded to multiples of it, which makes the files four times smaller."""
+SAME_PX = 1.5 * STEP_PX
+"""A step, where both were rounded, and what rounding of depth and pixels to float32 adds in images of 4000 px."""
 _BRIGHTEST = float(np.finfo(np.float16).max)
 
 
@@ -259,8 +261,7 @@ class TruthChannel:
 
 class _Pairs(TruthChannel):
     of_pairs = True
-    rounding = 1.5 * STEP_PX
-    """A step, where both were rounded, and what float32 of depth and pixels adds in images of 4000 px."""
+    rounding = SAME_PX
 
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
         layers = pair_layers([self.name], twins, frames)
@@ -419,6 +420,7 @@ class _Matches(TruthChannel):
             make_matches(whole.geometry, first, images, matching, whole.rays).save(folder / matches_file(first))
 
 
+NORMALS, INSTANCES, RADIANCE = _Normals(), _Instances(), _Radiance()
 OBJECTS: dict[str, TruthChannel] = {
     each.name: each
     for each in (
@@ -426,12 +428,12 @@ OBJECTS: dict[str, TruthChannel] = {
         _Flow(),
         _CorrectionFlow(),
         _Timing(),
-        _Normals(),
-        _Instances(),
+        NORMALS,
+        INSTANCES,
         _Inertial(),
         _Tracks(),
         _Affine(),
-        _Radiance(),
+        RADIANCE,
         _Matches(),
     )
 }
@@ -502,17 +504,9 @@ def pair_values(channel: PairChannel, source: ImageView, offset: FloatArray) -> 
     return (values + 0.0).astype(np.float32)  # no -0
 
 
-def surface_file(channel: Literal["normals", "instances"], side: str, frame: int) -> str:
-    return f"{channel}/{side}_{frame}.{'exr' if channel == 'normals' else 'png'}"
-
-
 def matches_file(first: int) -> str:
     """File of the matches of frame ``first`` and the next, below the folder of a sequence."""
     return f"matches/{first}.npz"
-
-
-def radiance_file(side: str, frame: int) -> str:
-    return f"hdr/{side}_{frame}.exr"
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:
@@ -540,10 +534,14 @@ class ChannelReader:
     folder: Path
     rig: StereoRig
     shutter: RollingShutter
-    channels: tuple[str, ...]
-    frames: int
-    first: int
+    channels: tuple[str, ...] = ()
+    """Names of channels in addition to images, depth and poses; later versions may have more."""
+    frames: int = len(FRAMES)
+    """Number of frames of each camera."""
+    first: int = 0
+    """Number in the folder of the frame that is frame 0 here; above 0 only for a pair."""
     manifest: dict[str, Any]
+    """Content of sequence.json."""
 
     def channel_values(self, channel: str, file: str) -> NDArray[Any]:
         """(H, W, ...) of a file below the folder, one that the channel has for each frame.
@@ -579,11 +577,11 @@ class ChannelReader:
 
         RsbenchError as of ``channel_values``.
         """
-        return self.channel_values("normals", surface_file("normals", side, frame + self.first))
+        return self.channel_values("normals", NORMALS.file(side, frame + self.first))
 
     def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
         """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``channel_values``."""
-        return self.channel_values("instances", surface_file("instances", side, frame + self.first))
+        return self.channel_values("instances", INSTANCES.file(side, frame + self.first))
 
     def instance_table(self) -> list[dict[str, str]]:
         """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``channel_values``, or another
@@ -619,7 +617,7 @@ class ChannelReader:
         Times the renderer's ``exposure``, 1 is white. Rounded to float16 on disk. RsbenchError as of
         ``channel_values``.
         """
-        return self.channel_values("hdr", radiance_file(side, frame + self.first))
+        return self.channel_values("hdr", RADIANCE.file(side, frame + self.first))
 
     def tracks(self) -> Tracks:
         """Surface points and where the frames see them; RsbenchError as of ``channel_values``."""

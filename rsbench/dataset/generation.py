@@ -164,7 +164,8 @@ def generate_dataset(
         todo = [sequence for sequence in card.sequence if sequence.name not in made]
         done: Counter[str] = Counter()
         ordered = sorted(todo, key=scene_name)
-        for name, steps in _render_all(card, ordered, options, plans, build, destination.target, workers):
+        run = _Run(card, options, destination.target)
+        for name, steps in run.sequences(ordered, plans, build, workers):
             done[name] += steps
             if done[name] == steps_of(card):
                 made[name] = destination.learned(name)
@@ -182,34 +183,66 @@ def build_scene(name: str) -> Built:
     return Built(scene, scene_hash(scene))
 
 
-def _render_all(
-    card: DatasetCard,
-    todo: list[SequenceCard],
-    options: RendererOptions,
-    plans: dict[str, Plan],
-    build: Build,
-    target: FolderTarget | StoreTarget,
-    workers: Workers,
-) -> Iterator[tuple[str, int]]:
-    """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
-    if workers == 1 or not todo:
-        stage = PosedScenes(build)
-        for sequence in todo:
-            for _ in _render_sequence(card, sequence, options, plans[sequence.name], stage, target):
-                yield sequence.name, 1
-        return
-    jobs = [(sequence, plans[sequence.name]) for sequence in todo]
-    threads = 1 if isinstance(workers, Cluster) else max(1, (os.cpu_count() or 1) // workers)
-    given = card, options, target, threads
-    found = finished_jobs(_serve_renders, jobs, workers, {}, *given, name=lambda job: f"sequence {job[0].name}")
-    with closing(found):
-        for (sequence, _), _ in found:
-            yield sequence.name, steps_of(card)
+@dataclass(frozen=True)
+class _Run:
+    """What renders the sequences of a card; picklable, for processes that share them."""
+
+    card: DatasetCard
+    options: RendererOptions
+    target: FolderTarget | StoreTarget
+
+    def sequences(
+        self, todo: list[SequenceCard], plans: dict[str, Plan], build: Build, workers: Workers
+    ) -> Iterator[tuple[str, int]]:
+        """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
+        if workers == 1 or not todo:
+            stage = PosedScenes(build)
+            for sequence in todo:
+                for _ in self.sequence(sequence, plans[sequence.name], stage):
+                    yield sequence.name, 1
+            return
+        jobs = [(sequence, plans[sequence.name]) for sequence in todo]
+        threads = 1 if isinstance(workers, Cluster) else max(1, (os.cpu_count() or 1) // workers)
+        found = finished_jobs(
+            _serve_renders, jobs, workers, {}, self, threads, name=lambda job: f"sequence {job[0].name}"
+        )
+        with closing(found):
+            for (sequence, _), _ in found:
+                yield sequence.name, steps_of(self.card)
+
+    def sequence(self, sequence: SequenceCard, plan: Plan, stage: PosedScenes) -> Iterator[None]:
+        """Render into a folder of the workplace and place it when complete; yields after each step."""
+        from rsbench.renderers.backend import start_backend
+        from rsbench.renderers.visibility import obstacle
+
+        card, backend, (mitsuba_scene, digest) = self.card, start_backend(), stage.set_for(sequence)
+        if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
+            raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
+        plan = with_gloss(plan, mitsuba_scene.glossy)
+        # Of this try alone: another machine may not know yet that its run was killed.
+        partial = self.target.work_folder() / f"{sequence.name}.{secrets.token_hex(4)}"
+        for folder in {Path(name).parent for name in files_of(plan)}:
+            (partial / folder).mkdir(parents=True, exist_ok=True)
+        with background_writer() as later:
+            for side, frame in views_of(card.frames):
+                yield from render_camera(card, sequence, self.options, mitsuba_scene, side, frame, partial, later)
+            write_sequence_channels(
+                card.channels, sequence_truth(partial, card, sequence, mitsuba_scene, plan["scene"])
+            )
+        files = {name: sha256(partial / name) for name in files_below(partial)}
+        made_by = {
+            "rsbench": __version__,
+            "mitsuba": version("mitsuba"),
+            "drjit": version("drjit"),
+            "variant": backend.variant,
+        }
+        content = of_scene(plan, digest) | {"made_by": made_by, "files": files}
+        write_json(partial / "sequence.json", content)
+        self.target.place(partial, sequence.name)
+        yield
 
 
-def _serve_renders(
-    card: DatasetCard, options: RendererOptions, target: FolderTarget | StoreTarget, threads: int
-) -> Callable[[tuple[SequenceCard, Plan]], None]:
+def _serve_renders(run: _Run, threads: int) -> Callable[[tuple[SequenceCard, Plan]], None]:
     """What renders sequences, in a child."""
     from rsbench.renderers.backend import set_threads, start_backend
 
@@ -220,51 +253,12 @@ def _serve_renders(
     def render(job: tuple[SequenceCard, Plan]) -> None:
         sequence, plan = job
         try:
-            for _ in _render_sequence(card, sequence, options, plan, stage, target):
+            for _ in run.sequence(sequence, plan, stage):
                 pass
         except RsbenchError as error:
             raise EntryFailure(str(error)) from error
 
     return render
-
-
-def _render_sequence(
-    card: DatasetCard,
-    sequence: SequenceCard,
-    options: RendererOptions,
-    plan: Plan,
-    stage: PosedScenes,
-    target: FolderTarget | StoreTarget,
-) -> Iterator[None]:
-    """Render into a folder of the workplace and place it when complete; yields after each step."""
-    from rsbench.renderers.backend import start_backend
-    from rsbench.renderers.visibility import obstacle
-
-    backend, (mitsuba_scene, digest) = start_backend(), stage.set_for(sequence)
-    if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
-        raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
-    plan = with_gloss(plan, mitsuba_scene.glossy)
-    # Of this try alone: another machine may not know yet that its run was killed.
-    partial = target.work_folder() / f"{sequence.name}.{secrets.token_hex(4)}"
-    for folder in {Path(name).parent for name in files_of(plan)}:
-        (partial / folder).mkdir(parents=True, exist_ok=True)
-    with background_writer() as later:
-        for side, frame in views_of(card.frames):
-            yield from render_camera(card, sequence, options, mitsuba_scene, side, frame, partial, later)
-        write_sequence_channels(
-            card.channels, sequence_truth(partial, card, sequence, mitsuba_scene, plan["scene"])
-        )
-    files = {name: sha256(partial / name) for name in files_below(partial)}
-    made_by = {
-        "rsbench": __version__,
-        "mitsuba": version("mitsuba"),
-        "drjit": version("drjit"),
-        "variant": backend.variant,
-    }
-    content = of_scene(plan, digest) | {"made_by": made_by, "files": files}
-    write_json(partial / "sequence.json", content)
-    target.place(partial, sequence.name)
-    yield
 
 
 def render_camera(

@@ -23,9 +23,10 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.dataset.timing import write_rows
 from rsbench.renderers.image import Sensor
 from rsbench.scenes.model import Start, Viewpoint
-from rsbench.storage.files import write_bytes, write_json
+from rsbench.storage.files import write_json
 from rsbench.storage.untrusted_files import inside, read_text
 
 IMU_MANIFEST, MEASURED, TRUE = "imu/imu.json", "imu/measured.csv", "imu/true.csv"
@@ -184,8 +185,7 @@ def write_imu(folder: Path, imu: Imu, gravity: FloatArray, samples: ImuSamples) 
         (TRUE, TRUE_COLUMNS, samples.times_ns, np.concatenate([samples.true, samples.bias], axis=1)),
     ):
         rows = zip(times.tolist(), values.tolist(), strict=True)
-        lines = [",".join(map(repr, [time, *row])) for time, row in rows]
-        write_bytes(folder / file, ("\n".join([columns, *lines]) + "\n").encode())
+        write_rows(folder / file, columns, ([time, *row] for time, row in rows))
 
 
 def read_imu(folder: Path) -> ImuSamples:

@@ -245,10 +245,7 @@ class DatasetManifest:
 class Sequence(ChannelReader):
     """A sequence folder, or two successive frames of one; sides left and right, frames from 0."""
 
-    folder: Path
     name: str
-    rig: StereoRig
-    shutter: RollingShutter
     motion: Motion
     frame_period_s: float
     sensor: Sensor | None = None
@@ -261,20 +258,12 @@ class Sequence(ChannelReader):
     """Rows, in the order of the readout, at whose poses there are global-shutter twins in addition to row 0."""
     exposed_twins: bool = False
     """Whether it has global-shutter images with the sensor's exposure."""
-    channels: tuple[str, ...] = ()
-    """Names of channels in addition to images, depth and poses; later versions may have more."""
-    frames: int = len(FRAMES)
-    """Number of frames of each camera."""
-    first: int = 0
-    """Number in the folder of the frame that is frame 0 here; above 0 only for a pair."""
     moving: tuple[MovingManifest, ...] = ()
     """Moving objects, numbered from 1."""
     objects: tuple[MovingObject, ...] = ()
     """Motions of the moving objects."""
     glossy: bool = False
     """Whether its scene has glossy surfaces, which look different from each viewpoint."""
-    manifest: dict[str, Any]
-    """Content of sequence.json."""
 
     def pairs(self) -> list[Sequence]:
         """Pairs of successive frames as sequences of two frames, such as ``castle.3`` for frames 3 and 4.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,13 @@ def write_timing(
     write_json(folder / TIMING_MANIFEST, timing_manifest(shutter, frame_period_s, sensor, frames))
     for side, frame in views_of(frames):
         table = timing_table(shutter, frame_period_s, sensor, side, frame)
-        lines = [",".join(map(str, line)) for line in table.tolist()]
-        write_bytes(folder / table_file(side, frame), ("\n".join([TIMING_COLUMNS, *lines]) + "\n").encode())
+        write_rows(folder / table_file(side, frame), TIMING_COLUMNS, table.tolist())
+
+
+def write_rows(path: Path, columns: str, rows: Iterable[Iterable[float]]) -> None:
+    """A CSV file with this header and numbers to their last bit."""
+    lines = [",".join(map(repr, row)) for row in rows]
+    write_bytes(path, ("\n".join([columns, *lines]) + "\n").encode())
 
 
 def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:

@@ -22,6 +22,7 @@ from rsbench.core.rig import FRAMES, SIDES, Side
 from rsbench.core.se3 import Pose, inverse, transform
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.dataset.layout import SHUTTERS, Shutter, exposed_file, gloss_file, moving_file, picture_file
+from rsbench.vision.reprojection import bend, lens_table
 
 if TYPE_CHECKING:
     from rsbench.renderers.visibility import Surfaces
@@ -232,7 +233,7 @@ def find(
     pixels, eyes = np.full((*start.shape, 2), np.nan), np.zeros(points.shape)
     status = np.full(start.shape, _UNSURE, dtype=np.uint8)
     axis, lines = shutter.axis(target.side), shutter.lines(target.side)
-    optics, seen = _intrinsics(camera), np.zeros((0, 0, 3)) if in_camera is None else in_camera
+    optics, seen = _optics_of(camera), np.zeros((0, 0, 3)) if in_camera is None else in_camera
 
     def search(first: int, last: int) -> None:
         rows = slice(first, last)
@@ -290,15 +291,11 @@ def _pose_table(geometry: Geometry, view: ImageView) -> _Table:
     )
 
 
-def _intrinsics(camera: PinholeCamera) -> FloatArray:
-    """(18,) width, height, fx, fy, cx, cy; number of the lens model, largest radius and coefficients."""
-    lens = camera.lens
-    own = [0.0] * 12
-    if lens is not None:
-        kind = 1.0 + lens.number
-        own = [kind, lens.reach, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4]
-        own += [lens.k5, lens.k6, lens.xi, lens.alpha]
-    return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *own])
+def _optics_of(camera: PinholeCamera) -> FloatArray:
+    """(21,) width, height, fx, fy, cx, cy; 1 for a camera with a lens, and its ``lens_table``."""
+    lens = np.zeros(14) if camera.lens is None else lens_table(camera, camera.lens)
+    own = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.lens is not None]
+    return np.concatenate([own, lens])
 
 
 @compiled
@@ -424,37 +421,8 @@ def _pixel(pose: FloatArray, camera: FloatArray, X: tuple[float, float, float]) 
     x = (pose[0] * X[0] + pose[1] * X[1] + pose[2] * X[2] + pose[9]) / z
     y = (pose[3] * X[0] + pose[4] * X[1] + pose[5] * X[2] + pose[10]) / z
     if camera[6] > 0.0:
-        x, y = _distorted(camera, x, y)
+        x, y = bend(camera[7:], x, y)
     return camera[2] * x + camera[4], camera[3] * y + camera[5]
-
-
-@compiled
-def _distorted(camera: FloatArray, x: float, y: float) -> tuple[float, float]:
-    """Distorted coordinates. NumPy: ``Lens.distort``."""
-    k1, k2, p1, p2, k3, k4 = camera[8], camera[9], camera[10], camera[11], camera[12], camera[13]
-    s = x * x + y * y
-    r = math.sqrt(s)
-    if not r < camera[7]:
-        return math.nan, math.nan
-    if camera[6] == 4.0:
-        xi, alpha = camera[16], camera[17]
-        w = xi * math.sqrt(s + 1.0) + 1.0
-        gain = 1.0 / (alpha * math.sqrt(s + w * w) + (1.0 - alpha) * w)
-        return x * gain, y * gain
-    if camera[6] != 2.0:
-        gain = 1.0 + s * (k1 + s * (k2 + s * k3))
-        if camera[6] == 3.0:
-            gain /= 1.0 + s * (k4 + s * (camera[14] + s * camera[15]))
-        return (
-            x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
-            y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
-        )
-    angle = math.atan(r)
-    a = angle * angle
-    gain = 1.0 + s * (k1 - 1.0 / 3.0)
-    if s >= 1e-12:
-        gain = angle / r * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
-    return x * gain, y * gain
 
 
 Blocked = Callable[[FloatArray, FloatArray, FloatArray | None], NDArray[np.bool_]]

@@ -12,35 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.rig import SIDES
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import (
     INSTANCE_TABLE,
+    INSTANCES,
+    NORMALS,
     PAIR_CHANNELS,
-    STEP_PX,
+    RADIANCE,
+    SAME_PX,
     FrameTruth,
     Layer,
     known,
     pair_layers,
     pair_values,
-    radiance_file,
-    surface_file,
 )
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays, SeenSurfaces, numbers_of, times_at
 from rsbench.renderers.image import linear_of_codes, to_srgb8
-from rsbench.verification.content import clean_picture
+from rsbench.verification.content import Content, clean_picture
 from rsbench.verification.findings import Again, Finding, cheapest_cause, rows_of, rows_with_most
 from rsbench.verification.image_checks import Picture
-from rsbench.verification.reprojection import BoolArray, DepthMap, reproject
+from rsbench.verification.reprojection import BoolArray, DepthMap, around, reproject
 
 if TYPE_CHECKING:
     from rsbench.renderers.render import Frame
 
 Float32Array = NDArray[np.float32]
-_SAME_PX = 1.5 * STEP_PX
-"""A step, where both were rounded, and what rounding of depth and pixels to float32 adds in images of 4000 px."""
 _FEW, _OF_A_ROW = 1e-3, 0.25
 """Shares of pixels that may differ: in the image, those at its borders that rounding moves across; in a row."""
 _SURFACE, _BEHIND = 5e-5, 3e-4
@@ -78,18 +77,14 @@ class _Derived(NamedTuple):
 
 
 def channel_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    stride: int = 1,
-    times: tuple[int, ...] = FRAMES,
-    new: tuple[int, ...] = FRAMES,
+    content: Content, reported: Collection[str], new: tuple[int, ...], stride: int = 1
 ) -> Iterator[Finding]:
     """What the channels of a sequence show that its depth maps and motion cannot have made.
 
     Files that are ``reported`` already, missing or wrong, are left out; a wrong depth map would accuse others. Of
-    channels between two frames of these ``times``, or within one, at least one of which is ``new``.
+    channels between two frames of the content, or within one, at least one of which is ``new``.
     """
+    sequence, maps, times = content.sequence, content.maps_without(reported), content.times
     for layer in pair_layers(sequence.channels, sequence.twins, sequence.frames):
         stored: dict[ImageView, _Stored] = {}
         for side, frame in layer.views(sequence.frames):
@@ -101,10 +96,8 @@ def channel_faults(
             except RsbenchError as error:
                 yield Finding.of(error)
         for view in stored:
-            there = layer.target(view, sequence.frames)
-            used = {each for each in (view, there) if each in maps and each.depth not in reported}
-            if len(used) == 2:
-                yield from _pair_faults(sequence, maps, layer, view, stored, stride)
+            if {view, layer.target(view, sequence.frames)} <= maps.keys():
+                yield from _pair_faults(content, layer, view, stored, stride)
 
 
 def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
@@ -117,7 +110,7 @@ def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
 def channels_again(
     sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
 ) -> Iterator[Again]:
-    """Make rows of the channels of a frame again: each file, its fault or None, and whether its bits are equal.
+    """Make rows of the channels of a frame again, and compare each file.
 
     Args:
         sequence: holds them.
@@ -151,23 +144,18 @@ def channels_again(
                 np.arange(sequence.rig.sensor(view.side).height), np.asarray(rows)[np.any(wrong, axis=1)]
             )
             same = np.array_equal(stored, made.astype(stored.dtype), equal_nan=stored.dtype.kind == "f")
-            yield file, Finding(file, what, rows_of(in_rows)) if bad else None, same
+            yield Again(file, Finding(file, what, rows_of(in_rows)) if bad else None, same)
 
 
 def _pair_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    layer: Layer,
-    view: ImageView,
-    stored: Mapping[ImageView, _Stored],
-    stride: int,
+    content: Content, layer: Layer, view: ImageView, stored: Mapping[ImageView, _Stored], stride: int
 ) -> Iterator[Finding]:
-    derived = _derived(sequence, maps, layer, view, stride)
+    derived = _derived(content, layer, view, stride)
     values, classes = stored[view].values[::stride, ::stride], stored[view].classes[::stride, ::stride]
     file = layer.values(view.side, view.frame)
     known = ~np.isin(classes, _NO_VALUE)
     both = known & np.isfinite(derived.values[..., 0])
-    wrong = np.any(~(np.abs(values - derived.values) <= _SAME_PX), axis=-1)
+    wrong = np.any(~(np.abs(values - derived.values) <= SAME_PX), axis=-1)
     if _many(wrong & both, both):
         size = np.median(np.max(np.abs(values - derived.values), axis=-1)[wrong & both])
         what = f"{_percent(wrong & both, both)} differ from what depth and motion make, typically by {size:.2g} px"
@@ -177,7 +165,7 @@ def _pair_faults(
     if np.any(empty == known):
         what = f"{np.sum(empty & known)} pixels without a value and {np.sum(~empty & ~known)} with one too many"
         yield Finding(file, f"{what}, by {layer.mask(view.side, view.frame)}")
-    there, sky = layer.target(view, sequence.frames), maps[view].depth[::stride, ::stride] == 0
+    there, sky = layer.target(view, content.sequence.frames), content.maps[view].depth[::stride, ::stride] == 0
     yield from _mask_faults(layer, view, there, classes, sky, derived, stride)
 
 
@@ -209,10 +197,9 @@ def _mask_faults(
             yield Finding(file, f"{_percent(wrong & among, among)} are {words}", rows)
 
 
-def _derived(
-    sequence: Sequence, maps: Mapping[ImageView, DepthMap], layer: Layer, view: ImageView, stride: int
-) -> _Derived:
+def _derived(content: Content, layer: Layer, view: ImageView, stride: int) -> _Derived:
     """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
+    sequence, maps = content.sequence, content.maps
     depth = maps[view].depth
     filled = replace(maps[view], depth=np.where(depth > 0, depth, np.float32(FAR)))
     reprojection = reproject(sequence, filled, maps[layer.target(view, sequence.frames)], stride)
@@ -278,12 +265,12 @@ def _pair_cause(
             return f"the same as {layer.values(other.side, other.frame)}"
     ratio = float(np.nanmedian(sampled / np.where(np.abs(derived.values) < 1, np.nan, derived.values)))
     spread = np.nanmedian(np.abs(sampled - ratio * derived.values))
-    return f"looks scaled by {ratio:.5g}" if abs(ratio - 1) > 1e-4 and spread < 2 * _SAME_PX else ""
+    return f"looks scaled by {ratio:.5g}" if abs(ratio - 1) > 1e-4 and spread < 2 * SAME_PX else ""
 
 
 def _explains(candidate: Float32Array, derived: _Derived) -> bool:
     both = np.isfinite(candidate[..., 0]) & np.isfinite(derived.values[..., 0])
-    near = np.all(np.abs(candidate - derived.values) <= _SAME_PX, axis=-1)
+    near = np.all(np.abs(candidate - derived.values) <= SAME_PX, axis=-1)
     return bool(np.any(both) and np.mean(near[both]) > _EXPLAINS)
 
 
@@ -297,27 +284,22 @@ _FEW_OTHERS = 0.02
 four that see something else."""
 
 
-def surface_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    times: tuple[int, ...] = FRAMES,
-    new: tuple[int, ...] = FRAMES,
-) -> Iterator[Finding]:
+def surface_faults(content: Content, reported: Collection[str], new: tuple[int, ...]) -> Iterator[Finding]:
     """What normals and instances show that the surfaces of the depth maps are not, but for files ``reported``.
 
-    Of frames at these ``times``, and of pairs of them with one that is ``new``.
+    Of frames that are ``new``, and of pairs with one that is.
     """
+    sequence, maps = content.sequence, content.maps_without(reported)
     instances: dict[ImageView, NDArray[np.uint16]] = {}
-    for side, frame in product(SIDES, times):
+    for side, frame in product(SIDES, content.times):
         view = ImageView("rs", side, frame)
-        if view not in maps or view.depth in reported:
+        if view not in maps:
             continue
         try:
-            file = surface_file("normals", side, frame)
+            file = NORMALS.file(side, frame)
             if "normals" in sequence.channels and file not in reported and frame in new:
                 yield from _normal_faults(sequence, maps[view], file, sequence.normals(side, frame))
-            file = surface_file("instances", side, frame)
+            file = INSTANCES.file(side, frame)
             if "instances" in sequence.channels and not {file, INSTANCE_TABLE} & set(reported):
                 instances[view] = sequence.instances(side, frame)
                 if frame in new:
@@ -327,7 +309,7 @@ def surface_faults(
     for view in instances:
         for partner in view.partners():
             if partner in instances and {view.frame, partner.frame} & {*new}:
-                yield from _agreement_faults(sequence, maps, instances, view, partner)
+                yield from _agreement_faults(content, instances, view, partner)
 
 
 def _normal_faults(
@@ -388,45 +370,34 @@ def _number_faults(depth_map: DepthMap, file: str, numbers: NDArray[np.uint16], 
 
 
 def _agreement_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    instances: Mapping[ImageView, NDArray[np.uint16]],
-    view: ImageView,
-    partner: ImageView,
+    content: Content, instances: Mapping[ImageView, NDArray[np.uint16]], view: ImageView, partner: ImageView
 ) -> Iterator[Finding]:
-    reprojection = reproject(sequence, maps[view], maps[partner])
+    reprojection = reproject(content.sequence, content.maps[view], content.maps[partner])
     with np.errstate(invalid="ignore"):
         same = np.abs(reprojection.relative) < _SURFACE
     # One of the four pixels around must see the same: between them, things that touch change.
-    height, width = same.shape
-    x, y = np.floor(reprojection.pixels[same]).astype(int).T
-    around = [
-        instances[partner][np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
-        for down in (0, 1)
-        for across in (0, 1)
-    ]
+    there = around(instances[partner], reprojection.pixels[same], (0, 1))
     other = np.zeros(same.shape, dtype=np.bool_)
-    other[same] = ~np.any(np.equal(around, instances[view][same]), axis=0)
+    other[same] = ~np.any(there == instances[view][same], axis=0)
     if np.sum(other) > max(_FEW_OTHERS * np.sum(same), _LEAST):
-        file, there = (surface_file("instances", each.side, each.frame) for each in (view, partner))
+        file, other_file = (INSTANCES.file(each.side, each.frame) for each in (view, partner))
         share = f"{100 * np.sum(other) / np.sum(same):.2g} % of {np.sum(same)} pixels"
-        yield Finding(file, f"{share} see another instance than {there}", rows_with_most(other))
+        yield Finding(file, f"{share} see another instance than {other_file}", rows_with_most(other))
 
 
 _CODE = 0.54
 """Codes by which light may differ from a code: its rounding, and that of half floats by 2^-12 of a value."""
 
 
-def hdr_faults(
-    sequence: Sequence, pictures: Mapping[ImageView, Picture], reported: Collection[str]
-) -> Iterator[Finding]:
+def hdr_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]:
     """What linear images show otherwise than the clean images, but for files ``reported``."""
+    sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     exposure = renderer.get("exposure") if isinstance(renderer, dict) else None
     if "hdr" not in sequence.channels or not isinstance(exposure, float):
         return
-    for view, picture in pictures.items():
-        file, image = radiance_file(view.side, view.frame), clean_picture(sequence, view)
+    for view, picture in content.pictures.items():
+        file, image = RADIANCE.file(view.side, view.frame), clean_picture(sequence, view)
         if view.shutter != "rs" or {file, image} & set(reported):
             continue
         try:

@@ -179,31 +179,10 @@ def _twins(state: State) -> list[Finding]:
     return [*state.twins.faults, *other_twin_faults(state.fresh, state.twins, state.stride)]
 
 
-def _channels(state: State) -> Iterator[Finding]:
-    content = state.all_content
-    times, new = content.times, state.fresh.times
-    return channel_faults(state.sequence, content.maps, state.reported, state.stride, times, new)
-
-
-def _surfaces(state: State) -> Iterator[Finding]:
-    content = state.all_content
-    return surface_faults(state.sequence, content.maps, state.reported, content.times, state.fresh.times)
-
-
-def _matches(state: State) -> Iterator[Finding]:
-    content = state.all_content
-    return match_faults(state.sequence, content.maps, state.reported, content.times[0])
-
-
 def _matcher(state: State) -> list[Finding]:
     findings, notes = matched_again(state.sequence, state.reported, state.content.times[0])
     state.notes += notes
     return findings
-
-
-def _sensor(state: State) -> Iterator[Finding]:
-    content = with_twins(state.fresh, state.twins)
-    return sensor_faults(state.sequence, content.maps, content.pictures, state.missing)
 
 
 def _render_rows(state: State) -> tuple[Finding, ...]:
@@ -342,7 +321,7 @@ CHECKS = (
         "of that colour; with `jpeg_quality`, blocks whose coefficients are not multiples of that quality's "
         "steps",
         costs="filters over the whole frame",
-        run=_sensor,
+        run=lambda state: sensor_faults(with_twins(state.fresh, state.twins), state.missing),
     ),
     Check(
         name="depth and colours",
@@ -373,7 +352,7 @@ CHECKS = (
         "% of the pixels; wrong masks of sky and view; wrong visible or hidden pixels, where the target is "
         "one flat surface",
         costs="every pixel is projected once per channel, N squared times fewer with `--stride N`",
-        run=_channels,
+        run=lambda state: channel_faults(state.all_content, state.reported, state.fresh.times, state.stride),
     ),
     Check(
         name="tracks",
@@ -382,7 +361,7 @@ CHECKS = (
         finds="points that are not on the depth map at the drawn pixels, places and times that contradict"
         " the row equation, and points whose visibility contradicts the depths around them",
         costs="the row equation of every point in every view",
-        run=lambda state: track_faults(state.sequence, state.fresh.maps, state.reported, state.fresh.times),
+        run=lambda state: track_faults(state.fresh, state.reported),
     ),
     Check(
         name="affine",
@@ -391,7 +370,7 @@ CHECKS = (
         finds="derivatives that differ by more than 1e-6 from those of normals, tracks and row times, and"
         " normals that are not perpendicular to the surface of the depth map",
         costs="one derivative per point and view",
-        run=lambda state: affine_faults(state.sequence, state.fresh.maps, state.reported, state.fresh.times),
+        run=lambda state: affine_faults(state.fresh, state.reported),
     ),
     Check(
         name="normals and instances",
@@ -400,7 +379,7 @@ CHECKS = (
         finds="normals that are not perpendicular to the surface of the depth map or do not face the "
         "camera; surfaces that have different numbers in different images",
         costs="every image is projected into the others",
-        run=_surfaces,
+        run=lambda state: surface_faults(state.all_content, state.reported, state.fresh.times),
     ),
     Check(
         name="hdr",
@@ -408,7 +387,7 @@ CHECKS = (
         reads="channel `hdr`, images",
         finds="linear light that differs from the clean image by more than a code",
         costs="almost nothing",
-        run=lambda state: hdr_faults(state.sequence, state.fresh.pictures, state.reported),
+        run=lambda state: hdr_faults(state.fresh, state.reported),
     ),
     Check(
         name="matches",
@@ -417,7 +396,7 @@ CHECKS = (
         finds="keypoints whose depth differs from that of the pixels around, true places that contradict "
         "the row equation, and errors, classes and labels that contradict these places and the depths around",
         costs="the row equation of every match",
-        run=_matches,
+        run=lambda state: match_faults(state.all_content, state.reported),
     ),
     Check(
         name="matcher",

@@ -27,13 +27,13 @@ class Evidence(NamedTuple):
     difference: F32
 
 
-class Limits(NamedTuple):
-    """Constants of ``depth_checks``."""
-
-    agrees: float
-    near_miss: float
-    least_width: float
-    centred: float
+DEPTH_TOLERANCE = 1e-4
+"""Relative difference of two depths of one surface point that still agree."""
+NEAR_MISS = 1e-3
+"""A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
+_LEAST_WIDTH = 0.5
+_CENTRED = 0.3
+"""Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
 
 
 @compiled(error_model="numpy")
@@ -43,7 +43,6 @@ def weigh_rows(
     evidence: Evidence,
     target: tuple[Bits, F32],
     bits: tuple[int, int],
-    limits: Limits,
     near: F32,
     first: int,
     last: int,
@@ -56,7 +55,6 @@ def weigh_rows(
         evidence: of the source.
         target: holes (H, W) of the target, of which two bands may set the same bit; its depth (H, W).
         bits: of the target among the partners of the source, and of the source among those of the target.
-        limits: see there.
         near: (h, w) filled in: how far flat surfaces are apart that are not hidden; -1 elsewhere.
         first, last: rows, without the last.
     """
@@ -67,28 +65,28 @@ def weigh_rows(
     for y in range(first, last):
         for x in range(relative.shape[1]):
             value, size = relative[y, x], abs(relative[y, x])
-            wide = _is_wide(pixels, y, x, stride, limits.least_width)
+            wide = _is_wide(pixels, y, x, stride)
             flat = flats[y * stride, x * stride] and depth[y * stride, x * stride] > 0 and wide
-            agrees, nearby = size <= limits.agrees, value < limits.near_miss
+            agrees, nearby = size <= DEPTH_TOLERANCE, value < NEAR_MISS
             through = nearby and not agrees and (flat or (np.isfinite(value) and wide))
             if agrees:
                 evidence.confirmed[y, x] |= bit
             if through:
                 evidence.contradicted[y, x] |= bit
-                if size < limits.near_miss:
+                if size < NEAR_MISS:
                     evidence.near[y, x] = True
-            if value >= limits.near_miss:
+            if value >= NEAR_MISS:
                 evidence.hidden[y, x] |= bit
             near[y, x] = size if flat and nearby else np.float32(-1.0)
             if size < evidence.difference[y, x]:
                 evidence.difference[y, x] = size
             if flat:
-                _mark_hole(pixels[y, x, 0], pixels[y, x, 1], holes, target_depth, back, limits.centred)
+                _mark_hole(pixels[y, x, 0], pixels[y, x, 1], holes, target_depth, back)
 
 
 @compiled(error_model="numpy")
-def _is_wide(pixels: F32, y: int, x: int, stride: int, least: float) -> bool:
-    """Whether what a source pixel spans is ``least`` pixels wide in the target, in every direction."""
+def _is_wide(pixels: F32, y: int, x: int, stride: int) -> bool:
+    """Whether what a source pixel spans is ``_LEAST_WIDTH`` pixels wide in the target, in every direction."""
     height, width = pixels.shape[:2]
     if height < 2 or width < 2:
         return False
@@ -100,16 +98,16 @@ def _is_wide(pixels: F32, y: int, x: int, stride: int, least: float) -> bool:
     dy = (pixels[down, x, 1] / by - pixels[up, x, 1] / by) / over_y
     area = abs(ax * dy - ay * dx)
     longest = np.sqrt((ax * ax + dx * dx) + (ay * ay + dy * dy))
-    return area >= np.float32(least) * longest
+    return area >= np.float32(_LEAST_WIDTH) * longest
 
 
 @compiled(error_model="numpy")
-def _mark_hole(u: float, v: float, holes: Bits, depth: F32, bit: np.uint8, centred: float) -> None:
+def _mark_hole(u: float, v: float, holes: Bits, depth: F32, bit: np.uint8) -> None:
     """A pixel of the target without a surface although the middle of a flat one lies there."""
     if not np.isfinite(u):
         return
     near_x, near_y = np.rint(u), np.rint(v)
-    if not max(abs(u - near_x), abs(v - near_y)) <= np.float32(centred):
+    if not max(abs(u - near_x), abs(v - near_y)) <= np.float32(_CENTRED):
         return
     x = min(max(int(near_x), 0), depth.shape[1] - 1)
     y = min(max(int(near_y), 0), depth.shape[0] - 1)
@@ -128,7 +126,6 @@ class Shown(NamedTuple):
     """(h, w, 2) where, of every ``stride``-th pixel of the source."""
     relative: F32
     """(h, w)."""
-    agrees: float
     stride: int
 
 
@@ -164,7 +161,7 @@ def vote_rows(
         band = bands[0][y]
         for column in range(shown.relative.shape[1]):
             x = column * shown.stride
-            if not (shown.even[y, x] and abs(shown.relative[row, column]) <= shown.agrees):
+            if not (shown.even[y, x] and abs(shown.relative[row, column]) <= DEPTH_TOLERANCE):
                 continue
             near_x = min(max(int(np.rint(shown.pixels[row, column, 0])), 0), width - 1)
             near_y = min(max(int(np.rint(shown.pixels[row, column, 1])), 0), height - 1)
@@ -190,7 +187,7 @@ def every_nth(shown: Shown, every: int, places: NDArray[np.int64]) -> int:
     for row in range(shown.relative.shape[0]):
         for column in range(shown.relative.shape[1]):
             y, x = row * shown.stride, column * shown.stride
-            if shown.even[y, x] and abs(shown.relative[row, column]) <= shown.agrees:
+            if shown.even[y, x] and abs(shown.relative[row, column]) <= DEPTH_TOLERANCE:
                 if number % every == 0:
                     places[found, 0], places[found, 1] = y, x
                     found += 1

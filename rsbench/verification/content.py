@@ -22,12 +22,12 @@ from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_views, nearby_vi
 from rsbench.storage.files import read_png
 from rsbench.storage.untrusted_files import inside, open_regular
 from rsbench.verification import depth_checks, image_checks
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.depth_checks import likely_cause, roughly_agree
 from rsbench.verification.findings import DepthAgreement, Finding, rows_of
 from rsbench.verification.image_checks import OtherImages as OtherImages
 from rsbench.verification.image_checks import colour_faults
 from rsbench.verification.reprojection import (
-    DEPTH_TOLERANCE,
     BoolArray,
     DepthMap,
     reproject,
@@ -71,12 +71,14 @@ class Content:
     times: tuple[int, ...] = ()
     """Numbers of the frames that were read."""
 
+    def maps_without(self, reported: Collection[str]) -> dict[ImageView, DepthMap]:
+        """Depth maps that are not ``reported`` as wrong, which would accuse others."""
+        return {view: each for view, each in self.maps.items() if view.depth not in reported}
+
     def followed_by(self, other: Content, reported: Collection[str]) -> Content:
         """The last frame of this content and the next, without ``reported`` files, which would accuse others."""
         last = self.times[-1:]
-        maps = {
-            view: each for view, each in self.maps.items() if view.frame in last and view.depth not in reported
-        }
+        maps = {view: each for view, each in self.maps_without(reported).items() if view.frame in last}
         pictures = {
             view: each
             for view, each in self.pictures.items()
@@ -291,7 +293,7 @@ class Comparison:
                 yield view, fault
         sound = [each for each in self.colour_agreements if not {each.source, each.target} & {*wrong, *reported}]
         sound = image_checks.without_refuted(sound)
-        for view, fault in colour_faults(content.sequence, content.maps, content.pictures, sound, other_images):
+        for view, fault in colour_faults(content, sound, other_images):
             reported.add(view)
             yield view, fault
         for view, votes in self.votes.items():

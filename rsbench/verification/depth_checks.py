@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from typing import NamedTuple
 
@@ -18,22 +19,20 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView, Times, nearby_views
-from rsbench.verification.compiled_comparison import Evidence, Limits, weigh_rows
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE, Evidence, weigh_rows
 from rsbench.verification.findings import DepthAgreement, Finding
 from rsbench.verification.reprojection import (
-    DEPTH_TOLERANCE,
     BoolArray,
     DepthMap,
     Reprojection,
     by_bands,
     reproject,
     seen_in,
+    stride_for,
 )
 
 Bits = NDArray[np.uint8]
 
-NEAR_MISS = 1e-3
-"""A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
 _SPARE_PIXELS, _SPARE_SHARE = 30, 0.3
 """Pixels of a pair that may disagree: what is thinner than a pixel lies before what is flat. A wrong geometry
 shows in the median too."""
@@ -54,10 +53,7 @@ _OVER_TIME = "motion, readout_ratio and scan"
 """Keys of sequence.json on which pairs of one camera depend; ``_across`` has those of pairs of both."""
 _TILE, _BAD_IN_TILE = 5, 12
 """A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
-_LEAST_WIDTH = 0.5
 _HOLE, _HITS_IN_HOLE = 7, 8
-_CENTRED = 0.3
-"""Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
 
 
 @dataclass(eq=False)
@@ -123,7 +119,6 @@ def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojec
         Evidence(source.confirmed, source.contradicted, source.near, source.hidden, source.difference),
         (target.holes, target.map.depth),
         (int(source.bit(target.map.view)), int(target.bit(source.map.view))),
-        Limits(DEPTH_TOLERANCE, NEAR_MISS, _LEAST_WIDTH, _CENTRED),
         apart,
     )
     by_bands(work, len(apart))
@@ -373,7 +368,7 @@ def _changed_maps(
 
 def _relative(sequence: Sequence, source: DepthMap, partner: DepthMap, rows: BoolArray) -> NDArray[np.float32]:
     """(n,) relative differences of pixels in these rows that meet a flat surface of a partner, or -inf."""
-    stride = max(1, int(np.sqrt(np.sum(rows) * source.depth.shape[1] / _TRIED_PIXELS)))
+    stride = stride_for(np.sum(rows) * source.depth.shape[1], _TRIED_PIXELS)
     if not np.any(rows[::stride]):
         stride = 1
     relative = reproject(sequence, source, partner, stride).relative
@@ -433,7 +428,7 @@ def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: 
 
 
 def _roughly_alike(geometry: Geometry, source: DepthMap, target: DepthMap) -> bool:
-    stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+    stride = stride_for(source.depth.size, _TRIED_PIXELS)
     pixels, x_in_cam = seen_in(geometry, source, target, range(0, len(source.depth), stride), stride)
     inside = np.isfinite(pixels[..., 0]) & (source.depth[::stride, ::stride] > 0)
     middle, z = np.rint(pixels[inside]).astype(np.int64), x_in_cam[inside][:, 2]
@@ -495,8 +490,7 @@ class _MapsOverTime:
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
-        self._read: dict[int, DepthMap | None] = {}
-        self._found: dict[tuple[int, int, int], tuple[float, int]] = {}
+        self._map, self._share = cache(self._read), cache(self._compare)
 
     def near(self, frame: int) -> list[int]:
         """Other frames, the nearest first."""
@@ -512,28 +506,20 @@ class _MapsOverTime:
         """Whether another one near it sees what it sees."""
         return any(self._share(frame, frame, other)[1] >= _LEAST for other in self.near(frame))
 
-    def _share(self, frame: int, time: int, other: int) -> tuple[float, int]:
-        key = frame, time, other
-        if key not in self._found:
-            self._found[key] = self._compare(*key)
-        return self._found[key]
-
     def _compare(self, frame: int, time: int, other: int) -> tuple[float, int]:
+        """Share of the comparable pixels that agree, and how many these are."""
         source, target = self._map(frame), self._map(other)
         if source is None or target is None:
             return 0.0, 0
         moved = replace(source, view=source.view._replace(frame=time))
-        stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+        stride = stride_for(source.depth.size, _TRIED_PIXELS)
         relative = reproject(self.sequence, moved, target, stride).relative
         near = relative[(source.depth[::stride, ::stride] > 0) & (relative < 0.01)]
         near = near[np.isfinite(near)]
         return (float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if near.size else 0.0), near.size
 
-    def _map(self, frame: int) -> DepthMap | None:
-        if frame not in self._read:
-            view = ImageView("rs", "left", frame)
-            try:
-                self._read[frame] = DepthMap(view, self.sequence.depth(*view), self.sequence.rig.sensor("left"))
-            except RsbenchError:  # reported already
-                self._read[frame] = None
-        return self._read[frame]
+    def _read(self, frame: int) -> DepthMap | None:
+        view = ImageView("rs", "left", frame)
+        with suppress(RsbenchError):  # reported already
+            return DepthMap(view, self.sequence.depth(*view), self.sequence.rig.sensor("left"))
+        return None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +88,15 @@ class SequenceReport:
         return tuple(map(str, self.findings))
 
 
-Again = tuple[str, Finding | None, bool]
-"""A file that is made again: its name, its fault or None, and whether all of its bits are equal."""
+class Again(NamedTuple):
+    """A file, or rows of it, against what is made again."""
+
+    file: str
+    fault: Finding | None
+    """None when they are alike."""
+    same_bits: bool
+
+
 _Args = ParamSpec("_Args")
 _Found = TypeVar("_Found")
 

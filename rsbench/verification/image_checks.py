@@ -7,24 +7,27 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView
 from rsbench.verification.compiled_comparison import Shown, costs_of_changes, every_nth, vote_rows
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.reprojection import (
-    DEPTH_TOLERANCE,
     BoolArray,
     DepthMap,
     Reprojection,
     by_bands,
     reproject,
+    stride_for,
     without_changing_light,
 )
+
+if TYPE_CHECKING:
+    from rsbench.verification.content import Content
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0
@@ -198,16 +201,23 @@ def band_of_row(height: int) -> NDArray[np.int64]:
     return np.arange(height) * bands // height
 
 
-def show(
-    surface: DepthMap, target: Picture, reprojection: Reprojection, stride: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
-    """Rows and columns (n,) of the source that see one flat surface, or the sky, as the target does, and its
-    colours (n, 3) there; ``reprojection`` has every ``stride``-th pixel."""
+def shown_by(source: Picture, surface: DepthMap, reprojection: Reprojection, stride: int) -> Shown:
+    """A source for compiled loops; ``reprojection`` has every ``stride``-th pixel."""
     even = surface.flat | (surface.depth == 0)
-    y, x = np.nonzero(even[::stride, ::stride] & (np.abs(reprojection.relative) <= DEPTH_TOLERANCE))
-    places = np.nan_to_num(reprojection.pixels)
-    shown = cv2.remap(target.colours, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return y * stride, x * stride, shown[y, x]
+    return Shown(source.colours, even, reprojection.pixels, reprojection.relative, stride)
+
+
+def sampled(
+    shown: Shown, target: Picture, count: int, every: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
+    """Places in a source that see one surface, or the sky, as the target does: every ``every``-th of ``count``.
+
+    Returns:
+        Their rows and columns (n,), and the target's colours (n, 3) there.
+    """
+    places = np.zeros((count // every + 1, 2), dtype=np.int64)
+    y, x = places[: every_nth(shown, every, places)].T
+    return y, x, _interpolated(target.colours, shown.pixels[y // shown.stride, x // shown.stride])
 
 
 def _interpolated(colours: Colours, places: NDArray[np.float32]) -> Colours:
@@ -238,9 +248,8 @@ def compare(
     stride: int = 1,
 ) -> ColourAgreement:
     """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th."""
-    even = surface.flat | (surface.depth == 0)
-    shown = Shown(source.colours, even, reprojection.pixels, reprojection.relative, DEPTH_TOLERANCE, stride)
-    bands = band_of_row(len(even))
+    shown = shown_by(source, surface, reprojection, stride)
+    bands = band_of_row(len(shown.even))
     count = int(bands[-1]) + 1
     span, shape = (target.low, target.high, target.beyond), np.zeros((2, count), np.int64)
     by_rows = partial(vote_rows, shown, span, (votes.seen, votes.against), (bands, shape))
@@ -259,11 +268,8 @@ def _costs(
     """Of the capped difference from what the target shows, means over pixels of each band: (C, B) of each change,
     (C, B) standard errors of its gain over none, (B,) of the band's middle colour. Some of the ``pixels`` do."""
     every, count = max(1, pixels // _SAMPLES), int(bands[-1]) + 1
-    places = np.zeros((pixels // every + 1, 2), dtype=np.int64)
-    places = places[: every_nth(shown, every, places)]
-    y, x = places.T
-    seen = _interpolated(target.colours, shown.pixels[y // shown.stride, x // shown.stride])
-    of = bands[y]
+    y, x, seen = sampled(shown, target, pixels, every)
+    of, places = bands[y], np.stack([y, x], axis=1)
     size = np.maximum(np.bincount(of, minlength=count), 1)
     sums = np.zeros((2, len(CHANGES), count))
     costs_of_changes(shown.colours, places, seen, of, _TABLE, _CAP, sums)
@@ -341,27 +347,25 @@ _NOISY, _NOISIER = 15.0, 3.0
 
 
 def colour_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    pictures: Mapping[ImageView, Picture],
-    agreements: list[ColourAgreement],
-    other_images: OtherImages,
+    content: Content, agreements: list[ColourAgreement], other_images: OtherImages
 ) -> Iterator[tuple[ImageView, Finding]]:
     """A finding for each image that the others contradict."""
     wrong = list(wrong_images(agreements))
     suspects = {view for view, _ in wrong}
     for view, pairs in wrong:
-        bands = band_of_row(sequence.rig.sensor(view.side).height)
+        bands = band_of_row(content.sequence.rig.sensor(view.side).height)
         unlike = np.any([_of_bands(each.unlike, int(bands[-1]) + 1) for each in pairs], axis=0)
         others = sorted({(each.target if each.source == view else each.source).image for each in pairs})
         beyond = 100 * max(float(np.max(each.beyond[each.unlike])) for each in pairs)
         what = (
             f"shows other colours than {', '.join(others)} at the same surface, on up to {beyond:.3g} % of pixels"
         )
-        partners = sorted((each for each in view.partners() if each in maps), key=lambda each: each in suspects)
-        cause = "looks like noise" if _is_noise(pictures, view, unlike[bands]) else ""
+        partners = sorted(
+            (each for each in view.partners() if each in content.maps), key=lambda each: each in suspects
+        )
+        cause = "looks like noise" if _is_noise(content.pictures, view, unlike[bands]) else ""
         if partners and not cause:
-            cause = _image_cause(sequence, maps, pictures, view, partners[0], agreements, other_images)
+            cause = _image_cause(content, view, partners[0], agreements, other_images)
         yield view, Finding(view.image, what, rows_of(unlike[bands]), cause)
 
 
@@ -371,26 +375,25 @@ def _of_bands(unlike: BoolArray, count: int) -> BoolArray:
 
 
 def _image_cause(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    pictures: Mapping[ImageView, Picture],
+    content: Content,
     view: ImageView,
     partner: ImageView,
     agreements: list[ColourAgreement],
     other_images: OtherImages,
 ) -> str:
     """What turns the image into what the partner shows, as well as sound images are like each other."""
+    sequence, maps, pictures = content.sequence, content.maps, content.pictures
     others = [(other.image, picture.colours) for other, picture in pictures.items() if other != view]
     others += [(name, image.astype(np.float32)) for name, image in other_images(view)]
     image = pictures[view].colours
     for name, colours in others:
         if np.array_equal(image[1:], colours[1:]):
             return f"the same as {name}"
-    height, width = image.shape[:2]
-    stride = max(1, int(np.sqrt(height * width / _TRIED_PIXELS)))
+    stride = stride_for(image.size / 3, _TRIED_PIXELS)
     reprojection = reproject(sequence, maps[view], maps[partner], stride)
     reprojection = without_changing_light(sequence, maps[view], maps[partner], reprojection, stride)
-    y, x, shown = show(maps[view], pictures[partner], reprojection, stride)
+    source = shown_by(pictures[view], maps[view], reprojection, stride)
+    y, x, shown = sampled(source, pictures[partner], reprojection.relative.size, 1)
     if len(y) == 0:
         return ""
     own = image[y, x]

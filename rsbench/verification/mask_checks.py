@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from rsbench.core.errors import RsbenchError
 from rsbench.core.version import __version__
 from rsbench.dataset.views import ImageView, numbers_of, view_pairs
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
 from rsbench.verification.content import Content, shared_line, spare_pixels
 from rsbench.verification.findings import Finding, rows_of
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, reproject
+from rsbench.verification.reprojection import BoolArray, DepthMap, nearest, reproject, stride_for
 from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8
@@ -77,9 +78,7 @@ def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
         return
     for each in (*fresh.maps.values(), *twins.maps.values()):
         yield from _gloss_by_itself(each)
-    for part in (content, twins):
-        what = "pixels at the same pose"
-        yield from _dropped(part, {v: _unlike_twin(content, each, "gloss", what) for v, each in part.maps.items()})
+    yield from _unlike_twins(content, twins, "gloss", "pixels at the same pose")
     yield from _dropped(content, dict(_contradicted(content)))
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
@@ -103,6 +102,15 @@ def _gloss_by_itself(each: DepthMap) -> Iterator[Finding]:
     if np.any(solid) and left < _LEAST_LEFT:
         what = f"leaves {100 * left:.2g} % of the surfaces to be compared; its scene was not built (see --scene)"
         yield Finding(each.view.gloss, what)
+
+
+def _unlike_twins(
+    content: Content, twins: Content, kind: Literal["gloss", "labels"], what: str
+) -> Iterator[Finding]:
+    for part in (content, twins):
+        yield from _dropped(
+            part, {view: _unlike_twin(content, each, kind, what) for view, each in part.maps.items()}
+        )
 
 
 def _unlike_twin(content: Content, own: DepthMap, kind: Literal["gloss", "labels"], what: str) -> Finding | None:
@@ -145,18 +153,14 @@ def _contradicted(content: Content) -> Iterator[tuple[ImageView, Finding]]:
 def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolArray:
     """(H,) rows of a map in which even surfaces are marked, or not, as another map has it not."""
     source, target = content.maps[one], content.maps[other]
-    stride = max(1, int(np.sqrt(source.depth.size / _TRIED_PIXELS)))
+    stride = stride_for(source.depth.size, _TRIED_PIXELS)
     reprojection = reproject(content.sequence, source, target, stride)
     with np.errstate(invalid="ignore"):
         alike = (np.abs(reprojection.relative) <= DEPTH_TOLERANCE) & source.flat[::stride, ::stride]
-    x, y = np.rint(np.nan_to_num(reprojection.pixels)).astype(np.int64).reshape(-1, 2).T
-    height, width = target.depth.shape
-    place = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-    (least, most), there = _span(source), _span(target)
-    least, most = least[::stride, ::stride], most[::stride, ::stride]
-    low, high = (each[place].reshape(least.shape) for each in there)
+    least, most = (each[::stride, ::stride] for each in _span(source))
+    low, high = (nearest(each, reprojection.pixels) for each in _span(target))
     wrong = alike & ((least & ~high) | (~most & low))
-    rows = np.zeros(height, dtype=np.bool_)
+    rows = np.zeros(len(source.depth), dtype=np.bool_)
     if np.sum(wrong) > max(_FEW, _OTHER * np.sum(alike)):
         rows[::stride][np.any(wrong, axis=1)] = True
     return rows
@@ -185,11 +189,7 @@ def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[F
     for part in (content, twins):
         faults = {view: _on_nothing(each) or _misplaced(content, each) for view, each in part.maps.items()}
         yield from _dropped(part, faults)
-    for part in (content, twins):
-        what = "labels at the same time"
-        yield from _dropped(
-            part, {v: _unlike_twin(content, each, "labels", what) for v, each in part.maps.items()}
-        )
+    yield from _unlike_twins(content, twins, "labels", "labels at the same time")
     for view in fresh.maps.keys() - content.maps.keys():
         del fresh.maps[view]
 
@@ -206,7 +206,7 @@ def _on_nothing(each: DepthMap) -> Finding | None:
 def _misplaced(content: Content, own: DepthMap) -> Finding | None:
     """Surfaces through which partners see where their labels take them, and which they see where another would."""
     sequence, view = content.sequence, own.view
-    stride = max(1, int(np.sqrt(own.depth.size / _TRIED_PIXELS)))
+    stride = stride_for(own.depth.size, _TRIED_PIXELS)
     numbers = numbers_of(_mask_of(own, "labels"))
     elsewhere = np.zeros(own.depth[::stride, ::stride].shape, dtype=np.bool_)
     # The other camera sees all of them at about the same time, which shows no movement.

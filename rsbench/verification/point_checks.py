@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict
 from functools import partial
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import repeated
 from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import RSProjection, back_project, project_at, rs_project
-from rsbench.core.rig import FRAMES, VIEWS, View
+from rsbench.core.rig import VIEWS, View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
@@ -40,6 +41,7 @@ from rsbench.dataset.matches import (
 from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.tracks import (
     AffineFrames,
+    ArrayFile,
     Tracks,
     jacobians_of,
     look_for,
@@ -49,10 +51,15 @@ from rsbench.dataset.tracks import (
 )
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays
 from rsbench.verification.channel_checks import FEW_BENT, LEVEL
+from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE
+from rsbench.verification.content import Content
 from rsbench.verification.findings import Again, Finding, reports_unreadable, skips_unreadable
-from rsbench.verification.reprojection import DEPTH_TOLERANCE, BoolArray, DepthMap, relative_depth
+from rsbench.verification.reprojection import BoolArray, DepthMap, around, relative_depth
 from rsbench.vision.feature_matcher import FEATURE_MATCHERS
 from rsbench.vision.features import SiftMatcher
+
+if TYPE_CHECKING:
+    from rsbench.renderers.visibility import SceneRays
 
 _SAME, _SAME_PX = 1e-9, 1e-6
 """Tolerances for equal points, relative, and equal pixels, px: rounding, and 1e-9 px at a small slope."""
@@ -65,28 +72,24 @@ _FEW_AGAIN, _LEAST = 5e-3, 4
 
 
 @reports_unreadable
-def track_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    times: tuple[int, ...] = FRAMES,
-) -> Iterator[Finding]:
-    """Find faults of the tracks in the frames ``times`` that depth maps and motion reveal.
+def track_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]:
+    """Find faults of the tracks in the content's frames that depth maps and motion reveal.
 
     Files in ``reported`` are ignored.
     """
+    sequence, maps = content.sequence, content.maps_without(reported)
     if "tracks" not in sequence.channels or TRACKS in reported:
         return
     tracks = sequence.tracks()
-    if len(tracks.points) == 0 and any(np.any(each.depth) for each in maps.values()):
+    if len(tracks.points) == 0 and any(np.any(each.depth) for each in content.maps.values()):
         yield Finding(TRACKS, "has no points")
     for k, view in enumerate(track_views(sequence.frames)):
-        if view[1] not in times:
+        if view[1] not in content.times:
             continue
         image_view, name = ImageView("rs", *view), f"{view[0]}_{view[1]}"
         found = rs_project(sequence.rig, sequence.shutter, sequence.motion, *view, tracks.points)
         yield from _pixel_faults(sequence, tracks, k, found, name)
-        if image_view in maps and image_view.depth not in reported:
+        if image_view in maps:
             yield from _source_faults(sequence, tracks, k, maps[image_view], name)
             yield from _hiding_faults(tracks, k, found, maps[image_view], name)
 
@@ -149,29 +152,31 @@ def _hiding_faults(tracks: Tracks, k: int, found: RSProjection, depth: DepthMap,
 def depths_around(depth: NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest depth (n,) of the 4 x 4 pixels around pixels (n, 2); sky is infinitely far."""
     far = np.where(depth > 0, depth.astype(np.float64), np.inf)
-    x, y = np.floor(pixels).astype(np.int64).T
-    height, width = depth.shape
-    steps = range(-1, 3)
-    around = [
-        far[np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
-        for down in steps
-        for across in steps
-    ]
-    return np.min(around, axis=0, initial=np.inf), np.max(around, axis=0, initial=0.0)
+    found = around(far, pixels, range(-1, 3))
+    return np.min(found, axis=0, initial=np.inf), np.max(found, axis=0, initial=0.0)
+
+
+def points_again(sequence: Sequence, rays: SceneRays, compared: Callable[[str], bool]) -> Iterator[Again]:
+    """``channel_checks.channels_again`` for the channels of points; ``compared``: whether a file is."""
+    if "tracks" in sequence.channels and compared(TRACKS):
+        yield from _tracks_again(sequence, rays)
+    if "affine" in sequence.channels and compared(AFFINE):
+        yield from _affine_again(sequence, rays)
+    if "matches" in sequence.channels:
+        for first in filter(lambda each: compared(matches_file(each)), range(sequence.frames - 1)):
+            yield from _matches_again(sequence, rays, first)
 
 
 @skips_unreadable
-def tracks_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
-    """``channel_checks.channels_again`` for tracks: compute the visibility in each frame again by ray casting."""
-    if "tracks" not in sequence.channels or TRACKS in reported:
-        return
+def _tracks_again(sequence: Sequence, rays: Rays) -> Iterator[Again]:
+    """Compute the visibility of tracks in each frame again by ray casting."""
     tracks = sequence.tracks()
     views = enumerate(track_views(sequence.frames))
     wrong: list[BoolArray] = [_classes_unlike(sequence, tracks, k, view, rays) for k, view in views]
     share = float(np.mean(wrong)) if len(tracks.points) else 0.0
     bad = np.sum(wrong) > max(_FEW_AGAIN * np.size(wrong), _LEAST)
     what = f"{100 * share:.2g} % of {np.size(wrong)} classes differ from ray casting"
-    yield TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong)
+    yield Again(TRACKS, Finding(TRACKS, what) if bad else None, not np.any(wrong))
 
 
 def _classes_unlike(sequence: Sequence, tracks: Tracks, k: int, view: View, rays: Rays) -> BoolArray:
@@ -187,16 +192,12 @@ _FEW_WITHOUT_NORMAL = 0.02
 
 
 @reports_unreadable
-def affine_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    times: tuple[int, ...] = FRAMES,
-) -> Iterator[Finding]:
+def affine_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]:
     """Find faults of affine frames that tracks, depth maps and motion reveal; files in ``reported`` are ignored.
 
-    Derivatives are checked once, if frame 0 is among ``times``; normals are checked by the available maps.
+    Derivatives are checked once, with frame 0; normals are checked by the available maps.
     """
+    sequence, maps = content.sequence, content.maps_without(reported)
     if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
         return
     affine, tracks = sequence.affine(), sequence.tracks()
@@ -204,7 +205,7 @@ def affine_faults(
         shapes = f"{affine.jacobians.shape[:2]} points and views, but tracks.npz {tracks.tau.shape}"
         yield Finding(AFFINE, f"has {shapes}")
         return
-    if 0 in times:
+    if 0 in content.times:
         yield from _jacobian_faults(sequence, affine, tracks)
     lost = np.all(affine.normals == 0.0, axis=1)
     off = ~lost & (np.abs(np.linalg.norm(affine.normals, axis=1) - 1.0) > _UNIT)
@@ -213,7 +214,7 @@ def affine_faults(
         return
     for k, view in enumerate(track_views(sequence.frames)):
         image_view, own = ImageView("rs", *view), (tracks.sources == k) & ~lost
-        if image_view in maps and image_view.depth not in reported:
+        if image_view in maps:
             yield from _normal_faults(sequence, maps[image_view], affine.normals[own], tracks.pixels[own, k])
 
 
@@ -268,18 +269,14 @@ def _normal_faults(
 
 
 @skips_unreadable
-def affine_again(sequence: Sequence, rays: Rays, reported: Collection[str]) -> Iterator[Again]:
-    """``channel_checks.channels_again`` for affine frames: compute normals of tracks by ray casting."""
-    if "affine" not in sequence.channels or {AFFINE, TRACKS} & set(reported):
-        return
+def _affine_again(sequence: Sequence, rays: Rays) -> Iterator[Again]:
+    """Compute the normals of affine frames again by ray casting."""
     stored, tracks = sequence.affine(), sequence.tracks()
     made = make_affine(sequence, tracks, rays)
     wrong = np.any(np.abs(made.normals - stored.normals) > 10 * _UNIT, axis=1)
     bad = np.sum(wrong) > max(_FEW_AGAIN * len(wrong), _LEAST)
     what = f"{np.sum(wrong)} of {len(wrong)} normals differ from ray casting"
-    names = ("normals", "jacobians")
-    same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield AFFINE, Finding(AFFINE, what) if bad else None, same
+    yield Again(AFFINE, Finding(AFFINE, what) if bad else None, _same_bits(made, stored, "normals", "jacobians"))
 
 
 _BESIDE_ALL, _FEW_BESIDE = 1e-2, 0.15
@@ -295,13 +292,12 @@ _OURS = f"{SiftMatcher.__module__}:{SiftMatcher.__qualname__}"
 
 
 @reports_unreadable
-def match_faults(
-    sequence: Sequence, maps: Mapping[ImageView, DepthMap], reported: Collection[str], first: int = 0
-) -> Iterator[Finding]:
-    """Find faults in the labels of frame ``first`` and the next that depth maps and motion reveal.
+def match_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]:
+    """Find faults in the labels of the content's first frame and the next that depth maps and motion reveal.
 
     Files in ``reported`` are ignored.
     """
+    sequence, maps, first = content.sequence, content.maps_without(reported), content.times[0]
     if "matches" not in sequence.channels:
         return
     matching = sequence.matching or Matching()
@@ -317,9 +313,11 @@ def match_faults(
         if np.any(outside):
             yield found(f"{np.sum(outside)} matches have a keypoint outside the images")
             continue
-        yield from _depth_faults(sequence, part, source, maps, reported, found)
+        yield from _depth_faults(part, maps.get(ImageView("rs", *source)), found)
         yield from _truth_faults(sequence, part, source, target, found)
-        yield from _class_faults(sequence, part, source, target, maps, reported, matching.bound_px, found)
+        yield from _class_faults(part, matching.bound_px, found)
+        if (seen := maps.get(ImageView("rs", *target))) is not None:
+            yield from _occlusion_faults(sequence, part, source, seen, found)
 
 
 @reports_unreadable
@@ -340,29 +338,21 @@ def _record_faults(sequence: Sequence, matching: Matching, reported: Collection[
         yield Finding(MATCHER, "class and parameters of the matcher are needed")
 
 
-def _depth_faults(
-    sequence: Sequence,
-    part: PairLabels,
-    source: View,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    found: Report,
-) -> Iterator[Finding]:
+def _depth_faults(part: PairLabels, seen: DepthMap | None, found: Report) -> Iterator[Finding]:
     """Check that a keypoint's depth is that of a flat surface around it, or between those of pixels around."""
-    view = ImageView("rs", *source)
-    if view not in maps or view.depth in reported:
+    if seen is None:
         return
     sky = part.depth == 0.0
-    ideal = maps[view].camera.ideal_pixels(part.pixels[:, 0])
-    relative = relative_depth(maps[view], part.pixels[:, 0], part.depth, sky, ideal)
-    low, high = depths_around(maps[view].depth, part.pixels[:, 0])
+    ideal = seen.camera.ideal_pixels(part.pixels[:, 0])
+    relative = relative_depth(seen, part.pixels[:, 0], part.depth, sky, ideal)
+    low, high = depths_around(seen.depth, part.pixels[:, 0])
     z = np.where(sky, np.inf, part.depth)
     with np.errstate(invalid="ignore"):
         flat, beside = np.isfinite(relative), (z < low * (1 - _BESIDE_ALL)) | (z > high * (1 + _BESIDE_ALL))
         off = flat & (np.abs(relative) > DEPTH_TOLERANCE)
     for wrong, among, few in ((off, flat, _FEW_OTHERS), (beside, np.ones_like(flat), _FEW_BESIDE)):
         if np.sum(wrong) > max(few * np.sum(among), _LEAST):
-            what = f"the depth of {np.sum(wrong)} of {np.sum(among)} keypoints is not that of {view.depth}"
+            what = f"the depth of {np.sum(wrong)} of {np.sum(among)} keypoints is not that of {seen.view.depth}"
             ratio = float(np.median(1.0 + relative[off])) if np.any(off) else 1.0
             scaled = np.mean(np.abs(relative[off] + 1.0 - ratio) < DEPTH_TOLERANCE) > 0.5 if np.any(off) else False
             yield found(what, cause=f"looks scaled by {ratio:.6g}" if scaled else "")
@@ -391,30 +381,26 @@ def _truth_faults(
         yield found(f"{np.sum(bad)} of {len(bad)} errors are not the distance from the true pixel")
 
 
-def _class_faults(
-    sequence: Sequence,
-    part: PairLabels,
-    source: View,
-    target: View,
-    maps: Mapping[ImageView, DepthMap],
-    reported: Collection[str],
-    bound_px: float,
-    found: Report,
-) -> Iterator[Finding]:
-    """Check that classes follow from errors, and that only hidden points lie behind the target's surfaces."""
+def _class_faults(part: PairLabels, bound_px: float, found: Report) -> Iterator[Finding]:
+    """Check that classes follow from errors."""
     hidden = part.classes == MatchClass.OCCLUDED
     unsolved = part.classes == MatchClass.UNSOLVED
     made = classes_of(part.pixels, part.depth, part.truth, hidden, unsolved, bound_px)
     if np.any(made != part.classes):
         what = f"{np.sum(made != part.classes)} of {len(made)} classes do not follow from error and depth"
         yield found(f"{what}, with a bound of {bound_px:g} px")
-    view, seen = ImageView("rs", *target), np.isfinite(part.error) & (part.depth > 0.0)
-    if view not in maps or view.depth in reported:
-        return
+
+
+def _occlusion_faults(
+    sequence: Sequence, part: PairLabels, source: View, target: DepthMap, found: Report
+) -> Iterator[Finding]:
+    """Check that only hidden points lie behind the target's surfaces."""
+    view, seen = target.view, np.isfinite(part.error) & (part.depth > 0.0)
+    hidden = part.classes == MatchClass.OCCLUDED
     points, places = _points(sequence, part, source)[seen], part.truth[seen]
-    times = sequence.shutter.pixel_time(places, target[1], target[0])
-    z = project_at(sequence.rig, sequence.motion, target[0], times, points)[:, 2]
-    low, high = depths_around(maps[view].depth, places)
+    times = sequence.shutter.pixel_time(places, view.frame, view.side)
+    z = project_at(sequence.rig, sequence.motion, view.side, times, points)[:, 2]
+    low, high = depths_around(target.depth, places)
     for words, so, wrong in (
         ("are marked visible, but hidden according to", z > high * (1 + _BESIDE_ALL), ~hidden[seen]),
         ("are marked hidden, but visible according to", z < low * (1 + _BESIDE_ALL), hidden[seen]),
@@ -466,11 +452,9 @@ def _unlike_faults(file: str, stored: LabelledMatches, found: Arranged) -> Itera
 
 
 @skips_unreadable
-def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Collection[str]) -> Iterator[Again]:
-    """``channel_checks.channels_again`` for matches of frame ``first`` and the next: label them by ray casting."""
-    if "matches" not in sequence.channels or (file := matches_file(first)) in reported:
-        return
-    stored = sequence.matches(first)
+def _matches_again(sequence: Sequence, rays: MatchRays, first: int) -> Iterator[Again]:
+    """Label the matches of frame ``first`` and the next again by ray casting."""
+    stored, file = sequence.matches(first), matches_file(first)
     as_given = Arranged(stored.sets, stored.tracks, stored.pixels)
     made = labelled(sequence, first, as_given, (sequence.matching or Matching()).bound_px, rays)
     with np.errstate(invalid="ignore"):
@@ -478,6 +462,10 @@ def matches_again(sequence: Sequence, first: int, rays: MatchRays, reported: Col
     alike = (made.classes == stored.classes) & (near | (np.isnan(made.error) & np.isnan(stored.error)))
     wrong = int(np.sum(~alike))
     what = f"{wrong} of {len(alike)} labels differ from ray casting"
-    names = ("depth", "truth", "classes")
-    same = all(np.array_equal(getattr(made, k), getattr(stored, k), equal_nan=True) for k in names)
-    yield file, Finding(file, what) if wrong > max(_FEW_OTHERS * len(alike), _LEAST) else None, same
+    bad = wrong > max(_FEW_OTHERS * len(alike), _LEAST)
+    same = _same_bits(made, stored, "depth", "truth", "classes")
+    yield Again(file, Finding(file, what) if bad else None, same)
+
+
+def _same_bits(made: ArrayFile, stored: ArrayFile, *names: str) -> bool:
+    return all(np.array_equal(getattr(made, name), getattr(stored, name), equal_nan=True) for name in names)

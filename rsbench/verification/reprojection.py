@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple, TypeVar
+from itertools import product
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import ImageView, SeenSurfaces, carry, numbers_of
 
 T = TypeVar("T")
+S = TypeVar("S", bound=np.generic)
 _LEAST_ROWS = 64
 """Fewest rows of a band: starting a thread costs as much as some rows."""
 _threads = os.cpu_count() or 1
@@ -48,8 +50,6 @@ def by_bands(work: Callable[[int, int], T], height: int) -> list[T]:
 ROUNDING_PX = 1e-9
 """A place so far before a pixel's centre counts as on it: the two cameras see whole rows in whole rows."""
 
-DEPTH_TOLERANCE = 1e-4
-"""Relative difference of two depths of one surface point that still agree."""
 FLATNESS = 2e-5
 """Largest relative second difference of inverse depth (linear on planes by ideal pixels) of a locally flat
 surface: bilinear interpolation errs by an eighth of it along each axis, well under the tolerance; an edge bends
@@ -188,6 +188,11 @@ def reproject(geometry: Geometry, source: DepthMap, target: DepthMap, stride: in
     return found
 
 
+def stride_for(pixels: float, tried: int) -> int:
+    """Stride in both directions at which about ``tried`` of so many pixels are left."""
+    return max(1, int(np.sqrt(pixels / tried)))
+
+
 def seen_in(
     geometry: Geometry, source: DepthMap, target: DepthMap, rows: range, stride: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -204,6 +209,21 @@ def seen_in(
     return found.landed.pixels, x_in_cam
 
 
+def nearest(values: NDArray[S], pixels: NDArray[Any]) -> NDArray[S]:
+    """Values (...) of a map (H, W) at the pixels nearest to places (..., 2); of any pixel for NaN."""
+    height, width = values.shape
+    x, y = np.moveaxis(np.rint(np.nan_to_num(pixels)).astype(np.int64), -1, 0)
+    return values[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+
+
+def around(values: NDArray[S], pixels: NDArray[Any], steps: Iterable[int]) -> NDArray[S]:
+    """Values (k, n) of a map (H, W) by all these steps, down and across, from places (n, 2) rounded down."""
+    height, width = values.shape
+    x, y = np.floor(pixels).astype(np.int64).T
+    down, across = np.array(list(product(steps, repeat=2))).T[..., None]
+    return values[np.clip(y + down, 0, height - 1), np.clip(x + across, 0, width - 1)]
+
+
 def without_changing_light(
     sequence: Sequence, source: DepthMap, target: DepthMap, reprojection: Reprojection, stride: int
 ) -> Reprojection:
@@ -215,9 +235,7 @@ def without_changing_light(
         return reprojection
     own = cv2.dilate(changing[0], np.ones((3, 3), np.uint8))[::stride, ::stride] > 0
     other = cv2.dilate(changing[1], np.ones((5, 5), np.uint8)) > 0
-    x, y = np.rint(np.nan_to_num(reprojection.pixels)).astype(np.int64).reshape(-1, 2).T
-    height, width = other.shape
-    there = other[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].reshape(own.shape)
+    there = nearest(other, reprojection.pixels)
     return reprojection._replace(relative=np.where(own | there, np.float32(np.nan), reprojection.relative))
 
 

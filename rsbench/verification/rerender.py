@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
-from rsbench.core.geometry import poses_of
+from rsbench.core.geometry import MovingObject, poses_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.version import __version__
-from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
+from rsbench.dataset.channels import AFFINE, TRACKS
 from rsbench.dataset.generation import render_view
 from rsbench.dataset.layout import whole_frames
 from rsbench.dataset.motion_cards import MovingManifest
@@ -35,9 +35,9 @@ from rsbench.scenes.model import Start
 from rsbench.scenes.object_meshes import with_moving
 from rsbench.verification.channel_checks import channels_again
 from rsbench.verification.content import Content, clean_picture, stack_rows
-from rsbench.verification.findings import Finding, cheapest_cause, rows_of
+from rsbench.verification.findings import Again, Finding, cheapest_cause, rows_of
 from rsbench.verification.image_checks import CHANGES, Picture
-from rsbench.verification.point_checks import affine_again, matches_again, tracks_again
+from rsbench.verification.point_checks import points_again
 from rsbench.verification.reprojection import DepthMap
 
 if TYPE_CHECKING:
@@ -82,31 +82,22 @@ _OTHER_LABELS, _FEW_LABELS = 1e-3, 8
 """Share and number of labels that rounding on another processor may change, at edges."""
 
 
-@dataclass(frozen=True)
-class RowCheck:
-    """One file against its rows rendered again; ``fault`` is None when they are alike."""
-
-    file: str
-    fault: Finding | None
-    same_bits: bool
-
-
-def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[RowCheck]:
+def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[Again]:
     if stored.labels is None:
         return
     wrong, file = stored.labels[rows] != rendered, stored.view.labels
     what = f"{100 * np.mean(wrong):.2g} % of {wrong.size} labels differ from a new rendering"
     in_rows = np.isin(np.arange(len(stored.labels)), np.asarray(rows)[np.any(wrong, axis=1)])
     bad = np.sum(wrong) > max(_OTHER_LABELS * wrong.size, _FEW_LABELS)
-    yield RowCheck(file, Finding(file, what, rows_of(in_rows)) if bad else None, not np.any(wrong))
+    yield Again(file, Finding(file, what, rows_of(in_rows)) if bad else None, not np.any(wrong))
 
 
-def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> RowCheck:
+def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]) -> Again:
     depth, file = stored.depth[rows], stored.view.depth
     wrong = np.abs(depth - rendered) > SAME_DEPTH * np.maximum(depth, rendered)
     share = float(np.mean(wrong))
     if share <= _OTHER_DEPTH:
-        return RowCheck(file, None, np.array_equal(depth, rendered))
+        return Again(file, None, np.array_equal(depth, rendered))
     both = wrong & (depth > 0) & (rendered > 0)
     ratio = depth[both] / rendered[both] if np.any(both) else np.ones(1)
     middle = float(np.median(ratio))
@@ -115,12 +106,12 @@ def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]
     what = f"depth differs from a new rendering on {100 * share:.3g} % of {wrong.size} pixels"
     if np.any(both):
         what += f", typically by {np.median(np.abs(ratio - 1)):.1e} of itself"
-    return RowCheck(file, Finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
+    return Again(file, Finding(file, what, _rows(wrong, rows, len(stored.depth)), cause), False)
 
 
 def image_check(
     file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool, by_gpu: bool = False
-) -> RowCheck:
+) -> Again:
     """``noisy``: by other random numbers; ``by_gpu``: one was rendered on a GPU and the other was not."""
     truth = rendered.astype(np.float32)
     difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
@@ -128,7 +119,7 @@ def image_check(
     other = far if noisy else difference > 0
     few = _FAR_ON_GPU if by_gpu else _FAR_CODES
     if np.mean(far) <= few and np.mean(other) <= _OTHER_CODES:
-        return RowCheck(file, None, not np.any(difference))
+        return Again(file, None, not np.any(difference))
     what = (
         f"the image differs from a new rendering on {100 * np.mean(other):.3g} % of {far.size} pixels, "
         f"by up to {np.max(difference):g} codes"
@@ -139,7 +130,7 @@ def image_check(
     ]
     best = int(np.argmin(costs))
     cause = cheapest_cause({CHANGES[best].words: costs[best]}, costs[0], 0.5)
-    return RowCheck(file, Finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
+    return Again(file, Finding(file, what, _rows(other, rows, len(stored.colours)), cause), False)
 
 
 def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:
@@ -194,24 +185,17 @@ class Rerenderer:
 
     def cleared(self, content: Content, accused: Collection[str]) -> set[str]:
         """The accused files of channels whose bits are the same when they are made again by rays."""
-        from rsbench.renderers.visibility import SceneRays
-
         sequence, same = content.sequence, set[str]()
         with contextlib.suppress(RsbenchError):
             for view in [each for each in image_views(content.times) if each.shutter == "rs"]:
                 if any(f"/{view.side}_{view.frame}." in file for file in accused):
                     scene, frame = self.whole(content, view)
                     rows = list(range(sequence.rig.sensor(view.side).height))
-                    checks = channels_again(sequence, view, rows, frame, SceneRays(scene, sequence.objects), ())
+                    checks = channels_again(sequence, view, rows, frame, _rays(scene, sequence.objects), ())
                     same |= {file for file, _, alike in checks if alike}
             scene, _ = self.scene(sequence)
-            for file, again in ((TRACKS, tracks_again), (AFFINE, affine_again)):
-                if file in accused:
-                    same |= {name for name, _, alike in again(sequence, SceneRays(scene), ()) if alike}
-            for first in content.times[:-1]:
-                if matches_file(first) in accused:
-                    checks = matches_again(sequence, first, SceneRays(scene), ())
-                    same |= {name for name, _, alike in checks if alike}
+            again = points_again(sequence, _rays(scene), accused.__contains__)
+            same |= {file for file, _, alike in again if alike}
         return same & set(accused)
 
     def whole(self, content: Content, view: ImageView) -> tuple[MitsubaScene, Frame]:
@@ -256,7 +240,7 @@ class RerenderedRows:
     """Rows of one sequence rendered again, some frames after the other."""
 
     def __init__(self, again: Rerenderer, sequence: Sequence) -> None:
-        self._sequence, self._checks = sequence, list[RowCheck]()
+        self._sequence, self._checks = sequence, list[Again]()
         self._begun, self._seconds, self._refusal = time.perf_counter(), 0.0, ""
         try:
             self._options = _options_of(sequence)
@@ -272,9 +256,9 @@ class RerenderedRows:
     def add(self, content: Content, reported: set[str]) -> None:
         """Render again what was read, but for channels that are ``reported`` already."""
         if not self._refusal:
-            self._take(_row_checks(content, self._scene, self._options, self._rows, reported))
+            self._take(self._row_checks(content, reported))
 
-    def _take(self, checks: Iterator[RowCheck]) -> None:
+    def _take(self, checks: Iterator[Again]) -> None:
         start = time.perf_counter()
         self._checks += checks
         self._seconds += time.perf_counter() - start
@@ -284,11 +268,8 @@ class RerenderedRows:
         if self._refusal:
             return [], self._refusal
         manifest, checks = self._sequence.manifest, self._checks
-        rays, pairs = _rays(self._scene), range(self._sequence.frames - 1)
-        of_matches = (each for first in pairs for each in matches_again(self._sequence, first, rays, reported))
-        of_points = (made(self._sequence, rays, reported) for made in (tracks_again, affine_again))
-        again = chain(*of_points, of_matches)
-        self._take(RowCheck(*check) for check in again)
+        left_out = reported | ({AFFINE} if TRACKS in reported else set())  # whose points those are
+        self._take(points_again(self._sequence, _rays(self._scene), lambda file: file not in left_out))
         wrong = [check for check in checks if check.fault]
         done = (
             f"{len(self._rows['left'])} rows of each image and depth map rendered again in {self._seconds:.1f} s"
@@ -305,11 +286,74 @@ class RerenderedRows:
         done += _ALIKE[0] if same else "" if wrong else _ALIKE[1]
         return [check.fault for check in wrong if check.fault and check.file not in reported], done
 
+    def _row_checks(self, content: Content, reported: set[str]) -> Iterator[Again]:
+        scene, options = self._scene, self._options
+        own = image_views(content.times)
+        twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
+        for view in (*own, *twins):
+            if view not in content.maps and view not in content.pictures:
+                continue
+            rows = self._rows[view.side]
+            frame = _render(content, scene, options, view, rows)
+            if view in content.maps:
+                yield depth_check(content.maps[view], frame.depth, rows)
+                yield from label_checks(content.maps[view], frame.labels, rows)
+            if view in content.pictures:
+                yield _picture_check(content, frame, options, view, rows)
+            rays = _rays(scene, content.sequence.objects)
+            yield from channels_again(content.sequence, view, rows, frame, rays, reported)
+            yield from self._sensed_check(content, view, reported)
+            if view.shutter == "rs" and whole_frames(content.sequence.manifest):
+                with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+                    yield self._stack_check(content, view)
 
-def _rays(scene: MitsubaScene) -> SceneRays:
+    def _sensed_check(self, content: Content, view: ImageView, reported: set[str]) -> Iterator[Again]:
+        """What the sensor makes of a rolling-shutter frame, or shows of a global-shutter picture without noise.
+
+        Each row of a sensor has random numbers of its own, so it can be made alone with the same bits; a row of an
+        image that was interpolated or compressed is made with the rows around it.
+        """
+        from rsbench.renderers.render import sensed_rows
+
+        sequence, rows, rolling = content.sequence, self._rows[view.side], view.shutter == "rs"
+        file = view.image if rolling else view.exposed
+        if sequence.sensor is None or file in reported or not (rolling or sequence.exposed_twins):
+            return
+        with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
+            image = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
+            seen, sensor = Picture.of(view, image, noisy=False), sequence.sensor.of(view.side, view.frame)
+            sensor, twin = (sensor, None) if rolling else (sensor.noiseless, view.row)
+            few = rolling and sensor.jpeg_quality and len(rows) < len(seen.colours)
+            some, chosen = rows[::_COMPRESSED] if few else rows, _of_image(content, self._options, view)
+            place, period = (view.side, view.frame), sequence.frame_period_s
+            made = sensed_rows(self._scene, sequence, place, sensor, period, chosen, some, twin)
+            yield image_check(file, seen, made, some, not _made_here(content), _by_gpu(content))
+
+    def _stack_check(self, content: Content, view: ImageView) -> Again:
+        """Rows of the stack at other rows' poses: row i of the image that is rendered at the pose of row j."""
+        from rsbench.renderers.image import to_srgb8
+        from rsbench.renderers.render import LinePoses, render
+
+        sequence, rows, chosen = content.sequence, self._rows[view.side], _of_image(content, self._options, view)
+        of = rows[::-1]
+        seen = Picture.of(view, stack_rows(sequence, view, rows, of), noisy=False)
+        R, t = (
+            each.copy()
+            for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
+        )
+        tau = sequence.shutter.line_times(view.frame, view.side).copy()
+        R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
+        poses = LinePoses(R, t, poses_of(sequence.objects, tau))
+        frame = render(self._scene, sequence.rig.sensor(view.side), poses, chosen, rows=rows)
+        rendered = to_srgb8(frame.image, chosen.exposure)
+        noisy = chosen.integrator == "path" and not _made_here(content)
+        return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy, _by_gpu(content))
+
+
+def _rays(scene: MitsubaScene, objects: Many[MovingObject] = ()) -> SceneRays:
     from rsbench.renderers.visibility import SceneRays
 
-    return SceneRays(scene)
+    return SceneRays(scene, objects)
 
 
 def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> dict[Side, list[int]]:
@@ -349,96 +393,15 @@ def _table(manifest: Mapping[str, Any], key: str) -> dict[str, Any]:
     return table
 
 
-def _row_checks(
-    content: Content,
-    scene: MitsubaScene,
-    options: RendererOptions,
-    rows_of_sides: Mapping[Side, list[int]],
-    reported: set[str],
-) -> Iterator[RowCheck]:
-    from rsbench.renderers.visibility import SceneRays
-
-    own = image_views(content.times)
-    twins = (each._replace(row=row) for row in content.sequence.twins for each in own if each.shutter == "gs")
-    for view in (*own, *twins):
-        if view not in content.maps and view not in content.pictures:
-            continue
-        rows = rows_of_sides[view.side]
-        frame = _render(content, scene, options, view, rows)
-        if view in content.maps:
-            yield depth_check(content.maps[view], frame.depth, rows)
-            yield from label_checks(content.maps[view], frame.labels, rows)
-        if view in content.pictures:
-            yield _picture_check(content, frame, options, view, rows)
-        rays = SceneRays(scene, content.sequence.objects)
-        again = channels_again(content.sequence, view, rows, frame, rays, reported)
-        yield from (RowCheck(*check) for check in again)
-        yield from _sensed_check(content, scene, options, view, rows, reported)
-        if view.shutter == "rs" and whole_frames(content.sequence.manifest):
-            with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
-                yield _stack_check(content, scene, _of_image(content, options, view), view, rows)
-
-
 def _picture_check(
     content: Content, frame: Frame, options: RendererOptions, view: ImageView, rows: list[int]
-) -> RowCheck:
+) -> Again:
     from rsbench.renderers.image import to_srgb8
 
     noisy = options.integrator == "path" and not _made_here(content)
     rendered = to_srgb8(frame.image, options.exposure)
     file, stored = clean_picture(content.sequence, view), content.pictures[view]
     return image_check(file, stored, rendered, rows, noisy, _by_gpu(content))
-
-
-def _sensed_check(
-    content: Content,
-    scene: MitsubaScene,
-    options: RendererOptions,
-    view: ImageView,
-    rows: list[int],
-    reported: set[str],
-) -> Iterator[RowCheck]:
-    """What the sensor makes of a rolling-shutter frame, or shows of a global-shutter picture without noise.
-
-    Each row of a sensor has random numbers of its own, so it can be made alone with the same bits; a row of an
-    image that was interpolated or compressed is made with the rows around it.
-    """
-    from rsbench.renderers.render import sensed_rows
-
-    sequence, rolling = content.sequence, view.shutter == "rs"
-    file = view.image if rolling else view.exposed
-    if sequence.sensor is None or file in reported or not (rolling or sequence.exposed_twins):
-        return
-    with contextlib.suppress(RsbenchError):  # reported already: a file that cannot be read
-        image = sequence.image(*view[:3]) if rolling else sequence.exposed_image(*view[1:])
-        seen, sensor = Picture.of(view, image, noisy=False), sequence.sensor.of(view.side, view.frame)
-        sensor, twin = (sensor, None) if rolling else (sensor.noiseless, view.row)
-        few = rolling and sensor.jpeg_quality and len(rows) < len(seen.colours)
-        some, chosen = rows[::_COMPRESSED] if few else rows, _of_image(content, options, view)
-        place, period = (view.side, view.frame), sequence.frame_period_s
-        made = sensed_rows(scene, sequence, place, sensor, period, chosen, some, twin)
-        yield image_check(file, seen, made, some, not _made_here(content), _by_gpu(content))
-
-
-def _stack_check(
-    content: Content, scene: MitsubaScene, chosen: RendererOptions, view: ImageView, rows: list[int]
-) -> RowCheck:
-    """Rows of the stack at other rows' poses: row i of the image that is rendered at the pose of row j."""
-    from rsbench.renderers.image import to_srgb8
-    from rsbench.renderers.render import LinePoses, render
-
-    sequence, of = content.sequence, rows[::-1]
-    seen = Picture.of(view, stack_rows(sequence, view, rows, of), noisy=False)
-    R, t = (
-        each.copy() for each in row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
-    )
-    tau = sequence.shutter.line_times(view.frame, view.side).copy()
-    R[rows], t[rows], tau[rows] = R[of], t[of], tau[of]
-    poses = LinePoses(R, t, poses_of(sequence.objects, tau))
-    frame = render(scene, sequence.rig.sensor(view.side), poses, chosen, rows=rows)
-    rendered = to_srgb8(frame.image, chosen.exposure)
-    noisy = chosen.integrator == "path" and not _made_here(content)
-    return image_check(f"gs_stack/{view.side}_{view.frame}", seen, rendered, rows, noisy, _by_gpu(content))
 
 
 def _by_gpu(content: Content) -> bool:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple, TypeVar, get_args
+from typing import NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -34,12 +34,11 @@ from rsbench.renderers.image import (
     srgb_of,
 )
 from rsbench.storage.untrusted_files import inside
-from rsbench.verification.content import png_fault
+from rsbench.verification.content import Content, png_fault
 from rsbench.verification.findings import Finding, rows_of
 from rsbench.verification.image_checks import Picture
 from rsbench.verification.reprojection import BoolArray, DepthMap
 
-T = TypeVar("T")
 _BLOCK = 8
 _MOST, _MOST_OF_ROWS = 0.02, 0.1
 """Share of the values of an image, or of a row of pixels or blocks, that may be otherwise. Sound: none of a
@@ -85,7 +84,7 @@ def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> Fin
         if not np.any(wrong := blocks.off_steps(sensor.jpeg_quality).rows()):
             return None
         # The coarsest that fits: whole steps of 8 are those of 4 too.
-        like = _first(q for q in range(1, 100) if _fits(blocks.off_steps(q)))
+        like = next((q for q in range(1, 100) if _fits(blocks.off_steps(q))), None)
         what = f"is no JPEG image of quality {sensor.jpeg_quality}: its blocks are not of whole steps"
         return Finding(
             file, what, rows_of(wrong), f"looks like quality {like}" if like else "looks not compressed"
@@ -93,13 +92,9 @@ def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> Fin
     if sensor.mosaic == "none" or not np.any(wrong := _not_means(image, sensor.mosaic).rows()):
         return None
     patterns = [each for each in get_args(Mosaic) if each != "none"]
-    alike = _first(each for each in patterns if _fits(_not_means(image, each)))
+    alike = next((each for each in patterns if _fits(_not_means(image, each))), None)
     what = f"is not interpolated from a mosaic {sensor.mosaic}: values are not the mean of their neighbours"
     return Finding(file, what, rows_of(wrong), f"looks like {alike or 'no mosaic'}")
-
-
-def _first(values: Iterable[T]) -> T | None:
-    return next(iter(values), None)
 
 
 def _fits(counts: _Counts) -> bool:
@@ -199,13 +194,9 @@ _UNCLIPPED = (0.03, 0.75)
 _WHITE = 255.0
 
 
-def sensor_faults(
-    sequence: Sequence,
-    maps: Mapping[ImageView, DepthMap],
-    pictures: Mapping[ImageView, Picture],
-    missing: Collection[str],
-) -> Iterator[Finding]:
+def sensor_faults(content: Content, missing: Collection[str]) -> Iterator[Finding]:
     """What the frames of a sequence show that their sensor cannot have made of the clean twins."""
+    sequence, maps, pictures = content.sequence, content.maps, content.pictures
     sensor = sequence.sensor
     for view in pictures:
         camera = sequence.rig.sensor(view.side)

@@ -33,13 +33,9 @@ def reports_apart(
     threads = max(1, (os.cpu_count() or 1) // workers)
     environment = dict.fromkeys(THREAD_VARIABLES, "1") if threads == 1 else {}
     given = (make, threads, renders, *arguments)
-    with closing(finished_jobs(_serve, names, workers, environment, *given, name=_name)) as found:
+    with closing(finished_jobs(_serve, names, workers, environment, *given, name="sequence {}".format)) as found:
         for _, report in found:
             yield _report(**report)
-
-
-def _name(sequence: str) -> str:
-    return f"sequence {sequence}"
 
 
 def _report(name: str, findings: Any, agreements: Any, notes: Any) -> SequenceReport:

@@ -128,7 +128,13 @@ def across_lines(columns: bool, u: float, v: float) -> float:
 @compiled(error_model="numpy")
 def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """``rsbench.core.camera.Lens.distort`` of one ideal pixel, in pixels; NaN beyond the lens's reach."""
-    x, y = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
+    x, y = bend(lens, (u - lens[2]) / lens[0], (v - lens[3]) / lens[1])
+    return x * lens[0] + lens[2], y * lens[1] + lens[3]
+
+
+@compiled(error_model="numpy")
+def bend(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """``rsbench.core.camera.Lens.distort`` of one point of the plane z = 1; NaN beyond the lens's reach."""
     s = x * x + y * y
     if not s < lens[4] * lens[4]:  # NaN included
         return np.nan, np.nan
@@ -137,22 +143,21 @@ def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
         xi, alpha = k1, k2
         w = xi * np.sqrt(s + 1.0) + 1.0
         gain = 1.0 / (alpha * np.sqrt(s + w * w) + (1.0 - alpha) * w)
-        xd, yd = x * gain, y * gain
-    elif lens[5] == 1.0:
+        return x * gain, y * gain
+    if lens[5] == 1.0:
         r = np.sqrt(s)
         angle = np.arctan(r)
         a = angle * angle
         # atan r = r - r^3 / 3: what is left out near the axis is below rounding.
         bent = angle / r if r > 1e-6 else 1.0 - s / 3.0
         gain = bent * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
-        xd, yd = x * gain, y * gain
-    else:
-        gain = 1.0 + s * (k1 + s * (k2 + s * k3))
-        if lens[5] == 2.0:
-            gain /= 1.0 + s * (k4 + s * (lens[12] + s * lens[13]))
-        xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
-        yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
-    return xd * lens[0] + lens[2], yd * lens[1] + lens[3]
+        return x * gain, y * gain
+    gain = 1.0 + s * (k1 + s * (k2 + s * k3))
+    if lens[5] == 2.0:
+        gain /= 1.0 + s * (k4 + s * (lens[12] + s * lens[13]))
+    xd = x * gain + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
+    yd = y * gain + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+    return xd, yd
 
 
 F32 = NDArray[np.float32]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -80,11 +80,22 @@ def rehash(folder: Path) -> None:
 def planted(fault: Fault, sound: Path, out: Path) -> Path:
     """A copy of the sound dataset with the fault in it."""
     shutil.rmtree(out, ignore_errors=True)
+    return spoilt(sound, out, fault.plant, fit=fault.rehash)
+
+
+def spoilt(sound: Path, out: Path, *plants: Plant, sequence: str = "", fit: bool = True) -> Path:
+    """A copy of a dataset with faults in it, or in the folder of a ``sequence``; hashes are made to ``fit``."""
     shutil.copytree(sound, out)
-    fault.plant(out)
-    if fault.rehash:
+    for plant in plants:
+        plant(out / sequence)
+    if fit:
         rehash(out)
     return out
+
+
+def named(faults: Iterable[str], words: Iterable[str]) -> bool:
+    """Whether one of the faults has all of these words."""
+    return any(all(word in fault for word in words) for fault in faults)
 
 
 def found(fault: Fault, folder: Path) -> tuple[bool, list[str]]:
@@ -92,7 +103,7 @@ def found(fault: Fault, folder: Path) -> tuple[bool, list[str]]:
     listing = Listing.of(folder, read_json(folder / "dataset.json"))
     again = Rerenderer("auto", [WET_CASTLE]) if fault.rendered else None
     lines = [*map(str, dataset_faults(listing)), *_of_victim(listing, again)]
-    return any(all(word in line for word in fault.words) for line in lines), lines
+    return named(lines, fault.words), lines
 
 
 def _of_victim(listing: Listing, again: Rerenderer | None) -> tuple[str, ...]:

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from yard_dataset import boxes_card
 
-from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard, load_dataset_card
+from rsbench.dataset.card import DatasetCard, MotionCard, SequenceCard, load_dataset_card
 
 STRATA = ("mild", "moderate", "aggressive")
 
 
 def _card(**changes: object) -> DatasetCard:
     motion = MotionCard(rotation_deg=2.0, rotation_axis="random", translation=0.3, translation_axis="random")
-    card = DatasetCard(
-        name="x",
-        camera=CameraCard(width=8, height=8, focal=8.0),
-        baseline=0.1,
-        readout_ratio=0.8,
-        motion=motion,
-        seeds=(1, 2),
-        sequence=(SequenceCard(name="a", scene="castle"), SequenceCard(name="b", scene="room")),
-    )
-    return replace(card, **changes)  # pyrefly: ignore[bad-argument-type]
+    sequences = (SequenceCard(name="a", scene="castle"), SequenceCard(name="b", scene="room"))
+    return boxes_card("castle", **({"motion": motion, "seeds": (1, 2), "sequence": sequences} | changes))
 
 
 def test_every_sequence_is_made_once_per_seed() -> None:

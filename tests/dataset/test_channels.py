@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from attack.planting import rehash
+from attack.planting import named, spoilt
 from channel_faults import FAULTS
 from numpy.typing import NDArray
 from traced_truth import World, agreement, first_hit, grid_of, line_times, look, rays, row_seeing, within
@@ -339,18 +339,10 @@ def test_sound_channels_pass(yard: Path) -> None:
 
 @pytest.mark.parametrize("names", rounds(), ids=lambda names: names[0])
 def test_planted_faults_are_named(yard: Path, tmp_path: Path, names: list[str]) -> None:
-    shutil.copytree(yard, tmp_path / "data")
-    for name in names:
-        FAULTS[name][0](tmp_path / "data/yard")
-    rehash(tmp_path / "data")
+    data = spoilt(yard, tmp_path / "data", *(FAULTS[name][0] for name in names), sequence="yard")
     again: Rerender = "all" if any("new computation" in FAULTS[name][1] for name in names) else "no"
-    (report,) = verify_dataset(tmp_path / "data", rerender=again, scenes=[yard.parent / "yard.toml"])
-    missed = [
-        name
-        for name in names
-        if not any(all(word in fault for word in FAULTS[name][1]) for fault in report.faults)
-    ]
-    assert missed == [], report.faults
+    (report,) = verify_dataset(data, rerender=again, scenes=[yard.parent / "yard.toml"])
+    assert [name for name in names if not named(report.faults, FAULTS[name][1])] == [], report.faults
 
 
 def test_a_map_that_others_contradict_is_acquitted_when_it_is_what_rays_meet(yard: Path) -> None:

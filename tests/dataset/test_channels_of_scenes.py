@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from yard_dataset import boxes_card
 
-from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.card import CameraCard, MotionCard
 from rsbench.dataset.generation import generate_dataset
 from rsbench.verification import verify_dataset
 
@@ -23,17 +24,9 @@ def test_things_thinner_than_a_pixel_are_no_faults(
     motion = MotionCard(
         rotation_deg=rotation_deg, rotation_axis="random", translation=0.2, translation_axis="random"
     )
-    card = DatasetCard(
-        name="thin",
-        camera=CameraCard(width=width, height=3 * width // 4, focal=focal),
-        baseline=0.3,
-        readout_ratio=0.8,
-        motion=motion,
-        renderer="preview",
-        channels=("gs_flow", "instances"),
-        seeds=(seed,),
-        sequence=(SequenceCard(name=scene, scene=scene),),
-    )
+    camera = CameraCard(width=width, height=3 * width // 4, focal=focal)
+    channels = ("gs_flow", "instances")
+    card = boxes_card(scene, camera=camera, readout_ratio=0.8, motion=motion, channels=channels, seeds=(seed,))
     generate_dataset(card.expanded(), tmp_path / "out")
     (report,) = verify_dataset(tmp_path / "out", rerender="no")
     assert report.faults == ()

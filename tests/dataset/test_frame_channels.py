@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_dataset import PLANES, card_of, write_analytic_dataset
-from attack.planting import rehash
+from analytic_dataset import PLANES, add_channels, card_of, write_analytic_dataset
+from attack.planting import named, spoilt
 from frame_faults import FAULTS
 from numpy.typing import NDArray
 
@@ -19,13 +17,13 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.channels import Channel, channel_files, write_sequence_channels
+from rsbench.dataset.channels import Channel, write_sequence_channels
 from rsbench.dataset.generation import sequence_truth
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.tracks import track_views
 from rsbench.renderers import visibility
 from rsbench.renderers.visibility import Surfaces
-from rsbench.storage.files import read_json, write_json
+from rsbench.storage.files import read_json
 from rsbench.verification import verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(96, 80, 110.0), baseline=0.3)
@@ -68,20 +66,16 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four frames of two planes with all channels of whole sequences, by what writes them of rendered ones."""
     out = tmp_path_factory.mktemp("channels") / "data"
     write_analytic_dataset(out, RIG, SHUTTER, MOTION, frames=COUNT)
-    card, folder = replace(card_of(RIG, SHUTTER, MOTION, COUNT), channels=CHANNELS), out / "planes"
-    own = read_json(folder / "sequence.json")
-    for name in channel_files(CHANNELS, (), COUNT):
-        (folder / name).parent.mkdir(exist_ok=True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(visibility, "SceneRays", PlaneRays)
-        whole = sequence_truth(folder, card, card.sequence[0], None, own["scene"])  # pyrefly: ignore[bad-argument-type]
-        write_sequence_channels(card.channels, whole)
-    own |= {key: card.manifest_of(card.sequence[0])[key] for key in ("channels", "imu", "matches")}
-    own["files"] |= dict.fromkeys(channel_files(CHANNELS, (), COUNT), "")
-    write_json(folder / "sequence.json", own)
-    manifest = json.loads((out / "dataset.json").read_text())
-    write_json(out / "dataset.json", manifest | {"card": asdict(card)})
-    rehash(out)
+    card = replace(card_of(RIG, SHUTTER, MOTION, COUNT), channels=CHANNELS)
+    scene = read_json(out / "planes/sequence.json")["scene"]
+
+    def write(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(visibility, "SceneRays", PlaneRays)
+            whole = sequence_truth(folder, card, card.sequence[0], None, scene)  # pyrefly: ignore[bad-argument-type]
+            write_sequence_channels(card.channels, whole)
+
+    add_channels(out, card, write)
     return out
 
 
@@ -110,9 +104,6 @@ def test_tracks_are_where_rays_from_every_frame_meet_them(sound: Path) -> None:
 @pytest.mark.parametrize("name", SAMPLE)
 def test_a_fault_beyond_the_first_two_frames_is_named(sound: Path, tmp_path: Path, name: str) -> None:
     plant, words = FAULTS[name]
-    shutil.copytree(sound, tmp_path / "data")
-    plant(tmp_path / "data/planes")
-    rehash(tmp_path / "data")
-    faults = verify_dataset(tmp_path / "data", 3)[-1].faults
-    assert any(all(word in fault for word in words) for fault in faults), faults
+    faults = verify_dataset(spoilt(sound, tmp_path / "data", plant, sequence="planes"), 3)[-1].faults
+    assert named(faults, words), faults
     assert not any(fault.startswith(("sequence.json", "rs", "gs", "poses")) for fault in faults), faults

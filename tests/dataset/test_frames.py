@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_dataset import PLANES, write_analytic_dataset
-from attack.planting import rehash
-from channel_faults import mask_of, values_of
+from analytic_dataset import PLANES, add_channels, card_of, write_analytic_dataset
+from attack.planting import copied, exchanged, named, rehash, spoilt
+from channel_faults import image_of, mask_of, scaled, values_of
 from numpy.typing import NDArray
+from yard_dataset import boxes_card
 
 from rsbench.benchmark.images.evaluation import open_evaluation
 from rsbench.benchmark.images.plan import EvaluationOptions
@@ -27,14 +28,14 @@ from rsbench.core.se3 import compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
+from rsbench.dataset.card import DatasetCard, MotionCard
 from rsbench.dataset.channels import CHANNELS, STEP_PX, Layer, channel_files, pair_layers, write_channels
 from rsbench.dataset.sequence import files_of, is_of_sequence, read_dataset, read_pairs
 from rsbench.dataset.views import ImageView
 from rsbench.renderers.image import Sensor
 from rsbench.renderers.render import Frame
 from rsbench.renderers.visibility import Surfaces
-from rsbench.storage.files import background_writer, read_depth, read_png, write_depth, write_png
+from rsbench.storage.files import background_writer
 from rsbench.verification import verification_steps, verify_dataset
 
 RIG = StereoRig(camera=PinholeCamera.centred(64, 54, 74.0), baseline=0.3)
@@ -71,35 +72,11 @@ def test_a_sound_sequence_has_no_faults_and_every_pair_is_compared(sound: Path) 
     assert len(steps) == verification_steps(json.loads((sound / "dataset.json").read_text()))
 
 
-def exchanged(*pairs: tuple[str, str]) -> Callable[[Path], None]:
-    def plant(folder: Path) -> None:
-        for one, other in pairs:
-            kept = (folder / one).read_bytes()
-            (folder / one).write_bytes((folder / other).read_bytes())
-            (folder / other).write_bytes(kept)
-
-    return plant
-
-
-def depth_changed(file: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    return lambda folder: write_depth(folder / file, change(read_depth(folder / file)).astype(np.float32))
-
-
 def all_of(one: int, other: int) -> list[tuple[str, str]]:
     kinds = (("rs", "png"), ("gs", "png"), ("rs_depth", "exr"), ("gs_depth", "exr"))
     return [
         (f"{kind}/{side}_{one}.{end}", f"{kind}/{side}_{other}.{end}") for kind, end in kinds for side in SIDES
     ]
-
-
-def moved(folder: Path) -> None:
-    path = folder / "rs/left_2.png"
-    write_png(path, np.roll(read_png(path), 1, axis=0))
-
-
-def later(folder: Path) -> None:
-    lines = (folder / "poses/right_3.csv").read_text().splitlines()
-    (folder / "poses/right_2.csv").write_text("\n".join(lines) + "\n")
 
 
 FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
@@ -112,25 +89,44 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
         exchanged(("gs/right_2.png", "gs/right_3.png")),
         ("gs/right_2.png", "looks like gs/right_3.png"),
     ),
-    "an image of frame 2 shifted": (moved, ("rs/left_2.png", "shifted by one row")),
+    "an image of frame 2 shifted": (
+        image_of("rs/left_2.png", lambda image: np.roll(image, 1, axis=0)),
+        ("rs/left_2.png", "shifted by one row"),
+    ),
     "a depth map of frame 3 scaled": (
-        depth_changed("rs_depth/left_3.exr", lambda depth: depth * 1.002),
+        values_of("rs_depth/left_3.exr", scaled(1.002)),
         ("rs_depth/left_3.exr", "scaled by 1.002"),
     ),
-    "poses of frame 3 in frame 2": (later, ("poses/right_2.csv", "looks like the poses of right_3")),
+    "poses of frame 3 in frame 2": (
+        copied("poses/right_3.csv", "poses/right_2.csv"),
+        ("poses/right_2.csv", "looks like the poses of right_3"),
+    ),
     "a missing frame": (lambda folder: (folder / "rs/right_2.png").unlink(), ("rs/right_2.png", "missing")),
+    "flow back negated": (
+        values_of("flow_back/left_1.exr", np.negative),
+        ("flow_back/left_1.exr", "looks negated"),
+    ),
+    "flow back and forth exchanged": (
+        exchanged(("flow_back/right_2.exr", "flow/right_2.exr")),
+        ("flow_back/right_2.exr", "differ from what depth and motion make"),
+    ),
+    "flow of frame 1 in frame 2": (
+        exchanged(("flow/left_1.exr", "flow/left_2.exr"), ("flow_mask/left_1.png", "flow_mask/left_2.png")),
+        ("flow/left_2.exr", "differ from what depth and motion make"),
+    ),
+    "a mask of frame 2 upside down": (
+        mask_of("flow_back_mask/left_2.png", np.flipud),
+        ("flow_back_mask/left_2.png", "in or out of view"),
+    ),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_planted_fault_is_named(sound: Path, tmp_path: Path, name: str) -> None:
+def test_a_planted_fault_is_named(flowing: Path, tmp_path: Path, name: str) -> None:
     plant, words = FAULTS[name]
-    shutil.copytree(sound, tmp_path / "data")
-    plant(tmp_path / "data/planes")
-    if name != "a missing frame":
-        rehash(tmp_path / "data")
-    faults = faults_of(tmp_path / "data")
-    assert any(all(word in fault for word in words) for fault in faults), faults
+    fit = name != "a missing frame"
+    faults = faults_of(spoilt(flowing, tmp_path / "data", plant, sequence="planes", fit=fit))
+    assert named(faults, words), faults
     assert not any(fault.startswith(("sequence.json", "rs_depth/left_0", "gs/left_0")) for fault in faults), faults
 
 
@@ -221,21 +217,16 @@ def flowing(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("flow") / "data"
     shutil.copytree(sound, out)
     (whole,) = read_dataset(out)
-    for name in channel_files(["flow"], (), COUNT):
-        (whole.folder / name).parent.mkdir(exist_ok=True)
-    for view in views_of(COUNT):
-        image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
-        gloss = np.zeros(labels.shape, np.bool_)
-        seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
-        with background_writer() as later:
-            write_channels(whole.folder, ["flow"], whole, ImageView("rs", *view), seen, Open(), later)
-    own = json.loads((whole.folder / "sequence.json").read_text()) | {"channels": ["flow"]}
-    own["files"] |= dict.fromkeys(channel_files(["flow"], (), COUNT), "")
-    (whole.folder / "sequence.json").write_text(json.dumps(own))
-    manifest = json.loads((out / "dataset.json").read_text())
-    manifest["card"]["channels"] = ["flow"]
-    (out / "dataset.json").write_text(json.dumps(manifest))
-    rehash(out)
+
+    def write(folder: Path) -> None:
+        for view in views_of(COUNT):
+            image, labels = np.zeros((54, 64, 3), np.float32), np.zeros((54, 64), np.uint8)
+            gloss = np.zeros(labels.shape, np.bool_)
+            seen = Frame(image=image, depth=whole.depth("rs", *view), labels=labels, gloss=gloss)
+            with background_writer() as later:
+                write_channels(folder, ["flow"], whole, ImageView("rs", *view), seen, Open(), later)
+
+    add_channels(out, replace(card_of(RIG, SHUTTER, MOTION, COUNT), channels=("flow",)), write)
     return out
 
 
@@ -251,6 +242,7 @@ class Open:
 
 def test_flow_leads_to_both_neighbours_in_time(flowing: Path) -> None:
     """Against the row equation, solved by another way; and of a pair, the flow between its two frames."""
+    assert faults_of(flowing) == ()
     (whole,), grid = read_dataset(flowing), RIG.camera.pixel_grid()
     for side, frame in views_of(COUNT):
         depth = whole.depth("rs", side, frame)
@@ -271,34 +263,6 @@ def test_flow_leads_to_both_neighbours_in_time(flowing: Path) -> None:
             )
     with pytest.raises(RsbenchError, match="flow of frame 0 leads to no frame before"):
         whole.offsets("flow", "left", 0, back=True)
-
-
-FLOWS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
-    "nothing": (lambda folder: None, ()),
-    "back negated": (values_of("flow_back/left_1.exr", np.negative), ("flow_back/left_1.exr", "looks negated")),
-    "back and forth exchanged": (
-        exchanged(("flow_back/right_2.exr", "flow/right_2.exr")),
-        ("flow_back/right_2.exr", "differ from what depth and motion make"),
-    ),
-    "of frame 1 in frame 2": (
-        exchanged(("flow/left_1.exr", "flow/left_2.exr"), ("flow_mask/left_1.png", "flow_mask/left_2.png")),
-        ("flow/left_2.exr", "differ from what depth and motion make"),
-    ),
-    "a mask of frame 2 upside down": (
-        mask_of("flow_back_mask/left_2.png", np.flipud),
-        ("flow_back_mask/left_2.png", "in or out of view"),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", FLOWS)
-def test_a_planted_fault_of_flow_is_named(flowing: Path, tmp_path: Path, name: str) -> None:
-    plant, words = FLOWS[name]
-    shutil.copytree(flowing, tmp_path / "data")
-    plant(tmp_path / "data/planes")
-    rehash(tmp_path / "data")
-    faults = faults_of(tmp_path / "data")
-    assert any(all(word in fault for word in words) for fault in faults) == bool(words), faults
 
 
 # Names and cards
@@ -326,15 +290,7 @@ def card(**fields: object) -> DatasetCard:
     motion = MotionCard(
         model="spline", rotation_deg=1.0, rotation_axis=(0, 1, 0), translation=0.1, translation_axis=(1, 0, 0)
     )
-    own = {
-        "name": "card",
-        "camera": CameraCard(width=64, height=48, focal=60.0),
-        "baseline": 0.3,
-        "readout_ratio": 0.5,
-        "motion": motion,
-        "sequence": (SequenceCard(name="one", scene="castle"),),
-    }
-    return DatasetCard(**own | fields)  # pyrefly: ignore[bad-argument-type]
+    return boxes_card("castle", **({"readout_ratio": 0.5, "motion": motion} | fields))
 
 
 def test_a_card_lets_the_shake_last_as_long_as_its_frames() -> None:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from commands import rename_failing
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.corrected_frames import fresh_folder
@@ -95,45 +96,26 @@ def test_the_working_folder_is_not_replaced(tmp_path: Path, monkeypatch: pytest.
 def test_a_failure_between_the_old_and_the_new_leaves_the_old(
     out: Path, monkeypatch: pytest.MonkeyPatch, failing: int
 ) -> None:
-    real = os.rename
-    calls: list[Path] = []
-
-    def fail(source: Path, target: Path) -> None:
-        calls.append(target)
-        if len(calls) == failing:
-            raise OSError(5, "Input/output error")
-        real(source, target)
-
-    monkeypatch.setattr(os, "rename", fail)
+    monkeypatch.setattr(os, "rename", rename_failing(lambda call: call == failing))
     with pytest.raises(OSError, match="Input"):
         write(out, "second")
     assert texts(out) == FIRST
+
+
+class KilledError(BaseException):
+    """What a kill leaves, as after ``os._exit``: nothing is put in order."""
 
 
 @pytest.mark.parametrize("killed_after", [0, 1, 2])
 def test_a_kill_between_the_old_and_the_new_leaves_one_of_them(
     out: Path, monkeypatch: pytest.MonkeyPatch, killed_after: int
 ) -> None:
-    """What a kill leaves, as after ``os._exit``: nothing is put in order."""
-
-    class KilledError(BaseException):
-        pass
-
-    real = os.rename
-    calls: list[Path] = []
-
-    def kill(source: Path, target: Path) -> None:
-        if len(calls) >= killed_after:
-            raise KilledError
-        calls.append(target)
-        real(source, target)
-
     def stop(path: Path) -> None:
         if path.exists():
             raise KilledError
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "rename", kill)
+        patch.setattr(os, "rename", rename_failing(lambda call: call > killed_after, KilledError()))
         patch.setattr("rsbench.storage.work_folder._leave", lambda hidden, descriptor, fresh: os.close(descriptor))
         patch.setattr("rsbench.dataset.corrected_frames.remove", stop)
         with pytest.raises(KilledError):

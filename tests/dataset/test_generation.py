@@ -17,21 +17,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from attack.planting import rehash
-from commands import refused
+from commands import bytes_below, refused
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, load_dataset_card
 from rsbench.dataset.generation import estimate_dataset, generate_dataset, steps_of
 from rsbench.dataset.sequence import read_dataset
-from rsbench.storage.files import read_png, sha256, write_png
+from rsbench.renderers.image import Sensor
+from rsbench.storage.files import read_png, write_png
 from rsbench.storage.work_folder import HIDDEN
 from rsbench.verification import verify_dataset
-
-
-def bytes_of(folder: Path) -> dict[str, str]:
-    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and HIDDEN not in path.parts)
-    return {str(path.relative_to(folder)): sha256(path) for path in paths}
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,19 @@ def test_manifest_states_the_paper_conventions(smoke_dataset: Path) -> None:
 
 def test_same_card_gives_the_same_bytes_whatever_the_workers(small: Small, tmp_path: Path) -> None:
     generate_dataset(load_dataset_card(str(small.card)), tmp_path / "again", workers=2)
-    assert bytes_of(tmp_path / "again") == bytes_of(small.dataset)
+    assert bytes_below(tmp_path / "again", HIDDEN) == bytes_below(small.dataset, HIDDEN)
+
+
+def child(card: Path, out: Path, progress: str) -> list[str]:
+    """A command that generates a dataset, and runs ``progress`` after each step of the sequence ``name``."""
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from rsbench.dataset.card import load_dataset_card\n"
+        "from rsbench.dataset.generation import generate_dataset\n"
+        f"def step(name): {progress}\n"
+        "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=step)"
+    )
+    return [sys.executable, "-c", code, str(card), str(out)]
 
 
 def _frames(folder: Path) -> int:
@@ -84,13 +92,7 @@ def test_killed_run_resumes_to_the_bytes_of_an_undisturbed_one(small: Small, tmp
     """Killed in its first sequence, of 8 images and 8 depths, and in its second."""
     out = tmp_path / "killed"
     # A child that waits after each step is killed between the files that the test waits for and the end.
-    code = (
-        "import sys, time; from pathlib import Path\n"
-        "from rsbench.dataset.card import load_dataset_card\n"
-        "from rsbench.dataset.generation import generate_dataset\n"
-        "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=lambda _: time.sleep(0.1))"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code, str(small.card), str(out)])
+    process = subprocess.Popen(child(small.card, out, "time.sleep(0.1)"))
     deadline = time.monotonic() + 120
     while _frames(out) < files and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -100,7 +102,7 @@ def test_killed_run_resumes_to_the_bytes_of_an_undisturbed_one(small: Small, tmp
     with pytest.raises(RsbenchError, match="not a dataset"):
         read_dataset(out)
     assert generate_dataset(load_dataset_card(str(small.card)), out) == (["a", "b"] if files < 16 else ["b"])
-    assert bytes_of(out) == bytes_of(small.dataset)
+    assert bytes_below(out, HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 def test_damaged_sequence_is_rendered_again_and_sound_ones_are_kept(small: Small, tmp_path: Path) -> None:
@@ -109,7 +111,7 @@ def test_damaged_sequence_is_rendered_again_and_sound_ones_are_kept(small: Small
     assert generate_dataset(card, out) == []
     (out / "b/rs/left_0.png").write_bytes(b"damaged")
     assert generate_dataset(card, out) == ["b"]
-    assert bytes_of(out) == bytes_of(small.dataset)
+    assert bytes_below(out, HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 @pytest.mark.slow
@@ -119,14 +121,7 @@ def test_memory_does_not_grow_with_the_scenes(tmp_path: Path) -> None:
         pytest.skip("reads the memory of a process from /proc")
     scenes = [write_box_scene(tmp_path, name, (1536 + 64 * k, 2048 - 64 * k)) for k, name in enumerate("abcd")]
     card = write_small_card(tmp_path, scenes)
-    code = (
-        "import sys; from pathlib import Path\n"
-        "from rsbench.dataset.card import load_dataset_card\n"
-        "from rsbench.dataset.generation import generate_dataset\n"
-        "def say(name): print(name, int(open('/proc/self/statm').read().split()[1]) * 4096 / 2**20)\n"
-        "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=say)"
-    )
-    command = [sys.executable, "-c", code, str(card), str(tmp_path / "out")]
+    command = child(card, tmp_path / "out", "print(name, int(open('/proc/self/statm').read().split()[1]) / 256)")
     # The C library keeps freed blocks of some MB for itself unless told to map each one anew.
     environ = {**os.environ, "MALLOC_MMAP_THRESHOLD_": "1000000"}
     done = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=300, check=False)
@@ -204,17 +199,31 @@ def test_shards_brought_together_are_the_dataset(small: Small, tmp_path: Path) -
         (made,) = generate_dataset(card.shard(part, 2), tmp_path / str(part))
         shutil.copytree(tmp_path / str(part) / made, tmp_path / "both" / made)
     assert generate_dataset(card, tmp_path / "both") == []
-    assert bytes_of(tmp_path / "both") == bytes_of(small.dataset)
+    assert bytes_below(tmp_path / "both", HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 def test_the_estimate_counts_files_and_bytes(small: Small) -> None:
     words: list[str] = []
     found = estimate_dataset(load_dataset_card(str(small.card)), words.append)
-    made = [path for path in small.dataset.rglob("*") if path.is_file() and HIDDEN not in path.parts]
+    made = bytes_below(small.dataset, HIDDEN).values()
     assert len(words) == 2 and (found.sequences, found.files) == (2, len(made))
     # One camera at one time stands for four.
-    assert found.bytes == pytest.approx(sum(path.stat().st_size for path in made), rel=0.1)
+    assert found.bytes == pytest.approx(sum(map(len, made)), rel=0.1)
     assert 0.0 < found.seconds < 60.0
+
+
+def test_every_sensor_of_a_scene_is_tried_for_an_estimate(small: Small) -> None:
+    """Files have the same bytes in each run, so that an estimate for two sensors is the sum of two estimates."""
+    card = load_dataset_card(str(small.card)).only(["a"])
+    (ideal,), noise = card.sequence, Sensor(photon_noise=True, full_well=6000)
+    noisy = replace(ideal, name="noisy", sensor=noise)
+    one, other, both = (
+        estimate_dataset(replace(card, sequence=sequences), lambda scene: None)
+        for sequences in ((ideal,), (noisy,), (ideal, noisy))
+    )
+    # dataset.json and croissant.json, which list each file in 200 bytes, are there once.
+    assert (both.sequences, both.files) == (2, one.files + other.files - 2)
+    assert both.bytes == one.bytes + other.bytes - 2 * 200 and other.bytes > 1.1 * one.bytes
 
 
 def test_a_frame_without_any_surface_is_an_error(tmp_path: Path) -> None:
@@ -251,7 +260,7 @@ def test_a_camera_through_a_wall_is_refused(small: Small, tmp_path: Path) -> Non
 
 def test_dataset_manifest_lists_every_file(smoke_dataset: Path) -> None:
     manifest = json.loads((smoke_dataset / "dataset.json").read_text())
-    assert set(manifest["files"]) == set(bytes_of(smoke_dataset)) - {"dataset.json", "croissant.json"}
+    assert set(manifest["files"]) == set(bytes_below(smoke_dataset, HIDDEN)) - {"dataset.json", "croissant.json"}
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
@@ -13,10 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from attack.planting import rehash
+from attack.planting import spoilt
+from channel_faults import mask_of, other_object
+from commands import bytes_below
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from traced_truth import Array, Thing, World, agreement, axis_of, first_hit, grid_of, line_times, rays
+from yard_dataset import boxes_card, write_boxes
 
 from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import LinearMotion
@@ -27,7 +29,7 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.channels import PAIR_CHANNELS, PairChannel
-from rsbench.dataset.generation import generate_dataset, seen_scene
+from rsbench.dataset.generation import estimate_dataset, generate_dataset, seen_scene
 from rsbench.dataset.motion_cards import TAKEN, MovingCard
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.dataset.views import NUMBER, SHADED
@@ -37,23 +39,15 @@ from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.visibility import obstacle
 from rsbench.scenes.load import load_scene
-from rsbench.storage.files import read_grey_png, write_png
+from rsbench.storage.work_folder import HIDDEN
 from rsbench.verification import verify_dataset
 from rsbench.verification.content import read_content, read_twins
 from rsbench.verification.mask_checks import label_faults
 
-SCENE = """
-name = "lot"
-builder = "mesh"
+LIGHT = """
 [light]
 sun_azimuth_deg = 300
 sun_elevation_deg = 50
-[parameters]
-file = "lot.glb"
-up_axis = "z"
-[viewpoints.default]
-eye = [0.0, -4.0, 1.2]
-target = [0.2, 3.0, 0.9]
 """
 CART = MovingCard(
     instance="cart",
@@ -73,36 +67,20 @@ BOX = MovingCard(
 
 def write_lot(folder: Path) -> Path:
     """Ground, a wall, and a cart that will move."""
-    parts = {}
-    for name, size, place in (
-        ("ground", (14.0, 12.0, 0.1), (0.0, 3.0, -0.05)),
-        ("wall", (7.0, 0.3, 2.2), (2.0, 6.0, 1.1)),
-        ("cart", (0.9, 0.7, 1.0), (-0.6, 0.5, 0.55)),
-    ):
-        parts[name] = trimesh.creation.box(size)
-        parts[name].apply_transform(trimesh.transformations.rotation_matrix(0.3, (0, 0, 1)))
-        parts[name].apply_translation(place)
-    trimesh.Scene(parts).export(folder / "lot.glb")
-    (folder / "lot.toml").write_text(SCENE)
-    return folder / "lot.toml"
+    ground, wall = ((14.0, 12.0, 0.1), (0.0, 3.0, -0.05)), ((7.0, 0.3, 2.2), (2.0, 6.0, 1.1))
+    boxes = {"ground": ground, "wall": wall, "cart": ((0.9, 0.7, 1.0), (-0.6, 0.5, 0.55))}
+    return write_boxes(folder, "lot", boxes, LIGHT)
 
 
 def lot_card(folder: Path, **fields: object) -> DatasetCard:
     kept = {
-        "name": "lot",
         "camera": CameraCard(width=80, height=60, focal=75.0),
-        "baseline": 0.3,
-        "readout_ratio": 0.9,
-        "motion": MotionCard(
-            rotation_deg=4.0, rotation_axis=(0.5, 1.0, -0.6), translation=0.3, translation_axis=(-0.7, 0.3, -0.6)
-        ),
-        "renderer": "preview",
         "channels": TAKEN,
         "twins": (24,),
         "sensor": Sensor(exposure_s=0.02, full_well=6000, photon_noise=True, read_noise=2.5),
         "sequence": (SequenceCard(name="lot", scene=str(folder / "lot.toml"), moving=(CART, BOX)),),
     }
-    return DatasetCard(**(kept | fields)).expanded()  # pyrefly: ignore[bad-argument-type]
+    return boxes_card(folder / "lot.toml", **(kept | fields)).expanded()
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +89,9 @@ def lot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_lot(folder)
     generate_dataset(lot_card(folder), folder / "data")
     assert generate_dataset(lot_card(folder), folder / "data") == [], "a second run has nothing to do"
+    assert estimate_dataset(lot_card(folder), lambda scene: None).files == len(
+        bytes_below(folder / "data", HIDDEN)
+    )
     return folder / "data"
 
 
@@ -297,23 +278,11 @@ def test_verify_finds_nothing_in_a_sound_one(lot: Path) -> None:
     assert report.faults == () and "the same bits" in report.notes[-1]
 
 
-def _label_of(file: str, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Callable[[Path], None]:
-    def plant(folder: Path) -> None:
-        path = folder / "lot" / file
-        write_png(path, np.ascontiguousarray(change(read_grey_png(path))))
-
-    return plant
-
-
-def _exchanged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.where((labels & NUMBER) > 0, labels ^ 3, labels).astype(np.uint8)
-
-
 @pytest.mark.parametrize(
     ("file", "change"),
     [
         ("rs_moving/left_0.png", np.zeros_like),
-        ("gs_moving/right_1.png", _exchanged),
+        ("gs_moving/right_1.png", other_object),
         ("rs_moving/right_0.png", lambda labels: np.maximum(labels, 1)),
         ("gs_twin_moving/0024/left_1.png", lambda labels: labels[::-1]),
     ],
@@ -321,9 +290,7 @@ def _exchanged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def test_labels_that_contradict_depth_are_named(
     lot: Path, tmp_path: Path, file: str, change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 ) -> None:
-    shutil.copytree(lot, tmp_path / "data")
-    _label_of(file, change)(tmp_path / "data")
-    (sequence,) = read_dataset(tmp_path / "data")
+    (sequence,) = read_dataset(spoilt(lot, tmp_path / "data", mask_of(file, change), sequence="lot"))
     content, twins = read_content(sequence), read_twins(sequence, (), (0, 1))
     (fault,) = label_faults(content, content, twins)
     assert fault.file == file
@@ -332,11 +299,10 @@ def test_labels_that_contradict_depth_are_named(
 
 def test_labels_that_depth_does_not_tell_are_made_again(lot: Path, tmp_path: Path) -> None:
     """No shadows, and all one pixel beside, with hashes made to fit."""
-    shutil.copytree(lot, tmp_path / "data")
-    _label_of("rs_moving/left_1.png", lambda labels: labels & np.uint8(NUMBER))(tmp_path / "data")
-    _label_of("gs_moving/left_0.png", lambda labels: np.roll(labels, 1, axis=1))(tmp_path / "data")
-    rehash(tmp_path / "data")
-    (report,) = verify_dataset(tmp_path / "data", rerender="auto", scenes=[lot.parent / "lot.toml"])
+    unlit = mask_of("rs_moving/left_1.png", lambda labels: labels & np.uint8(NUMBER))
+    beside = mask_of("gs_moving/left_0.png", lambda labels: np.roll(labels, 1, axis=1))
+    data = spoilt(lot, tmp_path / "data", unlit, beside, sequence="lot")
+    (report,) = verify_dataset(data, rerender="auto", scenes=[lot.parent / "lot.toml"])
     for file in ("rs_moving/left_1.png", "gs_moving/left_0.png"):
         assert any(fault.startswith(file) for fault in report.faults), report.faults
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -11,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from attack.planting import rehash
-from channel_faults import values_of
+from attack.planting import copied, spoilt
+from channel_faults import mask_of, other_object, values_of
 from scipy.spatial.transform import Rotation
 from small_scenes import write_box_scene
 from traced_truth import Array, Thing, World, agreement, first_hit, line_times, rays
@@ -23,10 +22,10 @@ from rsbench.core.se3 import inverse, transform
 from rsbench.dataset.card import DatasetCard, load_dataset_card
 from rsbench.dataset.channels import PairChannel
 from rsbench.dataset.generation import generate_dataset
+from rsbench.dataset.layout import SHUTTERS
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.dataset.views import NUMBER
 from rsbench.scenes.load import load_scene
-from rsbench.storage.files import read_grey_png, write_png
 from rsbench.verification import verify_dataset
 from rsbench.verification.rerender import Rerenderer
 
@@ -180,33 +179,23 @@ def test_verify_finds_nothing_and_renders_again_where_the_meshes_are_named(fair:
     assert str(fair.parent) not in (fair / "fair/sequence.json").read_text(), "a dataset names no folder"
 
 
-def _exchanged(folder: Path) -> None:
-    path = folder / "rs_moving/left_2.png"
-    labels = read_grey_png(path)
-    write_png(path, np.where((labels & NUMBER) > 0, labels ^ 3, labels).astype(np.uint8))
-
-
-def _stays(folder: Path) -> None:
-    """Labels of frame 0 in frame 1, of both shutters, so that twins agree."""
-    for name in ("rs_moving", "gs_moving"):
-        shutil.copyfile(folder / name / "left_0.png", folder / name / "left_1.png")
-
-
 @pytest.mark.parametrize(
-    ("plant", "file"),
+    ("plants", "file"),
     [
-        (_exchanged, "rs_moving/left_2.png"),
-        (_stays, "_moving/left_1.png"),
-        (values_of("flow_back/left_1.exr", np.negative), "flow_back/left_1.exr"),
+        ([mask_of("rs_moving/left_2.png", other_object)], "rs_moving/left_2.png"),
+        # Of both shutters, so that twins agree.
+        (
+            [copied(f"{shutter}_moving/left_0.png", f"{shutter}_moving/left_1.png") for shutter in SHUTTERS],
+            "_moving/left_1.png",
+        ),
+        ([values_of("flow_back/left_1.exr", np.negative)], "flow_back/left_1.exr"),
     ],
+    ids=["objects exchanged", "objects that stay", "flow"],
 )
 def test_a_fault_in_a_later_frame_is_named(
-    fair: Path, tmp_path: Path, plant: Callable[[Path], None], file: str
+    fair: Path, tmp_path: Path, plants: list[Callable[[Path], None]], file: str
 ) -> None:
-    shutil.copytree(fair, tmp_path / "data")
-    plant(tmp_path / "data/fair")
-    rehash(tmp_path / "data")
-    (report,) = verify_dataset(tmp_path / "data")
+    (report,) = verify_dataset(spoilt(fair, tmp_path / "data", *plants, sequence="fair"))
     assert any(file in fault.partition(": ")[0] for fault in report.faults), report.faults
 
 
@@ -221,37 +210,29 @@ def test_a_mesh_that_changed_makes_another_sequence(fair: Path, tmp_path: Path) 
         generate_dataset(fair_card(folder), folder / "data")
 
 
-def _smaller(text: str) -> str:
-    return text.replace("size = 1.1", "size = 0")
-
-
-def _same_name(text: str) -> str:
-    return text.replace("meshes/slab.ply", "other/kite.glb")
-
-
-def _short(text: str) -> str:
-    given = json.dumps(np.zeros((5, 6)).tolist())
-    return text.replace(
-        "motion = { rotation_deg = 15",
-        f'motion = {{ model = "spline", parameters = {{ interval = 1, shake = {given} }}, rotation_deg = 15',
-    )
+SHORT = f'model = "spline", parameters = {{ interval = 1, shake = {np.zeros((5, 6)).tolist()} }}, '
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
+    ("old", "new", "words"),
     [
-        (_smaller, r"mesh\.size = 0\.0: must be positive"),
-        (_same_name, r"two mesh files are named 'kite\.glb'"),
-        (_short, r"moving object 1: motion 'spline' lasts 2 frame periods; the frames need 2\.9"),
+        ("size = 1.1", "size = 0", r"mesh\.size = 0\.0: must be positive"),
+        ("meshes/slab.ply", "other/kite.glb", r"two mesh files are named 'kite\.glb'"),
         (
-            lambda text: text.replace("mesh = {", 'instance = "a"\nmesh = {', 1),
+            "rotation_deg = 15",
+            f"{SHORT}rotation_deg = 15",
+            "motion 'spline' lasts 2 frame periods; the frames need 2.9",
+        ),
+        (
+            'mesh = { file = "meshes/kite',
+            'instance = "a"\nmesh = { file = "meshes/kite',
             "one of 'instance', 'box' and 'mesh'",
         ),
     ],
 )
-def test_what_cannot_move_so_is_refused(tmp_path: Path, changed: Callable[[str], str], words: str) -> None:
+def test_what_cannot_move_so_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(RsbenchError, match=words):
-        fair_card(tmp_path, changed)
+        fair_card(tmp_path, lambda text: text.replace(old, new))
 
 
 def test_lengths_of_mesh_files_scale_and_shakes_last(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_scenes import write_box_scene
+from small_scenes import write_box_card
 
 from rsbench.components.cards import list_cards
 from rsbench.components.rig_tables import load_rig
@@ -18,22 +18,7 @@ from rsbench.dataset.card import DatasetCard, load_dataset_card
 
 
 def card_of(folder: Path, name: str, more: str = "") -> DatasetCard:
-    scene = write_box_scene(folder, "box")
-    path = folder / "card.toml"
-    path.write_text(f"""
-name = "one"
-rig = "{name}"
-{more}
-[motion]
-rotation_deg = 2
-rotation_axis = [0, 1, 0]
-translation = 0.1
-translation_axis = [0, 0, 1]
-[[sequence]]
-name = "box"
-scene = "{scene}"
-""")
-    return load_dataset_card(str(path))
+    return load_dataset_card(write_box_card(folder, f'name = "one"\nrig = "{name}"\n{more}'))
 
 
 @pytest.mark.parametrize("name", list_cards("rigs"))

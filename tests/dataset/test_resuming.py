@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import run_here
+from commands import rename_failing, run_here
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset import generation
@@ -110,11 +110,8 @@ def test_a_built_in_scene_is_not_built_again_to_know_it(tmp_path: Path) -> None:
 
     for _ in range(2):
         known = SceneHashes(tmp_path / "scenes.json", build)
-        assert [known.of("castle"), known.of("room"), known.of("castle")] == [
-            "hash of castle",
-            "hash of room",
-            "hash of castle",
-        ]
+        for name in ("castle", "room", "castle"):
+            assert known.of(name) == f"hash of {name}"
     assert built == ["castle", "room"]
 
 
@@ -191,15 +188,7 @@ def test_stopped_between_the_old_and_the_new_it_goes_on(
     boxes: DatasetCard, copy: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (copy / "a/rs/left_0.png").write_bytes(b"damaged")
-    real, calls = os.rename, list[Path]()
-
-    def second_fails(source: Path, target: Path) -> None:
-        calls.append(target)
-        if len(calls) == 2:
-            raise OSError(5, "Input/output error")
-        real(source, target)
-
-    monkeypatch.setattr(os, "rename", second_fails)
+    monkeypatch.setattr(os, "rename", rename_failing(lambda call: call == 2))
     with pytest.raises(OSError):
         generate_dataset(boxes, copy)
     monkeypatch.undo()

@@ -1,15 +1,17 @@
-"""The compiled search of rows against ``rs_project``, which brackets every crossing at exact poses."""
+"""The compiled search of rows against ``rs_project``, which brackets every crossing at exact poses.
+
+Global shutters, and motions that no table of poses follows: tests/verification/test_compiled_reprojection.py.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from general_rigs import LENSES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core.camera import Lens, PinholeCamera
-from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.projection import ProjectionStatus, back_project, project_at, rs_project
@@ -20,13 +22,6 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.dataset.views import ImageView, find
 
-LENSES = (
-    None,
-    Lens(model="brown-conrady", k1=-0.2, k2=0.05, p1=0.001, p2=-0.002),
-    Lens(model="kannala-brandt", k1=-0.03, k2=0.01),
-    Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006),
-    Lens(model="double-sphere", xi=-0.18, alpha=0.59),
-)
 MODELS = (LinearMotion, TwistMotion, AcceleratedMotion, lambda w, d: SplineMotion(w, d, preset="drone", seed=3))
 NEAR_PX = 5e-6
 """The residual at which the search stops, 1e-8 px, and where a spline ends between two rows, the table's error of
@@ -49,7 +44,7 @@ def _points(geometry: FixedGeometry, source: ImageView, rng: np.random.Generator
 
 @settings(max_examples=15)
 @given(
-    lens=st.sampled_from(LENSES),
+    lens=st.sampled_from((None, *LENSES.values())),
     model=st.sampled_from(MODELS),
     scan=st.sampled_from(("top", "bottom", "left", "right")),
     right=st.sampled_from((None, "top", "right")),
@@ -87,35 +82,9 @@ def test_it_finds_the_pixels_that_bracketing_finds(
     np.testing.assert_allclose(landed.eyes[seen], eyes, rtol=0, atol=1e-9)
 
 
-def test_a_global_shutter_has_one_pose() -> None:
-    rng = np.random.default_rng(5)
-    geometry = _geometry(LENSES[1], TwistMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
-    X, grid = _points(geometry, ImageView("rs", "left", 0), rng)
-    landed = find(geometry, ImageView("gs", "left", 0, 24), X, grid[..., 1])
-    pixels = project_at(geometry.rig, geometry.motion, "left", 0.9 * 24 / 48, X)[..., :2]
-    inside = geometry.rig.camera.contains(pixels)
-    np.testing.assert_allclose(landed.pixels[inside], pixels[inside], rtol=0, atol=NEAR_PX)
-    assert np.all(np.isnan(landed.pixels[~inside])) and not np.any(landed.unsolved)
-
-
 def test_rows_alone_have_the_bits_that_they_have_among_others() -> None:
     geometry = _geometry(None, LinearMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
     X, grid = _points(geometry, ImageView("rs", "left", 0), np.random.default_rng(6))
     target = ImageView("rs", "left", 1)
     whole, some = find(geometry, target, X, grid[..., 1]), find(geometry, target, X[1:3], grid[1:3, :, 1])
     np.testing.assert_array_equal(whole.pixels[1:3], some.pixels)
-
-
-class _Jump(LinearMotion):  # pyrefly: ignore[invalid-inheritance]  # final
-    """Stands somewhere else from half of the readout on."""
-
-    def body_from_world(self, tau):  # pyrefly: ignore[implicit-any-parameter, unannotated-return]
-        pose = super().body_from_world(tau)
-        return pose._replace(t=pose.t + (np.asarray(tau)[..., None] > 0.4) * 0.1)
-
-
-def test_a_motion_that_jumps_is_refused() -> None:
-    geometry = _geometry(None, _Jump([0.0, 0.1, 0.0], [0.2, 0.0, 0.0]))
-    X, grid = np.full((1, 1, 3), 5.0), np.zeros((1, 1, 2))
-    with pytest.raises(RsbenchError, match="_Jump: jumps between the lines of rs/left_0"):
-        find(geometry, ImageView("rs", "left", 0), X, grid[..., 1])

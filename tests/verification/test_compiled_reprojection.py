@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from general_rigs import LENSES
 
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
@@ -25,8 +26,7 @@ from rsbench.verification.reprojection import DepthMap, Reprojection, relative_d
 
 W, D = [0.03, -0.05, 0.04], [0.2, -0.1, 0.25]
 CAMERA = PinholeCamera.centred(64, 48, 60.0)
-BROWN = Lens(model="brown-conrady", k1=-0.25, k2=0.06, p1=0.004, p2=-0.003)
-FISHEYE = Lens(model="kannala-brandt", k1=-0.06, k2=0.01)
+BROWN, FISHEYE = LENSES["brown-conrady"], LENSES["kannala-brandt"]
 
 
 class Kinked(Motion):
@@ -115,32 +115,26 @@ def check_alike(found: Reprojection, exact: Reprojection) -> None:
     assert np.mean(inner) > 0.1
 
 
-@pytest.mark.parametrize(
-    "geometry",
-    [
-        pytest.param(geometry_of(LinearMotion(W, D)), id="linear"),
-        pytest.param(geometry_of(TwistMotion(W, D)), id="twist"),
-        pytest.param(geometry_of(AcceleratedMotion(W, D), BROWN, scan="bottom"), id="accelerated, lens"),
-        pytest.param(
-            geometry_of(SplineMotion(W, D, preset="handheld", seed=3), FISHEYE, scan="left"), id="spline"
-        ),
-        pytest.param(
-            geometry_of(SplineMotion(W, D, preset="drone", seed=1), right_scan="right", right_delay=0.2),
-            id="apart",
-        ),
-        pytest.param(geometry_of(LinearMotion(W, D), readout_ratio=0.0), id="global"),
-        pytest.param(geometry_of(Kinked(W, D)), id="no table"),
-        pytest.param(of_rig(LinearMotion(W, D), None, None, Scanning()), id="rig"),
-        pytest.param(
-            of_rig(TwistMotion(W, D), BROWN, FISHEYE, Scanning(right_scan="left", right_readout_ratio=0.4)),
-            id="rig of lenses",
-        ),
-        pytest.param(
-            of_rig(LinearMotion(W, D), FISHEYE, None, Scanning(right_readout_ratio=0.0, right_delay=0.1)),
-            id="rig, global right",
-        ),
-    ],
-)
+HANDHELD, DRONE = (SplineMotion(W, D, preset=name, seed=seed) for name, seed in (("handheld", 3), ("drone", 1)))
+GEOMETRIES = {
+    "linear": geometry_of(LinearMotion(W, D)),
+    "twist": geometry_of(TwistMotion(W, D)),
+    "accelerated, lens": geometry_of(AcceleratedMotion(W, D), BROWN, scan="bottom"),
+    "spline": geometry_of(HANDHELD, FISHEYE, scan="left"),
+    "apart": geometry_of(DRONE, right_scan="right", right_delay=0.2),
+    "global": geometry_of(LinearMotion(W, D), readout_ratio=0.0),
+    "no table": geometry_of(Kinked(W, D)),
+    "rig": of_rig(LinearMotion(W, D), None, None, Scanning()),
+    "rig of lenses": of_rig(
+        TwistMotion(W, D), BROWN, FISHEYE, Scanning(right_scan="left", right_readout_ratio=0.4)
+    ),
+    "rig, global right": of_rig(
+        LinearMotion(W, D), FISHEYE, None, Scanning(right_readout_ratio=0.0, right_delay=0.1)
+    ),
+}
+
+
+@pytest.mark.parametrize("geometry", GEOMETRIES.values(), ids=GEOMETRIES)
 def test_every_pixel_lands_where_the_row_equation_says(geometry: FixedGeometry) -> None:
     rig = geometry.rig
     for source, target in VIEW_PAIRS[:: 1 if geometry.motion.name == "linear" else 5]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic_dataset import write_analytic_dataset
+from general_rigs import LENSES
 
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import Lens, PinholeCamera
@@ -22,13 +23,6 @@ from rsbench.verification.depth_checks import roughly_agree
 from rsbench.verification.manifest_checks import Listing
 from rsbench.verification.reprojection import DepthMap
 
-LENSES = (
-    None,
-    Lens(model="brown-conrady", k1=-0.25, k2=0.06, p1=0.004, p2=-0.003),
-    Lens(model="kannala-brandt", k1=-0.06, k2=0.01),
-    Lens(model="rational", k1=0.9, k2=0.06, p1=-0.0004, p2=0.0002, k3=0.001, k4=1.25, k5=0.22, k6=0.006),
-    Lens(model="double-sphere", xi=-0.18, alpha=0.59),
-)
 PLANE = np.array([0.03, 0.12, 0.2])
 """n / c of n . X = c: the inverse depth of a ray (x, y, 1) is their product."""
 RIG = StereoRig(camera=PinholeCamera.centred(64, 48, 60.0), baseline=0.3)
@@ -42,7 +36,7 @@ def _plane(lens: Lens | None) -> DepthMap:
     return DepthMap(IMAGE_VIEWS[4], depth, camera)
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", [None, *LENSES.values()])
 def test_a_plane_is_flat_through_every_lens(lens: Lens | None) -> None:
     seen = _plane(lens)
     # Float32 rounds inverse depth by 6e-8, far below the bend that counts.
@@ -52,7 +46,7 @@ def test_a_plane_is_flat_through_every_lens(lens: Lens | None) -> None:
     assert not np.any(bent.flat_blocks[:, 10:30])
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", [None, *LENSES.values()])
 def test_depth_between_pixels_is_that_of_the_plane(lens: Lens | None) -> None:
     seen = _plane(lens)
     rng = np.random.default_rng(1)

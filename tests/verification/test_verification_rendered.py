@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from attack.planting import rehash
+from attack.planting import manifest_of, put, spoilt
 from small_scenes import write_box_scene, write_small_card
 
 from rsbench.dataset.card import load_dataset_card
@@ -39,14 +36,6 @@ def verified(sound: Path, dataset: Path, *, rerender: Any = "auto") -> SequenceR
     return verify_dataset(dataset, 4, rerender=rerender, scenes=[sound / "box.toml"])[-1]
 
 
-def spoilt(sound: Path, folder: Path, change: Callable[[Path], None]) -> Path:
-    """A copy of the dataset, changed, with hashes that fit."""
-    shutil.copytree(sound / "dataset", folder / "dataset")
-    change(folder / "dataset/box")
-    rehash(folder / "dataset")
-    return folder / "dataset"
-
-
 def test_rows_of_sound_data_have_the_same_bits(sound: Path) -> None:
     report = verified(sound, sound / "dataset", rerender="all")
     assert report.faults == ()
@@ -64,7 +53,7 @@ def test_a_common_scale_of_all_depth_is_found(sound: Path, tmp_path: Path) -> No
         for path in folder.glob("*_depth/*.exr"):
             write_depth(path, read_depth(path) * np.float32(1.00002))
 
-    faults = verified(sound, spoilt(sound, tmp_path, change)).faults
+    faults = verified(sound, spoilt(sound / "dataset", tmp_path / "data", change, sequence="box")).faults
     assert len(faults) == 8
     assert all("looks scaled by 1.00002" in fault for fault in faults)
 
@@ -77,20 +66,15 @@ def test_a_blur_is_found(sound: Path, tmp_path: Path) -> None:
         blurred[0] = image[0]
         write_png(path, blurred)
 
-    (fault,) = verified(sound, spoilt(sound, tmp_path, change)).faults
+    (fault,) = verified(sound, spoilt(sound / "dataset", tmp_path / "data", change, sequence="box")).faults
     assert "gs/left_1.png" in fault and "new rendering" in fault
 
 
 def test_a_picture_of_other_light_is_one_finding(sound: Path, tmp_path: Path) -> None:
     """All files are consistent with each other; the exposure that sequence.json states is another."""
 
-    def change(folder: Path) -> None:
-        path = folder / "sequence.json"
-        manifest = json.loads(path.read_text())
-        manifest["renderer"]["exposure"] = 0.9
-        path.write_text(json.dumps(manifest))
-
-    faults = verified(sound, spoilt(sound, tmp_path, change)).faults
+    change = manifest_of("sequence.json", put("renderer", "exposure", 0.9))
+    faults = verified(sound, spoilt(sound / "dataset", tmp_path / "data", change, sequence="box")).faults
     images = [fault for fault in faults if "the image differs from a new rendering" in fault]
     assert len(images) == 8
 
