@@ -443,8 +443,7 @@ class _Profile:
         rig = replace(self._rig, camera=replace(camera, fx=camera.fx * longer, fy=camera.fy * longer))
         motions = window_motions(self._windows, rig, self._shutter(start.ratio), seed)
         # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
-        first, last = span_of(len(self._windows), self._shutter(1.0))
-        span = first, last + float(self._times[-1]) - len(self._windows)
+        span = span_of(float(self._times[-1]), self._shutter(1.0))
         tracks, prior = self.tracks(start), TrajectoryOptions().prior
         curve, every = first_curve(motions, tracks, span, _KNOTS), np.ones(len(tracks))
         found = fit(curve, tracks, prior, True, _WIDE, every)
