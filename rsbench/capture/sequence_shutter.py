@@ -10,7 +10,9 @@ every frame. The ratio has a uniform prior, so its posterior is proportional to 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,12 +22,39 @@ from rsbench.capture.calibration import FOCAL, NO_ERRORS
 from rsbench.capture.hypotheses import scans_of
 from rsbench.capture.shutter_decision import OPPOSITE, shutter_found, shutter_of
 from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions, noise_px
-from rsbench.capture.trajectory_fit import Fit, choose, first_curve, fit, log_evidence, window_motions
-from rsbench.capture.trajectory_spline import Curve, NotDefiniteError, make_curve, span_of
+from rsbench.capture.trajectory_fit import (
+    ANCHORED,
+    DAMPING,
+    Equations,
+    Fit,
+    anchored,
+    choose,
+    estimate_variances,
+    first_curve,
+    fit,
+    log_evidence,
+    normal_equations,
+    right_tracks,
+    variances,
+    window_motions,
+)
+from rsbench.capture.trajectory_gyro import Border
+from rsbench.capture.trajectory_spline import (
+    Curve,
+    NotDefiniteError,
+    Prior,
+    band_factor,
+    band_solve,
+    from_pose_at,
+    make_curve,
+    moved,
+    span_of,
+)
 from rsbench.capture.trajectory_tracks import (
     Tails,
     TimedTracks,
     is_of_one_camera,
+    observed,
     pack_windows,
     thinned,
     thinned_chains,
@@ -38,6 +67,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import shared_error_factor, tiles, variance_factor
+from rsbench.solvers.engine.levenberg_marquardt import descend
 
 LONGEST = 12
 """Most successive windows that are used; further ones would hardly reduce the error."""
@@ -67,12 +97,20 @@ _PRECISION = 1e12
 _EXTRA_VARIANCE, _SHARED = 2.5, 0.02
 """Factor on the variance for errors beyond those correlated within image tiles, and error of the ratio common to
 all flow of a video. Chosen on twelve warped hand-held videos of 320 x 240 px (seed 7)."""
-_STEP, _STEP_FOCAL, _STEPS, _ROUGH_STEPS, _ROUNDS = 0.05, 0.1, 5, 2, 4
-"""First difference steps of ratio and log focal length; Newton steps, fine and rough; rounds of the tails."""
+_STEP, _STEP_FOCAL, _STEPS, _ROUNDS = 0.05, 0.1, 5, 4
+"""First difference steps of ratio and log focal length; Newton steps; rounds of the kind of prior."""
+_REFINED = 2
+"""Number of starts for which the fit is refined: those with the largest evidence under the wide distribution."""
+_SHARES_OF_STEP = (1.0, 0.5, 0.25)
+"""Shares of a Newton step that are tried."""
 _NO_FIT = -1e12
 """Logarithm of the evidence if there is no fit."""
-_BESIDE = 0.005
-"""Step of the ratio to where a fit is tried if there is none at the start of a search."""
+_DIFFERENCE = 1e-3
+"""Step of ratio and log focal length for derivatives of the cost."""
+_FIXED_ROUNDS, _FREE_ROUNDS, _STEPS_A_ROUND = 15, 25, 2
+"""Most rounds under the wide error distribution and under the tracks' own, and steps in each."""
+_FLAT_COST, _FLAT_VARIANCE, _FLAT_EVIDENCE, _FLAT_PLACE = 1e-3, 0.05, 0.1, np.array([0.002, 0.005])
+"""Changes below which the joint fit has converged: cost; variances, relative; evidence; ratio and focal length."""
 
 
 def shakes(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> bool:
@@ -102,6 +140,7 @@ def capture_of_sequence(
     scannings: Sequence[Scanning] | None = None,
     seed: int = 0,
     focal_sigma: float = 0.0,
+    times: FloatArray | None = None,
 ) -> Capture:
     """Estimate the shutter from one trajectory through successive windows, without motion models.
 
@@ -109,14 +148,14 @@ def capture_of_sequence(
         capture: the estimate by motion models, which is returned if no trajectory explains the tracks.
         windows: matches of the frames 0 and 1, 1 and 2, ...
         scannings: candidates; None: both cameras synchronous and from one of four sides, or as in ``capture``.
-        focal_sigma: see ``ratio_of_sequence``.
+        focal_sigma, times: see ``ratio_of_sequence``.
     """
     if scannings is None:
         best, scannings = capture.likeliest, _TOGETHER
         if best is not None and not best.scans.together and "global" not in astuple(best.scans):
             own = Scanning(scan=best.scans.left, right_scan=best.scans.right)  # pyrefly: ignore[bad-argument-type]
             scannings = (*_TOGETHER, own)
-    found = ratio_of_sequence(windows, rig, scannings, seed, focal_sigma)
+    found = ratio_of_sequence(windows, rig, scannings, seed, focal_sigma, times)
     if found is None:
         return capture
     candidate = Candidate(
@@ -168,18 +207,19 @@ def capture_of_video(
     scan: Scan | None,
     seed: int = 0,
     focal_sigma: float = 0.0,
+    times: FloatArray | None = None,
 ) -> Capture | None:
     """The shutter of one camera from a trajectory through successive frames; None if none explains the matches.
 
     Args:
         windows: matches (n, 4) x0, y0, x1, y1, px, of the frames 0 and 1, 1 and 2, ...; with outliers.
         scan: see ``known_alone``.
-        focal_sigma: see ``ratio_of_sequence``; the focal length is returned as one of the calibration errors.
+        focal_sigma, times: see ``ratio_of_sequence``. The focal length is returned as a calibration error.
     """
     matches, scan = [Correspondences(left=each) for each in windows], scan or "top"
     scannings = Scanning(scan=scan), Scanning(scan=OPPOSITE[scan])
     rig = StereoRig.of_one(camera)
-    found = capture_of_sequence(_without_estimate(matches), matches, rig, scannings, seed, focal_sigma)
+    found = capture_of_sequence(_without_estimate(matches), matches, rig, scannings, seed, focal_sigma, times)
     return found if found.candidates else None
 
 
@@ -218,6 +258,7 @@ def ratio_of_sequence(
     scannings: Sequence[Scanning],
     seed: int = 0,
     focal_sigma: float = 0.0,
+    times: FloatArray | None = None,
 ) -> SequenceRatio | None:
     """Estimate the ratio and choose among the scannings; None if no trajectory explains the tracks.
 
@@ -225,33 +266,39 @@ def ratio_of_sequence(
         windows: matches, with outliers, of the frames 0 and 1, 1 and 2, ...
         seed: seed of the search for motions of single windows.
         focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given.
+        times: (n + 1,) times of the frames' first lines, frame periods, all about one period apart; None: exactly.
     """
     alone = is_of_one_camera(windows)
     if sum(len(each.left if alone else each.tracks) for each in windows) < _FEWEST * len(windows):
         return None
     fewer = thinned_chains if alone else thinned
-    few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place]]()
-    # Start at several places: a spline may not leave the motions that were found with a wrong camera.
+    few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place, Fit]]()
+    # A spline may not leave the motions that were found with a wrong camera, so start at several places.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
     first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
-        try:
-            starts = [_Profile(few, rig, scanning, (each, seed), focal_sigma) for each in first]
-            profile = max(starts, key=lambda each: each.at(each.start))
-            place = profile.maximum(profile.climb(profile.start))
-        except NotDefiniteError:
-            continue
-        found[number] = profile.comparable(place), place
+        profile, rough = _Profile(few, rig, scanning, times, focal_sigma), list[tuple[float, _Place, Fit]]()
+        for start in first:
+            with suppress(NotDefiniteError):
+                rough.append(profile.rough(start, seed))
+        for _, place, fitted in sorted(rough, key=lambda each: -each[0])[:_REFINED]:
+            with suppress(NotDefiniteError):
+                place, fitted = profile.refined(place, fitted)
+                value = profile.comparable(place)
+                if number not in found or value > found[number][0]:
+                    found[number] = value, place, fitted
     if not found:
         return None
     best = max(found, key=lambda each: found[each][0])
     try:
-        profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], (found[best][1], seed), focal_sigma)
-        top, covariance = profile.newton(profile.maximum(found[best][1]))
+        profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
+        place, fitted = found[best][1:]
+        start = replace(fitted, trust=right_tracks(fitted, profile.tracks(place)))
+        top, covariance = profile.newton(profile.refined(place, start)[0])
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
-    odds = sum(np.exp((each - found[best][0]) / dispersion) for each, _ in found.values())
+    odds = sum(np.exp((each - found[best][0]) / dispersion) for each, *_ in found.values())
     estimate = profile.result(top, covariance * dispersion, 1.0 / float(odds))
     # Refuse fits to two or three wrong matches, and fits to all of them with an error scale too large for noise.
     right = estimate.used >= _LEAST_SHARE * estimate.total and estimate.noise_px <= MOST_NOISE_PX
@@ -265,110 +312,208 @@ class _Place(NamedTuple):
     log_focal: float
     """See ``SequenceRatio``."""
 
+    def moved(self, step: FloatArray) -> _Place:
+        """The place after a step (2,), within the limits."""
+        ratio, log_focal = np.clip(np.add(self, step), [_LEAST, -_FARTHEST], [1.0, _FARTHEST])
+        return _Place(float(ratio), float(log_focal))
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A spline, with the readout ratio and the focal length at which it is evaluated."""
+
+    problem: _Joint
+    curve: Curve
+    place: _Place
+    predicted: float = 0.0
+    """Decrease of the cost that was predicted for the last step."""
+
+    @cached_property
+    def equations(self) -> Equations:
+        """Normal equations of the control poses."""
+        return self.problem.equations(self.curve, self.place)
+
+    @cached_property
+    def border(self) -> Border:
+        """The parts that involve the place, by differences of cost and gradient."""
+        axes, here = self.problem.profile.axes, self.equations
+        steps = _DIFFERENCE * np.eye(2)[:axes]
+
+        def beside(step: FloatArray) -> Equations:
+            return self.problem.equations(self.curve, _Place(*np.add(self.place, step)))
+
+        ahead, behind = ([beside(sign * step) for step in steps] for sign in (1.0, -1.0))
+        pairs = list(zip(ahead, behind, strict=True))
+        mixed = np.stack([a.gradient - b.gradient for a, b in pairs], axis=1) / (2.0 * _DIFFERENCE)
+        slope = np.array([a.cost - b.cost for a, b in pairs]) / (2.0 * _DIFFERENCE)
+        corner = np.diag([a.cost + b.cost - 2.0 * here.cost for a, b in pairs])
+        if axes > 1:
+            both = beside(steps[0] + steps[1]).cost
+            corner[0, 1] = corner[1, 0] = both - ahead[0].cost - ahead[1].cost + here.cost
+        return Border(mixed, corner / _DIFFERENCE**2, slope)
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """The cost of a spline, a ratio and a focal length, in the form that ``descend`` takes.
+
+    The error distribution and the prior are fixed. The spline depends strongly on ratio and focal length, and
+    steps of these alone would creep along narrow curved valleys.
+    """
+
+    profile: _Profile
+    tails: Tails
+    prior: Prior
+    trust: FloatArray
+
+    def equations(self, curve: Curve, place: _Place) -> Equations:
+        """The normal equations of the control poses, with the prior of the focal length in the cost."""
+        found = normal_equations(curve, self.profile.tracks(place), self.tails, self.prior, self.trust)
+        return found._replace(cost=found.cost - self.profile.log_prior(place))
+
+    def stepped(self, here: _Point, damping: float) -> _Point | None:
+        equations, border, tracks = here.equations, here.border, self.profile.tracks(here.place)
+        damped = anchored(equations, here.curve, tracks, 1.0).copy()
+        damped[:, 0] += damping * equations.band[:, 0]
+        try:
+            lower = band_factor(damped)
+        except NotDefiniteError:
+            return None
+        follows, alone = band_solve(lower, border.mixed), band_solve(lower, equations.gradient)
+        values, vectors = np.linalg.eigh(border.corner - border.mixed.T @ follows)
+        values, slope = np.maximum(np.abs(values), 1.0), border.slope - border.mixed.T @ alone
+        step = -(vectors / (values * (1.0 + damping))) @ (vectors.T @ slope)
+        step *= np.min(np.minimum(1.0, [_COARSE, _COARSE_FOCAL][: len(step)] / np.maximum(np.abs(step), 1e-9)))
+        follow = -alone - follows @ step
+        predicted = -0.5 * float(follow @ equations.gradient + step @ border.slope)
+        curve = from_pose_at(moved(here.curve, follow), 0.0)
+        there = _Point(self, curve, here.place.moved(np.append(step, 0.0)[:2]), predicted)
+        return there if there.equations.cost <= equations.cost else None
+
+    def settled(self, before: _Point, after: _Point) -> bool:
+        return before.equations.cost - after.equations.cost < _FLAT_COST
+
 
 class _Profile:
-    """The evidence as a function of ratio and focal length, for fixed tracks and a fixed error distribution."""
+    """The evidence as a function of ratio and focal length, for some tracks."""
 
     def __init__(
         self,
         windows: Sequence[Correspondences],
         rig: StereoRig,
         scanning: Scanning,
-        start: tuple[_Place, int],
+        times: FloatArray | None,
         focal_sigma: float,
     ) -> None:
-        """Fit a first trajectory at the place in ``start`` (place, seed), from the motions of single windows."""
         self._windows, self._rig, self._scanning, self._focal_sigma = windows, rig, scanning, focal_sigma
+        self.axes = 2 if focal_sigma else 1
         self._linked = [np.ones(len(each.left)) for each in windows] if is_of_one_camera(windows) else None
         # Errors of dense flow are correlated, those of features are not.
         flow = self._linked is not None
         self._share, self._extra, self._shared = (_SHARE, _EXTRA_VARIANCE, _SHARED) if flow else (1.0, 1.0, 0.0)
+        self._times = np.arange(len(windows) + 1.0) if times is None else times
+        # Times are linear in the ratio, so that two ratios give the tracks of all.
+        self._packed = [
+            pack_windows(windows, rig, self._shutter(ratio), self._linked, share=self._share, times=self._times)
+            for ratio in (0.0, 1.0)
+        ]
         self._fits = dict[_Place, Fit]()
         self._values = dict[_Place, float]()
-        self.start = place = start[0]
-        tracks, options = self._tracks(place), TrajectoryOptions()
-        motions = window_motions(windows, self._rig_at(place), self._shutter(place.ratio), start[1])
-        # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
-        curve = first_curve(motions, tracks, span_of(len(windows), self._shutter(1.0)), _KNOTS)
-        self._near = place, fit(curve, tracks, options.prior, True, _WIDE, np.ones(len(tracks)))
 
     def _shutter(self, ratio: float) -> RollingShutter:
         return self._rig.shutter_of(self._scanning, ratio)
 
-    def _rig_at(self, place: _Place) -> StereoRig:
-        if not place.log_focal:
-            return self._rig
-        longer, camera = float(np.exp(place.log_focal)), self._rig.camera
-        return replace(self._rig, camera=replace(camera, fx=camera.fx * longer, fy=camera.fy * longer))
+    def tracks(self, place: _Place) -> TimedTracks:
+        """The tracks as read and seen with this ratio and focal length."""
+        still, full = self._packed
+        ends, longer = still.ends + place.ratio * (full.ends - still.ends), np.exp(place.log_focal)
+        ends[:, :2] /= longer
+        return replace(still, ends=ends, focal=still.focal * longer)
 
-    def _tracks(self, place: _Place) -> TimedTracks:
-        rig, shutter = self._rig_at(place), self._shutter(place.ratio)
-        return pack_windows(self._windows, rig, shutter, self._linked, share=self._share)
+    def log_prior(self, place: _Place) -> float:
+        """Logarithm of the prior density of the focal length, up to a constant."""
+        return -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
+
+    def rough(self, start: _Place, seed: int) -> tuple[float, _Place, Fit]:
+        """Fit under a wide error distribution, from the motions of single windows at a place.
+
+        Returns the logarithm of evidence, the place and the fit. Raises NotDefiniteError if there is no fit.
+        """
+        longer, camera = float(np.exp(start.log_focal)), self._rig.camera
+        rig = replace(self._rig, camera=replace(camera, fx=camera.fx * longer, fy=camera.fy * longer))
+        motions = window_motions(self._windows, rig, self._shutter(start.ratio), seed)
+        # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
+        span = span_of(float(self._times[-1]), self._shutter(1.0))
+        tracks, prior = self.tracks(start), TrajectoryOptions().prior
+        curve, every = first_curve(motions, tracks, span, _KNOTS), np.ones(len(tracks))
+        found = fit(curve, tracks, prior, True, _WIDE, every)
+        place, found = self._fitted(start, found, fixed=True)
+        return log_evidence(found, _PRECISION) + self.log_prior(place), place, found
+
+    def refined(self, place: _Place, found: Fit) -> tuple[_Place, Fit]:
+        """Fit under the error distribution of the tracks; ``at`` then gives the evidence under it.
+
+        Raises:
+            NotDefiniteError: no trajectory explains the tracks.
+        """
+        for _ in range(_ROUNDS):
+            last_place, (place, found) = place, self._fitted(place, found, fixed=False)
+            # The knots stay fine, since coarse ones would enforce a smoothness that the prior must decide on.
+            kind = choose(found, self.tracks(place), ())
+            near = np.all(np.abs(np.subtract(place, last_place)) < [_STEP, _STEP_FOCAL])
+            done, found = kind is found, kind
+            if done or near:
+                break
+        self._fits = {place: found}
+        self._values.clear()
+        return place, found
+
+    def _fitted(self, place: _Place, found: Fit, fixed: bool) -> tuple[_Place, Fit]:
+        """Fit spline, place, variances of the prior and, unless ``fixed``, the error distribution."""
+        curve, tails, prior, trust = found.curve, found.tails, found.prior, found.trust
+        for _ in range(_FIXED_ROUNDS if fixed else _FREE_ROUNDS):
+            start = _Point(_Joint(self, tails, prior, trust), curve, place)
+            here, last, old = descend(start.problem, start, _STEPS_A_ROUND, DAMPING), variances(prior, None), tails
+            moved_by, tracks = np.abs(np.subtract(here.place, place)), self.tracks(here.place)
+            curve, place = here.curve, here.place
+            lower = band_factor(anchored(here.equations, curve, tracks, ANCHORED))
+            used, determined, prior, _ = estimate_variances(here.equations, lower, prior, None)
+            if not fixed:
+                tails, trust = observed(here.equations.squares, tracks.freedom, tails, used)
+            change = np.abs(np.log(variances(prior, None) / last))
+            settling = (change > _FLAT_VARIANCE) & (change * determined > _FLAT_EVIDENCE)
+            still = abs(np.log(tails.scale / old.scale)) < _FLAT_VARIANCE and np.all(moved_by < _FLAT_PLACE)
+            if still and not np.any(settling):
+                break
+        equations = _Joint(self, tails, prior, trust).equations(curve, place)
+        return place, Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=equations)
 
     def _fit_near(self, place: _Place) -> tuple[_Place, Fit]:
-        if not self._fits:
-            return self._near
         near = min(self._fits, key=lambda other: float(np.hypot(*np.subtract(other, place))))
         return near, self._fits[near]
 
-    def adopt_fit(self, place: _Place) -> None:
-        """Adopt error distribution, inliers and kind of prior from the fit at a place.
-
-        The knots stay fine, since coarse ones would enforce a smoothness that the prior must decide on.
-        """
-        self.at(place)
-        tracks, (_, last) = self._tracks(place), self._fit_near(place)
-        self._near = place, choose(fit(last.curve, tracks, last.prior, tails=last.tails), tracks, ())
-        self._fits.clear()
-        self._values.clear()
-
     def at(self, place: _Place) -> float:
-        """Logarithm of evidence times the prior of the focal length."""
+        """Logarithm of evidence times the prior of the focal length, for the error distribution of ``refined``."""
         if place not in self._values:
             near, start = self._fit_near(place)
             curve = _with_smaller_rotations(start.curve, float(np.exp(place.log_focal - near.log_focal)))
             try:
-                found = fit(curve, self._tracks(place), start.prior, True, start.tails, start.trust)
-                prior = -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
-                self._fits[place], self._values[place] = found, log_evidence(found, _PRECISION) + prior
+                found = fit(curve, self.tracks(place), start.prior, True, start.tails, start.trust)
+                value = log_evidence(found, _PRECISION) + self.log_prior(place)
+                self._fits[place], self._values[place] = found, value
             except NotDefiniteError:
                 self._values[place] = _NO_FIT
         return self._values[place]
 
-    def climb(self, start: _Place) -> _Place:
-        """Move in steps of ``_COARSE`` to a place whose neighbours all have less evidence.
-
-        Raises:
-            NotDefiniteError: there is no fit at the start or just beside it, where rounding may allow one.
-        """
-        best = start
-        if self.at(best) == _NO_FIT:
-            ratios = np.clip(start.ratio + np.array([-_BESIDE, _BESIDE]), _LEAST, 1.0)
-            best = max((_Place(float(ratio), start.log_focal) for ratio in ratios), key=self.at)
-        if self.at(best) == _NO_FIT:
-            raise NotDefiniteError("no trajectory explains the tracks")
-        strides = [(-_COARSE, 0.0), (_COARSE, 0.0)]
-        strides += [(0.0, -_COARSE_FOCAL), (0.0, _COARSE_FOCAL)] if self._focal_sigma else []
-        moved = True
-        while moved:
-            moved = False
-            for ratio, log_focal in strides:
-                while True:
-                    other = _Place(float(np.clip(best.ratio + ratio, _LEAST, 1.0)), best.log_focal + log_focal)
-                    if other == best or abs(other.log_focal) > _FARTHEST or self.at(other) <= self.at(best):
-                        break
-                    best, moved = other, bool(self._focal_sigma)
-        return best
-
-    def newton(self, start: _Place, steps: int = _STEPS) -> tuple[_Place, FloatArray]:
+    def newton(self, start: _Place) -> tuple[_Place, FloatArray]:
         """The place of largest evidence and its covariance (2, 2), by Newton's method on finite differences.
 
         The second row and column are 0 if the focal length is given.
         """
-        best, axes = start, 2 if self._focal_sigma else 1
+        best, axes = start, self.axes
         reach, H = np.array([_STEP, _STEP_FOCAL]), np.eye(2)
-        for number in range(steps):
-            middle = _Place(float(np.clip(best.ratio, _LEAST + reach[0], 1.0 - reach[0])), best.log_focal)
+        for number in range(_STEPS):
+            middle = best._replace(ratio=float(np.clip(best.ratio, _LEAST + reach[0], 1.0 - reach[0])))
 
             def beside(a: int, b: int, middle: _Place = middle, reach: FloatArray = reach) -> float:
                 return self.at(_Place(middle.ratio + a * reach[0], middle.log_focal + b * reach[1]))
@@ -381,37 +526,23 @@ class _Profile:
             values, vectors = np.linalg.eigh(H)
             H = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
             slope = ((ahead - behind)[:axes] / (2.0 * reach[:axes]))[:axes]
-            step = np.linalg.solve(H, slope)
-            step *= min(1.0, _COARSE / max(abs(step[0]), 1e-9), _COARSE_FOCAL / max(float(np.abs(step[-1])), 1e-9))
-            there = _Place(
-                float(np.clip(middle.ratio + step[0], _LEAST, 1.0)),
-                float(np.clip(middle.log_focal + step[1], -_FARTHEST, _FARTHEST)) if axes > 1 else 0.0,
-            )
-            moved, sigma = np.abs(np.subtract(there, best))[:axes], np.sqrt(np.diagonal(np.linalg.inv(H)))
-            best = there if self.at(there) >= here else middle
+            step = np.append(np.linalg.solve(H, slope), 0.0)[:2]
+            step *= np.min(np.minimum(1.0, [_COARSE, _COARSE_FOCAL] / np.maximum(np.abs(step), 1e-9)))
+            tried = (middle.moved(share * step) for share in _SHARES_OF_STEP)
+            there = next((each for each in tried if self.at(each) >= here), middle)
+            moved_by, sigma = np.abs(np.subtract(there, best))[:axes], np.sqrt(np.diagonal(np.linalg.inv(H)))
+            best = there
             reach = np.clip(np.append(sigma, _STEP_FOCAL)[:2], [0.002, 0.02], [0.1, 0.3])
-            if number > 0 and np.all(moved < 0.3 * sigma):
+            if number > 0 and np.all(moved_by < 0.3 * sigma):
                 break
         out = np.zeros((2, 2))
         out[:axes, :axes] = np.linalg.inv(H)
         return best, out
 
-    def maximum(self, place: _Place) -> _Place:
-        """Maximise the evidence, adopting error distribution and inliers at each new maximum until it stays.
-
-        Those of a fit that is far off have large errors, and the evidence under them is flat with other maxima.
-        """
-        for _ in range(_ROUNDS):
-            self.adopt_fit(place)
-            last, place = place, self.newton(self.climb(place), _ROUGH_STEPS)[0]
-            if abs(place.ratio - last.ratio) < _STEP and abs(place.log_focal - last.log_focal) < _STEP_FOCAL:
-                break
-        return place
-
     def comparable(self, place: _Place) -> float:
         """Normalised logarithm of evidence, which can be compared with that of other profiles of these tracks."""
         value, (_, found) = self.at(place), self._fit_near(place)
-        tails, freedom = found.tails, self._tracks(place).freedom
+        tails, freedom = found.tails, self.tracks(place).freedom
         each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
         each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
         wrong = -freedom * np.log(MOST_NOISE_PX)  # outliers have a uniform distribution in all profiles
@@ -419,7 +550,7 @@ class _Profile:
 
     def dispersion(self, top: _Place, covariance: FloatArray) -> float:
         """Factor on the covariance that accounts for correlated errors of tracks in one part of the image."""
-        axes, tracks = 2 if self._focal_sigma else 1, self._tracks(top)
+        axes, tracks = self.axes, self.tracks(top)
         scores = np.zeros((len(tracks), axes))
         for axis in range(axes):
             step = float(np.sqrt(covariance[axis, axis])) * np.eye(2)[axis]
@@ -440,7 +571,7 @@ class _Profile:
 
     def _spans(self, place: _Place) -> FloatArray:
         """Number of windows that each track extends over."""
-        tracks = self._tracks(place)
+        tracks = self.tracks(place)
         return np.maximum(np.round(np.diff(tracks.starts) / (1 if self._linked else 2)) - 1.0, 1.0)
 
     def result(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:

@@ -84,7 +84,7 @@ _FEWEST = 2.0
 """Number of accelerations that the tracks must determine before the prior's variance is estimated."""
 _LIMITS = (1e-10, 1e2)
 """Smallest and largest variance of accelerations, far beyond those of hand-carried cameras."""
-_DAMPING = Damping(least=0.0, first=1e-6, largest=3e8, dropped=1e-6)
+DAMPING = Damping(least=0.0, first=1e-6, largest=3e8, dropped=1e-6)
 _SOME = 250
 """Approximate number of tracks per window from which the first motions are estimated."""
 _SHORT = 0.03
@@ -340,7 +340,7 @@ class _Problem:
 
     def descended(self, curve: Curve, drift: Drift | None, steps: int) -> tuple[Curve, Equations, Drift | None]:
         """Descend until the predicted decrease of the cost is below a thousandth of a unit."""
-        found = descend(self, self.place(curve, drift), steps, _DAMPING)
+        found = descend(self, self.place(curve, drift), steps, DAMPING)
         return found.curve, found.equations, found.drift
 
 
@@ -368,13 +368,13 @@ def fit(
         drift = first_drift(curve, tracks.gyro)
     for _ in range(_ROUNDS):
         curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _STEPS_A_ROUND)
-        last = _variances(prior, drift)
+        last = variances(prior, drift)
         old, lower = tails.scale, band_factor(anchored(here, curve, tracks, ANCHORED))
-        used, determined, better, drift = _estimate_variances(here, lower, prior, drift)
+        used, determined, better, drift = estimate_variances(here, lower, prior, drift)
         if not fixed:
             tails, trust = observed(here.squares, tracks.freedom, tails, used)
         prior = better if learn else prior
-        change = np.abs(np.log(_variances(prior, drift) / last))
+        change = np.abs(np.log(variances(prior, drift) / last))
         settling = (change > _FLAT_VARIANCE) & (change * determined > _FLAT_EVIDENCE)
         if abs(np.log(tails.scale / old)) < _FLAT and not np.any(settling):
             break
@@ -382,12 +382,12 @@ def fit(
     return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, drift=drift)
 
 
-def _variances(prior: Prior, drift: Drift | None) -> FloatArray:
+def variances(prior: Prior, drift: Drift | None) -> FloatArray:
     """(2 or 3,) variances that are estimated with the spline."""
     return np.array([prior.rotation, prior.position, *([] if drift is None else [drift.variance])])
 
 
-def _estimate_variances(
+def estimate_variances(
     here: Equations, lower: FloatArray, prior: Prior, drift: Drift | None
 ) -> tuple[float, FloatArray, Prior, Drift | None]:
     """Re-estimate the variances by evidence: returns the number of parameters that tracks determine, the numbers

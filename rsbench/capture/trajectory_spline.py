@@ -161,9 +161,9 @@ def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
     return make_curve(curve.first + low * curve.interval - zero, curve.interval, curve.R[chosen], curve.p[chosen])
 
 
-def span_of(windows: int, shutter: RollingShutter) -> tuple[float, float]:
-    """Times of the first and the last line of a number of windows; the first is at most 0."""
-    ends = [shutter.start(frame, side) for frame in (0, windows) for side in SIDES]
+def span_of(length: float, shutter: RollingShutter) -> tuple[float, float]:
+    """Times of the first line of a frame and the last one of another, ``length`` later; the first is at most 0."""
+    ends = [shutter.start(frame, side) for frame in (0.0, length) for side in SIDES]
     return min(0.0, float(np.min(ends))), float(np.max(ends)) + shutter.readout_ratio
 
 

@@ -471,6 +471,7 @@ def pack_windows(
     first: int = 0,
     past: Past | None = None,
     share: float = 1.0,
+    times: FloatArray | None = None,
 ) -> TimedTracks:
     """Pack the tracks of windows, and their pairs outside tracks; window k has the frames k and k + 1.
 
@@ -479,7 +480,9 @@ def pack_windows(
             frame are joined to one track; None: none are joined.
         first: number of the first window.
         past, share: see ``TimedTracks``.
+        times: (n + 1,) times of the frames' first lines, frame periods; None: ``first``, ``first + 1``, ...
     """
+    times = np.arange(first, first + len(windows) + 1.0) if times is None else times
     members = [np.zeros(0, dtype=np.int64) for _ in windows]
     ends, owners = list[FloatArray](), list[IntArray]()
     count = offset = 0
@@ -498,7 +501,7 @@ def pack_windows(
                 for i, side in enumerate(sides):
                     place = 2 * (frame * len(sides) + i)
                     ends.append(
-                        pack_ends(pixels[k][chosen, place : place + 2], first + k + frame, side, rig, shutter)
+                        pack_ends(pixels[k][chosen, place : place + 2], times[k + frame], side, rig, shutter)
                     )
                     owners.append(own[chosen])
             members[k] = np.concatenate([members[k], own])
@@ -553,8 +556,8 @@ def _nearest_ends(begins: FloatArray, ends: FloatArray, known: BoolArray) -> Int
     return out
 
 
-def pack_ends(pixels: FloatArray, frame: int, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """Observations (n, 10) for pixels (n, 2) of one image."""
+def pack_ends(pixels: FloatArray, frame: float, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """Observations (n, 10) for pixels (n, 2) of one image whose first line is read at time ``frame``."""
     out = np.zeros((len(pixels), END))
     eye = rig.eye(side)
     out[:, :2], out[:, 2] = eye.unproject(pixels)[:, :2], shutter.pixel_time(pixels, frame, side)

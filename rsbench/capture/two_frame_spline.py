@@ -9,6 +9,7 @@ whose variance is estimated, adapts to it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +28,7 @@ from rsbench.capture.trajectory_spline import (
     approximated,
     band_inner,
     covariance_between,
+    make_curve,
     motion_covariance,
     part,
     span_of,
@@ -246,9 +248,15 @@ class _Spline:
 
 
 def camera_trajectory(
-    windows: Sequence[FloatArray], motions: Sequence[Motion], rig: StereoRig, shutter: RollingShutter
+    windows: Sequence[FloatArray],
+    motions: Sequence[Motion],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    times: FloatArray | None = None,
 ) -> list[ContinuousMotion] | None:
     """Estimate the motion in each window relative to the camera at its start, with d of length 1; None: no fit.
+
+    The unit of time of each motion is the time between the window's frames.
 
     Args:
         windows: matches (n, 4) x0, y0, x1, y1, px, with outliers, of the frames 0 and 1, 1 and 2, ...; matches
@@ -256,12 +264,14 @@ def camera_trajectory(
         motions: start motion of each window, with d of any length.
         rig: a rig whose left camera is the camera and whose body is at this camera.
         shutter: shutter of the camera.
+        times: (n + 1,) times of the frames' first lines, frame periods, all about one period apart; None: exactly.
     """
+    times = np.arange(len(windows) + 1.0) if times is None else times
     try:
-        curve = _fitted(windows, motions, rig, shutter, _SHARE_OF_VIDEO)[0].curve
+        curve = _fitted(windows, motions, rig, shutter, _SHARE_OF_VIDEO, times)[0].curve
     except NotDefiniteError:
         return None
-    found = [_window(curve, number, shutter) for number in range(len(windows))]
+    found = [_window(curve, *ends, shutter) for ends in itertools.pairwise(times.tolist())]
     moving = [each for each in found if each is not None]
     return moving if len(moving) == len(windows) else None
 
@@ -279,7 +289,7 @@ def camera_two_frame_spline(
     if shutter.still or len(matches) < _FEWEST:
         return None
     try:
-        found, tracks = _fitted([matches], [law], rig, shutter, _SHARE)
+        found, tracks = _fitted([matches], [law], rig, shutter, _SHARE, np.arange(2.0))
         inverse = covariance_band(found, tracks, _SHARE)
     except NotDefiniteError:
         return None
@@ -291,7 +301,7 @@ def camera_two_frame_spline(
     gained = (other - own) / max(float(np.sum(found.trust)), 1.0)
     if gained < _LEAST_GAIN or _undetermined_px(found.curve, inverse, rig, shutter) > _MOST_UNDETERMINED_PX:
         return None
-    return _window(found.curve, 0, shutter)
+    return _window(found.curve, 0.0, 1.0, shutter)
 
 
 def _undetermined_px(curve: Curve, inverse: FloatArray, rig: StereoRig, shutter: RollingShutter) -> float:
@@ -309,23 +319,27 @@ def _fitted(
     rig: StereoRig,
     shutter: RollingShutter,
     share: float,
+    times: FloatArray,
 ) -> tuple[Fit, TimedTracks]:
     """Fit the spline to the inliers, after a first fit to some of the matches that selects them."""
 
     def packed(each: Sequence[FloatArray], right: Sequence[FloatArray] | None = None) -> TimedTracks:
-        return pack_windows([Correspondences(left=one) for one in each], rig, shutter, right, share=share)
+        matches = [Correspondences(left=one) for one in each]
+        return pack_windows(matches, rig, shutter, right, share=share, times=times)
 
     few = packed([each[:: max(len(each) // _FIRST_MATCHES, 1)] for each in windows])
-    first = fit(first_curve(motions, few, span_of(len(windows), shutter), _KNOTS), few, _PRIOR)
+    first = fit(first_curve(motions, few, span_of(float(times[-1]), shutter), _KNOTS), few, _PRIOR)
     tracks = packed(windows)
     trust = right_tracks(first, tracks)
     tracks = packed(windows, [trust[each] for each in tracks.members])
     return fit(first.curve, tracks, first.prior, False, first.tails), tracks
 
 
-def _window(curve: Curve, number: int, shutter: RollingShutter) -> ContinuousMotion | None:
-    """The motion in one window with d of length 1; None if d is 0."""
-    start, end = span_of(1, shutter)
-    motion = ContinuousMotion.of(part(curve, number + start, number + end, float(number)))
+def _window(curve: Curve, begin: float, end: float, shutter: RollingShutter) -> ContinuousMotion | None:
+    """The motion in the window of frames at two times, with its length as unit and d of length 1; None: d is 0."""
+    first, last = span_of(end - begin, shutter)
+    own = part(curve, begin + first, begin + last, begin)
+    own = make_curve(own.first / (end - begin), own.interval / (end - begin), own.R, own.p)
+    motion = ContinuousMotion.of(own)
     length = float(np.linalg.norm(motion.d))
     return motion.seen(np.eye(3), 1.0 / length) if length > 0.0 else None

@@ -150,6 +150,7 @@ def find_shutter(
     options: RobustOptions,
     seed: int = 0,
     advance: Callable[[str], None] = lambda word: None,
+    starts: FloatArray | None = None,
 ) -> FoundShutter:
     """The shutter of a camera, from its card or its frames (H, W[, 3]); refuses frames in reverse order.
 
@@ -159,6 +160,7 @@ def find_shutter(
         card: given values.
         options, seed: settings of the search for a motion.
         advance: called after each pair that is examined.
+        starts: (n,) times of the frames' first rows, frame periods, all about one period apart; None: exactly.
 
     Raises:
         NoMotionError: the frames do not determine the shutter.
@@ -166,7 +168,7 @@ def find_shutter(
         RsbenchError: there are fewer than two frames, or frames of two sizes.
     """
     if card.readout_ratio is None:
-        return _estimate_shutter(frames, count, card, options, seed, advance)
+        return _estimate_shutter(frames, count, card, options, seed, advance, starts)
     scan, ratio = card.scan or "top", card.readout_ratio
     found, shutter = list[FloatArray](), None
     for matches, _, camera in matched_pairs(frames, card, 1, IN_ORDER if ratio >= LEAST_BACKWARDS else 0, seed):
@@ -196,12 +198,14 @@ def _estimate_shutter(
     options: RobustOptions,
     seed: int,
     advance: Callable[[str], None],
+    starts: FloatArray | None,
 ) -> FoundShutter:
     """Estimate the shutter from a trajectory through successive pairs, or else from single pairs."""
-    run, camera = _successive_matches(frames, card, seed, advance)
-    focal_sigma = PRIOR if card.focal_unknown else 0.0
-    many = len(run) >= _FEWEST_PAIRS
-    on_trajectory = capture_of_video(run, camera, card.scan, seed, focal_sigma) if many else None
+    first, run, camera = _successive_matches(frames, card, seed, advance)
+    focal_sigma, on_trajectory = PRIOR if card.focal_unknown else 0.0, None
+    if len(run) >= _FEWEST_PAIRS:
+        times = None if starts is None else starts[first : first + len(run) + 1] - starts[first]
+        on_trajectory = capture_of_video(run, camera, card.scan, seed, focal_sigma, times)
     if on_trajectory is not None:
         focal = focal_of_capture(on_trajectory, camera.width) if card.focal_unknown else None
         return replace(_conclude(on_trajectory, camera, card), focal=focal)
@@ -227,12 +231,14 @@ def _conclude(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> F
 
 def _successive_matches(
     frames: Iterable[NDArray[Any]], card: OneCameraCard, seed: int, advance: Callable[[str], None]
-) -> tuple[list[FloatArray], PinholeCamera]:
-    """``trajectory_matches`` of the first usable successive pairs, at most ``LONGEST``; and the camera.
+) -> tuple[int, list[FloatArray], PinholeCamera]:
+    """Number of the first frame and ``trajectory_matches`` of the first usable successive pairs, and the camera.
+
+    At most ``LONGEST`` pairs are used.
 
     Raises RsbenchError as ``matched_pairs`` does.
     """
-    run, number, camera = list[FloatArray](), 0, None
+    run, first, camera = list[FloatArray](), 0, None
     for number, (before, image) in enumerate(itertools.pairwise(frames), start=1):
         check_alike({f"frame {number - 1}": before, f"frame {number}": image})
         camera = card.camera_of(image.shape[1], image.shape[0])
@@ -244,11 +250,12 @@ def _successive_matches(
             break
         else:
             run.clear()
+            first = number
         if len(run) == LONGEST or number >= _MOST_EXAMINED:
             break
     if camera is None:
         raise RsbenchError(TOO_FEW)
-    return run, camera
+    return first, run, camera
 
 
 def matched_pairs(

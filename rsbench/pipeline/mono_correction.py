@@ -24,6 +24,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.footage import about_one
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
@@ -332,8 +333,8 @@ class SeenPair:
     """None: the pair cannot be corrected."""
     matches: FloatArray
     """(n, 4) x0, y0, x1, y1, px, see ``trajectory_matches``."""
-    even: bool = True
-    """Whether about one frame period lies between them."""
+    period: float = 1.0
+    """Time between them, frame periods."""
 
     @property
     def motion(self) -> Motion | None:
@@ -381,7 +382,7 @@ def _group_motions(pending: dict[int, SeenPair], first: int) -> list[FoundOwnMot
 
 
 def _is_usable(pair: SeenPair) -> bool:
-    return pair.even and pair.motion is not None and len(pair.matches) >= _LEAST
+    return bool(about_one(pair.period)) and pair.motion is not None and len(pair.matches) >= _LEAST
 
 
 def _trajectory_motions(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
@@ -390,8 +391,15 @@ def _trajectory_motions(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundO
     owns = [pair.found.own for _, pair in run if pair.found is not None]
     if len(run) < _FEWEST_PAIRS or owns[0].shutter.readout_ratio == 0.0:
         return {}
+    periods = np.array([pair.period for _, pair in run])
+    # Ratios are relative to the period of each pair, at most 1.
+    ratio = float(np.max(periods * [own.shutter.readout_ratio for own in owns]))
     trajectories = camera_trajectory(
-        [pair.matches for _, pair in run], motions, owns[0].rig.about("left"), owns[0].shutter
+        [pair.matches for _, pair in run],
+        motions,
+        owns[0].rig.about("left"),
+        owns[0].shutter.with_ratio(min(ratio, 1.0)),
+        np.concatenate([[0.0], np.cumsum(periods)]),
     )
     out = dict[int, FoundOwnMotion]()
     for (number, pair), own, steady, path in zip(run, owns, motions, trajectories or [], strict=False):

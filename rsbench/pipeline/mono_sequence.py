@@ -24,7 +24,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import inpainted
-from rsbench.pipeline.footage import about_one, check_alike
+from rsbench.pipeline.footage import check_alike
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.mono_camera import TOO_FEW
 from rsbench.pipeline.mono_correction import (
@@ -178,9 +178,7 @@ def _pairs(
     def kept(seen: Iterable[_Seen]) -> Iterator[SeenPair]:
         for each in seen:
             waiting.append(each)
-            yield SeenPair(
-                found=each.found, matches=each.matches, even=bool(about_one(_span(each.number, starts)[1]))
-            )
+            yield SeenPair(found=each.found, matches=each.matches, period=_span(each.number, starts)[1])
 
     def ready(at: tuple[_Seen, FoundOwnMotion | None]) -> tuple[_Seen, _Pair | None]:
         seen, found = at

@@ -144,13 +144,13 @@ def _know_camera(
     progress: Progress,
 ) -> KnownCapture:
     frames, starts = frames_with_times(source)
-    if starts is not None:  # use the longest run of even intervals, as most estimates assume these
+    if starts is not None:  # use the longest run of intervals of about one period, as most estimates assume these
         run = source.timeline.even_run()
         frames, starts = source.only(source.timeline.originals[run]), starts[run]
     robust, seed, pairs = options.robust, options.seed, max(frames.count - 1, 1)
     unknown = card.readout_ratio is None
     with progress("estimating the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
-        found = find_shutter(frames, frames.count, card, robust, seed, advance)
+        found = find_shutter(frames, frames.count, card, robust, seed, advance, starts)
         if unknown:
             advance("all pairs together")
     shutter = found.shutter

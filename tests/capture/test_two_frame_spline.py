@@ -266,7 +266,7 @@ def place(tau: FloatArray, shake: float) -> Pose:
     return Pose(R, -(R @ (tau[:, None] * V)[..., None])[..., 0])
 
 
-def seen(points: FloatArray, frame: int, shake: float) -> tuple[FloatArray, np.ndarray]:
+def seen(points: FloatArray, frame: float, shake: float) -> tuple[FloatArray, np.ndarray]:
     """Pixels (n, 2), each at the time of its own row, and which lie in the image."""
     pixels = np.full((len(points), 2), 240.0)
     for _ in range(30):
@@ -277,11 +277,17 @@ def seen(points: FloatArray, frame: int, shake: float) -> tuple[FloatArray, np.n
     return pixels, inside
 
 
-def windows_of(count: int, shake: float, noise_px: float, rng: np.random.Generator) -> list[FloatArray]:
+UNEVEN = np.array([0.0, 0.9, 2.05, 2.95, 4.1, 5.0, 6.1, 7.0, 7.9])
+"""Times of frames of a phone, whose intervals vary by a tenth."""
+
+
+def windows_of(
+    count: int, shake: float, noise_px: float, rng: np.random.Generator, times: FloatArray | None = None
+) -> list[FloatArray]:
     """Matches of neighbouring frames; one in ten is wrong. What ends somewhere begins there again."""
     depth = rng.uniform(5.0, 40.0, 3000)
     points = np.column_stack([rng.uniform(-0.7, 0.7, (3000, 2)) * depth[:, None], depth + 3.0])
-    frames = [seen(points, frame, shake) for frame in range(count + 1)]
+    frames = [seen(points, time, shake) for time in (range(count + 1) if times is None else times)]
     drawn = [pixels + rng.normal(0.0, noise_px, pixels.shape) for pixels, _ in frames]
     out = []
     for k in range(count):
@@ -293,12 +299,26 @@ def windows_of(count: int, shake: float, noise_px: float, rng: np.random.Generat
     return out
 
 
-def turned_deg(motion: Motion, number: int, shake: float) -> float:
+def turned_deg(motion: Motion, begin: float, shake: float, period: float = 1.0) -> float:
     """Root mean square of how rows of a window turn wrongly against its first one."""
-    tau = np.linspace(0.0, 1.8, 19)
-    true = place(tau + number, shake).R @ place(np.array([float(number)]), shake).R[0].T
-    angles = np.linalg.norm(so3.log(motion.body_from_world(tau).R @ np.swapaxes(true, 1, 2)), axis=-1)
+    tau = np.linspace(0.0, period + 0.8, 19)
+    true = place(tau + begin, shake).R @ place(np.array([float(begin)]), shake).R[0].T
+    angles = np.linalg.norm(so3.log(motion.body_from_world(tau / period).R @ np.swapaxes(true, 1, 2)), axis=-1)
     return float(np.rad2deg(np.sqrt(np.mean(angles**2))))
+
+
+@pytest.mark.slow
+def test_a_trajectory_uses_the_times_of_uneven_frames() -> None:
+    """Each motion counts time in its own interval; with even times the errors are far larger."""
+    windows = windows_of(8, 0.01, 0.1, np.random.default_rng(1), UNEVEN)
+    laws, errors = [InertialMotion(W, -V)] * 8, {}
+    for times in (UNEVEN, None):
+        motions = camera_trajectory(windows, laws, CAMERA_RIG, SHUTTER, times)
+        assert motions is not None
+        spans = zip(motions, UNEVEN, np.diff(UNEVEN) if times is not None else np.ones(8), strict=False)
+        errors[times is None] = [turned_deg(motion, begin, 0.01, period) for motion, begin, period in spans]
+    assert np.median(errors[False]) < 0.03 and np.max(errors[False]) < 0.06
+    assert np.median(errors[True]) > 3.0 * np.median(errors[False])
 
 
 @pytest.mark.slow
@@ -359,10 +379,11 @@ def test_wrong_matches_of_two_frames_are_no_way() -> None:
 @pytest.mark.parametrize("backwards", [False, True])
 def test_a_video_of_a_hand_tells_how_its_lines_are_read(backwards: bool) -> None:
     """And frames in reverse look as if they were read from the bottom. Its ratio is within three deviations."""
-    windows = windows_of(7, 0.01, 0.1, np.random.default_rng(4))
+    times = UNEVEN[:8]
+    windows = windows_of(7, 0.01, 0.1, np.random.default_rng(4), times)
     if backwards:
-        windows = [each[:, [2, 3, 0, 1]] for each in windows[::-1]]
-    capture = capture_of_video(windows, CAMERA_RIG.camera, None)
+        windows, times = [each[:, [2, 3, 0, 1]] for each in windows[::-1]], times[-1] - times[::-1]
+    capture = capture_of_video(windows, CAMERA_RIG.camera, None, times=times)
     assert capture is not None and capture.likeliest is not None
     best = capture.likeliest
     assert best.scans.left == ("bottom" if backwards else "top") and best.probability > 0.99
