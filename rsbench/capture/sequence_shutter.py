@@ -9,11 +9,11 @@ every frame. The ratio has a uniform prior, so its posterior is proportional to 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy
@@ -69,6 +69,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import shared_error_factor, tiles, variance_factor
 from rsbench.solvers.engine.levenberg_marquardt import descend
 
+_Start = TypeVar("_Start")
 LONGEST = 12
 """Most successive windows that are used; further ones would hardly reduce the error."""
 SUCCESSIVE = 6
@@ -99,8 +100,8 @@ _EXTRA_VARIANCE, _SHARED = 2.5, 0.02
 all flow of a video. Chosen on twelve warped hand-held videos of 320 x 240 px (seed 7)."""
 _STEP, _STEP_FOCAL, _STEPS, _ROUNDS = 0.05, 0.1, 5, 4
 """First difference steps of ratio and log focal length; Newton steps; rounds of the kind of prior."""
-_REFINED = 2
-"""Number of starts for which the fit is refined: those with the largest evidence under the wide distribution."""
+_ROUGH, _REFINED = 3, 2
+"""Number of starts from which the place is fitted, and number of these for which the fit is then refined."""
 _SHARES_OF_STEP = (1.0, 0.5, 0.25)
 """Shares of a Newton step that are tried."""
 _NO_FIT = -1e12
@@ -111,6 +112,8 @@ _FIXED_ROUNDS, _FREE_ROUNDS, _STEPS_A_ROUND = 15, 25, 2
 """Most rounds under the wide error distribution and under the tracks' own, and steps in each."""
 _FLAT_COST, _FLAT_VARIANCE, _FLAT_EVIDENCE, _FLAT_PLACE = 1e-3, 0.05, 0.1, np.array([0.002, 0.005])
 """Changes below which the joint fit has converged: cost; variances, relative; evidence; ratio and focal length."""
+_ROUGHLY = 5.0
+"""Factor on the last ones under the wide error distribution."""
 
 
 def shakes(capture: Capture, windows: Sequence[Correspondences], rig: StereoRig, seed: int = 0) -> bool:
@@ -272,33 +275,28 @@ def ratio_of_sequence(
     if sum(len(each.left if alone else each.tracks) for each in windows) < _FEWEST * len(windows):
         return None
     fewer = thinned_chains if alone else thinned
-    few, found = fewer(windows, _SOME), dict[int, tuple[float, _Place, Fit]]()
+    few, found = fewer(windows, _SOME), dict[int, _Found]()
     # A spline may not leave the motions that were found with a wrong camera, so start at several places.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
     first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
-        profile, rough = _Profile(few, rig, scanning, times, focal_sigma), list[tuple[float, _Place, Fit]]()
-        for start in first:
-            with suppress(NotDefiniteError):
-                rough.append(profile.rough(start, seed))
-        for _, place, fitted in sorted(rough, key=lambda each: -each[0])[:_REFINED]:
-            with suppress(NotDefiniteError):
-                place, fitted = profile.refined(place, fitted)
-                value = profile.comparable(place)
-                if number not in found or value > found[number][0]:
-                    found[number] = value, place, fitted
+        profile = _Profile(few, rig, scanning, times, focal_sigma)
+        started = _likeliest(partial(profile.started, seed=seed), first, _ROUGH)
+        rough = _likeliest(profile.rough, started, _REFINED)
+        for each in _likeliest(profile.refined, rough, 1):
+            found[number] = each
     if not found:
         return None
-    best = max(found, key=lambda each: found[each][0])
+    best = max(found, key=lambda each: found[each].evidence)
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
-        place, fitted = found[best][1:]
-        start = replace(fitted, trust=right_tracks(fitted, profile.tracks(place)))
-        top, covariance = profile.newton(profile.refined(place, start)[0])
+        start = found[best].fit
+        start = replace(start, trust=right_tracks(start, profile.tracks(found[best].place)))
+        top, covariance = profile.newton(profile.refined(found[best]._replace(fit=start)).place)
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
-    odds = sum(np.exp((each - found[best][0]) / dispersion) for each, *_ in found.values())
+    odds = sum(np.exp((each.evidence - found[best].evidence) / dispersion) for each in found.values())
     estimate = profile.result(top, covariance * dispersion, 1.0 / float(odds))
     # Refuse fits to two or three wrong matches, and fits to all of them with an error scale too large for noise.
     right = estimate.used >= _LEAST_SHARE * estimate.total and estimate.noise_px <= MOST_NOISE_PX
@@ -316,6 +314,23 @@ class _Place(NamedTuple):
         """The place after a step (2,), within the limits."""
         ratio, log_focal = np.clip(np.add(self, step), [_LEAST, -_FARTHEST], [1.0, _FARTHEST])
         return _Place(float(ratio), float(log_focal))
+
+
+class _Found(NamedTuple):
+    """A fit at a place, with the logarithm of its evidence."""
+
+    evidence: float
+    place: _Place
+    fit: Fit
+
+
+def _likeliest(step: Callable[[_Start], _Found], starts: Iterable[_Start], count: int) -> list[_Found]:
+    """The results of a step of the search with the largest evidence, at most ``count``."""
+    found = list[_Found]()
+    for start in starts:
+        with suppress(NotDefiniteError):
+            found.append(step(start))
+    return sorted(found, key=lambda each: -each.evidence)[:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,10 +449,11 @@ class _Profile:
         """Logarithm of the prior density of the focal length, up to a constant."""
         return -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
 
-    def rough(self, start: _Place, seed: int) -> tuple[float, _Place, Fit]:
-        """Fit under a wide error distribution, from the motions of single windows at a place.
+    def started(self, start: _Place, seed: int) -> _Found:
+        """The fit at a place under a wide error distribution, from the motions of single windows.
 
-        Returns the logarithm of evidence, the place and the fit. Raises NotDefiniteError if there is no fit.
+        Raises:
+            NotDefiniteError: there is no fit; ``rough`` and ``refined`` raise it too.
         """
         longer, camera = float(np.exp(start.log_focal)), self._rig.camera
         rig = replace(self._rig, camera=replace(camera, fx=camera.fx * longer, fy=camera.fy * longer))
@@ -446,16 +462,18 @@ class _Profile:
         span = span_of(float(self._times[-1]), self._shutter(1.0))
         tracks, prior = self.tracks(start), TrajectoryOptions().prior
         curve, every = first_curve(motions, tracks, span, _KNOTS), np.ones(len(tracks))
-        found = fit(curve, tracks, prior, True, _WIDE, every)
-        place, found = self._fitted(start, found, fixed=True)
-        return log_evidence(found, _PRECISION) + self.log_prior(place), place, found
+        return self._found(start, fit(curve, tracks, prior, True, _WIDE, every))
 
-    def refined(self, place: _Place, found: Fit) -> tuple[_Place, Fit]:
-        """Fit under the error distribution of the tracks; ``at`` then gives the evidence under it.
+    def _found(self, place: _Place, found: Fit) -> _Found:
+        return _Found(log_evidence(found, _PRECISION) + self.log_prior(place), place, found)
 
-        Raises:
-            NotDefiniteError: no trajectory explains the tracks.
-        """
+    def rough(self, start: _Found) -> _Found:
+        """Fit spline and place together under the same wide error distribution."""
+        return self._found(*self._fitted(start.place, start.fit, fixed=True))
+
+    def refined(self, start: _Found) -> _Found:
+        """Fit spline and place under the error distribution of the tracks, for which ``at`` gives the evidence."""
+        place, found = start.place, start.fit
         for _ in range(_ROUNDS):
             last_place, (place, found) = place, self._fitted(place, found, fixed=False)
             # The knots stay fine, since coarse ones would enforce a smoothness that the prior must decide on.
@@ -466,7 +484,7 @@ class _Profile:
                 break
         self._fits = {place: found}
         self._values.clear()
-        return place, found
+        return _Found(self.comparable(place), place, found)
 
     def _fitted(self, place: _Place, found: Fit, fixed: bool) -> tuple[_Place, Fit]:
         """Fit spline, place, variances of the prior and, unless ``fixed``, the error distribution."""
@@ -482,7 +500,9 @@ class _Profile:
                 tails, trust = observed(here.equations.squares, tracks.freedom, tails, used)
             change = np.abs(np.log(variances(prior, None) / last))
             settling = (change > _FLAT_VARIANCE) & (change * determined > _FLAT_EVIDENCE)
-            still = abs(np.log(tails.scale / old.scale)) < _FLAT_VARIANCE and np.all(moved_by < _FLAT_PLACE)
+            still = abs(np.log(tails.scale / old.scale)) < _FLAT_VARIANCE and np.all(
+                moved_by < (_ROUGHLY if fixed else 1.0) * _FLAT_PLACE
+            )
             if still and not np.any(settling):
                 break
         equations = _Joint(self, tails, prior, trust).equations(curve, place)

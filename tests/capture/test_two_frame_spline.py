@@ -311,14 +311,14 @@ def turned_deg(motion: Motion, begin: float, shake: float, period: float = 1.0) 
 def test_a_trajectory_uses_the_times_of_uneven_frames() -> None:
     """Each motion counts time in its own interval; with even times the errors are far larger."""
     windows = windows_of(8, 0.01, 0.1, np.random.default_rng(1), UNEVEN)
-    laws, errors = [InertialMotion(W, -V)] * 8, {}
-    for times in (UNEVEN, None):
-        motions = camera_trajectory(windows, laws, CAMERA_RIG, SHUTTER, times)
+    laws, errors = [InertialMotion(W, -V)] * 8, list[list[float]]()
+    for given in (UNEVEN, None):
+        motions = camera_trajectory(windows, laws, CAMERA_RIG, SHUTTER, given)
         assert motions is not None
-        spans = zip(motions, UNEVEN, np.diff(UNEVEN) if times is not None else np.ones(8), strict=False)
-        errors[times is None] = [turned_deg(motion, begin, 0.01, period) for motion, begin, period in spans]
-    assert np.median(errors[False]) < 0.03 and np.max(errors[False]) < 0.06
-    assert np.median(errors[True]) > 3.0 * np.median(errors[False])
+        spans = zip(motions, UNEVEN, np.ones(8) if given is None else np.diff(UNEVEN), strict=False)
+        errors.append([turned_deg(motion, begin, 0.01, period) for motion, begin, period in spans])
+    assert np.median(errors[0]) < 0.03 and np.max(errors[0]) < 0.06
+    assert np.median(errors[1]) > 3.0 * np.median(errors[0])
 
 
 @pytest.mark.slow
