@@ -192,15 +192,13 @@ def test_scale_error_is_the_logarithm_of_the_ratio(factor: float) -> None:
     )
 
 
-def test_a_zero_estimate_scores_the_worst_value() -> None:
-    assert pose_errors.translation_error(np.zeros(3), [1.0, 0, 0]) == pose_errors.WORST_ANGLE
-    assert pose_errors.scale_error(np.zeros(3), [1.0, 0, 0]) == pose_errors.WORST_SCALE
-
-
-def test_a_zero_truth_has_neither_direction_nor_scale() -> None:
-    for estimate in ([1.0, 0, 0], np.zeros(3)):
-        assert np.isnan(pose_errors.translation_error(estimate, np.zeros(3)))
-        assert np.isnan(pose_errors.scale_error(estimate, np.zeros(3)))
+def test_a_zero_estimate_scores_the_worst_value_and_a_zero_truth_none() -> None:
+    along, zero = [1.0, 0, 0], np.zeros(3)
+    assert pose_errors.translation_error(zero, along) == pose_errors.WORST_ANGLE
+    assert pose_errors.scale_error(zero, along) == pose_errors.WORST_SCALE
+    for estimate in (along, zero):
+        assert np.isnan(pose_errors.translation_error(estimate, zero))
+        assert np.isnan(pose_errors.scale_error(estimate, zero))
 
 
 @few
