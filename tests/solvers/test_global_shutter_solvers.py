@@ -12,7 +12,19 @@ import numpy as np
 import poselib
 import pytest
 from scipy.optimize import least_squares
-from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, errors_deg, median_errors, robust, trial
+from solver_trials import (
+    GLOBAL,
+    RIG,
+    SHUTTER,
+    D,
+    W,
+    assert_near,
+    errors_deg,
+    matches_of,
+    median_errors,
+    robust,
+    trial,
+)
 
 from rsbench.benchmark.simulated.simulation import Simulation
 from rsbench.components.motion_models import LinearMotion
@@ -121,9 +133,9 @@ def test_without_readout_it_is_the_global_shutter_optimum_of_poselib(
 ) -> None:
     """Of the same left and right pairs, in degrees; PoseLib stops where rounding hides the fall of its cost."""
     ours, theirs = RefinedSolver(shutter=kind, use_tracks=False), load_solver("gs-poselib-stereo")
-    for seed in range(10):
-        s = hundred(seed, "linear", 0.3, shutter)
-        first, second = (solver.estimate(s.correspondences, RIG, shutter) for solver in (ours, theirs))
+    for seed in range(20):
+        c = matches_of(LinearMotion(W, D), seed=seed, shutter=shutter, pairs=60, noise_px=0.3)
+        first, second = (solver.estimate(c, RIG, shutter) for solver in (ours, theirs))
         assert_near(first, LinearMotion(second.w, second.d), e_R, e_T)
         assert kind == "global" or scale_error(first.d, second.d) < 1e-6
 
