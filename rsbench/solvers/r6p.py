@@ -220,11 +220,7 @@ class _Search:
     def __init__(self, tracks: FloatArray, solver: R6pSolver, rig: StereoRig, shutter: RollingShutter) -> None:
         self.tracks, self.solver, self.rig, self.shutter = tracks, solver, rig, shutter
         self.R0 = solver.beginning(tracks, rig, shutter)
-        self.data = self.of(tracks)
-
-    @property
-    def num_data(self) -> tuple[int, ...]:
-        return (len(self.tracks),)
+        self.data, self.num_data = self.of(tracks), (len(tracks),)
 
     def of(self, tracks: FloatArray, minimal: bool = False) -> Resection:
         """The data of some tracks (n, 8); minimal samples use the left camera alone."""

@@ -418,6 +418,7 @@ class _Problem:
     rig: StereoRig
     noise: FloatArray
     """(2,) standard deviations of a coordinate of points and of lines, px."""
+    sample_size = (_LEAST,)
 
     @classmethod
     def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig, noise_px: float) -> _Problem:
@@ -433,10 +434,6 @@ class _Problem:
     @property
     def num_data(self) -> tuple[int, ...]:
         return (len(self.points.tracks) + len(self.lines.rays),)
-
-    @property
-    def sample_size(self) -> tuple[int, ...]:
-        return (_LEAST,)
 
     def generate(self, samples: IntArray) -> Iterator[list[MotionEstimate]]:
         for models in sample_motions(lambda views: self.features.triplets(samples, views, self.rig)):

@@ -65,7 +65,7 @@ class RobustProblem:
         self._stereo = "stereo" in self.spec.needs
         self.reasons: Counter[str] = Counter()
         """How often the solver failed on a sample for each reason."""
-        self._sizes, self.linked = self._plan(linked)
+        self.sample_size, self.linked = self._plan(linked)
         self._affine = "affine" in self.spec.needs
         self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
         if self._affine:  # tracks have no affine frames: such a solver is given the left matches alone
@@ -120,10 +120,6 @@ class RobustProblem:
     @property
     def num_data(self) -> tuple[int, ...]:
         return len(self.data.left), len(self.data.right), len(self.data.tracks)
-
-    @property
-    def sample_size(self) -> tuple[int, ...]:
-        return self._sizes
 
     def generate(self, samples: IntArray) -> Iterator[list[MotionEstimate]]:
         subsets = [self._subset(sample) for sample in samples]
