@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.components.motion_models import make_motion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -71,6 +72,35 @@ def errors_deg(found: MotionEstimate, motion: Motion, point: str = "body") -> Fl
     """Errors of the rotation and of the direction of the translation (2,), in degrees."""
     e_T = translation_error(found.d, true_d(motion, point))
     return np.degrees([float(rotation_error(found.w, motion.w)), float(e_T)])
+
+
+def median_errors(solver: Solver, *, trials: int = 30, **options: Any) -> FloatArray:
+    """Median errors (2,) in degrees over random trials, of the solver's own point; 180 where it fails."""
+    errors, point = list[FloatArray](), solver.spec.reference_point
+    for seed in range(trials):
+        s = trial(np.random.default_rng(seed), **options)
+        found = solver.estimate(s.correspondences, s.rig, s.shutter)
+        errors.append(errors_deg(found, s.motion, point) if found.success else np.array([180.0, 180.0]))
+    return np.median(errors, axis=0)
+
+
+def errors_of_size(
+    solver: Solver, size: float, *, seeds: int = 8, rig: StereoRig = RIG, **options: Any
+) -> FloatArray:
+    """Median errors (2,) in rad of a solver on exact matches of ``size`` times the motion (W, D)."""
+    spec, errors = solver.spec, list[FloatArray]()
+    motion = make_motion(spec.motion_model, size * W, size * D, spec.motion_parameters)
+    for seed in range(seeds):
+        found = solver.estimate(matches_of(motion, seed=seed, rig=rig, **options), rig, SHUTTER)
+        assert found.success, found.reason
+        errors.append(np.radians(errors_deg(found, motion)))
+    return np.median(errors, axis=0)
+
+
+def assert_second_order(solver: Solver, **options: Any) -> None:
+    """Half the motion has a quarter of the rotation's error, and half of the direction's."""
+    half, quarter = (errors_of_size(solver, size, **options) for size in (0.5, 0.25))
+    np.testing.assert_allclose(half / quarter, [4.0, 2.0], rtol=0.25)
 
 
 def assert_near(found: MotionEstimate, motion: Motion, e_R: float, e_T: float, point: str = "body") -> None:

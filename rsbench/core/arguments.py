@@ -105,8 +105,9 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
     except (ValueError, TypeError):  # rows of unequal lengths
         array = np.zeros((), dtype=object)
     if array.dtype.kind not in _REAL and array.size > 0:
-        raise ValueError(f"{name} must be real numbers, got {_kind(array, value)}")
-    if isinstance(value, Sequence) and len(value) <= 16 and any(map(_is_truth, value)):
+        what = shown(value) if array.dtype == object and array.ndim == 0 else f"an array of {array.dtype}"
+        raise ValueError(f"{name} must be real numbers, got {what}")
+    if isinstance(value, Sequence) and len(value) <= 16 and any(isinstance(v, bool | np.bool_) for v in value):
         raise ValueError(f"{name} must be real numbers, got truth values: {shown(value)}")
     return np.array(array, dtype=np.float64)
 
@@ -130,14 +131,6 @@ def shown(value: object) -> str:
     text = _SHORT.repr(value) if not isinstance(value, np.generic) else str(value)
     line = " ".join(text.split())
     return line if len(line) <= _WIDEST else f"{line[:_WIDEST]} ..."
-
-
-def _kind(array: np.ndarray[Any, Any], value: object) -> str:
-    return shown(value) if array.dtype == object and array.ndim == 0 else f"an array of {array.dtype}"
-
-
-def _is_truth(value: object) -> bool:
-    return isinstance(value, bool | np.bool_)
 
 
 _WIDEST = 120

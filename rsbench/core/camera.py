@@ -223,11 +223,10 @@ class Lens:
         across = bend * x * y + 2.0 * (p1 * x + p2 * y)
         by_x = gain + bend * x * x + 2.0 * p1 * y + 6.0 * p2 * x
         by_y = gain + bend * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        return Distorted(np.stack([xd, yd], axis=-1), _matrix(by_x, across, by_y))
+        return Distorted(np.stack([xd, yd], axis=-1), _stack_2x2(by_x, across, across, by_y))
 
     def _kannala(self, ideal: FloatArray) -> Distorted:
-        x, y = ideal[..., 0], ideal[..., 1]
-        s = x * x + y * y
+        s = ideal[..., 0] * ideal[..., 0] + ideal[..., 1] * ideal[..., 1]
         r = np.sqrt(s)
         angle = np.arctan(r)
         a = angle * angle
@@ -237,8 +236,7 @@ class Lens:
         central = s < 1e-12  # atan r = r - r^3 / 3 up to rounding
         gain = np.where(central, 1.0 + s * (k1 - 1.0 / 3.0), bent / np.where(central, 1.0, r))
         bend = np.where(central, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + s) - gain) / np.where(central, 1.0, s))
-        J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
-        return Distorted(ideal * gain[..., None], J)
+        return _radially(ideal, gain, bend)
 
     def _rational_reach(self) -> float:
         """Ideal radius at which the distorted one stops growing or is infinite, by successively finer tables."""
@@ -261,15 +259,13 @@ class Lens:
         return ideal, ideal * self._quotient(ideal * ideal)[0]
 
     def _sphere(self, ideal: FloatArray) -> Distorted:
-        x, y = ideal[..., 0], ideal[..., 1]
-        s, xi, alpha = x * x + y * y, self.xi, self.alpha
+        s, xi, alpha = ideal[..., 0] * ideal[..., 0] + ideal[..., 1] * ideal[..., 1], self.xi, self.alpha
         d1 = np.sqrt(s + 1.0)
         w = xi * d1 + 1.0
         d2 = np.sqrt(s + w * w)
         gain = 1.0 / (alpha * d2 + (1.0 - alpha) * w)
         bend = -gain * gain * (alpha * (1.0 + xi * w / d1) / d2 + (1.0 - alpha) * xi / d1)
-        J = _matrix(gain + bend * x * x, bend * x * y, gain + bend * y * y)
-        return Distorted(ideal * gain[..., None], J)
+        return _radially(ideal, gain, bend)
 
     def _sphere_reach(self) -> float:
         """Tangent of the angle at which the second projection folds (alpha > 1/2) or goes to infinity.
@@ -295,9 +291,12 @@ class Lens:
         return np.where(seen[..., None], ideal, np.nan)
 
 
-def _matrix(by_x: FloatArray, across: FloatArray, by_y: FloatArray) -> FloatArray:
-    """Symmetric (..., 2, 2)."""
-    return np.stack([np.stack([by_x, across], axis=-1), np.stack([across, by_y], axis=-1)], axis=-2)
+def _radially(ideal: FloatArray, gain: FloatArray, bend: FloatArray) -> Distorted:
+    """Distort by a radial factor, given with twice its derivative by s = x^2 + y^2."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    across = bend * x * y
+    J = _stack_2x2(gain + bend * x * x, across, across, gain + bend * y * y)
+    return Distorted(ideal * gain[..., None], J)
 
 
 def inverse_2x2(J: FloatArray) -> FloatArray:

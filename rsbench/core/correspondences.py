@@ -61,16 +61,12 @@ class Correspondences:
     """(n, 4) tau, g: direction of gravity at that time, in the body's axes at that time; of any length."""
 
     def __post_init__(self) -> None:
-        for name, columns in SET_COLUMNS.items():
+        for name, columns in {**SET_COLUMNS, "affine": 4, "gyro": 4, "gravity": 4, "covariance": 3}.items():
             object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
-        for name, columns in {"affine": 4, "gyro": 4, "gravity": 4, "covariance": 3}.items():
-            object.__setattr__(self, name, _matches(getattr(self, name), name, columns))
-        if len(self.affine) not in (0, len(self.left)):
-            raise ValueError(f"affine has {len(self.affine)} rows and left {len(self.left)}: one each, or none")
-        if len(self.covariance) not in (0, len(self.tracks)):
-            raise ValueError(
-                f"covariance has {len(self.covariance)} rows and tracks {len(self.tracks)}: one each, or none"
-            )
+        for name, matches in (("affine", "left"), ("covariance", "tracks")):
+            rows, count = len(getattr(self, name)), len(getattr(self, matches))
+            if rows not in (0, count):
+                raise ValueError(f"{name} has {rows} rows and {matches} {count}: one each, or none")
         flat = np.flatnonzero(~np.any(self.gravity[:, 1:], axis=1))
         if len(flat):
             raise ValueError(f"gravity[{flat[0]}] has no direction: gx, gy, gz are 0")
@@ -119,9 +115,9 @@ def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspond
         lost = np.flatnonzero(np.any(np.isnan(sets[name]), axis=1))
         if len(lost):
             raise ValueError(f"{name}[{lost[0]}] = {rows[lost[0]].tolist()}: the lens shows no ray at this pixel")
-    left = rig.eye("left")
-    covariance = _turned(correspondences.covariance, left.ideal_by_pixel(correspondences.tracks[:, :2]))
-    return replace(correspondences, **sets, affine=_ideal_affine(correspondences, left), covariance=covariance)
+    left, c = rig.eye("left"), correspondences
+    covariance = _turned(c.covariance, left.ideal_by_pixel(c.tracks[:, :2]))
+    return replace(c, **sets, affine=_ideal_affine(c.affine, c.left, left), covariance=covariance)
 
 
 def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | AlignedCamera) -> FloatArray:
@@ -132,7 +128,7 @@ def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | Al
     """
     if len(affine) == 0:
         return affine
-    by_0, by_1 = _ideal_by_pixels(left, camera)
+    by_0, by_1 = (camera.ideal_by_pixel(left[:, k : k + 2]) for k in (0, 2))
     return (inverse_2x2(by_1) @ affine.reshape(-1, 2, 2) @ by_0).reshape(-1, 4)
 
 
@@ -155,16 +151,12 @@ def _turned(covariance: FloatArray, J: FloatArray) -> FloatArray:
     return full.reshape(-1, 4)[:, [0, 1, 3]]
 
 
-def _ideal_affine(correspondences: Correspondences, camera: PinholeCamera | AlignedCamera) -> FloatArray:
+def _ideal_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | AlignedCamera) -> FloatArray:
     """The inverse of ``lens_affine``."""
-    if len(correspondences.affine) == 0:
-        return correspondences.affine
-    by_0, by_1 = _ideal_by_pixels(correspondences.left, camera)
-    return (by_1 @ correspondences.affine.reshape(-1, 2, 2) @ inverse_2x2(by_0)).reshape(-1, 4)
-
-
-def _ideal_by_pixels(left: FloatArray, camera: PinholeCamera | AlignedCamera) -> tuple[FloatArray, FloatArray]:
-    return camera.ideal_by_pixel(left[:, :2]), camera.ideal_by_pixel(left[:, 2:])
+    if len(affine) == 0:
+        return affine
+    by_0, by_1 = (camera.ideal_by_pixel(left[:, k : k + 2]) for k in (0, 2))
+    return (by_1 @ affine.reshape(-1, 2, 2) @ inverse_2x2(by_0)).reshape(-1, 4)
 
 
 def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:

@@ -5,6 +5,7 @@ The sensor stands at the body's origin with the body's axes: x right, y down, z 
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, final
 
@@ -62,9 +63,7 @@ class GyroMotion(Motion):
 
     def along(self, d: FloatArray) -> GyroMotion:
         """The same rotation with another translation."""
-        other = object.__new__(GyroMotion)
-        for name in ("w", "samples", "nodes", "origin"):
-            object.__setattr__(other, name, getattr(self, name))
+        other = copy.copy(self)
         object.__setattr__(other, "d", d)
         return other
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -99,7 +99,7 @@ class StatedShutter(Scanning):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RollingShutter:
+class RollingShutter(Scanning):
     """Lines are read evenly within ``readout_ratio`` of a frame period: rows from the top by default.
 
     A line is a row of the image, or a column where a camera reads from the left or the right. Times belong to
@@ -110,15 +110,8 @@ class RollingShutter:
     """Number of rows."""
     readout_ratio: float
     """phi = T_a / (T_a + T_b) in [0, 1]; 0 is a global shutter (paper, section 2.2)."""
-    scan: Scan = "top"
-    right_scan: Scan | None = None
-    """Side at which the readout of the right camera begins; None: as the left camera's."""
-    right_delay: float = 0.0
-    """Frame periods by which the right camera reads later than the left one, from -1 to 1."""
     width: int | None = None
     """Number of columns; needed where columns are read."""
-    right_readout_ratio: float | None = None
-    """Readout ratio of the right camera; None: that of the left camera."""
     right_size: tuple[int, int] | None = None
     """Columns and rows of the right camera; None: as the left camera's."""
 
@@ -142,12 +135,12 @@ class RollingShutter:
     @property
     def plain(self) -> bool:
         """Whether both cameras read rows from the top at the same times, as ``row_time`` says."""
-        return self.scanning.plain and self.right_size is None
+        return super().plain and self.right_size is None
 
     @property
     def rows_together(self) -> bool:
         """Whether both cameras read each row at one time, from the top or from the bottom."""
-        return self.scanning.rows_together and self.right_size is None
+        return super().rows_together and self.right_size is None
 
     @property
     def h(self) -> float:
@@ -165,12 +158,7 @@ class RollingShutter:
     @property
     def scanning(self) -> Scanning:
         """The part of it that ``Scanning.shutter_of`` takes."""
-        return Scanning(
-            scan=self.scan,
-            right_scan=self.right_scan,
-            right_delay=self.right_delay,
-            right_readout_ratio=self.right_readout_ratio,
-        )
+        return Scanning(**{each.name: getattr(self, each.name) for each in fields(Scanning)})
 
     @property
     def still(self) -> bool:

@@ -58,12 +58,17 @@ def exp(w: ArrayLike) -> FloatArray:
     return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
 
 
+def _vee(R: FloatArray) -> FloatArray:
+    """Vector (..., 3) of which ``hat`` is R - R^T, for R (..., 3, 3)."""
+    return np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+    )
+
+
 def log(R: ArrayLike) -> FloatArray:
     """Rotation vector (..., 3) in radians, norm in [0, pi], of the rotation matrix ``R`` (..., 3, 3)."""
     R = np.asarray(R, dtype=np.float64)
-    vee = 0.5 * np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
-    )
+    vee = 0.5 * _vee(R)
     sine = np.linalg.norm(vee, axis=-1)
     angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
     scale = np.where(sine > 1e-8, angle / np.where(sine > 1e-8, sine, 1.0), 1.0)
@@ -91,10 +96,7 @@ def left_jacobian(w: ArrayLike) -> FloatArray:
 def angle(R: ArrayLike) -> FloatArray:
     """Rotation angle (...) in radians by atan2, exact down to 1e-15 where acos of the trace reads zero."""
     R = np.asarray(R, dtype=np.float64)
-    vee = np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
-    )
-    return np.arctan2(np.linalg.norm(vee, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    return np.arctan2(np.linalg.norm(_vee(R), axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0)
 
 
 def quaternion(R: ArrayLike) -> FloatArray:

@@ -329,23 +329,19 @@ def _generator(purpose: str, parameters: Mapping[str, Any]) -> np.random.Generat
 
 def _periods(parameters: Mapping[str, Any]) -> float:
     periods = parameters.get("periods", LAST)
-    if isinstance(periods, bool) or not isinstance(periods, int | float) or not LAST <= periods <= _LONGEST:
-        raise ValueError(f"periods = {periods!r}: must be a number from {LAST:g} to {_LONGEST:g}")
+    arguments.check_number("periods", periods, LAST, _LONGEST)
     return float(periods)
 
 
 def _given_spline(parameters: Mapping[str, Any]) -> _Spline:
-    if "spectrum" in parameters:
-        return _spectral_spline(parameters)
-    _only(parameters, "poses")
+    spectral = "spectrum" in parameters
+    _only(parameters, *(("spectrum", "seed", "periods") if spectral else ("poses",)))
     interval = _interval(parameters)
-    poses = _twists(parameters["poses"], interval, "poses")
+    poses = _spectral_poses(parameters, interval) if spectral else _twists(parameters["poses"], interval, "poses")
     return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
 
 
-def _spectral_spline(parameters: Mapping[str, Any]) -> _Spline:
-    _only(parameters, "spectrum", "seed", "periods")
-    interval = _interval(parameters)
+def _spectral_poses(parameters: Mapping[str, Any], interval: float) -> FloatArray:
     spectrum = ShakeSpectrum.of(parameters["spectrum"], interval)
     count = least_poses(interval, _periods(parameters))
     if count > _MOST_DRAWN:
@@ -353,8 +349,7 @@ def _spectral_spline(parameters: Mapping[str, Any]) -> _Spline:
             f"interval = {interval:g}: too small: {count} control poses, at most {_MOST_DRAWN} are drawn"
         )
     times = np.asarray(interval * (np.arange(count) - 1.0), dtype=np.float64)
-    poses = spectrum.control(times, interval, _generator("spectrum", parameters))
-    return _Spline(interval, Pose(so3.exp(poses[:, :3]), poses[:, 3:]))
+    return spectrum.control(times, interval, _generator("spectrum", parameters))
 
 
 def _only(parameters: Mapping[str, Any], name: str, *more: str) -> None:

@@ -163,16 +163,12 @@ def effective_count(leverages: FloatArray) -> float:
 
 
 @functools.lru_cache(maxsize=4096)
-def _hotelling(count: float, parameters: int, level: float) -> float:
-    freedom = max(count - parameters + 1.0, _LEAST_FREEDOM)
+def small_sample_factor(count: float, parameters: int, level: float = LEVEL) -> float:
+    """Quantile of Hotelling's T^2 for a covariance from K samples over that of chi-squared, at least 1."""
+    freedom = max(float(count) - parameters + 1.0, _LEAST_FREEDOM)
     quantile = float(scipy.special.fdtri(parameters, freedom, level))
     normal = 2.0 * float(scipy.special.gammaincinv(0.5 * parameters, level))
     return (freedom + parameters - 1.0) / freedom * parameters * quantile / normal
-
-
-def small_sample_factor(count: float, parameters: int, level: float = LEVEL) -> float:
-    """Quantile of Hotelling's T^2 for a covariance from K samples over that of chi-squared, at least 1."""
-    return _hotelling(float(count), parameters, level)
 
 
 def variance_factor(freedom: float, parameters: int, level: float = LEVEL) -> float:

@@ -21,6 +21,12 @@ from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
 
 _ROUNDING = 1e-10
+DEGENERATE = "the matches fit more than one essential matrix: degenerate scene or motion"
+
+
+def rays_of(matches: FloatArray, rig: StereoRig) -> tuple[FloatArray, FloatArray]:
+    """Rays (n, 3), z = 1, of both ends of matches (n, 4) of one camera."""
+    return rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
 
 
 def normalising_transform(x: FloatArray) -> FloatArray:
@@ -82,15 +88,12 @@ class EightPointSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = temporal_pairs(correspondences, "left")
-        short = self.spec.shortage({"left": len(matches)})
-        if short is not None:
+        if short := self.spec.shortage({"left": len(matches)}):
             return short
-        x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+        x0, x1 = rays_of(matches, rig)
         E = eight_point(x0, x1)
         if E is None:
-            return MotionEstimate.failed(
-                "the matches fit more than one essential matrix: degenerate scene or motion"
-            )
+            return MotionEstimate.failed(DEGENERATE)
         pose, front = decompose_essential(E, x0, x1)
         if front == 0:
             return MotionEstimate.failed("no match lies in front of both cameras")
@@ -125,8 +128,7 @@ class OpenCvFivePointSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         matches = temporal_pairs(correspondences, "left")
-        short = self.spec.shortage({"left": len(matches)})
-        if short is not None:
+        if short := self.spec.shortage({"left": len(matches)}):
             return short
         motions = self._motions(matches, rig)
         return motions[0] if motions else MotionEstimate.failed("OpenCV found no essential matrix")
@@ -152,7 +154,7 @@ class OpenCvFivePointSolver(Solver):
             return []
         if stacked is None or stacked.size % 9 or not np.all(np.isfinite(stacked)):
             return []
-        x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
+        x0, x1 = rays_of(matches, rig)
         out = []
         for E in stacked.reshape(-1, 3, 3):
             pose, front = decompose_essential(E, x0, x1)

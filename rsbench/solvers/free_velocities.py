@@ -79,7 +79,7 @@ from rsbench.solvers.engine.free_kernels import (
     free_proposal,
     free_terms,
 )
-from rsbench.solvers.essential_matrix import eight_point, normalising_transform, null_essential
+from rsbench.solvers.essential_matrix import DEGENERATE, eight_point, normalising_transform, null_essential
 from rsbench.solvers.linear import null_vector
 
 
@@ -194,12 +194,7 @@ def places(degree: int) -> NDArray[np.int64]:
     return out
 
 
-def coefficients(motion: FreeMotion, degree: int) -> FloatArray:
-    """The (21,) or (45,) coefficients of a motion."""
-    return with_derivatives(motion, degree)[0]
-
-
-def with_derivatives(motion: FreeMotion, degree: int) -> tuple[FloatArray, FloatArray]:
+def coefficients(motion: FreeMotion, degree: int) -> tuple[FloatArray, FloatArray]:
     """The (21,) or (45,) coefficients, and their derivatives (18, 21) or (18, 45) by ``FreeMotion.moved``."""
     place = places(degree)
     out, by = np.zeros(np.max(place) + 1), np.zeros((18, np.max(place) + 1))
@@ -350,8 +345,7 @@ class FreeVelocitySolver(Solver):
     def from_equations(self, matches: FloatArray, rig: StereoRig) -> list[FreeMotion] | str:
         """The linear solutions with s = 0 at the principal point: those with most points in front first."""
         frames = len(matches) if matches.shape[1] > 4 else 0
-        short = self.spec.shortage({"left": len(matches), "affine": frames})
-        if short is not None:
+        if short := self.spec.shortage({"left": len(matches), "affine": frames}):
             return short.reason
         rows = Rows.of(matches, rig.camera, rig.camera.cy)
         found = self.linear(rows)
@@ -401,15 +395,7 @@ def _at_first_row(motion: FreeMotion, camera: PinholeCamera) -> FreeMotion:
 
 def _answer(motion: FreeMotion, rows: Rows) -> MotionEstimate:
     motion, _ = signed(motion.of_unit_length(), rows)
-    return motion_of(so3.log(motion.R), motion.t)
-
-
-def motion_of(w: FloatArray, d: FloatArray) -> MotionEstimate:
-    """The answer with w and d (3,)."""
-    if not np.all(np.isfinite([*w, *d])):
-        return MotionEstimate.failed("no finite motion fits")
-    reason = "the length of d is not determined by one camera"
-    return MotionEstimate(w=w, d=d, success=True, reason=reason)
+    return MotionEstimate.of_one_camera(so3.log(motion.R), motion.t)
 
 
 def velocities(still: FreeMotion, rows: Rows) -> FreeMotion:
@@ -427,25 +413,17 @@ def velocities(still: FreeMotion, rows: Rows) -> FreeMotion:
 class TwelveParameterSolver(FreeVelocitySolver):
     """Essential matrix by the eight-point algorithm, then velocities of both frames by linear least squares."""
 
-    @property
-    def turning(self) -> bool:
-        return True
-
-    @property
-    def least(self) -> int:
-        return 20
-
-    @property
-    def about(self) -> tuple[str, str]:
-        return (
-            "D. Barath: Rolling Shutter Made Practical, ECCV 2026 (its baseline); Hartley, PAMI 1997",
-            "slow motion within the frames; readout ratio above 0; a scene that is not planar; translation",
-        )
+    turning = True
+    least = 20
+    about = (
+        "D. Barath: Rolling Shutter Made Practical, ECCV 2026 (its baseline); Hartley, PAMI 1997",
+        "slow motion within the frames; readout ratio above 0; a scene that is not planar; translation",
+    )
 
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
         still = without_velocities(rows)
         if still is None:
-            return _DEGENERATE
+            return DEGENERATE
         return [velocities(still, rows)]
 
 
@@ -511,7 +489,7 @@ def _translation_basis(degree: int) -> FloatArray:
     """(3, 3, 9, 21 or 45) derivatives of the coefficients by R and by (t, v0, v1), without w0 and w1."""
     units = np.eye(9).reshape(3, 3, 3, 3)
     still = np.zeros((5, 3))
-    return np.array([[with_derivatives(FreeMotion(R, *still), degree)[1][3:12] for R in row] for row in units])
+    return np.array([[coefficients(FreeMotion(R, *still), degree)[1][3:12] for R in row] for row in units])
 
 
 def _sample_motions(matches: FloatArray, camera: PinholeCamera, refined: bool) -> list[MotionEstimate]:
@@ -527,16 +505,11 @@ def _sample_motions(matches: FloatArray, camera: PinholeCamera, refined: bool) -
     data = np.concatenate([x[..., :2], y[..., :2], x[..., 1:2], y[..., 1:2]], axis=-1)
     most = (_SAMPLE_MOST[0], _SAMPLE_MOST[1] if refined else 0)
     focal, slowness = np.array([camera.fx, camera.fy]), (camera.height / camera.fy) ** 2 / matches.shape[1]
-    first, place, R, vectors = (
-        -camera.cy / camera.fy,
-        places(1),
-        np.zeros((len(F), 3, 3)),
-        np.zeros((len(F), 5, 3)),
-    )
+    R, vectors, at = np.zeros((len(F), 3, 3)), np.zeros((len(F), 5, 3)), (focal, -camera.cy / camera.fy, slowness)
     for k, (Rs, begun) in enumerate(zip(*_starts(F, 1), strict=True)):
-        free_proposal(Rs, begun, F[k], place, data[k], focal, first, slowness, most, R[k], vectors[k])
+        free_proposal(Rs, begun, F[k], places(1), data[k], *at, most, R[k], vectors[k])
     return [
-        motion_of(*motion) if usable else MotionEstimate.failed(_SINGULAR)
+        MotionEstimate.of_one_camera(*motion) if usable else MotionEstimate.failed(_SINGULAR)
         for motion, usable in zip(zip(so3.log(R), vectors[:, 0], strict=True), good, strict=True)
     ]
 
@@ -599,7 +572,6 @@ class DaiSolver(FreeVelocitySolver):
 
 _STEPS = 6
 """Gauss-Newton steps: for exact matches at 6 degrees and 1.2 m per frame, the last one changes w by 1e-9 rad."""
-_DEGENERATE = "the matches fit more than one essential matrix: degenerate scene or motion"
 
 
 def jets(rows: Rows, patch_px: float) -> tuple[FloatArray, FloatArray]:
@@ -680,23 +652,15 @@ class AffineSolver(FreeVelocitySolver):
     patch_px: float = 10.0
     """Noise of points divided by that of affine frames, px: the distance at which both weigh the same."""
 
+    turning = True
+    least = 7
+    about = (
+        "D. Barath: Rolling Shutter Made Practical, ECCV 2026 (its equations); Hartley, PAMI 1997",
+        "affine frames of the left matches; slow motion within the frames; readout ratio above 0; translation",
+    )
+
     def __post_init__(self) -> None:
         check_number("patch_px", self.patch_px, 1e-3, 1e3)
-
-    @property
-    def turning(self) -> bool:
-        return True
-
-    @property
-    def least(self) -> int:
-        return 7
-
-    @property
-    def about(self) -> tuple[str, str]:
-        return (
-            "D. Barath: Rolling Shutter Made Practical, ECCV 2026 (its equations); Hartley, PAMI 1997",
-            "affine frames of the left matches; slow motion within the frames; readout ratio above 0; translation",
-        )
 
     @property
     def spec(self) -> SolverSpec:
@@ -712,7 +676,7 @@ class AffineSolver(FreeVelocitySolver):
         x, y = jets(rows, self.patch_px)
         E = essential_of_jets(x, y)
         if E is None:
-            return _DEGENERATE
+            return DEGENERATE
         still = at_rest_of(E, rows)
         return [*moving([still], x[None], y[None], rows.camera), still]
 
@@ -724,14 +688,13 @@ class AffineSolver(FreeVelocitySolver):
     ) -> list[list[MotionEstimate]]:
         """Propose each solution with its velocities and at rest, since noise of few matches may dominate them."""
         sets = [self.matches_of(sample) for sample in samples]
-        short = self.spec.shortage({"left": len(sets[0]), "affine": len(samples[0].affine)})
-        if short is not None:
+        if short := self.spec.shortage({"left": len(sets[0]), "affine": len(samples[0].affine)}):
             return [[short] for _ in samples]
         rows = [Rows.of(matches, rig.camera, rig.camera.cy) for matches in sets]
         x, y = (np.stack(part) for part in zip(*(jets(each, self.patch_px) for each in rows), strict=True))
         found = [essential_of_jets(*each) for each in zip(x, y, strict=True)]
         stills = {k: at_rest_of(E, rows[k]) for k, E in enumerate(found) if E is not None}
-        out = [[MotionEstimate.failed(_DEGENERATE)] for _ in samples]
+        out = [[MotionEstimate.failed(DEGENERATE)] for _ in samples]
         known = [*stills]
         moved = moving([*stills.values()], x[known], y[known], rig.camera) if known else []
         for k, motion in zip(known, moved, strict=True):

@@ -69,10 +69,8 @@ class SensorSolver(Solver):
 
     def _shortage(self, correspondences: Correspondences, sensor: MatchSet) -> MotionEstimate | None:
         """A failed estimate where there are too few matches or samples; None when there are enough."""
-        counts: dict[MatchSet, int] = {sensor: len(getattr(correspondences, sensor))}
-        for side, matches in self._matches(correspondences).items():
-            counts[side] = len(matches)
-        return self.spec.shortage(counts)
+        counts = {side: len(matches) for side, matches in self._matches(correspondences).items()}
+        return self.spec.shortage({**counts, sensor: len(getattr(correspondences, sensor))})
 
 
 @final
@@ -117,8 +115,8 @@ class GyroSolver(SensorSolver):
     def _solved(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, descend: bool
     ) -> MotionEstimate:
-        matches, short = self._matches(correspondences), self._shortage(correspondences, "gyro")
-        if short is not None:
+        matches = self._matches(correspondences)
+        if short := self._shortage(correspondences, "gyro"):
             return short
         if not np.ptp(correspondences.gyro[:, 0]) > 0.0:
             return MotionEstimate.failed("all samples of the gyroscope have one time")
@@ -243,6 +241,7 @@ def _signed(
 
 
 _DOWN = np.array([0.0, 1.0, 0.0])
+_NO_GRAVITY = "no direction of gravity near the start of either frame"
 _ANGLES = 90
 _UPRIGHT_QUICK, _UPRIGHT_FULL = 8, 50
 _LONGEST = 100.0
@@ -340,17 +339,18 @@ class UprightSolver(SensorSolver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        matches, up, short = *self._given(correspondences), self._shortage(correspondences, "gravity")
-        if short is not None:
+        matches, up = self._given(correspondences)
+        if short := self._shortage(correspondences, "gravity"):
             return short
         if up is None:
-            return MotionEstimate.failed("no direction of gravity near the start of either frame")
+            return MotionEstimate.failed(_NO_GRAVITY)
         rays = [rig.camera.unproject(matches["left"][:, k : k + 2]) for k in (0, 2)]
         if not np.all(np.isfinite(rays)) or np.max(np.abs(rays)) > 1e6:
             return MotionEstimate.failed("matches too far away to compute with")
         angle, direction = best_angle(rays[0] @ up.first.T, rays[1] @ up.second.T)
-        d = _signed_direction(up.rotation(angle), up.second.T @ direction, *rays)
-        return self._refined(up, up.rotation(angle), 0.5 * rig.baseline * d, correspondences, rig, _UPRIGHT_FULL)
+        R, d = up.rotation(angle), up.second.T @ direction
+        d = 0.5 * rig.baseline * (_sign(R, d, *rays) * d)
+        return self._refined(up, R, d, correspondences, rig, _UPRIGHT_FULL)
 
     def improve(
         self,
@@ -373,7 +373,7 @@ class UprightSolver(SensorSolver):
         if poselib is None:
             return [MotionEstimate.failed(MISSING)]
         if up is None:
-            return [MotionEstimate.failed("no direction of gravity near the start of either frame")]
+            return [MotionEstimate.failed(_NO_GRAVITY)]
         places: list[list[FloatArray]] = [[], []]
         rays: list[list[FloatArray]] = [[], []]
         for side, pairs in matches.items():
@@ -386,11 +386,9 @@ class UprightSolver(SensorSolver):
         found = []
         for pose in poses:
             R, t = np.array(pose.R), np.array(pose.t)
-            T = t + q - p @ R.T
-            front = [np.count_nonzero(in_front(Pose(R, each), x, y)) for each in (T, -T)]
-            if np.all(np.isfinite(R)) and np.all(np.isfinite(t)) and (front[0] >= front[1] or not self._stereo):
-                w, d = so3.log(up.second.T @ R @ up.first), up.second.T @ t
-                d = d if front[0] >= front[1] else -d
+            sign = _sign(R, t + q - p @ R.T, x, y)
+            if np.all(np.isfinite(R)) and np.all(np.isfinite(t)) and (sign > 0.0 or not self._stereo):
+                w, d = so3.log(up.second.T @ R @ up.first), sign * (up.second.T @ t)
                 found.append(MotionEstimate(w=w, d=d, success=True, metric=self._stereo))
         return found
 
@@ -420,8 +418,7 @@ class UprightSolver(SensorSolver):
         if not (np.all(np.isfinite([*w, *d])) and np.any(d)):
             return MotionEstimate.failed("no finite motion fits")
         if not self._stereo:
-            reason = "the length of d is not determined by one camera"
-            return MotionEstimate(w=w, d=d / np.linalg.norm(d), success=True, reason=reason)
+            return MotionEstimate.of_one_camera(w, d / np.linalg.norm(d))
         inverse, freedom = inverse_definite(end.H), len(descent.packed.pairs) - descent.unknowns
         metric = inverse is not None and freedom > 0
         if inverse is not None and metric:
@@ -471,7 +468,7 @@ def _about(axis: FloatArray) -> FloatArray:
     return np.vstack([axis, rest.T])
 
 
-def _signed_direction(R: FloatArray, d: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """d or -d, whichever has more points in front of the camera."""
-    front = [np.count_nonzero(in_front(Pose(R, each), x, y)) for each in (d, -d)]
-    return d if front[0] >= front[1] else -d
+def _sign(R: FloatArray, T: FloatArray, x: FloatArray, y: FloatArray) -> float:
+    """1, or -1 where -T (3,) or (n, 3) has more points of rays x, y (n, 3) in front of both cameras than T."""
+    front = [np.count_nonzero(in_front(Pose(R, each), x, y)) for each in (T, -T)]
+    return 1.0 if front[0] >= front[1] else -1.0

@@ -55,6 +55,18 @@ def null_vector(A: FloatArray, unit_columns: bool, rounding: float = ROUNDING) -
     return np.linalg.svd(A, full_matrices=len(A) < columns)[2][-1], ""
 
 
+SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Indices of the six entries that determine a symmetric matrix."""
+
+
+def symmetric(entries: FloatArray) -> FloatArray:
+    """The matrix (3, 3) of the entries (6,) named by ``SYMMETRIC``."""
+    out = np.zeros((3, 3))
+    for value, (i, j) in zip(entries, SYMMETRIC, strict=True):
+        out[i, j] = out[j, i] = value
+    return out
+
+
 def rotation_from_essential(E: FloatArray, d: FloatArray, symmetric: bool) -> FloatArray:
     """w (3,) from E = [d]x[w]x = w d^T - (d.w) I, by least squares over all nine entries or the symmetric part."""
     basis = np.eye(3)
@@ -65,14 +77,19 @@ def rotation_from_essential(E: FloatArray, d: FloatArray, symmetric: bool) -> Fl
     return np.asarray(w, np.float64)
 
 
+def pair_rays(pairs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rays (n, 3), z = 1, of both ends of pairs (n, 7 or 17)."""
+    ones = np.ones((len(pairs), 1))
+    return np.hstack([pairs[:, :2], ones]), np.hstack([pairs[:, 2:4], ones])
+
+
 def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatArray | None:
     """d (3,) in metres for a known rotation; None when the pairs do not hold its length.
 
     For a given w the exact constraint of the paper's motion is linear in d: ``m . d + beta = 0``; the smallest
     singular vector of [m, beta] gives d with its length.
     """
-    n = len(pairs)
-    x, y = np.column_stack([pairs[:, :2], np.ones(n)]), np.column_stack([pairs[:, 2:4], np.ones(n)])
+    x, y = pair_rays(pairs)
     R = so3.exp((pairs[:, 5] - pairs[:, 4])[:, None] * w)
     normal = so3.cross((R @ x[:, :, None])[:, :, 0], y)
     back = (np.swapaxes(R, 1, 2) @ normal[:, :, None])[:, :, 0]
@@ -81,7 +98,7 @@ def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatA
     norms = np.array([np.linalg.norm(m), np.linalg.norm(beta)])
     if not np.all(norms > 0.0):
         return None
-    _, _, Vt = np.linalg.svd(np.column_stack([m / norms[0], beta / norms[1]]), full_matrices=n < 4)
+    _, _, Vt = np.linalg.svd(np.column_stack([m / norms[0], beta / norms[1]]), full_matrices=len(pairs) < 4)
     d, factor = Vt[-1, :3] / norms[0], Vt[-1, 3] / norms[1]
     if not abs(factor) * limit > np.linalg.norm(d):
         return None
@@ -190,8 +207,7 @@ class LinearSolver(Solver):
         matches = {side: temporal_pairs(correspondences, side) for side in SIDES}
         if self.sampling == "nine-apart":
             matches = {side: far_apart(matches[side], 9) for side in SIDES}
-        short = self.spec.shortage({side: len(matches[side]) for side in SIDES})
-        if short is not None:
+        if short := self.spec.shortage({side: len(matches[side]) for side in SIDES}):
             return short
         unit = 1.0 if self.baseline_unit == "metre" else 0.5 * rig.baseline
         scaled, third = replace(rig, baseline=rig.baseline / unit), self.terms == "third"
@@ -225,23 +241,19 @@ class LinearSolver(Solver):
         return d * (float(np.linalg.norm(by_constraint)) / float(np.linalg.norm(d)))
 
 
-_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-
 def reduced_blocks(pairs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Columns of d (n, 3), their part that the rotation shifts (n, 3), and the other columns (n, 12).
 
     The columns of d are the first plus ``cross(w, second)``.
     """
-    n = len(pairs)
-    x, y = np.column_stack([pairs[:, :2], np.ones(n)]), np.column_stack([pairs[:, 2:4], np.ones(n)])
+    x, y = pair_rays(pairs)
     k1, k3, sb = pairs[:, 4], pairs[:, 5], pairs[:, 6]
     a = k3 - k1
     c = so3.cross(x, y)
     M = y[:, :, None] * x[:, None, :]
     M = M + np.swapaxes(M, 1, 2)
     by_w = (a * sb)[:, None] * np.column_stack([c[:, 2], -c[:, 1]])
-    by_E = [a**2 * M[:, i, j] * (0.5 if i == j else 1.0) for i, j in _SYMMETRIC]
+    by_E = [a**2 * M[:, i, j] * (0.5 if i == j else 1.0) for i, j in SYMMETRIC]
     products = (M[:, 0, 2], -M[:, 0, 1], M[:, 2, 2] - M[:, 1, 1], -M[:, 1, 2])
     by_ww = [a**2 * sb * product / 2 for product in products]
     shifted = (a * (k1 + k3) / 2)[:, None] * c
@@ -251,8 +263,7 @@ def reduced_blocks(pairs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatArray, FloatArray] | str:
     """``(w, d)`` of pairs (n, 7), d of arbitrary length and sign; or why there is none."""
     by_d, shifted, rest = reduced_blocks(pairs)
-    others = {15: range(12), 11: range(8), 9: range(2, 8)}[unknowns]
-    rest = rest[:, list(others)]
+    rest = rest[:, {15: slice(12), 11: slice(8), 9: slice(2, 8)}[unknowns]]
     first_E = 3 + (0 if unknowns == 9 else 2)
     w = d = np.zeros(3)
     for _ in range(passes):
@@ -262,10 +273,7 @@ def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatA
         d = X[:3]
         if not np.linalg.norm(d) > 1e-10 * np.linalg.norm(X):
             return "no translation: its direction and the rotation are not separable"
-        E = np.zeros((3, 3))
-        for value, (i, j) in zip(X[first_E : first_E + 6], _SYMMETRIC, strict=True):
-            E[i, j] = E[j, i] = value
-        w = rotation_from_essential(E, d, symmetric=True)
+        w = rotation_from_essential(symmetric(X[first_E : first_E + 6]), d, symmetric=True)
         if not np.linalg.norm(w) < np.pi / 2:
             return "the passes ran away: no small rotation fits"
     return w, d / np.linalg.norm(d)
@@ -347,14 +355,7 @@ class IteratedSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         packed = pack(correspondences, rig, shutter, use_tracks=False)
-        pairs = packed.pair_counts()
-        counts: dict[MatchSet, int] = {
-            "left": pairs["left"],
-            "right": pairs["right"],
-            "tracks": len(correspondences.tracks),
-        }
-        short = self.spec.shortage(counts)
-        if short is not None:
+        if short := self.spec.shortage({**packed.pair_counts(), "tracks": len(correspondences.tracks)}):
             return short
         solution = solve_reduced(packed.pairs, self.unknowns, self.passes)
         if isinstance(solution, str):

@@ -31,7 +31,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.essential_matrix import decompose_essential, eight_point
+from rsbench.solvers.essential_matrix import DEGENERATE, decompose_essential, eight_point, rays_of
 
 _BUNDLE = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-14, "step_tol": 1e-14}
 MISSING = "poselib is not installed: there is no wheel for this platform"
@@ -99,19 +99,8 @@ def estimate_of(pose: Any, metric: bool) -> MotionEstimate:
     if not (np.all(np.isfinite(R)) and np.all(np.isfinite(t))):
         return MotionEstimate.failed(_NOT_FINITE)
     if not metric:
-        t = t / max(float(np.linalg.norm(t)), 1e-300)
-    reason = "" if metric else "the length of d is not determined by one camera"
-    return MotionEstimate(w=so3.log(R), d=t, success=True, metric=metric, reason=reason)
-
-
-def left_start(matches: FloatArray, rig: StereoRig) -> MotionEstimate:
-    """Motion of the left camera, with a unit d, by the eight-point algorithm on matches (n, 4), n >= 8."""
-    x0, x1 = rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
-    E = eight_point(x0, x1)
-    if E is None:
-        return MotionEstimate.failed("the matches fit more than one essential matrix: degenerate scene or motion")
-    pose, _ = decompose_essential(E, x0, x1)
-    return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True)
+        return MotionEstimate.of_one_camera(so3.log(R), t / max(float(np.linalg.norm(t)), 1e-300))
+    return MotionEstimate(w=so3.log(R), d=t, success=True, metric=True)
 
 
 def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
@@ -121,8 +110,7 @@ def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstima
         return [MotionEstimate.failed(MISSING)]
     if len(matches) < 5:
         return []
-    rays = [rig.camera.unproject(matches[:5, k : k + 2]) for k in (0, 2)]
-    unit = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
+    unit = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays_of(matches[:5], rig)]
     motions = [estimate_of(pose, metric=False) for pose in poselib.relpose_5pt(*unit)]
     return [motion for motion in motions if motion.success]
 
@@ -137,13 +125,15 @@ class PoselibPairsSolver(PoselibSolver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        short = self.spec.shortage({side: len(temporal_pairs(correspondences, side)) for side in SIDES})
-        if short is not None:
+        if short := self.spec.shortage({side: len(temporal_pairs(correspondences, side)) for side in SIDES}):
             return short
-        start = left_start(temporal_pairs(correspondences, "left"), rig)
-        if not start.success:
-            return start
-        return self.improve(replace(start, d=self._length(rig) * start.d), correspondences, rig, shutter)
+        x0, x1 = rays_of(temporal_pairs(correspondences, "left"), rig)
+        E = eight_point(x0, x1)
+        if E is None:
+            return MotionEstimate.failed(DEGENERATE)
+        pose, _ = decompose_essential(E, x0, x1)
+        start = MotionEstimate(w=so3.log(pose.R), d=self._length(rig) * pose.t, success=True)
+        return self.improve(start, correspondences, rig, shutter)
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
         return {"left": 5}
@@ -229,11 +219,8 @@ class PoselibPnpSolver(PoselibSolver):
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        usable = with_depth(correspondences.tracks)
-        if len(usable) < self.spec.minimum["tracks"]:
-            return MotionEstimate.failed(
-                f"{len(usable)} tracks with positive disparity, need {self.spec.minimum['tracks']}"
-            )
+        if short := shortage_of_depth(with_depth(correspondences.tracks), self.spec.minimum["tracks"]):
+            return short
         # A frame's motion is small: no motion at all is as good a start as a minimal solver's.
         still = MotionEstimate(w=np.zeros(3), d=np.zeros(3), success=True)
         return self.improve(still, correspondences, rig, shutter)
@@ -251,7 +238,8 @@ class PoselibPnpSolver(PoselibSolver):
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         # Points in the body; the left camera of frame 1 sees them at R x + d + offset.
         poses = poselib.p3p(rays, stereo_points(tracks[:3], rig))
-        return [_shifted(pose, rig.offset("left")) for pose in poses if np.all(np.isfinite(pose.t))]
+        motions = [(so3.log(np.array(p.R)), np.array(p.t) - rig.offset("left")) for p in poses]
+        return [MotionEstimate(w=w, d=d, success=True, metric=True) for w, d in motions if np.all(np.isfinite(d))]
 
     def refined(
         self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
@@ -282,8 +270,11 @@ def pose_of_points(
     return pose
 
 
-def _shifted(pose: Any, offset: FloatArray) -> MotionEstimate:
-    return MotionEstimate(w=so3.log(np.array(pose.R)), d=np.array(pose.t) - offset, success=True, metric=True)
+def shortage_of_depth(tracks: FloatArray, least: int) -> MotionEstimate | None:
+    """A failed estimate where too few tracks have depth; None when there are enough."""
+    if len(tracks) >= least:
+        return None
+    return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {least}")
 
 
 _LEAST = 10
@@ -326,9 +317,8 @@ class P3pSolver(Solver):
         poselib, tracks = poselib_module(), with_depth(correspondences.tracks)
         if poselib is None:
             return MotionEstimate.failed(MISSING)
-        if len(tracks) < self.spec.minimum["tracks"]:
-            least = self.spec.minimum["tracks"]
-            return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {least}")
+        if short := shortage_of_depth(tracks, self.spec.minimum["tracks"]):
+            return short
         options = {
             "max_reproj_error": self.threshold_px,
             "success_prob": self.confidence,

@@ -40,7 +40,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.ransac import BoolArray, IntArray, RansacOptions, ransac
-from rsbench.solvers.poselib import P3pSolver
+from rsbench.solvers.poselib import P3pSolver, shortage_of_depth
 
 _LEAST = 6
 _STEPS = 6
@@ -220,11 +220,7 @@ class _Search:
     def __init__(self, tracks: FloatArray, solver: R6pSolver, rig: StereoRig, shutter: RollingShutter) -> None:
         self.tracks, self.solver, self.rig, self.shutter = tracks, solver, rig, shutter
         self.R0 = solver.beginning(tracks, rig, shutter)
-        self.data = self.of(tracks)
-
-    @property
-    def num_data(self) -> tuple[int, ...]:
-        return (len(self.tracks),)
+        self.data, self.num_data = self.of(tracks), (len(tracks),)
 
     def of(self, tracks: FloatArray, minimal: bool = False) -> Resection:
         """The data of some tracks (n, 8); minimal samples use the left camera alone."""
@@ -304,8 +300,8 @@ class R6pSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         tracks = with_depth(correspondences.tracks)
-        if len(tracks) < _LEAST:
-            return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {_LEAST}")
+        if short := shortage_of_depth(tracks, _LEAST):
+            return short
         search = _Search(tracks, self, rig, shutter)
         best, inliers = None, np.ones(len(tracks), dtype=np.bool_)
         if len(tracks) > _LEAST:  # six fit always

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, final
 
 import cv2
@@ -38,7 +38,7 @@ from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, Solver
 from rsbench.solvers.engine.levenberg_marquardt import Minimum, levenberg_marquardt
 from rsbench.solvers.engine.packed import Packed, each_term, heavy_tailed, pack, pack_pairs, solve_triples
 from rsbench.solvers.essential_matrix import decompose_essential, eight_point
-from rsbench.solvers.linear import scaled_translation, solve_reduced
+from rsbench.solvers.linear import pair_rays, scaled_translation, solve_reduced
 
 IntArray = NDArray[np.int64]
 _DEGREES = [
@@ -232,16 +232,9 @@ class RefinedSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         packed = self.packed(correspondences, rig, shutter)
-        if len(packed.tracks) == 0:
-            pairs = packed.pair_counts()
-            counts: dict[MatchSet, int] = {
-                "tracks": len(correspondences.tracks),
-                "left": pairs["left"],
-                "right": pairs["right"],
-            }
-            short = self.spec.shortage(counts)
-            if short is not None:
-                return short
+        counts: dict[MatchSet, int] = {**packed.pair_counts(), "tracks": len(correspondences.tracks)}
+        if len(packed.tracks) == 0 and (short := self.spec.shortage(counts)):
+            return short
         best = self._descend(packed, rig)
         if best is None:
             return MotionEstimate.failed("no start found: degenerate motion or scene")
@@ -323,11 +316,11 @@ class RefinedSolver(Solver):
 
     def _descend(self, packed: Packed, rig: StereoRig) -> Minimum | None:
         if len(packed.tracks) > 0:
-            tracks, start = packed.tracks_only(), np.zeros(6)
+            tracks, start = replace(packed, pairs=packed.pairs[:0]), np.zeros(6)
             if packed.apart:
                 start = self._minimise(tracks.at_once(), start, self.iterations).theta
             return self._checked(packed, self._minimise(tracks, start, self.iterations).theta)
-        starts = linear_starts(packed, (15, 11, 9), rig)
+        starts = linear_starts(packed, rig)
         if not starts:
             return None
         screen = packed.subset(_SCREEN_MATCHES)
@@ -458,19 +451,15 @@ def _translation_sigmas(d: FloatArray, covariance: FloatArray | None) -> tuple[f
     return float(np.sqrt(along)) / length, float(np.sqrt(max(np.trace(C) - along, 0.0))) / length
 
 
-def linear_starts(packed: Packed, families: tuple[int, ...], rig: StereoRig) -> list[FloatArray]:
+def linear_starts(packed: Packed, rig: StereoRig) -> list[FloatArray]:
     """Starting parameters (6,) from the pairs: iterated linear solvers, then eight points of the left camera."""
     step = max(1, len(packed.pairs) // (2 * _SCREEN_MATCHES))
     pairs = packed.pairs[::step]
-    motions = []
-    for unknowns in families:
-        solution = solve_reduced(pairs, unknowns, 3)
-        if not isinstance(solution, str):
-            motions.append(solution)
+    solutions = [solve_reduced(pairs, unknowns, 3) for unknowns in (15, 11, 9)]
+    motions = [solution for solution in solutions if not isinstance(solution, str)]
     left = pairs[pairs[:, 6] >= 0.0]
     if len(left) >= 8:
-        ones = np.ones((len(left), 1))
-        x0, x1 = np.hstack([left[:, :2], ones]), np.hstack([left[:, 2:4], ones])
+        x0, x1 = pair_rays(left)
         E = eight_point(x0, x1)
         if E is not None:
             pose, _ = decompose_essential(E, x0, x1)

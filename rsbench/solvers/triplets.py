@@ -30,7 +30,7 @@ line are eliminated by Gauss-Newton steps; its eight errors then have four degre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, NamedTuple, final
@@ -38,17 +38,17 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.arguments import check_number, check_whole
+from rsbench.core.arguments import check_number
 from rsbench.core.correspondences import BoolArray, Correspondences, stereo_points, with_depth
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, cross, hat
-from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, SolverSpec
+from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
-from rsbench.solvers.engine.packed import Packed, inverse_definite, pack
+from rsbench.solvers.engine.packed import TRACK_FREEDOM, Packed, inverse_definite, pack
 from rsbench.solvers.engine.ransac import IntArray, RansacOptions, ransac
-from rsbench.solvers.engine.robust_motion import SIGMAS, quantile, truncated
+from rsbench.solvers.engine.robust_motion import SECOND_TRY, SIGMAS, quantile, truncated
 
 View = tuple[Literal[0, 1], Side]
 """The third image of a feature: its frame, in which the feature's depth is not used, and its camera."""
@@ -165,22 +165,18 @@ class TripletSolver(Solver):
         start = motion_of(pose)
         return self._refined(start, tracks, rig, _FULL) if start.success else start
 
-    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        return {"tracks": _LEAST}
-
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
         return next(iter(self.propose_all([sample], rig, shutter)))
 
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        def solve(tracks: FloatArray) -> Iterable[list[MotionEstimate]]:
-            with np.errstate(all="ignore"):
-                found = [newton(Triplets.of(tracks, pattern, rig)) for pattern in PATTERNS]
-            each = (zip(*pose, strict=True) for pose in found)
-            return [[motion_of(Pose(*one)) for one in poses] for poses in zip(*each, strict=True)]
-
-        return propose_together(samples, _LEAST, with_depths, solve)
+        tracks = [with_depths(sample.tracks)[:_LEAST] for sample in samples]
+        whole = [each for each in tracks if len(each) == _LEAST]
+        stacked = np.stack(whole) if whole else np.zeros((0, _LEAST, 8))
+        found = sample_motions(lambda views: Triplets.of(stacked, views, rig))
+        few = MotionEstimate.failed(f"fewer than {_LEAST} points of a sample have positive disparity")
+        return [next(found) if len(each) == _LEAST else [few] for each in tracks]
 
     def improve(
         self,
@@ -216,21 +212,12 @@ def motion_of(pose: Pose) -> MotionEstimate:
     return MotionEstimate(w=so3.log(pose.R), d=pose.t, success=True, metric=True)
 
 
-def propose_together(
-    samples: Sequence[Correspondences],
-    least: int,
-    usable: Callable[[FloatArray], FloatArray],
-    solve: Callable[[FloatArray], Iterable[list[MotionEstimate]]],
-) -> list[list[MotionEstimate]]:
-    """The motions of each sample, by one call of ``solve`` for all, which takes tracks (b, least, 8).
-
-    A sample with fewer ``usable`` tracks has failed.
-    """
-    tracks = [usable(sample.tracks)[:least] for sample in samples]
-    whole = [each for each in tracks if len(each) == least]
-    found = iter(solve(np.stack(whole)) if whole else ())
-    few = MotionEstimate.failed(f"fewer than {least} points of a sample have positive disparity")
-    return [next(found) if len(each) == least else [few] for each in tracks]
+def sample_motions(triplets: Callable[[Sequence[View]], Triplets]) -> Iterator[list[MotionEstimate]]:
+    """The motions of each sample of three features, by either pattern of the third images."""
+    with np.errstate(all="ignore"):
+        found = [newton(triplets(views)) for views in PATTERNS]
+    for poses in zip(*(zip(*pose, strict=True) for pose in found), strict=True):
+        yield [motion_of(Pose(*one)) for one in poses]
 
 
 FREEDOM = 4
@@ -376,11 +363,7 @@ def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
     return np.linalg.solve(N, At @ b).astype(np.float64)
 
 
-_SAMPLES = 10
-"""Fewest RANSAC samples, as in rsbench's robust loop."""
 _LINE_QUICK = 5
-_TRACK_FREEDOM = 5
-_SECOND_TRY = 3.0
 _REFITS = 5
 _NOISE_STEPS = 8
 _RANGE = (0.2, 4.0)
@@ -435,6 +418,7 @@ class _Problem:
     rig: StereoRig
     noise: FloatArray
     """(2,) standard deviations of a coordinate of points and of lines, px."""
+    sample_size = (_LEAST,)
 
     @classmethod
     def of(cls, tracks: FloatArray, lines: FloatArray, rig: StereoRig, noise_px: float) -> _Problem:
@@ -451,16 +435,9 @@ class _Problem:
     def num_data(self) -> tuple[int, ...]:
         return (len(self.points.tracks) + len(self.lines.rays),)
 
-    @property
-    def sample_size(self) -> tuple[int, ...]:
-        return (_LEAST,)
-
     def generate(self, samples: IntArray) -> Iterator[list[MotionEstimate]]:
-        with np.errstate(all="ignore"):
-            found = [newton(self.features.triplets(samples, views, self.rig)) for views in PATTERNS]
-        each = (zip(*pose, strict=True) for pose in found)
-        for poses in zip(*each, strict=True):
-            yield [model for model in (motion_of(Pose(*one)) for one in poses) if model.success]
+        for models in sample_motions(lambda views: self.features.triplets(samples, views, self.rig)):
+            yield [model for model in models if model.success]
 
     def squares(self, model: MotionEstimate) -> tuple[FloatArray, FloatArray]:
         """Squared errors of points and of lines, px^2."""
@@ -472,7 +449,7 @@ class _Problem:
     def residuals(self, model: MotionEstimate) -> FloatArray:
         """(n,) errors in standard deviations; those of inliers, points or lines, are at most ``SIGMAS``."""
         squares = self.squares(model)
-        scales = SIGMAS / (self.noise * np.sqrt([quantile(_TRACK_FREEDOM), quantile(FREEDOM)]))
+        scales = SIGMAS / (self.noise * np.sqrt([quantile(TRACK_FREEDOM), quantile(FREEDOM)]))
         return np.concatenate([np.sqrt(each) * scale for each, scale in zip(squares, scales, strict=True)])
 
     def refine(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate | None:
@@ -507,7 +484,7 @@ class _Problem:
     def with_noise_of(self, model: MotionEstimate, least: float, most: float) -> _Problem:
         """The problem with the noise of points and of lines estimated from the inliers of a motion."""
         noise = self.noise.copy()
-        for k, (squares, freedom) in enumerate(zip(self.squares(model), (_TRACK_FREEDOM, FREEDOM), strict=True)):
+        for k, (squares, freedom) in enumerate(zip(self.squares(model), (TRACK_FREEDOM, FREEDOM), strict=True)):
             for _ in range(_NOISE_STEPS):
                 below = squares <= noise[k] ** 2 * quantile(freedom)
                 if np.count_nonzero(below) < _MANY:
@@ -531,8 +508,7 @@ class LineTripletSolver(Solver):
 
     def __post_init__(self) -> None:
         check_number("threshold_px", self.threshold_px, 1e-6)
-        check_number("confidence", self.confidence, 1e-6, 1.0 - 1e-9)
-        check_whole("max_iterations", self.max_iterations, _SAMPLES)
+        self._options()
 
     spec = SolverSpec(
         needs=frozenset({"tracks"}),
@@ -561,19 +537,17 @@ class LineTripletSolver(Solver):
         if count == _LEAST:  # without further features, RANSAC has nothing to count
             return self._of_all(problem)
         reason = ""
-        for factor in (1.0, _SECOND_TRY):
+        for factor in (1.0, SECOND_TRY):
             wider = replace(problem, noise=factor * problem.noise)
-            options = RansacOptions(
-                threshold=SIGMAS,
-                confidence=self.confidence,
-                min_iterations=_SAMPLES,
-                max_iterations=self.max_iterations,
-            )
-            found = ransac(wider, options, np.random.default_rng(0))
+            found = ransac(wider, self._options(), np.random.default_rng(0))
             if found.model is not None:
                 return self._concluded(wider, found.model)
             reason = reason or found.reason
         return MotionEstimate.failed(reason)
+
+    def _options(self) -> RansacOptions:
+        """The options of the search; checks the values."""
+        return RansacOptions(threshold=SIGMAS, confidence=self.confidence, max_iterations=self.max_iterations)
 
     def _of_all(self, problem: _Problem) -> MotionEstimate:
         every = np.arange(problem.num_data[0])

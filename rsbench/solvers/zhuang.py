@@ -45,13 +45,12 @@ from rsbench.solvers.engine.base import (
     SolverSpec,
     load_solver_entry,
 )
-from rsbench.solvers.linear import ROUNDING, rotation_from_essential
+from rsbench.solvers.linear import ROUNDING, SYMMETRIC, rotation_from_essential, symmetric
 
 _SLOWEST, _FASTEST = -0.49, 3.0
 """Accelerations k that are looked for: beyond the first the camera would turn back before the last row."""
 _GRID = 29
 _K_STEPS = 8
-_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class Flow(NamedTuple):
@@ -84,7 +83,7 @@ class Flow(NamedTuple):
     def system(self) -> tuple[FloatArray, FloatArray]:
         """Z0 and Z1 (n, 9): columns of v and of the six entries of s."""
         x = self.x
-        quadratic = [x[:, i] * x[:, j] * (1.0 if i == j else 2.0) for i, j in _SYMMETRIC]
+        quadratic = [x[:, i] * x[:, j] * (1.0 if i == j else 2.0) for i, j in SYMMETRIC]
         q, c = np.stack(quadratic, axis=-1), so3.cross(x, self.u)
         return np.hstack([c, self.alpha[:, None] * q]), np.hstack([0.0 * c, self.alpha_k[:, None] * q])
 
@@ -144,12 +143,10 @@ def velocity_of(flow: Flow, e: FloatArray, k: float) -> Velocity | str:
     """Velocity of a null vector (9,), its sign by the points in front; or why there is none."""
     if not np.all(np.isfinite(e)):
         return "the linear system has more than one solution: degenerate motion or scene"
-    v, s = e[:3] * (2.0 / (2.0 + k)), np.zeros((3, 3))
+    v = e[:3] * (2.0 / (2.0 + k))
     if not np.linalg.norm(v) > ROUNDING * np.linalg.norm(e):
         return "no translation: its direction and the rotation are not separable"
-    for value, (i, j) in zip(e[3:], _SYMMETRIC, strict=True):
-        s[i, j] = s[j, i] = value
-    w = rotation_from_essential(s, v, symmetric=True)
+    w = rotation_from_essential(symmetric(e[3:]), v, symmetric=True)
     if not np.linalg.norm(w) < np.pi / 2:
         return "no small rotation fits"
     return _in_front(flow, Velocity(w, v / np.linalg.norm(v), k))
@@ -256,8 +253,7 @@ class ZhuangSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         flow = Flow.of(correspondences, rig, shutter)
-        short = self.spec.shortage({"left": len(flow.x)})
-        if short is not None:
+        if short := self.spec.shortage({"left": len(flow.x)}):
             return short
         found, reason = self._linear(flow)
         if not found:
@@ -279,9 +275,6 @@ class ZhuangSolver(Solver):
         vectors = null_vectors(np.stack([flow.system()[0] for flow in flows]))
         found = (velocity_of(flow, e, 0.0) for flow, e in zip(flows, vectors, strict=True))
         return ([self._reported(each)] for each in found)
-
-    def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        return {"left": self._least}
 
     def improve(
         self,
@@ -320,15 +313,8 @@ class ZhuangSolver(Solver):
             return MotionEstimate.failed(found)
         constant = self._least == 8
         d = so3.left_jacobian(found.w) @ found.v if constant else found.v
-        if not np.all(np.isfinite([*found.w, *d])):
-            return MotionEstimate.failed("no finite motion fits")
-        return MotionEstimate(
-            w=found.w,
-            d=d / np.linalg.norm(d),
-            success=True,
-            reason="the length of d is not determined by one camera",
-            motion_parameters={} if constant else {"acceleration": found.k},
-        )
+        parameters = {} if constant else {"acceleration": found.k}
+        return MotionEstimate.of_one_camera(found.w, d / np.linalg.norm(d), **parameters)
 
 
 _LEAST_DURATION = 0.05

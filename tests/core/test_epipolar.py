@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import derivatives
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,11 +54,7 @@ def _world_constraint(motion: Motion, side: Side, match: FloatArray, shutter: Ro
 
 
 def _numeric_gradient(motion: Motion, side: Side, match: FloatArray, step: float = 1e-3) -> FloatArray:
-    units = step * np.eye(4)
-    ends = [
-        (_world_constraint(motion, side, match + u), _world_constraint(motion, side, match - u)) for u in units
-    ]
-    return np.array([(plus - minus) / (2 * step) for plus, minus in ends])
+    return derivatives(lambda moved: _world_constraint(motion, side, moved), match, step)
 
 
 def test_row_pair_pose_is_the_chain_through_the_world() -> None:
@@ -174,25 +171,18 @@ def test_ray_depths_of_skew_rays_are_the_least_squares_ones() -> None:
     np.testing.assert_allclose(epipolar.ray_depths(pose, x0, x1), expected, rtol=1e-10)
 
 
-@pytest.mark.parametrize("depth", [3.0, -3.0])
-def test_in_front_needs_both_depths_positive(depth: float) -> None:
-    pose = Pose(np.eye(3), np.array([-0.5, 0.0, 0.0]))
-    point = np.array([0.1, 0.2, depth])
-    x0, x1 = point / point[2], transform(pose, point) / depth
-    np.testing.assert_allclose(epipolar.ray_depths(pose, x0, x1), [depth, depth], rtol=1e-12)
-    assert epipolar.in_front(pose, x0, x1) == (depth > 0)
-
-
-@pytest.mark.parametrize("depth", [3.0, -2.0])
-def test_in_front_needs_both_depths_positive_when_they_differ(depth: float) -> None:
-    """Five metres along the axis: a point 3 m ahead of one camera is 2 m behind the other, either way round."""
-    pose = Pose(np.eye(3), np.array([0.0, 0.0, -np.copysign(5.0, depth)]))
-    point = np.array([0.1, 0.2, depth])
-    moved = transform(pose, point)
-    x0, x1 = point / point[2], moved / moved[2]
-    np.testing.assert_allclose(epipolar.ray_depths(pose, x0, x1), [depth, moved[2]], rtol=1e-12)
-    assert depth * moved[2] < 0.0
-    assert not epipolar.in_front(pose, x0, x1)
+@pytest.mark.parametrize(
+    ("t", "depth", "moved_depth"),
+    # Sideways; and five metres along the axis: 3 m ahead of one camera is 2 m behind the other, either way round.
+    [((-0.5, 0, 0), 3.0, 3.0), ((-0.5, 0, 0), -3.0, -3.0), ((0, 0, -5), 3.0, -2.0), ((0, 0, 5), -2.0, 3.0)],
+)
+def test_in_front_needs_both_depths_positive(
+    t: tuple[float, float, float], depth: float, moved_depth: float
+) -> None:
+    pose, point = Pose(np.eye(3), np.array(t)), np.array([0.1, 0.2, depth])
+    x0, x1 = point / depth, transform(pose, point) / moved_depth
+    np.testing.assert_allclose(epipolar.ray_depths(pose, x0, x1), [depth, moved_depth], rtol=1e-12)
+    assert epipolar.in_front(pose, x0, x1) == (depth > 0.0 and moved_depth > 0.0)
 
 
 def test_parallel_rays_have_no_depth_and_are_not_in_front() -> None:

@@ -268,6 +268,17 @@ def test_explicit_poses_fix_the_motion() -> None:
         SplineMotion(w, 1.1 * d, **given)
 
 
+STILL = [0.0] * 6
+
+
+def _spectral(spectrum: Any) -> dict[str, Any]:
+    return {"interval": 0.5, "spectrum": spectrum}
+
+
+def _banded(low: float, high: float, degrees: float) -> dict[str, Any]:
+    return _spectral({"path": STILL, "bands": [[low, high, degrees, 0.0]]})
+
+
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
@@ -278,6 +289,17 @@ def test_explicit_poses_fix_the_motion() -> None:
         ({"shake": np.zeros((6, 6)), "interval": 0.5}, "shake has 6 rows; an interval of 0.5 needs 7"),
         ({"shake": np.zeros((7, 5)), "interval": 0.5}, "rows of 6 finite numbers"),
         ({"shake": np.zeros((7, 6)), "interval": 0.5, "seed": 1}, "shake and seed exclude each other"),
+        (_spectral(3), "spectrum must be a table with path and bands"),
+        (_spectral({"bands": [[0.1, 0.2, 0.1, 0.0]]}), "spectrum must be a table with path and bands"),
+        (_spectral({"path": [0.0] * 5, "bands": [[0.1, 0.2, 0.1, 0.0]]}), "spectrum.path must be 6"),
+        (_spectral({"path": ["a"] * 6, "bands": [[0.1, 0.2, 0.1, 0.0]]}), "spectrum.path"),
+        (_spectral({"path": STILL, "bands": []}), "spectrum.bands must be 1 to 32 rows of 4"),
+        (_banded(0.2, 0.1, 0.1), "must rise from 0"),
+        (_banded(0.2, 0.6, 0.1), "at most 0.5 cycles per frame period"),
+        (_banded(0.2, 0.3, -0.1), "standard deviations from 0"),
+        (_banded(0.2, 0.3, float("nan")), "spectrum.bands"),
+        (_banded(0.1, 0.2, 0.1) | {"preset": "handheld"}, "spectrum and preset exclude each other"),
+        (_banded(0.1, 0.2, 0.1) | {"interval": 1e-6}, "at most 20000 are drawn"),
     ],
 )
 def test_a_spline_refuses_what_it_cannot_be(parameters: dict[str, object], words: str) -> None:
@@ -300,11 +322,8 @@ def test_the_pose_alone_of_a_spline_is_that_of_its_pose_with_velocity() -> None:
         np.testing.assert_array_equal(alone.t, whole.t)
 
 
-STILL = [0.0] * 6
-
-
 def _motion(bands: list[list[float]], path: list[float] = STILL, **others: Any) -> SplineMotion:
-    given: dict[str, Any] = {"interval": 0.5, "spectrum": {"path": path, "bands": bands}, **others}
+    given = {**_spectral({"path": path, "bands": bands}), **others}
     w, d = SplineMotion.endpoint(given) or (None, None)
     assert w is not None and d is not None
     return SplineMotion(w, d, **given)
@@ -356,33 +375,6 @@ def test_a_longer_shake_begins_as_a_shorter_one_and_is_read_back_to_rounding() -
     for a, b in zip(again.body_from_world(tau), long.body_from_world(tau), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
     assert np.max(np.abs(_motion(bands, seed=4).w - short.w)) > 1e-4
-
-
-@pytest.mark.parametrize(
-    ("spectrum", "words"),
-    [
-        (3, "spectrum must be a table with path and bands"),
-        ({"bands": [[0.1, 0.2, 0.1, 0.0]]}, "spectrum must be a table with path and bands"),
-        ({"path": [0.0] * 5, "bands": [[0.1, 0.2, 0.1, 0.0]]}, "spectrum.path must be 6"),
-        ({"path": ["a"] * 6, "bands": [[0.1, 0.2, 0.1, 0.0]]}, "spectrum.path"),
-        ({"path": STILL, "bands": []}, "spectrum.bands must be 1 to 32 rows of 4"),
-        ({"path": STILL, "bands": [[0.2, 0.1, 0.1, 0.0]]}, "must rise from 0"),
-        ({"path": STILL, "bands": [[0.2, 0.6, 0.1, 0.0]]}, "at most 0.5 cycles per frame period"),
-        ({"path": STILL, "bands": [[0.2, 0.3, -0.1, 0.0]]}, "standard deviations from 0"),
-        ({"path": STILL, "bands": [[0.2, 0.3, float("nan"), 0.0]]}, "spectrum.bands"),
-    ],
-)
-def test_what_is_no_spectrum_is_refused(spectrum: Any, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        SplineMotion.endpoint({"interval": 0.5, "spectrum": spectrum})
-
-
-def test_a_spectrum_excludes_other_shakes() -> None:
-    spectrum = {"path": STILL, "bands": [[0.1, 0.2, 0.1, 0.0]]}
-    with pytest.raises(ValueError, match="spectrum and preset exclude each other"):
-        SplineMotion.endpoint({"interval": 0.5, "spectrum": spectrum, "preset": "handheld"})
-    with pytest.raises(ValueError, match="at most 20000 are drawn"):
-        SplineMotion.endpoint({"interval": 1e-6, "spectrum": spectrum})
 
 
 def test_the_card_handheld_turns_as_fast_as_it_says() -> None:

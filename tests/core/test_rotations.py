@@ -134,22 +134,13 @@ def _matrix(pose: Pose) -> FloatArray:
     return M
 
 
-def test_transform_is_the_homogeneous_product() -> None:
-    pose, x = _random_poses(0), np.random.default_rng(1).normal(size=(6, 3))
-    homogeneous = np.concatenate([x, np.ones((6, 1))], axis=1)
-    expected = np.einsum("nij,nj->ni", _matrix(pose), homogeneous)[:, :3]
+def test_transforms_are_homogeneous_matrices() -> None:
+    pose, first, x = _random_poses(0), _random_poses(4), np.random.default_rng(1).normal(size=(6, 3))
+    M, homogeneous = _matrix(pose), np.concatenate([x, np.ones((6, 1))], axis=1)
+    expected = np.einsum("nij,nj->ni", M, homogeneous)[:, :3]
     np.testing.assert_allclose(transform(pose, x), expected, rtol=0, atol=1e-14)
-
-
-def test_inverse_is_the_matrix_inverse() -> None:
-    pose = _random_poses(2)
-    np.testing.assert_allclose(_matrix(inverse(pose)), np.linalg.inv(_matrix(pose)), rtol=0, atol=1e-13)
-
-
-def test_compose_is_the_matrix_product() -> None:
-    c_from_b, b_from_a = _random_poses(3), _random_poses(4)
-    expected = _matrix(c_from_b) @ _matrix(b_from_a)
-    np.testing.assert_allclose(_matrix(compose(c_from_b, b_from_a)), expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(_matrix(inverse(pose)), np.linalg.inv(M), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(_matrix(compose(pose, first)), M @ _matrix(first), rtol=0, atol=1e-14)
 
 
 def test_one_pose_broadcasts_over_points_and_one_point_over_poses() -> None:
@@ -192,15 +183,13 @@ def test_scale_error_is_the_logarithm_of_the_ratio(factor: float) -> None:
     )
 
 
-def test_a_zero_estimate_scores_the_worst_value() -> None:
-    assert pose_errors.translation_error(np.zeros(3), [1.0, 0, 0]) == pose_errors.WORST_ANGLE
-    assert pose_errors.scale_error(np.zeros(3), [1.0, 0, 0]) == pose_errors.WORST_SCALE
-
-
-def test_a_zero_truth_has_neither_direction_nor_scale() -> None:
-    for estimate in ([1.0, 0, 0], np.zeros(3)):
-        assert np.isnan(pose_errors.translation_error(estimate, np.zeros(3)))
-        assert np.isnan(pose_errors.scale_error(estimate, np.zeros(3)))
+def test_a_zero_estimate_scores_the_worst_value_and_a_zero_truth_none() -> None:
+    along, zero = [1.0, 0, 0], np.zeros(3)
+    assert pose_errors.translation_error(zero, along) == pose_errors.WORST_ANGLE
+    assert pose_errors.scale_error(zero, along) == pose_errors.WORST_SCALE
+    for estimate in (along, zero):
+        assert np.isnan(pose_errors.translation_error(estimate, zero))
+        assert np.isnan(pose_errors.scale_error(estimate, zero))
 
 
 @few

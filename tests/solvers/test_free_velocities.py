@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 import pytest
 from commands import run_here
-from solver_trials import CAMERA, RIG, SHUTTER, D, W
+from differences import derivatives
+from solver_trials import CAMERA, RIG, SHUTTER, D, W, assert_second_order, errors_of_size
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, simulate
 from rsbench.components.motion_models import LinearMotion
@@ -40,7 +41,6 @@ from rsbench.solvers.free_velocities import (
     refine,
     signed,
     system,
-    with_derivatives,
 )
 from rsbench.solvers.linear import null_vector
 from rsbench.storage.files import load_matches
@@ -84,9 +84,7 @@ def constraint(motion: FreeMotion, matches: FloatArray) -> FloatArray:
 
 def by_pixels(motion: FreeMotion, matches: FloatArray) -> FloatArray:
     """Derivatives (n, 4) of the constraint by central differences: of third order in a tenth of a pixel over f."""
-    steps = 0.1 * np.eye(4)
-    by = [(constraint(motion, matches + e) - constraint(motion, matches - e)) / 0.2 for e in steps]
-    return np.stack(by, axis=-1)
+    return derivatives(lambda moved: constraint(motion, moved), matches, 0.1)
 
 
 def front(motion: FreeMotion, rows: Rows) -> int:
@@ -109,8 +107,8 @@ def test_coefficients_are_those_of_the_polynomial_of_essential_matrices(degree: 
     for x, y in zip(rows.x, rows.y, strict=True):
         Q = (np.eye(3) + y[1] * hat(m.w1)) @ m.R @ (np.eye(3) - x[1] * hat(m.w0))
         values.append(y @ (hat(m.t + y[1] * m.v1) @ Q - Q @ hat(x[1] * m.v0)) @ x)
-    np.testing.assert_allclose(system(rows.x, rows.y, degree) @ coefficients(m, degree), values, atol=1e-14)
-    assert coefficients(m, degree).shape == ({1: 21, 2: 45}[degree],)
+    np.testing.assert_allclose(system(rows.x, rows.y, degree) @ coefficients(m, degree)[0], values, atol=1e-14)
+    assert coefficients(m, degree)[0].shape == ({1: 21, 2: 45}[degree],)
 
 
 @pytest.mark.parametrize("count", [20, 100])
@@ -127,7 +125,7 @@ def test_the_linear_model_is_exact_from_twenty_matches(count: int) -> None:
 def test_the_uniform_model_is_read_off_its_own_coefficients() -> None:
     for seed in range(3):
         truth = free_motion(0.05, seed)
-        assert max(off(extract(-2.0 * coefficients(truth, 2), 2)[0], truth)) < 1e-9
+        assert max(off(extract(-2.0 * coefficients(truth, 2)[0], 2)[0], truth)) < 1e-9
 
 
 def test_half_the_turn_within_the_frames_has_half_of_the_uniform_model_s_error() -> None:
@@ -158,6 +156,7 @@ def test_the_linear_solver_is_exact_on_its_own_model(refinement: Literal["none",
             assert translation_error(found.d, first.t) < 1e-8
 
 
+STEREO = RIG.about("left")
 UNIFORM = (DaiSolver(model="uniform"), TwelveParameterSolver())
 
 
@@ -179,13 +178,7 @@ def test_the_descent_is_exact_on_the_paper_s_motion(
 
 def test_half_the_motion_has_a_quarter_of_the_rotation_s_and_half_of_the_direction_s_error() -> None:
     """Of the linear model where the camera turns within its frames: in them it is off by half of the turn."""
-
-    def errors_of(size: float) -> FloatArray:
-        found = [DaiSolver().estimate(of_the_paper(size, seed=seed), RIG, SHUTTER) for seed in range(5)]
-        each = [(rotation_error(one.w, size * W), translation_error(one.d, D)) for one in found]
-        return np.median(each, axis=0)
-
-    np.testing.assert_allclose(errors_of(0.5) / errors_of(0.25), [4.0, 2.0], rtol=0.25)
+    assert_second_order(DaiSolver(), seeds=5, rig=STEREO, pairs=100)
 
 
 @pytest.mark.parametrize("solver", [DaiSolver(), *UNIFORM])
@@ -238,12 +231,8 @@ def test_gradient_is_that_of_finite_differences() -> None:
     """To first order in the errors: those here are a hundredth of a pixel."""
     m = free_motion(0.1)
     matches = matches_of(m, 20) + 0.01 * np.random.default_rng(0).standard_normal((20, 4))
-    rows, steps = Rows.of(matches, CAMERA, CAMERA.cy), 1e-6 * np.eye(18)
-
-    def cost(step: FloatArray) -> float:
-        return 0.5 * float(np.sum(sampson(m.moved(step), rows) ** 2))
-
-    numeric = [(cost(step) - cost(-step)) / 2e-6 for step in steps]
+    rows = Rows.of(matches, CAMERA, CAMERA.cy)
+    numeric = derivatives(lambda step: 0.5 * np.sum(sampson(m.moved(step), rows) ** 2), np.zeros(18), 1e-6)
     r, J = errors(m, rows)
     np.testing.assert_allclose(J.T @ r, numeric, atol=2e-3 * np.max(np.abs(numeric)))
     sampson_errors = constraint(m, matches) / np.linalg.norm(by_pixels(m, matches), axis=1)
@@ -252,10 +241,9 @@ def test_gradient_is_that_of_finite_differences() -> None:
 
 @pytest.mark.parametrize("degree", [1, 2])
 def test_derivatives_of_the_coefficients_are_those_of_differences(degree: int) -> None:
-    m, h = free_motion(0.1 * (degree - 1)), 1e-6
-    steps = h * np.eye(18)[: 6 + 6 * degree]
-    numeric = [(coefficients(m.moved(e), degree) - coefficients(m.moved(-e), degree)) / (2.0 * h) for e in steps]
-    np.testing.assert_allclose(with_derivatives(m, degree)[1][: len(steps)], numeric, atol=1e-9)
+    m = free_motion(0.1 * (degree - 1))
+    numeric = derivatives(lambda step: coefficients(m.moved(step), degree)[0], np.zeros(6 + 6 * degree), 1e-6)
+    np.testing.assert_allclose(coefficients(m, degree)[1][: 6 + 6 * degree], numeric.T, atol=1e-9)
 
 
 @pytest.mark.parametrize("turning", [False, True])
@@ -305,9 +293,6 @@ def test_without_readout_or_with_too_few_matches_they_fail_by_value() -> None:
     assert not found.success and "more than one solution" in found.reason
 
 
-STEREO = RIG.about("left")
-
-
 def simulation(size: float = 1.0, seed: int = 0, pairs: int = 7, **noise: float) -> Simulation:
     options = SimulationOptions(pairs=pairs, affine=True, **noise)  # pyrefly: ignore[bad-argument-type]
     return simulate(STEREO, SHUTTER, LinearMotion(size * W, size * D), options, np.random.default_rng(seed))
@@ -323,7 +308,7 @@ def test_simulated_frames_are_those_of_planes_by_finite_differences() -> None:
     A change of depth moves it along a known line, so what is left across that line is zero; some plane has any
     two such columns.
     """
-    s, h = simulation(2.0, pairs=30), 1e-4
+    s = simulation(2.0, pairs=30)
     c = s.correspondences
     A = c.affine.reshape(-1, 2, 2)
 
@@ -338,27 +323,25 @@ def test_simulated_frames_are_those_of_planes_by_finite_differences() -> None:
         along = (seen(start, inverse + 1e-6) - seen(start, inverse - 1e-6)) / 2e-6
         inverse += np.sum((end - seen(start, inverse)) * along, axis=1) / np.sum(along**2, axis=1)
     np.testing.assert_allclose(seen(start, inverse), end, atol=1e-6)
-    for k, step in enumerate(h * np.eye(2)):
-        flat = (seen(start + step, inverse) - seen(start - step, inverse)) / (2.0 * h)
-        left_over = A[:, :, k] - flat  # what a change of depth along the step makes: along the epipolar line
-        across = left_over[:, 0] * along[:, 1] - left_over[:, 1] * along[:, 0]
-        np.testing.assert_allclose(across / np.linalg.norm(along, axis=1), 0.0, atol=1e-6)
-        assert np.max(np.abs(left_over)) > 1e-3
+    # What a change of depth along a step makes: along the epipolar line.
+    left_over = A - derivatives(lambda pixels: seen(pixels, inverse), start, 1e-4)
+    across = left_over[:, 0] * along[:, 1:] - left_over[:, 1] * along[:, :1]
+    np.testing.assert_allclose(across / np.linalg.norm(along, axis=1, keepdims=True), 0.0, atol=1e-6)
+    assert np.all(np.max(np.abs(left_over), axis=(0, 1)) > 1e-3)
 
 
 def test_frames_of_a_plane_are_those_of_its_homography() -> None:
     """Of a global shutter: R + d n^T of the plane n.X = 1 that ``shape`` promises, by differences."""
     options, still = SimulationOptions(pairs=40, affine=True, shape="plane"), replace(SHUTTER, readout_ratio=0.0)
     c = simulate(STEREO, still, LinearMotion(W, D), options, np.random.default_rng(0)).correspondences
-    H, h = so3.exp(W) + np.outer(D, [0.05, -0.2 / 6.0, 1.0 / 6.0]), 1e-4
+    H = so3.exp(W) + np.outer(D, [0.05, -0.2 / 6.0, 1.0 / 6.0])
 
     def moved(pixels: FloatArray) -> FloatArray:
         return CAMERA.project(CAMERA.unproject(pixels) @ H.T)
 
     start, end = c.left[:, :2], c.left[:, 2:]
     np.testing.assert_allclose(moved(start), end, atol=1e-9)
-    columns = [(moved(start + step) - moved(start - step)) / (2.0 * h) for step in h * np.eye(2)]
-    np.testing.assert_allclose(c.affine.reshape(-1, 2, 2), np.stack(columns, axis=-1), atol=1e-7)
+    np.testing.assert_allclose(c.affine.reshape(-1, 2, 2), derivatives(moved, start, 1e-4), atol=1e-7)
 
 
 def test_noise_of_frames_is_a_share_of_their_size() -> None:
@@ -379,39 +362,33 @@ def test_equations_are_the_derivatives_of_the_constraint() -> None:
     rows = Rows.of(np.hstack([c.left, c.affine]), CAMERA, CAMERA.cy)
     R, t = so3.exp(np.array([0.1, -0.2, 0.05])), np.array([0.6, 0.0, 0.8])
     value, J = equations(R, t, *jets(rows, 3.0))
-    A, still, h = c.affine.reshape(-1, 2, 2), FreeMotion(R, t, *np.zeros((4, 3))), 1e-6
+    A, still = c.affine.reshape(-1, 2, 2), FreeMotion(R, t, *np.zeros((4, 3)))
 
     def expected(motion: FreeMotion) -> FloatArray:
         f, gradient = constraint(motion, c.left), by_pixels(motion, c.left)
         return np.column_stack([f, 3.0 * (gradient[:, :2] + (gradient[:, None, 2:] @ A)[:, 0])])
 
     np.testing.assert_allclose(value, expected(still), atol=1e-12)
-    for k, step in enumerate(h * np.eye(18)):
-        numeric = (expected(still.moved(step)) - expected(still.moved(-step))) / (2.0 * h)
-        np.testing.assert_allclose(J[..., k], numeric, atol=1e-8)
+    numeric = derivatives(lambda step: expected(still.moved(step)), np.zeros(18), 1e-6)
+    np.testing.assert_allclose(J, numeric, atol=1e-8)
 
 
-def mean_errors(solver: AffineSolver, size: float, pairs: int) -> FloatArray:
-    each = []
-    for seed in range(15):
-        found = solver.estimate(left(simulation(size, seed, pairs)), STEREO, SHUTTER)
-        assert found.success
-        each.append((rotation_error(found.w, size * W), translation_error(found.d, D)))
-    return np.median(each, axis=0)
+def affine_errors(solver: AffineSolver, size: float, pairs: int) -> FloatArray:
+    return errors_of_size(solver, size, seeds=15, rig=STEREO, pairs=pairs, affine=True)
 
 
 def test_half_the_motion_has_an_eighth_of_the_rotation_s_and_a_quarter_of_the_direction_s_error() -> None:
     """Of second order in the velocities, relative to the motion."""
     solver = AffineSolver(refinement="none")
     for pairs in (7, 30):
-        ratio = mean_errors(solver, 1.0, pairs) / mean_errors(solver, 0.5, pairs)
+        ratio = affine_errors(solver, 1.0, pairs) / affine_errors(solver, 0.5, pairs)
         np.testing.assert_allclose(ratio, [8.0, 4.0], rtol=0.3)
-    assert np.all(mean_errors(solver, 1.0, 7) < [1e-5, 1e-4])
+    assert np.all(affine_errors(solver, 1.0, 7) < [1e-5, 1e-4])
 
 
 @pytest.mark.parametrize("size", [4.0, 1.0])
 def test_the_descent_from_affine_frames_is_exact_on_the_paper_s_motion(size: float) -> None:
-    assert np.all(mean_errors(AffineSolver(), size, 100) < [1e-9, 1e-8])
+    assert np.all(affine_errors(AffineSolver(), size, 100) < [1e-9, 1e-8])
 
 
 def test_samples_are_of_seven_and_have_two_motions_each() -> None:

@@ -1,4 +1,4 @@
-"""Global-shutter solvers on global shutters: essential matrices, PoseLib, P3P, points and lines in triplets."""
+"""The known accuracy of solvers; PoseLib, P3P, and points and lines in triplets on global shutters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,19 @@ import numpy as np
 import poselib
 import pytest
 from scipy.optimize import least_squares
-from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, errors_deg, robust, trial
+from solver_trials import (
+    GLOBAL,
+    RIG,
+    SHUTTER,
+    D,
+    W,
+    assert_near,
+    errors_deg,
+    matches_of,
+    median_errors,
+    robust,
+    trial,
+)
 
 from rsbench.benchmark.simulated.simulation import Simulation
 from rsbench.components.motion_models import LinearMotion
@@ -28,6 +40,7 @@ from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.poselib import P3pSolver
+from rsbench.solvers.refined import RefinedSolver
 from rsbench.solvers.triplets import (
     PATTERNS,
     Features,
@@ -51,44 +64,48 @@ def hundred(
     return trial(seed, model=model, noise_px=noise_px, shutter=shutter, pairs=pairs, tracks=of_tracks)
 
 
-def medians(name: str, model: str, noise_px: float, trials: int = 30) -> tuple[float, float]:
+def medians(name: str, model: str, noise_px: float, pairs: int = 100) -> FloatArray:
     """Median e_R and e_T in degrees, e_T of the solver's own point of the rig."""
     solver = load_solver(name)
-    errors = []
-    for seed in range(trials):
-        s = hundred(seed, model, noise_px, tracks="tracks" in solver.spec.needs)
-        estimate = solver.estimate(s.correspondences, RIG, SHUTTER)
-        assert estimate.success, estimate.reason
-        errors.append(errors_deg(estimate, s.motion, solver.spec.reference_point))
-    e_R, e_T = np.median(errors, axis=0)
-    return float(e_R), float(e_T)
+    sets = {"tracks": pairs} if "tracks" in solver.spec.needs else {"pairs": pairs}
+    return median_errors(solver, model=model, noise_px=noise_px, **sets)
 
 
-# Bands around medians of 150 motions of 2 degrees and 0.3 m, from the scripts that this package was designed with
-# (PoseLib 2.0.5 and OpenCV called directly, the rest in NumPy; none of it is in here). They catch a wrong frame or
-# scale, not a per cent: 30 motions scatter by 25 %.
+# Bands around medians of 150 or 200 motions of 2 degrees and 0.3 m, from the scripts that this package was
+# designed with (PoseLib 2.0.5 and OpenCV called directly, the rest in NumPy; none of it is in here). They catch a
+# wrong frame or scale, or a slip in a formula written twice, not a per cent: 30 motions scatter by 25 %.
 @pytest.mark.parametrize(
-    ("name", "model", "noise_px", "e_R", "e_T"),
+    ("name", "model", "pairs", "noise_px", "e_R", "e_T"),
     [
-        ("gs-poselib", "linear", 0.0, 0.051, 0.95),
-        ("gs-poselib", "linear", 0.81, 0.077, 1.19),
-        ("gs-poselib-stereo", "linear", 0.0, 0.051, 0.92),
-        ("gs-poselib-stereo", "linear", 0.81, 0.069, 1.08),
-        ("gs-stereo-pnp", "linear", 0.0, 0.077, 0.80),
-        ("gs-stereo-pnp", "linear", 0.81, 0.084, 0.90),
-        ("gs-stereo-tracks", "linear", 0.0, 0.075, 0.79),
-        ("gs-stereo-tracks", "linear", 0.81, 0.070, 0.88),
-        ("gs-8pt", "twist", 0.0, 0.048, 0.56),
-        ("gs-8pt-scaled", "twist", 0.81, 0.105, 0.72),
-        ("gs-poselib-stereo", "twist", 0.0, 0.044, 0.49),
-        ("gs-poselib-stereo-scaled", "twist", 0.81, 0.042, 0.40),
-        ("rs-stereo-tracks", "linear", 0.81, 0.021, 0.23),
+        ("gs-poselib", "linear", 100, 0.0, 0.051, 0.95),
+        ("gs-poselib", "linear", 100, 0.81, 0.077, 1.19),
+        ("gs-poselib-stereo", "linear", 100, 0.0, 0.051, 0.92),
+        ("gs-poselib-stereo", "linear", 100, 0.81, 0.069, 1.08),
+        ("gs-stereo-pnp", "linear", 100, 0.0, 0.077, 0.80),
+        ("gs-stereo-pnp", "linear", 100, 0.81, 0.084, 0.90),
+        ("gs-stereo-tracks", "linear", 100, 0.0, 0.075, 0.79),
+        ("gs-stereo-tracks", "linear", 100, 0.81, 0.070, 0.88),
+        ("gs-8pt", "linear", 100, 0.0, 0.059, 0.88),
+        ("gs-8pt", "linear", 100, 0.81, 0.112, 1.09),
+        ("gs-8pt", "twist", 100, 0.0, 0.048, 0.56),
+        ("gs-8pt-scaled", "twist", 100, 0.81, 0.105, 0.72),
+        ("gs-poselib-stereo", "twist", 100, 0.0, 0.044, 0.49),
+        ("gs-poselib-stereo-scaled", "twist", 100, 0.81, 0.042, 0.40),
+        ("rs-stereo-tracks", "linear", 100, 0.81, 0.021, 0.23),
+        ("rs-stereo-linear", "linear", 100, 0.0, 0.033, 0.044),
+        ("rs-stereo-linear", "linear", 100, 1e-2, 0.038, 0.056),
+        # What the paper's algorithm does with feature noise: the rotation is lost.
+        ("rs-stereo-linear", "linear", 100, 0.81, 2.0, 3.2),
+        ("rs-stereo-iterated", "linear", 100, 0.0, 0.026, 0.020),
+        ("rs-stereo-iterated", "linear", 100, 0.81, 0.075, 0.51),
+        ("rs-stereo-iterated", "linear", 9, 0.1, 0.079, 0.70),
     ],
 )
-def test_accuracy_is_the_known_one(name: str, model: str, noise_px: float, e_R: float, e_T: float) -> None:
-    measured = medians(name, model, noise_px)
-    assert e_R / 1.6 < measured[0] < 1.6 * e_R
-    assert e_T / 1.6 < measured[1] < 1.6 * e_T
+def test_accuracy_is_the_known_one(
+    name: str, model: str, pairs: int, noise_px: float, e_R: float, e_T: float
+) -> None:
+    measured = medians(name, model, noise_px, pairs)
+    assert np.all((measured > np.array([e_R, e_T]) / 1.6) & (measured < 1.6 * np.array([e_R, e_T])))
 
 
 @pytest.mark.parametrize(
@@ -108,18 +125,19 @@ def test_stereo_baselines_are_metric(name: str) -> None:
     assert estimate.metric and scale_error(estimate.d, s.motion.d) < 1e-6
 
 
-def test_both_global_shutter_optima_agree(tmp_path: Path) -> None:
-    """Our descent without readout and PoseLib's on the same left and right pairs."""
-    card = tmp_path / "ours.toml"
-    card.write_text(
-        'class = "rsbench.solvers.refined:RefinedSolver"\n[parameters]\nshutter = "global"\nuse_tracks = false\n'
-    )
-    ours, theirs = load_solver(card), load_solver("gs-poselib-stereo")
-    assert ours.spec.shutter == "global"
-    for seed in range(5):
-        s = hundred(seed, "linear", 0.5)
-        first, second = (solver.estimate(s.correspondences, RIG, SHUTTER) for solver in (ours, theirs))
-        assert_near(first, LinearMotion(second.w, second.d), 1e-5, 1e-4)
+@pytest.mark.parametrize(
+    ("kind", "shutter", "e_R", "e_T"), [("rolling", GLOBAL, 1e-6, 1e-6), ("global", SHUTTER, 1e-5, 1e-4)]
+)
+def test_without_readout_it_is_the_global_shutter_optimum_of_poselib(
+    kind: Literal["rolling", "global"], shutter: RollingShutter, e_R: float, e_T: float
+) -> None:
+    """Of the same left and right pairs, in degrees; PoseLib stops where rounding hides the fall of its cost."""
+    ours, theirs = RefinedSolver(shutter=kind, use_tracks=False), load_solver("gs-poselib-stereo")
+    for seed in range(20):
+        c = matches_of(LinearMotion(W, D), seed=seed, shutter=shutter, pairs=60, noise_px=0.3)
+        first, second = (solver.estimate(c, RIG, shutter) for solver in (ours, theirs))
+        assert_near(first, LinearMotion(second.w, second.d), e_R, e_T)
+        assert kind == "global" or scale_error(first.d, second.d) < 1e-6
 
 
 def test_scaled_matches_took_one_frame_period() -> None:
@@ -168,15 +186,8 @@ def test_scaled_solver_declares_what_its_inner_one_does(tmp_path: Path) -> None:
         load_solver(card)
 
 
-def test_tracks_only_solver_wants_tracks() -> None:
-    c = trial(0, pairs=30).correspondences
-    estimate = load_solver("rs-stereo-tracks").estimate(c, RIG, SHUTTER)
-    assert not estimate.success and "tracks" in estimate.reason
-    assert load_solver("rs-stereo-tracks").spec.needs == {"tracks"}
-
-
-def global_tracks(seed: int, count: int, noise_px: float = 0.0, outlier_ratio: float = 0.0) -> Simulation:
-    return trial(seed, shutter=GLOBAL, tracks=count, noise_px=noise_px, outlier_ratio=outlier_ratio)
+def global_tracks(seed: int, count: int, noise_px: float = 0.0) -> Simulation:
+    return trial(seed, shutter=GLOBAL, tracks=count, noise_px=noise_px)
 
 
 @pytest.mark.parametrize("cameras", ["left", "both"])
@@ -205,19 +216,6 @@ def test_the_end_is_opencv_s_least_squares() -> None:
         d = t[:, 0] + so3.exp(w[:, 0]) @ o - o
         np.testing.assert_allclose(found.w, w[:, 0], atol=1e-8)
         np.testing.assert_allclose(found.d, d, atol=1e-7)
-
-
-def test_it_throws_outliers_out_by_itself() -> None:
-    entry, s = load_solver_entry("gs-p3p"), global_tracks(1, 200, 0.3, 0.5)
-    assert entry.options.robust == "own"
-    c = s.correspondences
-    found = robust(c, entry.solver, shutter=GLOBAL, loop="own")
-    # Three times the noise-free optimum's scatter at 100 inliers: 0.01 and 0.12 degrees.
-    assert_near(found.estimate, s.motion, 0.04, 0.5)
-    right = ~s.outliers["tracks"]
-    assert np.mean(found.inliers["tracks"][right]) > 0.9 and not np.any(found.inliers["tracks"][~right])
-    wild = replace(c, tracks=np.random.default_rng(0).uniform(0, 899, (30, 8)))
-    assert not entry.solver.estimate(replace(c, tracks=wild.tracks[:3]), RIG, GLOBAL).success
 
 
 @pytest.mark.parametrize("known", [(0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)])
@@ -251,13 +249,10 @@ def test_points_known_in_frame_0_are_poselib_s_generalised_absolute_pose() -> No
     assert np.median(apart) < 1e-9 and np.sum(np.array(apart) < 1e-6) >= 8
 
 
-def test_many_tracks_and_outliers() -> None:
+def test_the_motion_of_many_exact_tracks_is_exact() -> None:
     s = global_tracks(0, 40)
     found = TripletSolver().estimate(s.correspondences, RIG, GLOBAL)
     np.testing.assert_allclose(np.concatenate([found.w, found.d]), [*s.motion.w, *s.motion.d], atol=1e-12)
-    s = global_tracks(3, 150, 0.3, 0.5)
-    # Three times the median error of the optimum on 75 tracks, 0.01 and 0.08 degrees.
-    assert_near(robust(s.correspondences, TripletSolver(), shutter=GLOBAL).estimate, s.motion, 0.03, 0.4)
 
 
 def test_samples_without_depth_are_told_and_leave_the_others_alone() -> None:

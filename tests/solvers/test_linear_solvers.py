@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, errors_deg, matches_of, trial
+from solver_trials import GLOBAL, RIG, SHUTTER, assert_near, matches_of, median_errors, trial
 
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.correspondences import Correspondences
@@ -17,7 +15,6 @@ from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import Side
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray, hat
-from rsbench.solvers.engine.base import Solver
 from rsbench.solvers.engine.packed import pack
 from rsbench.solvers.essential_matrix import EightPointSolver, decompose_essential, eight_point
 from rsbench.solvers.linear import (
@@ -87,52 +84,6 @@ def test_rows_equal_the_papers_equations_in_the_papers_axes(side: Side, sign: fl
         assert rows[0] @ X == pytest.approx(expected, abs=1e-12)
 
 
-def test_rows_vanish_to_third_order_on_exact_data() -> None:
-    sizes = []
-    for scale in (1.0, 0.1):
-        motion = LinearMotion(scale * np.array([0.02, -0.03, 0.025]), scale * np.array([0.2, 0.1, -0.2]))
-        c = matches_of(motion, pairs=50)
-        rows = system_rows(c.left, "left", RIG, SHUTTER)
-        sizes.append(np.max(np.abs(rows @ unknowns(motion.w, motion.d))))
-    assert sizes[0] / sizes[1] == pytest.approx(1000.0, rel=0.3)
-
-
-def median_errors(solver: Solver, pairs: int, noise_px: float, trials: int = 40) -> tuple[float, float]:
-    """Median e_R, e_T in degrees over random motions of 2 degrees and 0.3 m."""
-    errors = list[FloatArray]()
-    for seed in range(trials):
-        s = trial(np.random.default_rng(seed), pairs=pairs, noise_px=noise_px)
-        found = solver.estimate(s.correspondences, RIG, SHUTTER)
-        point = solver.spec.reference_point
-        errors.append(errors_deg(found, s.motion, point) if found.success else np.array([180.0, 180.0]))
-    e_R, e_T = np.median(errors, axis=0)
-    return float(e_R), float(e_T)
-
-
-# Bands around medians of 200 trials of the NumPy code that this package was designed with (none of it is in here):
-# the same formulas written twice, so a slip in either shows. Exactness is proved above; 40 trials scatter by 20 %.
-@pytest.mark.parametrize(
-    ("make", "pairs", "noise_px", "e_R", "e_T"),
-    [
-        (LinearSolver, 100, 0.0, 0.033, 0.044),
-        (LinearSolver, 100, 1e-2, 0.038, 0.056),
-        # What the paper's algorithm does with feature noise: the rotation is lost.
-        (LinearSolver, 100, 0.81, 2.0, 3.2),
-        (EightPointSolver, 100, 0.0, 0.059, 0.88),
-        (EightPointSolver, 100, 0.81, 0.112, 1.09),
-        (IteratedSolver, 100, 0.0, 0.026, 0.020),
-        (IteratedSolver, 100, 0.81, 0.075, 0.51),
-        (IteratedSolver, 9, 0.1, 0.079, 0.70),
-    ],
-)
-def test_accuracy_is_the_known_one(
-    make: Callable[[], Solver], pairs: int, noise_px: float, e_R: float, e_T: float
-) -> None:
-    measured = median_errors(make(), pairs, noise_px)
-    assert e_R / 1.6 < measured[0] < 1.6 * e_R
-    assert e_T / 1.6 < measured[1] < 1.6 * e_T
-
-
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), sign=st.sampled_from([-1.0, 1.0]))
 def test_tracks_hold_the_length_of_a_known_direction(seed: int, sign: float) -> None:
@@ -157,7 +108,7 @@ def test_left_right_matches_give_what_the_baseline_columns_cannot() -> None:
 
 def test_the_symmetric_extraction_is_better_with_minimal_samples() -> None:
     """0.057 degrees against 0.319 in the design's NumPy code (see above)."""
-    full, symmetric = (median_errors(LinearSolver(extraction=e), 9, 0.0)[0] for e in ("full", "symmetric"))
+    full, symmetric = (median_errors(LinearSolver(extraction=e), pairs=9)[0] for e in ("full", "symmetric"))
     assert symmetric < 0.1
     assert full > 2 * symmetric
 
@@ -258,8 +209,10 @@ def test_the_literal_reading_takes_the_null_vector_of_a_as_it_is() -> None:
 
 def test_scaling_columns_costs_the_rotation_at_a_tenth_of_a_pixel() -> None:
     """A reviewer measured, with 100 + 100 matches, 0.31, 0.41 deg literally and 1.68, 1.95 with unit columns."""
-    literal = median_errors(LinearSolver(scaling="none"), 100, 0.1)
-    scaled = median_errors(LinearSolver(scaling="unit-columns"), 100, 0.1)
+    literal, scaled = (
+        median_errors(LinearSolver(scaling=how), trials=40, pairs=100, noise_px=0.1)
+        for how in ("none", "unit-columns")
+    )
     assert 0.2 < literal[0] < 0.5 and 0.25 < literal[1] < 0.65
     assert scaled[0] > 3 * literal[0] and scaled[1] > 3 * literal[1]
 
@@ -290,19 +243,20 @@ def test_rotation_from_essential_inverts_its_definition(symmetric: bool) -> None
     np.testing.assert_allclose(rotation_from_essential(hat(d) @ hat(w), d, symmetric), w, atol=1e-12)
 
 
-def test_reduced_rows_vanish_to_third_order_on_exact_data() -> None:
+def test_rows_and_reduced_rows_vanish_to_third_order_on_exact_data() -> None:
     sizes = []
     for scale in (1.0, 0.1):
-        motion = LinearMotion(scale * np.array([0.02, -0.03, 0.025]), scale * np.array([0.2, 0.1, -0.2]))
-        w, d = motion.w, motion.d
-        c = matches_of(motion, pairs=50)
+        w, d = scale * np.array([0.02, -0.03, 0.025]), scale * np.array([0.2, 0.1, -0.2])
+        c = matches_of(LinearMotion(w, d), pairs=50)
+        rows = system_rows(c.left, "left", RIG, SHUTTER)
         by_d, shifted, rest = reduced_blocks(pack(c, RIG, SHUTTER).pairs)
         E = hat(d) @ hat(w)
         E = 0.5 * (E + E.T)
         products = [w[0] * w[1], w[0] * w[2], w[1] * w[2], w[2] ** 2 - w[1] ** 2]
         others = np.concatenate([w[1:], E[np.triu_indices(3)], products])
-        sizes.append(np.max(np.abs((by_d + np.cross(w, shifted)) @ d + rest @ others)))
-    assert sizes[0] / sizes[1] == pytest.approx(1000.0, rel=0.3)
+        reduced = (by_d + np.cross(w, shifted)) @ d + rest @ others
+        sizes.append([np.max(np.abs(rows @ unknowns(w, d))), np.max(np.abs(reduced))])
+    np.testing.assert_allclose(np.divide(sizes[0], sizes[1]), 1000.0, rtol=0.3)
 
 
 def test_scaled_translation_is_exact_for_the_true_rotation() -> None:
@@ -338,14 +292,3 @@ def test_eight_point_gives_the_left_camera_s_motion() -> None:
     estimate = EightPointSolver().estimate(matches_of(motion, shutter=GLOBAL, pairs=30), RIG, GLOBAL)
     assert_near(estimate, motion, 5e-7, 5e-6, "left")
     assert translation_error(estimate.d, motion.d) > 1e-3 and not estimate.metric
-
-
-def test_tracks_count_as_pairs_once() -> None:
-    motion = LinearMotion(np.array([0.01, 0.02, -0.02]), np.array([0.2, 0.1, -0.2]))
-    c = matches_of(motion, tracks=30)
-    tracks = c.tracks
-    pairs = Correspondences(left=tracks[:, [0, 1, 4, 5]], right=tracks[:, [2, 3, 6, 7]])
-    both = Correspondences(left=pairs.left, right=pairs.right, tracks=tracks)
-    estimates = [LinearSolver().estimate(each, RIG, SHUTTER).w for each in (pairs, both, c)]
-    np.testing.assert_array_equal(estimates[0], estimates[1])
-    np.testing.assert_array_equal(estimates[0], estimates[2])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from solver_trials import CAMERA, RIG, SHUTTER, W, assert_near, errors_deg, matches_of, robust
+from differences import derivatives
+from solver_trials import CAMERA, RIG, SHUTTER, W, assert_near, assert_second_order, matches_of, robust
 from solver_trials import D as V
 
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
@@ -96,25 +97,13 @@ def test_a_translation_along_an_axis_is_exact(kind: str, axis: int) -> None:
     assert "more than one solution" in solver.estimate(c, LEFT, SHUTTER).reason
 
 
-def errors(solver: ZhuangSolver, size: float) -> FloatArray:
-    """Medians of rotation and direction (rad) on exact matches of finite motions, ten scenes."""
-    found = []
-    for seed in range(10):
-        motion = make_motion(solver.spec.motion_model, size * W, size * V, solver.spec.motion_parameters)
-        c = matches_of(motion, seed=seed, rig=LEFT, pairs=60)
-        estimate = solver.estimate(Correspondences(left=c.left), LEFT, SHUTTER)
-        found.append(np.radians(errors_deg(estimate, motion)))
-    return np.median(found, axis=0)
-
-
 @pytest.mark.parametrize("kind", ["none", "constant"])
 @pytest.mark.parametrize("how", ["none", "reprojection"])
 def test_half_the_motion_has_a_quarter_of_the_rotation_s_and_half_of_the_direction_s_error(
     kind: str, how: str
 ) -> None:
     """Flow of finite motion is its velocity plus terms of second order."""
-    half, quarter = (errors(SOLVERS[kind, how], size) for size in (0.5, 0.25))
-    np.testing.assert_allclose(half / quarter, [4.0, 2.0], rtol=0.25)
+    assert_second_order(SOLVERS[kind, how], seeds=10, rig=LEFT, pairs=60)
 
 
 def test_derivatives_are_those_of_finite_differences() -> None:
@@ -124,9 +113,8 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     def at(p: FloatArray) -> FloatArray:
         return reprojection(flow, Velocity(p[:3], p[3:6], float(p[6])))[0]
 
-    steps = 1e-6 * np.eye(7)
-    numeric = np.stack([(at(p + s) - at(p - s)) / 2e-6 for s in steps], axis=-1)
-    np.testing.assert_allclose(reprojection(flow, Velocity(p[:3], p[3:6], 0.3))[1], numeric, rtol=1e-5, atol=1e-5)
+    found = reprojection(flow, Velocity(p[:3], p[3:6], 0.3))[1]
+    np.testing.assert_allclose(found, derivatives(at, p, 1e-6), rtol=1e-5, atol=1e-5)
 
 
 def test_the_robust_loop_judges_matches_by_the_acceleration_that_was_found() -> None:

@@ -85,6 +85,14 @@ class MotionEstimate:
         nowhere = np.full(3, np.nan)
         return cls(w=nowhere, d=nowhere, success=False, reason=reason, direction_known=False)
 
+    @classmethod
+    def of_one_camera(cls, w: FloatArray, d: FloatArray, **motion_parameters: float) -> MotionEstimate:
+        """The estimate of one camera, which leaves the length of d open; a failure where it is not finite."""
+        if not np.all(np.isfinite([*w, *d])):
+            return cls.failed("no finite motion fits")
+        reason = "the length of d is not determined by one camera"
+        return cls(w=w, d=d, success=True, reason=reason, motion_parameters=motion_parameters)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSpec:
@@ -332,17 +340,16 @@ def load_solver_entry(name_or_path: str | Path) -> SolverEntry:
     return SolverEntry(**vars(plugins.load_entry(SOLVERS, name_or_path)))
 
 
-def wrap_solver(solver: Solver) -> SolverEntry:
-    """The entry of a solver that was made without a card; its class names it."""
-    return SolverEntry(**vars(plugins.wrap(SOLVERS, solver)))
-
-
 def entry_of(solver: str | Path | Solver) -> SolverEntry:
-    """The entry of a solver by its name, the path of its card, or itself; ValueError for anything else."""
+    """The entry of a solver by its name, the path of its card, or itself, which its class then names.
+
+    Raises:
+        ValueError: it is none of them.
+    """
     if isinstance(solver, str | Path):
         return load_solver_entry(solver)
     if not isinstance(solver, Solver):
         raise ValueError(
             f"solver: must be a name, the path of a card or an rsbench.Solver, got {arguments.shown(solver)}"
         )
-    return wrap_solver(solver)
+    return SolverEntry(**vars(plugins.wrap(SOLVERS, solver)))

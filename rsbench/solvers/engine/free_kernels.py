@@ -180,7 +180,7 @@ def free_from_row(R: FloatArray, vectors: FloatArray, s: float, out_R: FloatArra
 def fill_coefficients(
     R: FloatArray, vectors: FloatArray, place: NDArray[np.int64], out: FloatArray, by: FloatArray
 ) -> None:
-    """``with_derivatives`` of a motion, vectors (5, 3) t, v0, v1, w0, w1; into zeros, place is ``places``."""
+    """``coefficients`` of a motion, vectors (5, 3) t, v0, v1, w0, w1; into zeros, place is ``places``."""
     degree = (len(place) - 3) // 2
     t, v0, v1, w0, w1 = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     Q, zero, unit = np.zeros((2, 2, 3, 3)), np.zeros(3), np.zeros(3)

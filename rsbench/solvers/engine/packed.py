@@ -71,6 +71,11 @@ class Packed:
         return quick_law(self.kernel)
 
     @property
+    def freedom(self) -> FloatArray:
+        """(n + m,) residuals of each measurement, p."""
+        return np.repeat([float(_PAIR_FREEDOM), float(TRACK_FREEDOM)], [len(self.pairs), len(self.tracks)])
+
+    @property
     def constraints(self) -> int:
         """Number of scalar equations that depend on the motion."""
         return len(self.pairs) + (3 if self.tracks.ndim == 2 else 5) * len(self.tracks)
@@ -111,10 +116,6 @@ class Packed:
         """At most about ``most`` evenly chosen pairs and tracks, for choosing among starts."""
         step_p, step_t = max(1, len(self.pairs) // most), max(1, len(self.tracks) // most)
         return self._of(self.pairs[::step_p], self.tracks[::step_t], self.row_checks[::step_t])
-
-    def tracks_only(self) -> Packed:
-        """Without the pairs."""
-        return self._of(self.pairs[:0], self.tracks, self.row_checks)
 
     def at_once(self) -> Packed:
         """The ends of the right camera where it would have seen them when the left one did, to first order.
@@ -283,6 +284,7 @@ def pack(
 
     Raises:
         RsbenchError: no such model, or it has no kernel.
+        ValueError: tracks of a rig that is not described by its middle, or a match at which a camera shows no ray.
     """
     kernel = load_kernel(motion_model, motion_parameters)
     tracks = correspondences.tracks if use_tracks else correspondences.tracks[:0]
@@ -295,7 +297,9 @@ def pack(
             matches = temporal_pairs(correspondences, side)
         if len(matches):
             pairs.append(pack_pairs(matches, side, rig, shutter))
-    camera, packed_tracks = rig.camera, (_pack_timed_tracks if timed else pack_tracks)(tracks, rig, shutter)
+    if len(tracks) and rig.origin != "middle":
+        raise ValueError(f"tracks are measured about the middle of the baseline, not the {rig.origin} camera")
+    camera, packed_tracks = rig.camera, (_pack_timed_tracks if timed else _pack_tracks)(tracks, rig, shutter)
     apart = timed and (not rig.aligned or shutter.right_readout_ratio is not None)
     checks = 0.5 * ((tracks[:, 1] - tracks[:, 3]) ** 2 + (tracks[:, 5] - tracks[:, 7]) ** 2)
     return Packed(
@@ -331,7 +335,6 @@ def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rolling
 
 def _pack_timed_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
     """(n, 4, 9) for ``residuals.timed_track_terms`` from tracks (n, 8)."""
-    _check_origin(tracks, rig)
     out = np.zeros((len(tracks), 4, 9))
     for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
         end, eye = tracks[:, 2 * k : 2 * k + 2], rig.eye(side)
@@ -348,20 +351,8 @@ def _check_rays(rays: FloatArray, rig: StereoRig) -> None:
         )
 
 
-def _check_origin(tracks: FloatArray, rig: StereoRig) -> None:
-    if len(tracks) and rig.origin != "middle":
-        raise ValueError(f"tracks are measured about the middle of the baseline, not the {rig.origin} camera")
-
-
-def pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """(n, 8) for ``residuals.track_terms`` from tracks (n, 8) of a rig whose rows are read together.
-
-    Raises:
-        ValueError: another rig, or one that is not described by its middle.
-    """
-    _check_origin(tracks, rig)
-    if not _rectified(rig, shutter):
-        raise ValueError("a lens, columns or a late right camera: the two ends of a stereo match have two times")
+def _pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
+    """(n, 8) for ``residuals.track_terms`` from tracks (n, 8) of a rig whose rows are read together."""
     camera = rig.camera
     middle = 0.5 * (tracks[:, [0, 1, 4, 5]] + tracks[:, [2, 3, 6, 7]])
     out = np.zeros((len(tracks), 8))
@@ -449,7 +440,7 @@ _SCALE_STEPS, _SCALE_FLAT = 50, 1e-4
 _ONE_SIGMA = 0.5 * (1.0 + math.erf(1.0 / math.sqrt(2.0)))
 _LEAST_SLOPE = 0.1
 _LEAST_SCALE_PX = 1e-9
-_TRACK_FREEDOM, _PAIR_FREEDOM, _PARAMETERS = 5, 1, 6
+TRACK_FREEDOM, _PAIR_FREEDOM, _PARAMETERS = 5, 1, 6
 _PARTS, _PART_TRACKS = 6, 10
 """Most groups of rows whose motions are compared, and fewest tracks in each."""
 _SHARED, _CHANCE, _PER_EXCESS = 1.5, 1e-3, 2.0
@@ -491,11 +482,6 @@ class HeavyTailed(Packed):
     right."""
     doubt: FloatArray | None = None
     """(n + m,) probability that each is wrong; None: 0."""
-
-    @property
-    def freedom(self) -> FloatArray:
-        """(n + m,) residuals of each measurement, p."""
-        return _freedom(self)
 
     def weights(self, squares: FloatArray) -> FloatArray:
         """(n + m,) of the measurements in a step that minimises their squared errors."""
@@ -579,7 +565,7 @@ def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed
         scale: px, of the first guess: measurements beyond 10 of them are wrong.
     """
     each = each_term(packed, theta)
-    freedom = _freedom(packed)
+    freedom = packed.freedom
     means, right, nu = each.squares / freedom, np.ones(len(freedom)), _FIRST_NU
     for step in range(_MIXTURE_STEPS):
         near = means <= (_REACH * scale) ** 2
@@ -630,10 +616,6 @@ def t_distribution(
     count = np.ones(len(p)) if count is None else count
     found = [(nu, _scale(squares, p, nu, scale, freedom, least, count)) for nu in _TAILS]
     return max(found, key=lambda tails: _likelihood(squares, p, *tails, count))
-
-
-def _freedom(packed: Packed) -> FloatArray:
-    return np.repeat([float(_PAIR_FREEDOM), float(_TRACK_FREEDOM)], [len(packed.pairs), len(packed.tracks)])
 
 
 def _scale(

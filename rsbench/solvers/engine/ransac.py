@@ -48,19 +48,27 @@ class Estimator(Protocol[Model]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RansacOptions:
-    """How long to search and what counts as an inlier."""
+class SearchOptions:
+    """How long to search."""
 
-    threshold: float
-    """Largest absolute residual of an inlier."""
     confidence: float = 0.999
-    """Probability of having drawn a sample without outliers before stopping."""
+    """Probability, 0 to 1, of having drawn a sample without outliers when RANSAC stops."""
     min_iterations: int = 10
+    """Samples that RANSAC draws, at least."""
     max_iterations: int = 1000
+    """Samples that RANSAC draws, at most."""
     lo_steps: int = 3
     """Refinements of each new best model, at thresholds that shrink from twice the threshold to it."""
     final_steps: int = 3
     """Refinements at the end, until the inliers stay the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RansacOptions(SearchOptions):
+    """How long to search and what counts as an inlier."""
+
+    threshold: float
+    """Largest absolute residual of an inlier."""
     chance: float = 0.02
     """Probability that a wrong datum is an inlier of a given model: a consensus must be beyond chance."""
 
@@ -227,14 +235,12 @@ def _report(best: _Best[Model], iterations: int, reason: str) -> RansacReport[Mo
     elif not reason and log10_false_alarms(count, total, least, iterations, best.chance) >= 0.0:
         reason = f"no consensus: {count} inliers of {total}, as chance would give in {iterations} samples"
     if reason:
-        return RansacReport(
-            success=False,
-            reason=reason,
-            model=None,
-            inliers=np.zeros(len(best.residuals), dtype=np.bool_),
-            iterations=iterations,
-            score=math.inf,
-        )
+        inliers = np.zeros_like(inliers)
     return RansacReport(
-        success=True, reason="", model=best.model, inliers=inliers, iterations=iterations, score=best.score
+        success=not reason,
+        reason=reason,
+        model=None if reason else best.model,
+        inliers=inliers,
+        iterations=iterations,
+        score=math.inf if reason else best.score,
     )

@@ -135,7 +135,7 @@ def _camera_move(
 ) -> Moved:
     """``kernel.move`` of a camera whose x is larger than the body's by ``offset``."""
     T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
-    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    Ro = times(offset, _of(R, 0))
     T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
     return T, plus(rate0, -1.0, cross(spin0, Ro)), plus(rate1, -1.0, cross(spin1, Ro)), spin0, spin1
 
@@ -186,7 +186,7 @@ def pair_jacobian(
     """Derivative (6,) of y^T [T]x R x by theta; R, A, T_w, T_v are work space."""
     T, _, _, _, _ = kernel.move(theta, tau0, tau1, R, A)
     kernel.translation_jacobian(theta, tau0, tau1, R, A, T_w, T_v)
-    Ro = (R[0, 0] * offset, R[1, 0] * offset, R[2, 0] * offset)
+    Ro = times(offset, _of(R, 0))
     T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
     p = apply(R, x)
     n = cross(p, y)
@@ -205,7 +205,7 @@ def count_in_front(theta: FloatArray, kernel: MotionKernel, pairs: FloatArray) -
     for m in range(len(pairs)):
         y, offset = (pairs[m, 2], pairs[m, 3], 1.0), pairs[m, 6]
         T, _, _, _, _ = kernel.move(theta, pairs[m, 4], pairs[m, 5], R, A)
-        T = plus((T[0] + offset, T[1], T[2]), -offset, (R[0, 0], R[1, 0], R[2, 0]))
+        T = plus((T[0] + offset, T[1], T[2]), -offset, _of(R, 0))
         p = apply(R, (pairs[m, 0], pairs[m, 1], 1.0))
         pp, yy, py, pT, yT = dot(p, p), dot(y, y), dot(p, y), dot(p, T), dot(y, T)
         if pp * yy - py * py > 1e-15 * pp * yy and py * yT > yy * pT and pp * yT > py * pT:
@@ -246,9 +246,7 @@ def timed_track_terms(
         if not linearise_best(theta, kernel, tracks[k], focal, baseline, e, D, W, N, inverse, work):
             squares[k] = BEHIND
             continue
-        squares[k] = 0.0
-        for i in range(8):
-            squares[k] += e[i] * e[i]
+        squares[k] = _product(e, e)
         if want:
             _add_reduced(D, e, inverse, Q, H, gradient)
 
@@ -277,11 +275,16 @@ def linearise_best(
     point = _first_point(theta, kernel, ends, baseline, work)
     for step in range(_POINT_STEPS + 1):
         if step > 0:
-            g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
+            g = (_product(D[:, 0], e), _product(D[:, 1], e), _product(D[:, 2], e))
             point = plus(point, -1.0, apply(inverse, g))
         # Weighed where it starts. A literal True would compile _linearise once more.
         seen = _linearise(theta, kernel, ends, focal, baseline, point, e, D, W, work, step == 0)
-        if not (seen and _fill_inverse(D, N, inverse)):
+        if not seen:
+            return False
+        for i in range(3):
+            for j in range(3):
+                N[i, j] = _product(D[:, i], D[:, j])
+        if not _invert(N, inverse):
             return False
     return True
 
@@ -295,7 +298,7 @@ def _first_point(
     x, half = (ends[0, 0], ends[0, 1], 1.0), 0.5 * baseline
     T, _, _, _, _ = kernel.move(theta, ends[0, 2], ends[1, 2], R, A)
     a = apply(R, x)
-    b = plus((T[0] - half, T[1], T[2]), -half, (R[0, 0], R[1, 0], R[2, 0]))
+    b = plus((T[0] - half, T[1], T[2]), -half, _of(R, 0))
     above = below = 0.0
     for i in range(2):
         factor = b[i] - ends[1, i] * b[2]
@@ -343,14 +346,14 @@ def _linearise(
         if weigh and not _fill_weight(ends[i], vx, vy, W[i]):
             return False
         whiten(W[i], focal[0] * (ends[i, 0] - u), focal[1] * (ends[i, 1] - v), i, e)
-        by_rho = plus(plus(T, 1.0, (offset, 0.0, 0.0)), -half, (R[0, 0], R[1, 0], R[2, 0]))
+        by_rho = plus(plus(T, 1.0, (offset, 0.0, 0.0)), -half, _of(R, 0))
         for j in range(9):
             if j < 2:
-                q = (R[0, j], R[1, j], R[2, j])
+                q = _of(R, j)
             elif j == 2:
                 q = by_rho
             elif j < 6:
-                q = plus(cross((A[0, j - 3], A[1, j - 3], A[2, j - 3]), turned), rho, _of(T_w, j - 3))
+                q = plus(cross(_of(A, j - 3), turned), rho, _of(T_w, j - 3))
             else:
                 q = times(rho, _of(T_v, j - 6))
             gx, gy = -focal[0] * (q[0] - u * q[2]) / p[2], -focal[1] * (q[1] - v * q[2]) / p[2]
@@ -394,26 +397,12 @@ def whiten(W: FloatArray, x: float, y: float, i: int, out: FloatArray) -> None:
 
 
 @compiled
-def _column(D: FloatArray, j: int, e: FloatArray) -> float:
-    total = 0.0
-    for i in range(8):
-        total += D[i, j] * e[i]
-    return total
-
-
-@compiled
-def _fill_inverse(D: FloatArray, N: FloatArray, out: FloatArray) -> bool:
-    """Inverse of the point's normal matrix; False when the ends do not determine the point."""
-    for i in range(3):
-        for j in range(3):
-            N[i, j] = 0.0
-            for n in range(8):
-                N[i, j] += D[n, i] * D[n, j]
-    first, second = (N[0, 0], N[1, 0], N[2, 0]), (N[0, 1], N[1, 1], N[2, 1])
-    third = (N[0, 2], N[1, 2], N[2, 2])
+def _invert(S: FloatArray, out: FloatArray) -> bool:
+    """Inverse of a symmetric positive definite (3, 3) matrix; False where it is singular to rounding."""
+    first, second, third = _of(S, 0), _of(S, 1), _of(S, 2)
     rows = (cross(second, third), cross(third, first), cross(first, second))
     det = dot(first, rows[0])
-    if not det > 1e-14 * N[0, 0] * N[1, 1] * N[2, 2]:
+    if not det > 1e-14 * S[0, 0] * S[1, 1] * S[2, 2]:
         return False
     for i in range(3):
         for j in range(3):
@@ -426,36 +415,19 @@ def _add_reduced(
     D: FloatArray, e: FloatArray, inverse: FloatArray, Q: FloatArray, H: FloatArray, gradient: FloatArray
 ) -> None:
     """Normal equations (6) without the point: H += Dt^T Dt - Q N^-1 Q^T with Q = Dt^T Dp."""
-    g = (_column(D, 0, e), _column(D, 1, e), _column(D, 2, e))
+    g = (_product(D[:, 0], e), _product(D[:, 1], e), _product(D[:, 2], e))
     best = apply(inverse, g)
     for i in range(6):
         for j in range(3):
-            Q[i, j] = _column(D, 3 + i, D[:, j])
+            Q[i, j] = _product(D[:, 3 + i], D[:, j])
     for i in range(6):
         q = apply(inverse, (Q[i, 0], Q[i, 1], Q[i, 2]))
-        gradient[i] += _column(D, 3 + i, e) - dot((Q[i, 0], Q[i, 1], Q[i, 2]), best)
+        gradient[i] += _product(D[:, 3 + i], e) - dot((Q[i, 0], Q[i, 1], Q[i, 2]), best)
         for j in range(6):
-            H[i, j] += _column(D, 3 + i, D[:, 3 + j]) - dot(q, (Q[j, 0], Q[j, 1], Q[j, 2]))
+            H[i, j] += _product(D[:, 3 + i], D[:, 3 + j]) - dot(q, (Q[j, 0], Q[j, 1], Q[j, 2]))
 
 
 _VARIANCE = (0.5, 0.5, 2.0)
-
-
-@compiled
-def _invert_symmetric(S: FloatArray, out: FloatArray) -> bool:
-    """Inverse of a symmetric positive definite (3, 3) matrix; False where it is singular to rounding."""
-    c00 = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
-    c01 = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
-    c02 = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
-    det = S[0, 0] * c00 + S[0, 1] * c01 + S[0, 2] * c02
-    if not det > 1e-14 * S[0, 0] * S[1, 1] * S[2, 2]:
-        return False
-    out[0, 0], out[0, 1], out[0, 2] = c00 / det, c01 / det, c02 / det
-    out[1, 1] = (S[0, 0] * S[2, 2] - S[0, 2] * S[0, 2]) / det
-    out[1, 2] = (S[0, 1] * S[0, 2] - S[0, 0] * S[1, 2]) / det
-    out[2, 2] = (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]) / det
-    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
-    return True
 
 
 @compiled
@@ -541,7 +513,7 @@ def _whitening(D0: FloatArray, D1: FloatArray, S: FloatArray, W: FloatArray) -> 
             for n in range(3):
                 S[i, j] += _VARIANCE[n] * (D0[i, n] * D0[j, n] + D1[i, n] * D1[j, n])
             S[j, i] = S[i, j]
-    return _invert_symmetric(S, W)
+    return _invert(S, W)
 
 
 @compiled
@@ -599,9 +571,9 @@ def _track_jacobian(
         return False
     _predict(p, disparity, focal, by_p)
     for j in range(3):
-        by_w = plus(cross((A[0, j], A[1, j], A[2, j]), turned), rho, (T_w[0, j], T_w[1, j], T_w[2, j]))
+        by_w = plus(cross(_of(A, j), turned), rho, _of(T_w, j))
         column_w = apply(by_p, by_w)
-        column_v = apply(by_p, (rho * T_v[0, j], rho * T_v[1, j], rho * T_v[2, j]))
+        column_v = apply(by_p, times(rho, _of(T_v, j)))
         for i in range(3):
             C[i, j], C[i, 3 + j] = -column_w[i], -column_v[i]
     return True
@@ -613,7 +585,7 @@ def _add_normal(
 ) -> None:
     """H += C^T W C, gradient += C^T lam."""
     for j in range(6):
-        column = (C[0, j], C[1, j], C[2, j])
+        column = _of(C, j)
         gradient[j] += dot(column, lam)
         whitened = apply(W, column)
         WC[0, j], WC[1, j], WC[2, j] = whitened
@@ -660,9 +632,8 @@ def add_tracks(
         if not linearise_best(theta, kernel, tracks[n], focal, baseline, e, D, W, N, inverse, work):
             cost += _loss(BEHIND, 5.0, tails, trust[n])
             continue
-        square = 0.0
+        square = _product(e, e)
         for i in range(8):
-            square += e[i] * e[i]
             for j in range(_MOTION):
                 J[i, j] = D[i, 3 + j]
         for k in range(size - _MOTION):

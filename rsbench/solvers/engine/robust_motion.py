@@ -6,7 +6,7 @@ import functools
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,14 +26,13 @@ from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import SENSORS, MatchSet, MotionEstimate, Solver, SolverSpec
-from rsbench.solvers.engine.packed import Packed, pack, pack_pairs
-from rsbench.solvers.engine.ransac import IntArray, RansacOptions, msac_score, ransac
+from rsbench.solvers.engine.packed import TRACK_FREEDOM, Packed, pack, pack_pairs
+from rsbench.solvers.engine.ransac import IntArray, RansacOptions, SearchOptions, msac_score, ransac
 
 SIGMAS = 2.5
 """Standard deviations of the noise at which a match is an outlier."""
 _NEAR = 8.0
 """Thresholds within which a solver that weighs matches itself is given them."""
-_TRACK_FREEDOM = 5
 _FIXED_POINT_STEPS = 8
 _GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 
@@ -66,7 +65,7 @@ class RobustProblem:
         self._stereo = "stereo" in self.spec.needs
         self.reasons: Counter[str] = Counter()
         """How often the solver failed on a sample for each reason."""
-        self._sizes, self.linked = self._plan(linked)
+        self.sample_size, self.linked = self._plan(linked)
         self._affine = "affine" in self.spec.needs
         self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
         if self._affine:  # tracks have no affine frames: such a solver is given the left matches alone
@@ -80,15 +79,14 @@ class RobustProblem:
         if not self._stereo:
             pairs = Correspondences(left=given.left, right=given.right)
             sizes = self.solver.sample_sizes(given if linked else pairs)
-            return (sizes.get("left", 0), sizes.get("right", 0), sizes.get("tracks", 0)), sizes.get(
-                "tracks", 0
-            ) > 0
+            left, right, tracks = (sizes.get(name, 0) for name in _GROUPS)
+            return (left, right, tracks), tracks > 0
         sizes = self.solver.sample_sizes(self._handed(given.left, given.right, given.tracks))
-        temporal = {side: sizes.get(side, 0) for side in SIDES}
-        least = max(sizes.get("stereo", 0), sizes.get("tracks", 0))
-        if len(given.tracks) >= max(least, *temporal.values()):
-            return (0, 0, max(least, *temporal.values())), True
-        return (max(temporal["left"] - least, 0), max(temporal["right"] - least, 0), least), True
+        left, right, tracks = (sizes.get(name, 0) for name in _GROUPS)
+        least = max(sizes.get("stereo", 0), tracks)
+        if len(given.tracks) >= max(least, left, right):
+            return (0, 0, max(least, left, right)), True
+        return (max(left - least, 0), max(right - least, 0), least), True
 
     def _data(self) -> Correspondences:
         """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
@@ -122,10 +120,6 @@ class RobustProblem:
     @property
     def num_data(self) -> tuple[int, ...]:
         return len(self.data.left), len(self.data.right), len(self.data.tracks)
-
-    @property
-    def sample_size(self) -> tuple[int, ...]:
-        return self._sizes
 
     def generate(self, samples: IntArray) -> Iterator[list[MotionEstimate]]:
         subsets = [self._subset(sample) for sample in samples]
@@ -170,7 +164,7 @@ class RobustProblem:
         """
         squares = self.residuals(model) ** 2
         tracks = len(self.packed.tracks)
-        moments = np.repeat([_moment(1), _moment(_TRACK_FREEDOM)], [len(squares) - tracks, tracks])
+        moments = np.repeat([_moment(1), _moment(TRACK_FREEDOM)], [len(squares) - tracks, tracks])
         for _ in range(_FIXED_POINT_STEPS):
             below = squares <= threshold**2
             if not np.any(below):
@@ -273,7 +267,7 @@ def quantile(freedom: int) -> float:
 @functools.cache
 def _track_scale() -> float:
     """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
-    return SIGMAS / float(np.sqrt(quantile(_TRACK_FREEDOM)))
+    return SIGMAS / float(np.sqrt(quantile(TRACK_FREEDOM)))
 
 
 @functools.cache
@@ -288,7 +282,7 @@ def _moment(freedom: int) -> float:
     return truncated(freedom) * SIGMAS**2 / quantile(freedom)
 
 
-_SECOND_TRY = 3.0
+SECOND_TRY = 3.0
 """Factor on the threshold when nothing was found."""
 _ADAPTATIONS = 2
 _WORSE = 1.5
@@ -298,28 +292,18 @@ solvers that noise upsets cost 1.7 times as much and more."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobustOptions:
+class RobustOptions(SearchOptions):
     """The robust loop, equal for every solver."""
 
     threshold_px: float = 1.25
     """Largest Sampson error of an inlier: 2.5 standard deviations of a match's noise of 0.5 px."""
     adapt_threshold: bool = True
     """Whether the threshold then follows the noise that the inliers show, between a fifth and four times it."""
-    confidence: float = 0.999
-    """Probability, 0 to 1, of having drawn a sample without outliers when RANSAC stops."""
-    min_iterations: int = 10
-    """Samples that RANSAC draws, at least."""
-    max_iterations: int = 1000
-    """Samples that RANSAC draws, at most."""
-    lo_steps: int = 3
-    """Refinements of each new best model, at thresholds that shrink from twice the threshold to it."""
-    final_steps: int = 3
-    """Refinements at the end, until the inliers stay the same."""
 
     def ransac(self) -> RansacOptions:
         """The options of the search; checks the values."""
-        same = ("confidence", "min_iterations", "max_iterations", "lo_steps", "final_steps")
-        return RansacOptions(threshold=self.threshold_px, **{name: getattr(self, name) for name in same})
+        same = {each.name: getattr(self, each.name) for each in fields(SearchOptions)}
+        return RansacOptions(threshold=self.threshold_px, **same)
 
     def __post_init__(self) -> None:
         self.ransac()
@@ -430,10 +414,9 @@ def _refused(
     correspondences: Correspondences, reason: str, solver: Solver, options: RobustOptions
 ) -> RobustEstimate:
     """The failure of a solver that is not run."""
-    names: tuple[MatchSet, ...] = ("left", "right", "tracks")
     return RobustEstimate(
         estimate=MotionEstimate.failed(reason),
-        inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in names},
+        inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in _GROUPS},
         iterations=0,
         seconds=0.0,
         threshold_px=options.threshold_px,
@@ -493,7 +476,7 @@ class _Task(NamedTuple):
             yield RobustProblem(*self[:4], linked=False), threshold
         if self.options.adapt_threshold and not problem.shortage:
             # Noise far above the threshold scatters the inliers of any model.
-            yield problem, _SECOND_TRY * threshold
+            yield problem, SECOND_TRY * threshold
 
 
 def _conclude(
