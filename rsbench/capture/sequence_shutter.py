@@ -276,12 +276,12 @@ def ratio_of_sequence(
         return None
     fewer = thinned_chains if alone else thinned
     few, found = fewer(windows, _SOME), dict[int, _Found]()
-    # A spline may not leave the motions that were found with a wrong camera, so start at several places.
+    # Far from the truth the evidence has several maxima, so start at several places.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
     first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
         profile = _Profile(few, rig, scanning, times, focal_sigma)
-        started = _likeliest(partial(profile.started, seed=seed), first, _ROUGH)
+        started = _likeliest(partial(profile.started, curve=profile.first_spline(seed)), first, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
         for each in _likeliest(profile.refined, rough, 1):
             found[number] = each
@@ -449,20 +449,23 @@ class _Profile:
         """Logarithm of the prior density of the focal length, up to a constant."""
         return -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
 
-    def started(self, start: _Place, seed: int) -> _Found:
-        """The fit at a place under a wide error distribution, from the motions of single windows.
+    def first_spline(self, seed: int) -> Curve:
+        """The spline through the motions of single windows at ``_FIRST`` and the given focal length."""
+        first = _Place(_FIRST, 0.0)
+        motions = window_motions(self._windows, self._rig, self._shutter(first.ratio), seed)
+        # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
+        span = span_of(float(self._times[-1]), self._shutter(1.0))
+        return first_curve(motions, self.tracks(first), span, _KNOTS)
+
+    def started(self, start: _Place, curve: Curve) -> _Found:
+        """The fit at a place under a wide error distribution, from the spline for the given focal length.
 
         Raises:
             NotDefiniteError: there is no fit; ``rough`` and ``refined`` raise it too.
         """
-        longer, camera = float(np.exp(start.log_focal)), self._rig.camera
-        rig = replace(self._rig, camera=replace(camera, fx=camera.fx * longer, fy=camera.fy * longer))
-        motions = window_motions(self._windows, rig, self._shutter(start.ratio), seed)
-        # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
-        span = span_of(float(self._times[-1]), self._shutter(1.0))
         tracks, prior = self.tracks(start), TrajectoryOptions().prior
-        curve, every = first_curve(motions, tracks, span, _KNOTS), np.ones(len(tracks))
-        return self._found(start, fit(curve, tracks, prior, True, _WIDE, every))
+        curve = _with_smaller_rotations(curve, float(np.exp(start.log_focal)))
+        return self._found(start, fit(curve, tracks, prior, True, _WIDE, np.ones(len(tracks))))
 
     def _found(self, place: _Place, found: Fit) -> _Found:
         return _Found(log_evidence(found, _PRECISION) + self.log_prior(place), place, found)
