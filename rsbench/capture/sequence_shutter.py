@@ -25,6 +25,7 @@ from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions
 from rsbench.capture.trajectory_fit import (
     ANCHORED,
     DAMPING,
+    Descent,
     Equations,
     Fit,
     anchored,
@@ -98,14 +99,14 @@ _PRECISION = 1e12
 _EXTRA_VARIANCE, _SHARED = 2.5, 0.02
 """Factor on the variance for errors beyond those correlated within image tiles, and error of the ratio common to
 all flow of a video. Chosen on twelve warped hand-held videos of 320 x 240 px (seed 7)."""
-_STEP, _STEP_FOCAL, _STEPS, _ROUNDS = 0.05, 0.1, 5, 4
-"""First difference steps of ratio and log focal length; Newton steps; rounds of the kind of prior."""
+_ROUNDS, _NEAR_PLACE = 4, np.array([0.05, 0.1])
+"""Most choices of the kind of prior, and changes of ratio and log focal length after which none follows."""
 _ROUGH, _REFINED = 3, 2
 """Number of starts from which the place is fitted, and number of these for which the fit is then refined."""
-_SHARES_OF_STEP = (1.0, 0.5, 0.25)
-"""Shares of a Newton step that are tried."""
-_NO_FIT = -1e12
-"""Logarithm of the evidence if there is no fit."""
+_STEPS, _STEPS_BESIDE, _LARGEST_STEP = 4, 4, np.array([0.05, 0.1])
+"""Most Newton steps to the largest evidence, steps of the spline at each place, and largest step of a place."""
+_REACH = np.array([[0.002, 0.01], [0.02, 0.04]])
+"""Smallest and largest steps of the differences of the evidence."""
 _DIFFERENCE = 1e-3
 """Step of ratio and log focal length for derivatives of the cost."""
 _FIXED_ROUNDS, _FREE_ROUNDS, _STEPS_A_ROUND = 15, 25, 2
@@ -292,12 +293,12 @@ def ratio_of_sequence(
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
         start = found[best].fit
         start = replace(start, trust=right_tracks(start, profile.tracks(found[best].place)))
-        top, covariance = profile.newton(profile.refined(found[best]._replace(fit=start)).place)
+        top, covariance = profile.most_evident(profile.refined(found[best]._replace(fit=start)))
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
     odds = sum(np.exp((each.evidence - found[best].evidence) / dispersion) for each in found.values())
-    estimate = profile.result(top, covariance * dispersion, 1.0 / float(odds))
+    estimate = profile.result(top, dispersion * covariance, 1.0 / float(odds))
     # Refuse fits to two or three wrong matches, and fits to all of them with an error scale too large for noise.
     right = estimate.used >= _LEAST_SHARE * estimate.total and estimate.noise_px <= MOST_NOISE_PX
     return estimate if right else None
@@ -309,6 +310,10 @@ class _Place(NamedTuple):
     ratio: float
     log_focal: float
     """See ``SequenceRatio``."""
+
+    def inside(self, reach: FloatArray) -> _Place:
+        """The nearest place whose ratio is at least ``reach[0]`` from its limits."""
+        return self._replace(ratio=float(np.clip(self.ratio, _LEAST + reach[0], 1.0 - reach[0])))
 
     def moved(self, step: FloatArray) -> _Place:
         """The place after a step (2,), within the limits."""
@@ -432,8 +437,6 @@ class _Profile:
             pack_windows(windows, rig, self._shutter(ratio), self._linked, share=self._share, times=self._times)
             for ratio in (0.0, 1.0)
         ]
-        self._fits = dict[_Place, Fit]()
-        self._values = dict[_Place, float]()
 
     def _shutter(self, ratio: float) -> RollingShutter:
         return self._rig.shutter_of(self._scanning, ratio)
@@ -475,19 +478,18 @@ class _Profile:
         return self._found(*self._fitted(start.place, start.fit, fixed=True))
 
     def refined(self, start: _Found) -> _Found:
-        """Fit spline and place under the error distribution of the tracks, for which ``at`` gives the evidence."""
+        """Fit spline and place under the error distribution of the tracks; the evidence is normalised."""
         place, found = start.place, start.fit
         for _ in range(_ROUNDS):
             last_place, (place, found) = place, self._fitted(place, found, fixed=False)
             # The knots stay fine, since coarse ones would enforce a smoothness that the prior must decide on.
             kind = choose(found, self.tracks(place), ())
-            near = np.all(np.abs(np.subtract(place, last_place)) < [_STEP, _STEP_FOCAL])
+            near = np.all(np.abs(np.subtract(place, last_place)) < _NEAR_PLACE)
             done, found = kind is found, kind
             if done or near:
                 break
-        self._fits = {place: found}
-        self._values.clear()
-        return _Found(self.comparable(place), place, found)
+        out = self._found(place, found)
+        return out._replace(evidence=self._normalised(out))
 
     def _fitted(self, place: _Place, found: Fit, fixed: bool) -> tuple[_Place, Fit]:
         """Fit spline, place, variances of the prior and, unless ``fixed``, the error distribution."""
@@ -511,106 +513,102 @@ class _Profile:
         equations = _Joint(self, tails, prior, trust).equations(curve, place)
         return place, Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=equations)
 
-    def _fit_near(self, place: _Place) -> tuple[_Place, Fit]:
-        near = min(self._fits, key=lambda other: float(np.hypot(*np.subtract(other, place))))
-        return near, self._fits[near]
-
-    def at(self, place: _Place) -> float:
-        """Logarithm of evidence times the prior of the focal length, for the error distribution of ``refined``."""
-        if place not in self._values:
-            near, start = self._fit_near(place)
-            curve = _with_smaller_rotations(start.curve, float(np.exp(place.log_focal - near.log_focal)))
-            try:
-                found = fit(curve, self.tracks(place), start.prior, True, start.tails, start.trust)
-                value = log_evidence(found, _PRECISION) + self.log_prior(place)
-                self._fits[place], self._values[place] = found, value
-            except NotDefiniteError:
-                self._values[place] = _NO_FIT
-        return self._values[place]
-
-    def newton(self, start: _Place) -> tuple[_Place, FloatArray]:
-        """The place of largest evidence and its covariance (2, 2), by Newton's method on finite differences.
-
-        The second row and column are 0 if the focal length is given.
-        """
-        best, axes = start, self.axes
-        reach, H = np.array([_STEP, _STEP_FOCAL]), np.eye(2)
-        for number in range(_STEPS):
-            middle = best._replace(ratio=float(np.clip(best.ratio, _LEAST + reach[0], 1.0 - reach[0])))
-
-            def beside(a: int, b: int, middle: _Place = middle, reach: FloatArray = reach) -> float:
-                return self.at(_Place(middle.ratio + a * reach[0], middle.log_focal + b * reach[1]))
-
-            ahead, behind = (np.array([beside(k, 0), beside(0, k) if axes > 1 else 0.0]) for k in (1, -1))
-            here = beside(0, 0)
-            H = np.diag((2.0 * here - ahead - behind)[:axes] / reach[:axes] ** 2)
-            if axes > 1:
-                H[0, 1] = H[1, 0] = (ahead[0] + ahead[1] - here - beside(1, 1)) / (reach[0] * reach[1])
-            values, vectors = np.linalg.eigh(H)
-            H = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
-            slope = ((ahead - behind)[:axes] / (2.0 * reach[:axes]))[:axes]
-            step = np.append(np.linalg.solve(H, slope), 0.0)[:2]
-            step *= np.min(np.minimum(1.0, [_COARSE, _COARSE_FOCAL] / np.maximum(np.abs(step), 1e-9)))
-            tried = (middle.moved(share * step) for share in _SHARES_OF_STEP)
-            there = next((each for each in tried if self.at(each) >= here), middle)
-            moved_by, sigma = np.abs(np.subtract(there, best))[:axes], np.sqrt(np.diagonal(np.linalg.inv(H)))
-            best = there
-            reach = np.clip(np.append(sigma, _STEP_FOCAL)[:2], [0.002, 0.02], [0.1, 0.3])
-            if number > 0 and np.all(moved_by < 0.3 * sigma):
-                break
-        out = np.zeros((2, 2))
-        out[:axes, :axes] = np.linalg.inv(H)
-        return best, out
-
-    def comparable(self, place: _Place) -> float:
-        """Normalised logarithm of evidence, which can be compared with that of other profiles of these tracks."""
-        value, (_, found) = self.at(place), self._fit_near(place)
-        tails, freedom = found.tails, self.tracks(place).freedom
+    def _normalised(self, found: _Found) -> float:
+        """Logarithm of evidence that can be compared with that under other error distributions of these tracks."""
+        tails, freedom = found.fit.tails, self.tracks(found.place).freedom
         each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
         each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
-        wrong = -freedom * np.log(MOST_NOISE_PX)  # outliers have a uniform distribution in all profiles
-        return value + self._share * float(np.sum(np.where(found.trust > 0.0, each, wrong)))
+        wrong = -freedom * np.log(MOST_NOISE_PX)  # outliers have a uniform distribution in all fits
+        return found.evidence + self._share * float(np.sum(np.where(found.fit.trust > 0.0, each, wrong)))
 
-    def dispersion(self, top: _Place, covariance: FloatArray) -> float:
-        """Factor on the covariance that accounts for correlated errors of tracks in one part of the image."""
-        axes, tracks = self.axes, self.tracks(top)
-        scores = np.zeros((len(tracks), axes))
-        for axis in range(axes):
-            step = float(np.sqrt(covariance[axis, axis])) * np.eye(2)[axis]
-            ends, costs = list[float](), list[FloatArray]()
-            for sign in (-1.0, 1.0):
-                ratio, log_focal = np.add(top, sign * step)
-                place = _Place(float(np.clip(ratio, _LEAST, 1.0)), float(log_focal))
-                self.at(place)
-                found = self._fit_near(place)[1]
-                factor = 0.5 * self._share * found.trust * (found.tails.nu + tracks.freedom)
-                spread = found.tails.nu * found.tails.scale**2
-                costs.append(factor * np.log1p(found.equations.squares / spread))
-                ends.append(place[axis])
-            scores[:, axis] = (costs[1] - costs[0]) / (ends[1] - ends[0])
-        inverse, groups = covariance[:axes, :axes], tiles(tracks.ends[tracks.starts[:-1], :2])
-        shared = shared_error_factor(scores @ inverse, groups, inverse, axes)
-        return self._extra * shared * variance_factor(len(np.unique(groups)) - 1.0, axes)
+    def beside(self, found: _Found, follows: FloatArray, step: FloatArray) -> _Found:
+        """The fit at a place near that of another one, with the same prior and error distribution.
 
-    def _spans(self, place: _Place) -> FloatArray:
-        """Number of windows that each track extends over."""
-        tracks = self.tracks(place)
-        return np.maximum(np.round(np.diff(tracks.starts) / (1 if self._linked else 2)) - 1.0, 1.0)
+        Args:
+            follows: derivative (6 controls, axes) of the spline by the place, negated; the fit starts along it.
+            step: (2,) from the other place.
+        """
+        (_, place, other), near = found, found.place.moved(step)
+        tracks, step = self.tracks(near), np.subtract(near, place)[: self.axes]
+        curve, equations, _ = Descent(tracks, other.tails, other.prior, other.trust).descended(
+            moved(other.curve, -follows @ step), None, _STEPS_BESIDE
+        )
+        return self._found(near, replace(other, curve=curve, equations=equations))
 
-    def result(self, top: _Place, covariance: FloatArray, probability: float) -> SequenceRatio:
-        """The result at the maximum ``top`` with its covariance (2, 2); the ratio is limited to at most 1."""
-        ratio, deviation = _truncated(top.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), self._shared)))
-        self.at(top)
-        found = self._fit_near(top)[1]
+    def follows(self, found: _Found) -> FloatArray:
+        """Minus the derivative (6 controls, axes) of a fitted spline by the place."""
+        (_, place, other), tracks = found, self.tracks(found.place)
+        here = _Point(_Joint(self, other.tails, other.prior, other.trust), other.curve, place)
+        lower = band_factor(anchored(here.equations, other.curve, tracks, ANCHORED))
+        return band_solve(lower, here.border.mixed)
+
+    def most_evident(self, start: _Found) -> tuple[_Found, FloatArray]:
+        """The fit of largest evidence and the covariance (2, 2) of its place, by Newton's method on differences.
+
+        The fit of largest probability ignores how the volume of possible splines changes with the place. The
+        second row and column are 0 if the focal length is given.
+        """
+        best, axes, reach = start, self.axes, _REACH[1].copy()
+        out = np.zeros((2, 2))
+        for _ in range(_STEPS):
+            best = best._replace(place=best.place.inside(reach))
+            follows, steps = self.follows(best), np.diag(reach)
+            here = self.beside(best, follows, np.zeros(2)).evidence
+            ahead, behind = (
+                np.array([self.beside(best, follows, sign * steps[k]).evidence for k in range(axes)])
+                for sign in (1.0, -1.0)
+            )
+            H = np.diag(2.0 * here - ahead - behind)
+            if axes > 1:
+                both = self.beside(best, follows, steps[0] + steps[1]).evidence
+                H[0, 1] = H[1, 0] = ahead[0] + ahead[1] - here - both
+            values, vectors = np.linalg.eigh(H / np.outer(reach[:axes], reach[:axes]))
+            inverse = (vectors / np.maximum(np.abs(values), 1.0)) @ vectors.T
+            out[:axes, :axes] = inverse
+            step = np.append(inverse @ ((ahead - behind) / (2.0 * reach[:axes])), 0.0)[:2]
+            step *= np.min(np.minimum(1.0, _LARGEST_STEP / np.maximum(np.abs(step), 1e-9)))
+            there = self.beside(best, follows, step)
+            if there.evidence >= here:
+                tracks, other = self.tracks(there.place), there.fit
+                again = fit(other.curve, tracks, other.prior, True, other.tails, other.trust)
+                best = self._found(there.place, again)
+            sigma = np.sqrt(np.diagonal(out))
+            reach = np.clip(np.where(sigma > 0.0, sigma, reach), *_REACH)
+            if np.all(np.abs(step) <= 0.3 * sigma):
+                break
+        return best, out
+
+    def dispersion(self, found: _Found, covariance: FloatArray) -> float:
+        """Factor on the covariance (2, 2) of a place for correlated errors of tracks in one part of the image."""
+        tracks, follows, fitted = self.tracks(found.place), self.follows(found), found.fit
+        inverse = covariance[: self.axes, : self.axes]
+        scores = np.zeros((len(tracks), self.axes))
+        factor = 0.5 * self._share * fitted.trust * (fitted.tails.nu + tracks.freedom)
+        for axis, step in enumerate(np.diag(np.sqrt(np.diagonal(inverse)))):
+            steps = [np.append(sign * step, 0.0)[:2] for sign in (-1.0, 1.0)]
+            ends = [self.beside(found, follows, each) for each in steps]
+            spread = fitted.tails.nu * fitted.tails.scale**2
+            costs = [factor * np.log1p(each.fit.equations.squares / spread) for each in ends]
+            scores[:, axis] = (costs[1] - costs[0]) / (ends[1].place[axis] - ends[0].place[axis])
+        groups = tiles(tracks.ends[tracks.starts[:-1], :2])
+        shared = shared_error_factor(scores @ inverse, groups, inverse, self.axes)
+        return self._extra * shared * variance_factor(len(np.unique(groups)) - 1.0, self.axes)
+
+    def result(self, found: _Found, covariance: FloatArray, probability: float) -> SequenceRatio:
+        """The result for a place with its covariance (2, 2); the ratio is limited to at most 1."""
+        place, tracks, trust = found.place, self.tracks(found.place), found.fit.trust
+        ratio, deviation = _truncated(place.ratio, float(np.hypot(np.sqrt(covariance[0, 0]), self._shared)))
+        # Number of windows that each track extends over.
+        spans = np.maximum(np.round(np.diff(tracks.starts) / (1 if self._linked else 2)) - 1.0, 1.0)
         return SequenceRatio(
             scanning=self._scanning,
             probability=probability,
             ratio=ratio,
             sigma=deviation,
-            noise_px=noise_px(found.tails),
-            used=int(np.sum(self._spans(top)[found.trust > 0.0])),
-            total=int(np.sum(self._spans(top))),
-            log_focal=top.log_focal,
+            noise_px=noise_px(found.fit.tails),
+            used=int(np.sum(spans[trust > 0.0])),
+            total=int(np.sum(spans)),
+            log_focal=place.log_focal,
             log_focal_sigma=float(np.sqrt(covariance[1, 1])),
         )
 

@@ -300,7 +300,7 @@ class _Place(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Descent:
     """The cost of a spline for a given error distribution and prior, in the form that ``descend`` takes.
 
     Steps with a small predicted decrease are always accepted: the equations treat the weights of pixels as
@@ -367,7 +367,7 @@ def fit(
     if tracks.gyro is not None and drift is None:
         drift = first_drift(curve, tracks.gyro)
     for _ in range(_ROUNDS):
-        curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _STEPS_A_ROUND)
+        curve, here, drift = Descent(tracks, tails, prior, trust).descended(curve, drift, _STEPS_A_ROUND)
         last = variances(prior, drift)
         old, lower = tails.scale, band_factor(anchored(here, curve, tracks, ANCHORED))
         used, determined, better, drift = estimate_variances(here, lower, prior, drift)
@@ -378,7 +378,7 @@ def fit(
         settling = (change > _FLAT_VARIANCE) & (change * determined > _FLAT_EVIDENCE)
         if abs(np.log(tails.scale / old)) < _FLAT and not np.any(settling):
             break
-    curve, here, drift = _Problem(tracks, tails, prior, trust).descended(curve, drift, _LAST_STEPS)
+    curve, here, drift = Descent(tracks, tails, prior, trust).descended(curve, drift, _LAST_STEPS)
     return Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=here, drift=drift)
 
 
