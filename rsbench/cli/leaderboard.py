@@ -221,11 +221,11 @@ def run(
 
     processes = chosen_workers(workers, scheduler, os.cpu_count() or 1)
     whole = split_of(track, data, seed_file, secret)
-    split, others = whole, _stored(whole, stored)
-    if problems is not None and problems > len(whole.truths):
-        raise RsbenchError(f"--problems {problems}: split {whole.name} has {len(whole.truths)}")
-    if problems is not None and problems < len(whole.truths):
-        split = replace(whole, truths=whole.truths[:problems])
+    there = len(whole.truths)
+    if problems is not None and problems > there:
+        raise RsbenchError(f"--problems {problems}: split {whole.name} has {there}")
+    split = whole if problems in (None, there) else replace(whole, truths=whole.truths[:problems])
+    others = _stored(whole, stored)
     load_cards(split.track, entry)  # before anything is written
     limits = Limits(time_limit, memory)
     with results_at(board, scheduler) as place:

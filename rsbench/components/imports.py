@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.untrusted_files import positive_variable, sha256
 
 _NUMERIC_ROOMS = ("core", "solvers", "vision", "capture", "pipeline")
 """Packages whose source decides what a component of ours answers."""
@@ -122,8 +121,13 @@ def own_source_version() -> str:
 
 
 def hash_of_files(folder: Path, files: list[Path]) -> str:
-    text = "\n".join(f"{path.relative_to(folder).as_posix()} {sha256(path)}" for path in files)
+    text = "\n".join(f"{path.relative_to(folder).as_posix()} {file_hash(path)}" for path in files)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's bytes. This module is imported by children that try packages, so it needs no NumPy."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def entry_points_by_name(group: str) -> dict[str, list[metadata.EntryPoint]]:
@@ -268,6 +272,8 @@ def try_import(module: str, version: str = "") -> None:
 
 @functools.cache
 def _fate(module: str, version: str) -> str:
+    from rsbench.storage.untrusted_files import positive_variable
+
     limit_s = positive_variable(IMPORT_LIMIT, _LIMIT_S, " of seconds")
     path = json.dumps([str(entry) for entry in sys.path])
     with lifeline() as line:
@@ -392,13 +398,13 @@ def _import_beside(module: str, folder: Path) -> object:
     beside = next((path for path in (first.with_suffix(".py"), first / "__init__.py") if path.is_file()), None)
     if beside is not None:
         _refuse_other(first.name, beside)
-    try_import(module, "".join(map(sha256, with_neighbours(beside))) if beside is not None else "")
+    try_import(module, "".join(map(file_hash, with_neighbours(beside))) if beside is not None else "")
     before = set(sys.modules)
     found = importlib.import_module(module)
     for name in set(sys.modules) - before:
         file = _file_of(name)
         if file is not None and file.is_relative_to(folder):
-            _beside_cards[name] = file, sha256(file)
+            _beside_cards[name] = file, file_hash(file)
     for file in with_neighbours(beside) if beside is not None else ():
         if file.parent == folder and file.stem in sys.modules:
             _refuse_other(file.stem, file)
@@ -418,7 +424,7 @@ def _put_on_path(folder: str) -> None:
 def _forget_changed(folder: Path) -> None:
     """Forget the modules of a folder when the file of one of them has changed."""
     mine = {name: file for name, (file, _) in _beside_cards.items() if file.is_relative_to(folder)}
-    if any(not file.is_file() or sha256(file) != _beside_cards[name][1] for name, file in mine.items()):
+    if any(not file.is_file() or file_hash(file) != _beside_cards[name][1] for name, file in mine.items()):
         for name in mine:
             del _beside_cards[name]
             sys.modules.pop(name, None)

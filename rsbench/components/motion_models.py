@@ -563,7 +563,9 @@ def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -
             f"motion model {motion_name!r} has no kernel, so no solver can assume it; these have: {known}"
         )
     motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), KERNELS[model]
-    names = [field.name for field in dataclasses.fields(kernel) if hasattr(motion, field.name)]  # pyrefly: ignore[bad-argument-type]
+    names = [field.name for field in dataclasses.fields(kernel)]  # pyrefly: ignore[bad-argument-type]
+    if issubclass(kernel, AnyLaw):  # its number, and an acceleration that the law lacks, are no parameters
+        names = [name for name in names if hasattr(motion, name)]
     return kernel(**{name: float(getattr(motion, name)) for name in names})
 
 

@@ -64,6 +64,10 @@ class RunOptions:
             raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
 
 
+def _anything_goes(component: Any) -> None:
+    pass
+
+
 @dataclass(frozen=True, kw_only=True)
 class Kind(Generic[Component, Options]):
     """One kind of component."""
@@ -80,7 +84,7 @@ class Kind(Generic[Component, Options]):
     """Dataclass of the keys that a card may set beside the parameters; all have defaults."""
     built_in: Mapping[str, str] = field(default_factory=dict)
     """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
-    check: Callable[[Component], None] = lambda component: None
+    check: Callable[[Component], None] = _anything_goes
     """Raises ValueError for a component whose declarations are inconsistent."""
 
     def __post_init__(self) -> None:

@@ -230,7 +230,7 @@ def remembered(kind: str, library: Path, machine: str, probe: Callable[[], Probe
     try:
         status = library.stat()
     except OSError as error:
-        return ProbeResult(ok=False, reason=f"{library} cannot be opened ({error.strerror})")
+        return ProbeResult(ok=False, reason=f"cannot be opened ({error.strerror})")
     key = f"{kind}|{library}|{status.st_mtime_ns}|{status.st_size}|{machine}"
     known = recall(key)
     if known is not None:

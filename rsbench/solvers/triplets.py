@@ -38,7 +38,7 @@ from typing import Literal, NamedTuple, final
 import numpy as np
 
 from rsbench.core import so3
-from rsbench.core.arguments import check_number
+from rsbench.core.arguments import check_number, check_whole
 from rsbench.core.correspondences import BoolArray, Correspondences, stereo_points, with_depth
 from rsbench.core.rig import FRAMES, SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
@@ -508,6 +508,7 @@ class LineTripletSolver(Solver):
 
     def __post_init__(self) -> None:
         check_number("threshold_px", self.threshold_px, 1e-6)
+        check_whole("max_iterations", self.max_iterations, RansacOptions.min_iterations)
         self._options()
 
     spec = SolverSpec(

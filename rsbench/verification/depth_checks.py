@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import product
@@ -490,7 +489,9 @@ class _MapsOverTime:
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
-        self._map, self._share = cache(self._read), cache(self._compare)
+        # Of functions, not of methods: these would keep the maps in a circle until a garbage collection.
+        self._map = cache(partial(_left_map, sequence))
+        self._share = cache(partial(_share_alike, sequence, self._map))
 
     def near(self, frame: int) -> list[int]:
         """Other frames, the nearest first."""
@@ -506,20 +507,25 @@ class _MapsOverTime:
         """Whether another one near it sees what it sees."""
         return any(self._share(frame, frame, other)[1] >= _LEAST for other in self.near(frame))
 
-    def _compare(self, frame: int, time: int, other: int) -> tuple[float, int]:
-        """Share of the comparable pixels that agree, and how many these are."""
-        source, target = self._map(frame), self._map(other)
-        if source is None or target is None:
-            return 0.0, 0
-        moved = replace(source, view=source.view._replace(frame=time))
-        stride = stride_for(source.depth.size, _TRIED_PIXELS)
-        relative = reproject(self.sequence, moved, target, stride).relative
-        near = relative[(source.depth[::stride, ::stride] > 0) & (relative < 0.01)]
-        near = near[np.isfinite(near)]
-        return (float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if near.size else 0.0), near.size
 
-    def _read(self, frame: int) -> DepthMap | None:
-        view = ImageView("rs", "left", frame)
-        with suppress(RsbenchError):  # reported already
-            return DepthMap(view, self.sequence.depth(*view), self.sequence.rig.sensor("left"))
+def _share_alike(
+    sequence: Sequence, map_of: Callable[[int], DepthMap | None], frame: int, time: int, other: int
+) -> tuple[float, int]:
+    """Share of the comparable pixels of two frames that agree, and how many these are."""
+    source, target = map_of(frame), map_of(other)
+    if source is None or target is None:
+        return 0.0, 0
+    moved = replace(source, view=source.view._replace(frame=time))
+    stride = stride_for(source.depth.size, _TRIED_PIXELS)
+    relative = reproject(sequence, moved, target, stride).relative
+    near = relative[(source.depth[::stride, ::stride] > 0) & (relative < 0.01)]
+    near = near[np.isfinite(near)]
+    return (float(np.mean(np.abs(near) <= DEPTH_TOLERANCE)) if near.size else 0.0), near.size
+
+
+def _left_map(sequence: Sequence, frame: int) -> DepthMap | None:
+    view = ImageView("rs", "left", frame)
+    try:
+        return DepthMap(view, sequence.depth(*view), sequence.rig.sensor("left"))
+    except RsbenchError:  # reported already
         return None

@@ -317,6 +317,7 @@ def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
 
 def refuse_unseen(found: Calibration, where: object) -> None:
     """Raises RsbenchError, with a crop that helps, where corners of an image show no ray before the camera."""
+    sizes = [size for table in found.cameras.values() if (size := _size_of(table)) is not None]
     for side, table in found.cameras.items():
         size = _size_of(table)
         error = None if size is None else _fault(table, size)
@@ -325,7 +326,8 @@ def refuse_unseen(found: Calibration, where: object) -> None:
         for share in np.arange(0.98, 0.3, -0.02):
             width, height = (2 * round(share * extent / 2) for extent in size)
             x, y = (size[0] - width) // 2, (size[1] - height) // 2
-            if _fault(_cut(table, x, y), (width, height)) is None:
+            within = all(x + width <= each[0] and y + height <= each[1] for each in sizes)
+            if within and _fault(_cut(table, x, y), (width, height)) is None:
                 raise RsbenchError(
                     f"{where}: {side}: {error}; or crop the frames to what is seen before the camera, and "
                     f"rsbench rig --crop {width}x{height}+{x}+{y} -o rig.toml"

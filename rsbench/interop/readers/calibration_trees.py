@@ -193,7 +193,7 @@ class Fields:
         if not np.all(np.isfinite(found)) or (counts and len(found) not in counts):
             wanted = f"{' or '.join(map(str, counts))} " if counts else ""
             raise RsbenchError(
-                f"{self.where}: {key} = {' '.join(str(value).split())[:60]}: must be {wanted}finite numbers"
+                f"{self.where}: {key} = {' '.join(map(str, _flat(value)))[:60]}: must be {wanted}finite numbers"
             )
         return found
 

@@ -242,11 +242,16 @@ def _kalibr_camera(camera: Fields) -> tuple[Table, tuple[str, ...]]:
             "calibrate as pinhole-equi, ds-none or eucm-none"
         )
     intrinsics = (fx, fy, cx, cy)
+    if model == "pinhole" and distortion == "fov" and not d:
+        raise RsbenchError(f"{where}: distortion_coeffs: is missing; fov has one")
     if model == "pinhole" and distortion != "fov":
         table, note = table_of(size, intrinsics, by_name(distortion, d, where)), ""
+    elif model == "pinhole":
+        table, note = camera_table(size, intrinsics, "fov", d[:1], where)
+    elif model == "omni":
+        table, note = camera_table(size, intrinsics, "omni", own + d[:2], where)
     else:
-        lenses = {"pinhole": ("fov", d[:1]), "omni": (model, own + d[:2]), "ds": ("double-sphere", own)}
-        table, note = camera_table(size, intrinsics, *lenses.get(model, (model, own)), where)
+        table, note = camera_table(size, intrinsics, {"ds": "double-sphere"}.get(model, model), own, where)
     if "line_delay" in camera:
         table["line_delay_s"] = camera.number("line_delay")
     return table, (note,) if note else ()
