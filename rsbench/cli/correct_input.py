@@ -356,16 +356,16 @@ def given_frames(
     say_notes("--rig", notes)
     if frames is not None and len(frames) == 4 and not (left or right):
         return CorrectInput(card=card, out=out, four=frames, gyro=gyro)
-    other = left if side_by_side and not right else right
-    if frames or not (left and other):
+    if side_by_side and left and not (frames or right):  # one file with both halves
+        return CorrectInput(
+            card=card, out=out, footage=[left, left], gyro=gyro, row_poses=row_poses, side_by_side=True
+        )
+    if frames or not (left and right):
         count = f"{len(frames)} images; " if frames else ""
         raise RsbenchError(
             f"frames: {count}give LEFT_0 RIGHT_0 LEFT_1 RIGHT_1, or --left and --right, or a sequence's folder"
         )
-    halves = side_by_side and not right
-    return CorrectInput(
-        card=card, out=out, footage=[left, other], gyro=gyro, row_poses=row_poses, side_by_side=halves
-    )
+    return CorrectInput(card=card, out=out, footage=[left, right], gyro=gyro, row_poses=row_poses)
 
 
 def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> CorrectInput:

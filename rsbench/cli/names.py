@@ -281,9 +281,9 @@ def _about_component(component: object) -> dict[str, Any]:
     spec = getattr(component, "spec", None)
     for field in dataclasses.fields(spec) if dataclasses.is_dataclass(spec) else ():
         value = getattr(spec, field.name)
-        about[field.name] = dict(value) if isinstance(value, Mapping) else value
         if isinstance(value, Set):
-            about[field.name] = sorted(value)
+            value = sorted(value)
+        about[field.name] = dict(value) if isinstance(value, Mapping) else value
     return about
 
 

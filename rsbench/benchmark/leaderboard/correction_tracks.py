@@ -156,9 +156,10 @@ class CorrectionTrack(PictureTrack):
         return [read_answer_frame(submission.folder / PICTURES, pictures, each) for each in pictures.requested]
 
     def hints(self, drawn: Sequence[Frame], pictures: TruePictures, public: bool) -> Iterable[str]:
-        truths = {each.stem: pictures.frame(each.row) for each in pictures.requested} if public else {}
-        found: set[str] = set()
-        for (stem, truth), (image, _) in zip(truths.items(), drawn, strict=False):
+        if not public:
+            return ()
+        truths, found = {each.stem: pictures.frame(each.row) for each in pictures.requested}, set[str]()
+        for (stem, truth), (image, _) in zip(truths.items(), drawn, strict=True):
             others = {name: other for name, other in truths.items() if name != stem}
             found |= set(_mistakes(image, truth, others))
         return found
@@ -173,15 +174,18 @@ class CorrectionTrack(PictureTrack):
 
     def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
         """Means over the requested frames, of dB too; FLIP takes most of the time."""
-        answers = [None] * len(true) if drawn is None else drawn
-        both = list(zip(answers, true, strict=True))
-        scores = [_WORST_FRAME if frame is None else _frame(*frame, one, self.flips) for frame, one in both]
-        images = ((frame and frame[0], one.picture.image, one.parts) for frame, one in both)
+        scores, images = list[Numbers](), list[NDArray[np.uint8] | None]()
+        for number, one in enumerate(true):
+            image, mask = (None, None) if drawn is None else drawn[number]
+            failed = image is None or mask is None
+            scores.append(_WORST_FRAME if failed else _frame(image, mask, one, self.flips))
+            images.append(image)
         keys = [key for key in _WORST_FRAME if self.flips or not key.startswith("flip_")]
         found = {key: float(np.mean([each[key] for each in scores])) for key in keys}
         by_row = {f"psnr_{name}": math.nan for name in self.rows}
         by_row |= {f"psnr_{one.name}": each["psnr"] for one, each in zip(true, scores, strict=True)}
-        squares = rms_by_part(self.part_score, images)
+        parted = zip(images, (one.picture.image for one in true), (one.parts for one in true), strict=True)
+        squares = rms_by_part(self.part_score, parted)
         return {**found, **by_row, **squares, "error": 1.0 - found["ssim"]}
 
     def draw(self, pictures: TruePictures, place: Path) -> None:

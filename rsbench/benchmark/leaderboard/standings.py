@@ -202,7 +202,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
     scenes, primary = list(problems["scene"]), track_of_id(kept[0].header.protocol).primary
     places = _ranked(ranked, primary.key, primary.sign, scenes)
     log_places = _ranked(stating, "log_score", 1.0, scenes)
-    lines = [_standing(each, scenes, *(by.get(each, Place()) for by in (places, log_places))) for each in kept]
+    lines = [_standing(each, scenes, places.get(each, Place()), log_places.get(each, Place())) for each in kept]
     return sorted(lines, key=_order)
 
 

@@ -159,7 +159,7 @@ def _notes(submission: Submission, split: Split, path: Path) -> Iterator[str]:
     if missing:
         yield f"{path}: no answer for {len(missing)} of {_few(missing, len(split.truths))}: they count as failures"
     answers = [answer for answer in submission.answers.values() if answer.success and answer.w is not None]
-    turns = [answer.name for answer in answers if math.hypot(*(answer.w or ())) > math.pi]
+    turns = [answer.name for answer in answers if answer.w is not None and math.hypot(*answer.w) > math.pi]
     if turns:
         yield (
             f"{path}: norm(w) is more than half a turn in {len(turns)} of {_few(turns, len(answers))}: w is in "

@@ -502,6 +502,7 @@ def summary_row(
 
 
 _AT_BOUND = ("bound_median", "bound_mean")
+_OVER_BOUND = ("rms", "bound", "over_bound", "over_bound_low", "over_bound_high")
 
 
 def at_bound(axes: FloatArray, seed: int) -> dict[str, float]:
@@ -521,13 +522,16 @@ def over_bound(values: FloatArray, sigmas: FloatArray, seed: int) -> dict[str, f
 
     None where they do not exist.
     """
-    rms = bound = over = low = high = None
-    if len(values) and not np.any(np.isnan(values)):
-        rms, bound = float(_rms(values)), float(_rms(sigmas))
-    if rms is not None and bound:
-        squares, over = np.stack([values**2, sigmas**2], axis=-1), rms / bound
-        low, high = average_interval(squares, seed, lambda means: np.sqrt(means[..., 0] / means[..., 1]))
-    return {"rms": rms, "bound": bound, "over_bound": over, "over_bound_low": low, "over_bound_high": high}
+    found: dict[str, float | None] = dict.fromkeys(_OVER_BOUND)
+    if not len(values) or np.any(np.isnan(values)):
+        return found
+    rms, bound = float(_rms(values)), float(_rms(sigmas))
+    found |= {"rms": rms, "bound": bound}
+    if bound == 0.0:
+        return found
+    squares = np.stack([values**2, sigmas**2], axis=-1)
+    low, high = average_interval(squares, seed, lambda means: np.sqrt(means[..., 0] / means[..., 1]))
+    return found | {"over_bound": rms / bound, "over_bound_low": low, "over_bound_high": high}
 
 
 def _rms(values: FloatArray) -> FloatArray:
