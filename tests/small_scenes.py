@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
-from rsbench.core.rig import StereoRig
+if TYPE_CHECKING:  # attacks choose which rsbench is imported after this module
+    from rsbench.core.rig import StereoRig
 
 Vector = tuple[float, float, float]
 SCENE = """

@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from small_scenes import DATASET, write_box_scene
+from small_scenes import DATASET, MOTION, write_box_scene
 
 ROOT = Path(__file__).parents[2]
 LINKED = ("rsbench", "docs", "examples")
@@ -55,7 +55,7 @@ def write_inputs(folder: Path) -> None:
     (folder / "rig.toml").write_text(RIG, "utf-8")
     scene = write_box_scene(folder, "box")
     sequences = [f'[[sequence]]\nname = "{name}"\nscene = "{scene}"\n' for name in ("one", "two")]
-    (folder / "tiny.toml").write_text("\n".join([DATASET, *sequences]), "utf-8")
+    (folder / "tiny.toml").write_text("\n".join([DATASET + MOTION, *sequences]), "utf-8")
     (folder / "sweep.toml").write_text(to_toml(SWEEP), "utf-8")
 
 
