@@ -270,7 +270,8 @@ def ratio_of_sequence(
     Args:
         windows: matches, with outliers, of the frames 0 and 1, 1 and 2, ...
         seed: seed of the search for motions of single windows.
-        focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given.
+        focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given,
+            as it must be for a camera with a lens.
         times: (n + 1,) times of the frames' first lines, frame periods, all about one period apart; None: exactly.
     """
     alone = is_of_one_camera(windows)
