@@ -272,7 +272,7 @@ def ratio_of_sequence(
         seed: seed of the search for motions of single windows.
         focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given,
             as it must be for a camera with a lens.
-        times: (n + 1,) times of the frames' first lines, frame periods, all about one period apart; None: exactly.
+        times: (n + 1,) times of the frames' first lines, frame periods; None: one period apart.
     """
     alone = is_of_one_camera(windows)
     if sum(len(each.left if alone else each.tracks) for each in windows) < _FEWEST * len(windows):
@@ -457,10 +457,10 @@ class _Profile:
     def first_spline(self, seed: int) -> Curve:
         """The spline through the motions of single windows at ``_FIRST`` and the given focal length."""
         first = _Place(_FIRST, 0.0)
-        motions = window_motions(self._windows, self._rig, self._shutter(first.ratio), seed)
+        motions = window_motions(self._windows, self._rig, self._shutter(first.ratio), seed, self._times)
         # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
         span = span_of(float(self._times[-1]), self._shutter(1.0))
-        return first_curve(motions, self.tracks(first), span, _KNOTS)
+        return first_curve(motions, self.tracks(first), span, _KNOTS, self._times)
 
     def started(self, start: _Place, curve: Curve) -> _Found:
         """The fit at a place under a wide error distribution, from the spline for the given focal length.

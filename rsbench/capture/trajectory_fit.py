@@ -407,40 +407,60 @@ def estimate_variances(
 
 
 def window_motions(
-    windows: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter, seed: int
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    seed: int,
+    times: FloatArray | None = None,
 ) -> list[Motion | None]:
     """The paper's linear motion of each window, from some of its tracks; None if none is found.
 
-    The unknown length of one camera's translation is set to ``_SHORT``.
+    The unknown length of one camera's translation is set to ``_SHORT`` per frame period.
+
+    Args:
+        times: (n + 1,) times of the frames' first lines, frame periods; None: 0, 1, 2, ... A motion has the time
+            between its two frames as unit.
     """
+    lengths = np.ones(len(windows)) if times is None else np.diff(times)
     alone = is_of_one_camera(windows)
     out, solver, unit = list[Motion | None](), RefinedSolver(one_camera=alone), _SHORT if alone else 1.0
-    for window in thinned(windows, _SOME):
-        rng = np.random.default_rng(seed)
+    for window, length in zip(thinned(windows, _SOME), lengths.tolist(), strict=True):
+        rng, paced = np.random.default_rng(seed), shutter
+        if length != 1.0:
+            paced = shutter.with_ratio(min(shutter.readout_ratio / length, 1.0))
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            found = estimate_motion(window, rig, shutter, solver, RobustOptions(), rng).estimate
-        out.append(LinearMotion(found.w, unit * found.d) if found.success else None)
+            found = estimate_motion(window, rig, paced, solver, RobustOptions(), rng).estimate
+        scale = unit * length if alone else unit
+        out.append(LinearMotion(found.w, scale * found.d) if found.success else None)
     return out
 
 
 def first_curve(
-    motions: Sequence[Motion | None], tracks: TimedTracks, span: tuple[float, float], interval: float
+    motions: Sequence[Motion | None],
+    tracks: TimedTracks,
+    span: tuple[float, float],
+    interval: float,
+    times: FloatArray | None = None,
 ) -> Curve:
     """The spline through the motions of the windows; missing and wrong ones are interpolated from neighbours.
 
     Args:
         span: times of the first and the last line.
+        times: see ``window_motions``.
     """
     rates, known = _rates(motions)
+    times = np.arange(len(rates) + 1.0) if times is None else times
+    rates = rates / np.diff(times)[:, None]
     places = np.arange(len(rates))
     others = np.stack([_interpolated(rates, known & (places != k))[k] for k in places])
-    own, bridged = (_spline_through(each, span, interval) for each in (_interpolated(rates, known), others))
+    both = _interpolated(rates, known), others
+    own, bridged = (_spline_through(each, span, interval, times) for each in both)
     errors = []
     for curve in (own, bridged):
         chosen = [squared_errors(curve, tracks)[members] for members in tracks.members]
         errors.append(np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen]))
     known &= ~(errors[0] > _SUSPECT * errors[1])
-    return _spline_through(_interpolated(rates, known), span, interval)
+    return _spline_through(_interpolated(rates, known), span, interval, times)
 
 
 def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:
@@ -451,7 +471,8 @@ def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: 
     rates = _interpolated(rates, known)
     count = control_count(curve.first, last, curve.interval)
     taus = curve.first + curve.interval * (np.arange(count) - 1.0)
-    ahead = from_pose_at(_spline_through(rates, (0.0, max(last - start, 1.0)), curve.interval), 0.0)
+    steps = np.arange(len(rates) + 1.0)
+    ahead = from_pose_at(_spline_through(rates, (0.0, max(last - start, 1.0)), curve.interval, steps), 0.0)
     own, later = evaluate(curve, taus)[0], evaluate(ahead, taus - start)[0]
     here = evaluate(curve, float(start))[0]
     R, p = curve.R, curve.p
@@ -476,15 +497,15 @@ def _interpolated(rates: FloatArray, known: BoolArray) -> FloatArray:
     return np.stack([np.interp(places, places[known], column[known]) for column in rates.T], axis=1)
 
 
-def _spline_through(rates: FloatArray, span: tuple[float, float], interval: float) -> Curve:
-    """The spline through the poses that result from rates (n, 6) of rotation and translation, one per period."""
+def _spline_through(rates: FloatArray, span: tuple[float, float], interval: float, times: FloatArray) -> Curve:
+    """The spline through the poses that result from rates (n, 6) of rotation and translation between times."""
     motions, poses = [LinearMotion(rate[:3], rate[3:]) for rate in rates], [Pose(np.eye(3), np.zeros(3))]
-    for motion in motions:
-        poses.append(compose(Pose(*motion.body_from_world(1.0)), poses[-1]))
+    for motion, length in zip(motions, np.diff(times), strict=True):
+        poses.append(compose(Pose(*motion.body_from_world(length)), poses[-1]))
     controls = []
     for tau in span[0] + interval * (np.arange(control_count(*span, interval)) - 1.0):
-        k = int(np.clip(np.floor(tau), 0, len(rates) - 1))
-        controls.append(inverse(compose(motions[k].body_from_world(tau - k), poses[k])))
+        k = int(np.clip(np.searchsorted(times, tau, side="right") - 1, 0, len(rates) - 1))
+        controls.append(inverse(compose(motions[k].body_from_world(tau - times[k]), poses[k])))
     R = np.swapaxes(np.stack([each.R for each in controls]), 1, 2)
     return make_curve(span[0], interval, R, np.stack([each.t for each in controls]))
 

@@ -28,7 +28,6 @@ from rsbench.capture.trajectory_spline import (
     approximated,
     band_inner,
     covariance_between,
-    make_curve,
     motion_covariance,
     part,
     span_of,
@@ -264,7 +263,7 @@ def camera_trajectory(
         motions: start motion of each window, with d of any length.
         rig: a rig whose left camera is the camera and whose body is at this camera.
         shutter: shutter of the camera.
-        times: (n + 1,) times of the frames' first lines, frame periods, all about one period apart; None: exactly.
+        times: (n + 1,) times of the frames' first lines, frame periods; None: one period apart.
     """
     times = np.arange(len(windows) + 1.0) if times is None else times
     try:
@@ -328,7 +327,8 @@ def _fitted(
         return pack_windows(matches, rig, shutter, right, share=share, times=times)
 
     few = packed([each[:: max(len(each) // _FIRST_MATCHES, 1)] for each in windows])
-    first = fit(first_curve(motions, few, span_of(float(times[-1]), shutter), _KNOTS), few, _PRIOR)
+    start = first_curve(motions, few, span_of(float(times[-1]), shutter), _KNOTS, times)
+    first = fit(start, few, _PRIOR)
     tracks = packed(windows)
     trust = right_tracks(first, tracks)
     tracks = packed(windows, [trust[each] for each in tracks.members])
@@ -339,7 +339,7 @@ def _window(curve: Curve, begin: float, end: float, shutter: RollingShutter) -> 
     """The motion in the window of frames at two times, with its length as unit and d of length 1; None: d is 0."""
     first, last = span_of(end - begin, shutter)
     own = part(curve, begin + first, begin + last, begin)
-    own = make_curve(own.first / (end - begin), own.interval / (end - begin), own.R, own.p)
+    own = own._replace(first=own.first / (end - begin), interval=own.interval / (end - begin))
     motion = ContinuousMotion.of(own)
     length = float(np.linalg.norm(motion.d))
     return motion.seen(np.eye(3), 1.0 / length) if length > 0.0 else None

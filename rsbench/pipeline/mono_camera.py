@@ -160,7 +160,7 @@ def find_shutter(
         card: given values.
         options, seed: settings of the search for a motion.
         advance: called after each pair that is examined.
-        starts: (n,) times of the frames' first rows, frame periods, all about one period apart; None: exactly.
+        starts: (n,) times of the frames' first rows, frame periods; None: one period apart.
 
     Raises:
         NoMotionError: the frames do not determine the shutter.
