@@ -265,6 +265,7 @@ RIGS = {
     "toed-in": _two(turned(0.0, 3.0, 1.0)),
     "vertical": _two(turned(0.3, -0.2, 0.4), (0.0, -0.2, 0.0)),
     "sizes": _two(turned(0.2, 0.3, -0.2), right={"width": 1280, "height": 720, "fx": 1010.0, "fy": 1010.0}),
+    "narrow": _two(right={"height": 370}),
     "global-left": _two(turned(0.2, -0.3, 0.1), left={"ratio": 0.0}),
     "global-right": _two(turned(0.2, -0.3, 0.1), right={"ratio": 0.0}),
     "fisheye": _two(
