@@ -248,12 +248,18 @@ def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> Floa
     Raises:
         NotDefiniteError: the tracks do not determine the spline.
     """
-    # Expected information of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
-    tails, curve = found.tails, found.curve
-    expected = found.trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
-    normal, each = Tails(NORMAL, tails.scale), replace(tracks, share=share)
-    equations = normal_equations(curve, each, normal, found.prior, expected, drift=found.drift)
-    return bordered_inverse(band_factor(anchored(equations, curve, tracks, ANCHORED)), equations.border)
+    each = replace(tracks, share=share)
+    equations = expected_equations(found.curve, each, found.tails, found.prior, found.trust, found.drift)
+    return bordered_inverse(band_factor(anchored(equations, found.curve, tracks, ANCHORED)), equations.border)
+
+
+def expected_equations(
+    curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, drift: Drift | None = None
+) -> Equations:
+    """``normal_equations`` with the expected information in place of the observed one."""
+    # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
+    expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
+    return normal_equations(curve, tracks, Tails(NORMAL, tails.scale), prior, expected, drift=drift)
 
 
 def log_evidence(found: Fit, precision: float) -> float:

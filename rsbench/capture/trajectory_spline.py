@@ -75,6 +75,13 @@ def band_inner(a: FloatArray, b: FloatArray) -> float:
     return float(np.sum(a[:, 0] * b[:, 0]) + 2.0 * np.sum(a[:, 1:] * b[:, 1:]))
 
 
+def band_form(band: FloatArray, x: FloatArray) -> float:
+    """x^T B x of a band matrix B and a vector x (n,)."""
+    n = len(x)
+    parts = [x[i:] @ (band[: n - i, i] * x[: n - i]) for i in range(min(n, band.shape[1]))]
+    return float(2.0 * np.sum(parts) - parts[0])
+
+
 @compiled
 def band_inverse(lower: FloatArray) -> FloatArray:
     """The elements of the inverse that lie in the band of the factor.
@@ -621,11 +628,16 @@ def _block(inverse: FloatArray, a: Views, b: Views) -> FloatArray:
     return inverse[low, high - low]
 
 
+def motion_from(curve: Curve, start: float) -> Pose:
+    """The motion (R, t) during one frame period, relative to the body at its start."""
+    (R, t), _, _ = evaluate(curve, np.array([start, start + 1.0]))
+    turn = R[1] @ R[0].T
+    return Pose(turn, t[1] - turn @ t[0])
+
+
 def motion_covariance(curve: Curve, inverse: FloatArray, start: float) -> FloatArray | None:
     """Covariance (6, 6) of w and d of the motion during one frame period, relative to the body at its start."""
-    (here, there), _, _ = evaluate(curve, np.array([start, start + 1.0]))
-    R = here[1] @ here[0].T
-    t = there[1] - R @ there[0]
+    R, t = motion_from(curve, start)
     # A rotation of the body about its own axes changes w by J^-1 of it; t = -R p depends on it and on p.
     by = np.zeros((6, 6))
     by[:3, :3] = np.linalg.inv(so3.left_jacobian(so3.log(R)))

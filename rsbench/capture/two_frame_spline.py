@@ -12,13 +12,25 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from rsbench.capture.hypotheses import LEAST_SCALE_PX
 from rsbench.capture.trajectory_estimate import Trajectory, TrajectoryOptions, estimate_trajectory
-from rsbench.capture.trajectory_fit import Fit, covariance_band, first_curve, fit, normal_equations, right_tracks
+from rsbench.capture.trajectory_fit import (
+    ANCHORED,
+    Fit,
+    anchored,
+    covariance_band,
+    expected_equations,
+    first_curve,
+    fit,
+    normal_equations,
+    right_tracks,
+    squared_errors,
+)
 from rsbench.capture.trajectory_spline import (
     NO_PRIOR,
     ContinuousMotion,
@@ -26,14 +38,24 @@ from rsbench.capture.trajectory_spline import (
     NotDefiniteError,
     Prior,
     approximated,
+    band_factor,
+    band_form,
     band_inner,
+    band_inverse,
+    band_log_determinant,
+    band_solve,
     covariance_between,
+    log_prior,
     motion_covariance,
+    motion_from,
+    moved,
     part,
+    roughness,
     span_of,
 )
-from rsbench.capture.trajectory_tracks import Tails, TimedTracks, informative, pack_windows
+from rsbench.capture.trajectory_tracks import REACH, Tails, TimedTracks, informative, pack_windows
 from rsbench.components.motion_models import has_kernel, make_motion
+from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
@@ -66,6 +88,11 @@ of dense flow are correlated, many matches count as one; rendered motions of con
 _MOST_UNDETERMINED_PX = 0.15
 """Largest standard deviation, px, of the image of a distant point, root mean square over the rows: above it, two
 frames do not determine the shake of the camera."""
+_SHAKES, _NO_SHAKE = tuple(np.geomspace(1e-3, 0.3, 5).tolist()), 1e-5
+"""Standard deviations of accelerations, rad and m per frame period^2, of departures that are equally probable: from
+those that move an image by half a pixel to those that rows always show; and of no departure."""
+_MEMORIES = (0.25, 1.0)
+"""Their memories, equally probable."""
 _ROWS = 24
 _FIRST_MATCHES = 150
 """Approximate number of matches per window from which the prior is estimated and the inliers are chosen."""
@@ -134,19 +161,84 @@ def two_frame_spline(
     )
 
 
-def dispersion_of_rows(matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> float:
-    """Factor on a motion's covariance for rows that do not fit its motion model, see ``Rows.dispersion``.
+class Departure(NamedTuple):
+    """By how much a motion may depart from the motion model under which it was estimated."""
+
+    scatter: float = 1.0
+    """Variance of the motions that fit groups of rows best over that of errors common to a tile, at least 1."""
+    covariance: FloatArray | float = 0.0
+    """(6, 6) covariance of w and d due to shakes."""
+
+    def of(self, covariance: FloatArray) -> FloatArray:
+        """The covariance (6, 6) of w and d from that under the model."""
+        return self.scatter * covariance + self.covariance
+
+
+def departure(matches: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> Departure:
+    """By how much the motion of a rig may depart from a motion model, which the matches need not show.
+
+    It departs by a spline with the prior of ``trajectory_spline``, of unknown variances and memory (``_SHAKES``,
+    ``_MEMORIES``), or, with the same probability, not at all. One step from the model leads to the mean and
+    covariance of w and d under each departure, and to its evidence (Laplace's approximation, with the likelihood
+    where the step ends: two frames hardly determine rotations that are the same during both readouts, so steps may
+    lead far off). The result is the covariance of their mixture about the model's motion, beyond that without a
+    departure. Fewer than 30 tracks show nothing.
 
     Args:
         law: see ``two_frame_spline``.
     """
-    tailed = None if shutter.still else _under_law(informative(matches), rig, shutter, law)
+    window = informative(matches)
+    tailed = None if shutter.still else _under_law(window, rig, shutter, law)
     theta = None if tailed is None else tailed.theta(law.w, law.d)
-    rows = None if tailed is None or theta is None else tailed.by_rows(theta)
-    if tailed is None or theta is None or rows is None:
-        return 1.0
-    stated = tailed.stated(theta)
-    return rows.dispersion(1.0 if stated is None else stated.shared)
+    if tailed is None or theta is None:
+        return Departure()
+    stated, rows = tailed.stated(theta), tailed.by_rows(theta)
+    shared = 1.0 if stated is None else stated.shared
+    scatter = 1.0 if rows is None else max(1.0, rows.square / rows.freedom / shared)
+    tracks = pack_windows([window], rig, shutter, share=1.0 / shared)
+    curve, tails = approximated(law.body_from_world, span_of(1, shutter), _KNOTS), Tails(tailed.nu, tailed.scale)
+    reach = tracks.freedom * (REACH * tails.scale) ** 2
+    trust = (squared_errors(curve, tracks) <= reach).astype(np.float64)
+    try:
+        parts = [_departures(curve, tracks, tails, trust, memory) for memory in _MEMORIES]
+    except NotDefiniteError:
+        return Departure(scatter)
+    logs, ends, covariances = (np.concatenate(each) for each in zip(*parts, strict=True))
+    probability = scipy.special.expit(scipy.special.logsumexp(logs) - np.log(len(logs)))
+    weights = probability * scipy.special.softmax(logs)
+    return Departure(scatter, np.tensordot(weights, covariances, 1) + spread_about(np.zeros(6), weights, ends))
+
+
+def _departures(
+    curve: Curve, tracks: TimedTracks, tails: Tails, trust: FloatArray, memory: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """For n departures from a spline: the logarithm of the evidence of each over that of none, (n,), and by how
+    much it moves w and d, (n, 6), and adds to their covariance, (n, 6, 6).
+
+    Raises:
+        NotDefiniteError: the tracks do not determine the spline.
+    """
+    slope = normal_equations(curve, tracks, tails, NO_PRIOR, trust).gradient
+    data = expected_equations(curve, tracks, tails, NO_PRIOR, trust)
+    rough, fixed = roughness(curve, memory, 1, data.band.shape[1]), anchored(data, curve, tracks, ANCHORED)
+    logs, ends, covariances = list[float](), list[FloatArray](), list[FloatArray]()
+    for rotation, position in [(_NO_SHAKE, _NO_SHAKE), *itertools.product(_SHAKES, _SHAKES)]:
+        prior = Prior(memory, 1, rotation**2, position**2)
+        tied = rough.bands[0] / prior.rotation + rough.bands[1] / prior.position
+        lower = band_factor(fixed + tied)
+        step = -band_solve(lower, slope)
+        there = moved(curve, step)
+        cost = normal_equations(there, tracks, tails, NO_PRIOR, trust, want=False).cost
+        cost += 0.5 * (band_form(tied, step) + band_log_determinant(lower))
+        logs.append(log_prior(curve, prior, rough) - cost)
+        R, t = motion_from(there, 0.0)
+        ends.append(np.concatenate([so3.log(R), t]))
+        covariance = motion_covariance(curve, band_inverse(lower), 0.0)
+        if covariance is None:
+            raise NotDefiniteError("the band is too narrow")
+        covariances.append(covariance)
+    own = np.array(logs), np.array(ends), np.array(covariances)
+    return tuple(each[1:] - each[0] for each in own)
 
 
 def _needs_spline(window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion) -> bool:

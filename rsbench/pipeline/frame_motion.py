@@ -19,7 +19,7 @@ from rsbench.capture.shutter_decision import LEAST_BACKWARDS, NoMotionError, rev
 from rsbench.capture.trajectory_gyro import GyroFound
 from rsbench.capture.trajectory_spline import ContinuousMotion
 from rsbench.capture.two_frame_estimate import CERTAIN, Capture, conclude, examine
-from rsbench.capture.two_frame_spline import dispersion_of_rows, log_odds_of_opposite, two_frame_spline
+from rsbench.capture.two_frame_spline import Departure, departure, log_odds_of_opposite, two_frame_spline
 from rsbench.components.motion_models import load_kernel, make_motion, model_name
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
@@ -200,7 +200,7 @@ def under_model(
     if splines and requested == AUTO and isinstance(motion, Motion):
         found, choice, motion = or_spline(found, choice, motion, *given, seed)
     elif isinstance(motion, Motion):
-        found = scaled(found, dispersion_of_rows(*given, motion))
+        found = departed(found, departure(*given, motion))
     return UnderModel(found, entry, choice, motion)
 
 
@@ -216,7 +216,7 @@ def or_spline(
     """The given answer of a solver under ``law``, or a spline in its place if the matches clearly support one."""
     found = two_frame_spline(matches, rig, shutter, law, seed)
     if found is None or found.probability < CERTAIN:
-        return scaled(robust, dispersion_of_rows(matches, rig, shutter, law)), choice, law
+        return departed(robust, departure(matches, rig, shutter, law)), choice, law
     motion = found.motion
     estimate = replace(
         robust.estimate, w=motion.w, d=motion.d, noise_px=found.noise_px, covariance=found.covariance
@@ -233,16 +233,13 @@ def or_spline(
 
 def widened(robust: RobustEstimate, spread: FloatArray) -> RobustEstimate:
     """The estimate with ``spread`` (6, 6) added to its covariance."""
-    known = robust.estimate.covariance
-    return (
-        robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=known + spread))
-    )
+    return departed(robust, Departure(covariance=spread))
 
 
-def scaled(robust: RobustEstimate, factor: float) -> RobustEstimate:
-    """The estimate with its covariance multiplied by a factor."""
+def departed(robust: RobustEstimate, by: Departure) -> RobustEstimate:
+    """The estimate with a covariance that includes departures from the motion model."""
     known = robust.estimate.covariance
-    return robust if known is None else widened(robust, (factor - 1.0) * known)
+    return robust if known is None else replace(robust, estimate=replace(robust.estimate, covariance=by.of(known)))
 
 
 def _solver_answer(
