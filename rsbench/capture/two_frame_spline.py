@@ -89,7 +89,7 @@ _MOST_UNDETERMINED_PX = 0.15
 """Largest standard deviation, px, of the image of a distant point, root mean square over the rows: above it, two
 frames do not determine the shake of the camera."""
 _SHAKES, _NO_SHAKE = tuple(np.geomspace(1e-3, 0.3, 5).tolist()), 1e-5
-"""Standard deviations of accelerations, rad and m per frame period^2, of departures that are equally probable: from
+"""Standard deviations of accelerations, rad and m per frame period^2, of equally probable departures: from
 those that move an image by half a pixel to those that rows always show; and of no departure."""
 _MEMORIES = (0.25, 1.0)
 """Their memories, equally probable."""
