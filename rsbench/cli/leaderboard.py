@@ -74,7 +74,11 @@ Track = Annotated[
 ]
 Data = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points and points-2."),
+    typer.Option(
+        metavar="DIR",
+        help="Dataset (a dataset.json) of all tracks but points and points-2; of points-recorded a folder of "
+        "recordings, such as hand-mine.txt, in place of ours.",
+    ),
 ]
 Secret = Annotated[
     Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")

@@ -1,5 +1,5 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``: what comes with rsbench, on
-tracks."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``, ``recorded``: what comes
+with rsbench, on tracks."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from rsbench.benchmark.leaderboard.board import entries_of, splits_of, store
 from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES
+from rsbench.benchmark.leaderboard.recorded import by_choice, by_recording
 from rsbench.benchmark.leaderboard.smoke import own_solvers
 from rsbench.benchmark.leaderboard.tracks import track_of_id, track_of_name
 from rsbench.benchmark.provenance import provenance
@@ -20,13 +23,15 @@ from rsbench.cli.leaderboard import oracles, run, smoke
 from rsbench.cli.reproduce_correction import LAWS_FRAMES
 from rsbench.components.plugins import Kind, offers
 from rsbench.report.board_page import build_site
-from rsbench.storage.files import write_json
+from rsbench.storage.files import write_json, write_table
 from rsbench.storage.untrusted_files import read_json
 from rsbench.vision.corrector import CORRECTORS, load_corrector
 from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
-BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
+BOARD, LAWS, HANDHELD, FOOTAGE, RECORDED = "leaderboard", "laws", "handheld", "footage", "recorded"
 """Folders of the boards below ``--data``."""
+OWN_RECORDINGS = "euroc"
+"""Folder below ``--data`` of recordings that do not come with rsbench."""
 SAME_METHOD = {
     "rs-r6p-single": "rs-r6p",
     "rs-stereo-iterated": "rs-stereo-iterated-metric",
@@ -78,6 +83,32 @@ def footage(out: Path, data: Path, workers: int | None) -> None:
     for name, entries in ((FOOTAGE, list(_OF_ONE_CAMERA)), ("standard", without_gyro)):
         _fill(board, {"correction-mono": entries}, workers, name, data / name)
     publish(board, out / FOOTAGE, "rsbench reproduce footage")
+
+
+def recorded(out: Path, data: Path, workers: int | None) -> None:
+    """The track of points on recordings: on those that come with rsbench, and on the user's own copy of others.
+
+    The answers to problems of recordings that rsbench may not pass on are not stored.
+    """
+    board, folder, own = data / f"{RECORDED}-board", out / RECORDED, data / OWN_RECORDINGS
+    if not own.is_dir():
+        echo(
+            f"{own}: is missing, so the drone is left out; cards/recordings/README.md says how to make it",
+            err=True,
+        )
+    track, tables, chosen = track_of_name("points-recorded"), list[pd.DataFrame](), list[pd.DataFrame]()
+    for given in (None, *([own] if own.is_dir() else [])):
+        run(track.name, entries_of_laws()["points-2"], str(board), given, workers=workers or os.cpu_count() or 1)
+        oracles(track.name, board, given)
+        split = track.split(given)
+        scores = {each.header.method: each.scores for each in entries_of(board, track.id, split.name)}
+        tables.append(by_recording(scores))
+        chosen.append(by_choice(scores[CHOOSES]))
+        if given is None:
+            store(board, track.id, split.name, folder / "predictions" / track.id)
+    publish(board, folder, "rsbench reproduce recorded")
+    write_table(folder / "recordings.csv", pd.concat(tables))
+    write_table(folder / "chosen.csv", pd.concat(chosen))
 
 
 def _fill(
