@@ -8,20 +8,16 @@ noise, outliers and number of points are drawn as in points-2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.deviations import calibration, named_numbers
 from rsbench.benchmark.leaderboard.splits import KINDS, DrawnPoints, Draws, RigKind, log_uniform
 from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.sweep_card import Setting
-from rsbench.benchmark.statistics import median_interval, share_interval
 from rsbench.components.cards import choices, shipped_folder
 from rsbench.components.motion_models import fixed_endpoint
 from rsbench.core.errors import RsbenchError
@@ -149,44 +145,3 @@ class RecordedPoints(DrawnPoints):
         if not folder.is_dir():
             raise RsbenchError(f"--data {folder}: is no folder of recordings, files such as hand-mine.txt")
         return recorded_draws(folder.resolve())
-
-
-# Tables
-
-
-def by_recording(entries: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """A row for each entry and recording: medians of the errors and coverage of what is stated, with intervals.
-
-    Args:
-        entries: tables of scores of the same problems by the name of the entry.
-    """
-    return pd.DataFrame(
-        {"method": name, "recording": recording, "problems": len(part), **_numbers(part)}
-        for name, scores in entries.items()
-        for recording, part in scores.groupby("recording")
-    )
-
-
-def by_choice(scores: pd.DataFrame) -> pd.DataFrame:
-    """A row for each recording and motion model that an entry chose there: its share, and as ``by_recording``."""
-    return pd.DataFrame(
-        {"recording": recording, "chosen": model, "problems": len(part), **share, **_numbers(part)}
-        for recording, whole in scores.groupby("recording")
-        for model, part in whole.groupby("chosen")
-        for share in [_triple("share", len(part) / len(whole), *share_interval(len(part), len(whole)))]
-    )
-
-
-def _numbers(scores: pd.DataFrame) -> dict[str, float]:
-    found = dict[str, float]()
-    for key in ("e_R_deg", "e_T_deg", "e_row_deg"):
-        values = scores[key].to_numpy(dtype=np.float64)
-        found |= _triple(key, float(np.median(values)), *median_interval(values))
-    stated = named_numbers(calibration(scores, 6), scored=False)
-    for key in ("nees_ratio", "covers_95"):
-        found |= _triple(key, *stated[key])
-    return found
-
-
-def _triple(name: str, *triple: float) -> dict[str, float]:
-    return {f"{name}{end}": value for end, value in zip(("", "_low", "_high"), triple, strict=True)}

@@ -17,8 +17,6 @@ from scipy.spatial.transform import Rotation
 from rsbench.benchmark.leaderboard.recorded import (
     DEVICES,
     OF_A_RECORDING,
-    by_choice,
-    by_recording,
     recorded_draws,
     recordings_folder,
     recordings_in,
@@ -119,25 +117,3 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine" / "horse.txt").rename(tmp_path / "mine" / "hand-short.txt")
     (tmp_path / "mine" / "hand-short.txt").write_text("0 0 0 0 0 0 0 1\n0.05 0 0 0 0 0 0 1\n")
     refused("is shorter than two frame periods")
-
-
-def test_tables_by_recording_and_by_choice() -> None:
-    count = 40
-    scores = pd.DataFrame(
-        {
-            "scene": [f"p{k}" for k in range(count)],
-            "recording": ["car-a"] * 10 + ["hand-b"] * 30,
-            "chosen": ["linear"] * 10 + ["continuous"] * 24 + ["twist"] * 6,
-            "e_R_deg": np.arange(count, dtype=float),
-            "e_T_deg": 1.0,
-            "e_row_deg": 2.0,
-            "nees": [1.0] * 10 + [1.0] * 15 + [100.0] * 15,
-            "log_score": 0.0,
-        }
-    )
-    table = by_recording({"a": scores}).set_index("recording")
-    assert list(table["problems"]) == [10, 30] and list(table["covers_95"]) == [1.0, 0.5]
-    assert list(table["e_R_deg"]) == [4.5, 24.5] and table["e_R_deg_low"]["hand-b"] < 24.5
-    chosen = by_choice(scores).set_index(["recording", "chosen"])
-    assert chosen["share"]["hand-b", "continuous"] == 0.8 and chosen["share"]["car-a", "linear"] == 1.0
-    assert chosen["covers_95"]["hand-b", "twist"] == 0.0
