@@ -69,24 +69,34 @@ def _triple(name: str, *triple: float) -> dict[str, float]:
 
 
 def write_page(folder: Path) -> Path:
-    """README.md from resampling.csv, recordings.csv and choices.csv of a folder; returns it."""
-    names = ("resampling", "recordings", "choices")
-    write_bytes(folder / "README.md", page(*(pd.read_csv(folder / f"{name}.csv") for name in names)).encode())
+    """README.md from recordings.csv, choices.csv and, if there, resampling.csv of a folder; returns it."""
+    tables = [pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices")]
+    resampling = folder / "resampling.csv"
+    text = page(*tables, pd.read_csv(resampling) if resampling.is_file() else None)
+    write_bytes(folder / "README.md", text.encode())
     return folder / "README.md"
 
 
-def page(resampling: pd.DataFrame, recordings: pd.DataFrame, chosen: pd.DataFrame) -> str:
-    """The page in Markdown."""
+def page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFrame | None) -> str:
+    """The page in Markdown.
+
+    Args:
+        recordings: as of ``by_recording``.
+        chosen: as of ``choices``.
+        resampling: errors of the recordings, by benchmarks/recorded_motion.py; left out if None.
+    """
+    about = (
+        "The recordings (`benchmarks/recorded_motion.py`): *left out* is the error of a spline through every\n"
+        "second sample at the others, *noise* that of one sample, *path* that of the fitted path, *bend* the\n"
+        "median over windows of the largest angle between a row and an even turn, *noise's bend* that of noise\n"
+        "alone."
+    )
     parts = [
         "# Points on recorded trajectories",
         "Made by `rsbench reproduce recorded`; all numbers are in [recordings.csv](recordings.csv) and\n"
         "[choices.csv](choices.csv), the boards in [tables](tables). `drone-mav` does not come with rsbench:\n"
         "cards/recordings/README.md says why, and how it is made.",
-        "The recordings (`benchmarks/recorded_motion.py`): *left out* is the error of a spline through every\n"
-        "second sample at the others, *noise* that of one sample, *path* that of the fitted path, *bend* the\n"
-        "median over windows of the largest angle between a row and an even turn, *noise's bend* that of noise\n"
-        "alone.",
-        _lines(_resampling(resampling)),
+        *([] if resampling is None else [about, _lines(_resampling(resampling))]),
         "Every method on every recording, 60 windows each: medians, the share of stated 95 % ellipsoids that\n"
         "contain the truth, and the median squared error by the stated covariance over that of a correct one.",
         _lines(_methods(recordings)),

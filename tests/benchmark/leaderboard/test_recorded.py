@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import assert_refused, run_here
-from leaderboards import leaderboard
+from leaderboards import jobs_here, leaderboard
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from rsbench.benchmark.leaderboard import recorded, running
 from rsbench.benchmark.leaderboard.recorded import (
     DEVICES,
     OF_A_RECORDING,
@@ -24,6 +26,8 @@ from rsbench.benchmark.leaderboard.recorded import (
 from rsbench.benchmark.leaderboard.splits import exact_problem
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
+from rsbench.cli import reproduce_leaderboard
+from rsbench.cli.reproduce import Target, reproduce
 from rsbench.core.motion import Motion
 
 TRACK = TRACKS["points-recorded"]
@@ -103,9 +107,43 @@ def test_recordings_of_ones_own(tmp_path: Path) -> None:
     assert list(scores["chosen"]) == [answer["motion_model"] for answer in answers]
 
 
+def test_one_command_makes_the_boards_and_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two windows of each recording, and of one's own copy of the drone where it is there."""
+    monkeypatch.setattr(recorded, "OF_A_RECORDING", 2)
+    monkeypatch.setattr(
+        reproduce_leaderboard, "entries_of_laws", lambda: {"points-2": ["gs-8pt", "rs-stereo-auto"]}
+    )
+    monkeypatch.setattr(running, "finished_jobs", jobs_here)
+    out, data = tmp_path / "results", tmp_path / "data"
+    forget()
+    reproduce(Target.recorded, out, data, workers=1)
+    assert set(pd.read_csv(out / "recorded/recordings.csv")["recording"]) == set(
+        recordings_in(recordings_folder())
+    )
+    (data / "euroc").mkdir()
+    shutil.copy(recordings_folder() / "hand-kinect.txt", data / "euroc/drone-mav.txt")
+    reproduce(Target.recorded, out, data, workers=1)
+    forget()
+    table = pd.read_csv(out / "recorded/recordings.csv")
+    assert set(table["problems"]) == {2} and "drone-mav" in set(table["recording"])
+    assert set(table["method"]) == {"gs-8pt", "rs-stereo-auto", "truth", "cramer-rao"}
+    assert (
+        len(list((out / "recorded/tables").glob("*.md"))) == 2
+        and "drone-mav" in (out / "recorded/README.md").read_text()
+    )
+    chosen = pd.read_csv(out / "recorded/choices.csv")
+    assert len(chosen) == 8 and (chosen["departure_px"] > 0.0).all()
+
+
+def forget() -> None:
+    """What is kept of the recordings that were read."""
+    for function in (recorded_draws, recordings_in, recorded._order, recorded._motion, recorded._setting):
+        function.cache_clear()
+
+
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     def refused(words: str) -> None:
-        recordings_in.cache_clear(), recorded_draws.cache_clear()
+        forget()
         run = run_here("leaderboard", "template", "points-recorded", "--data", tmp_path / "mine")
         assert_refused(run, words)
 
