@@ -37,6 +37,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench leaderboard run points --entry rs-stereo-refined --entry gs-8pt --board board
 
+  rsbench leaderboard run points-recorded --data walks --entry rs-stereo-auto --board board
+
   rsbench leaderboard show --board board
 
 More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]"""

@@ -70,9 +70,9 @@ def _triple(name: str, *triple: float) -> dict[str, float]:
 
 def write_page(folder: Path) -> Path:
     """README.md from recordings.csv, choices.csv and, if there, resampling.csv of a folder; returns it."""
-    tables = [pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices")]
+    recordings, chosen = (pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices"))
     resampling = folder / "resampling.csv"
-    text = page(*tables, pd.read_csv(resampling) if resampling.is_file() else None)
+    text = page(recordings, chosen, pd.read_csv(resampling) if resampling.is_file() else None)
     write_bytes(folder / "README.md", text.encode())
     return folder / "README.md"
 
