@@ -37,6 +37,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench leaderboard run points --entry rs-stereo-refined --entry gs-8pt --board board
 
+  rsbench leaderboard run points-recorded --data walks --entry rs-stereo-auto --board board
+
   rsbench leaderboard show --board board
 
 More: [bold]rsbench docs submit[/bold] and [bold]rsbench docs protocols[/bold]"""
@@ -74,7 +76,11 @@ Track = Annotated[
 ]
 Data = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Dataset (a dataset.json) of all tracks but points and points-2."),
+    typer.Option(
+        metavar="DIR",
+        help="Dataset (a dataset.json) of all tracks but points and points-2; of points-recorded a folder of "
+        "recordings, such as hand-mine.txt, in place of ours.",
+    ),
 ]
 Secret = Annotated[
     Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")

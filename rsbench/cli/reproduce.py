@@ -43,6 +43,8 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce footage --out results --data data      [dim](one camera's frames: 2 hours)[/dim]
 
+  rsbench reproduce recorded --out results --data data     [dim](recorded motion: 40 minutes of a core)[/dim]
+
   rsbench reproduce everything                             [dim](hours; goes on where it stopped)[/dim]"""
 
 
@@ -94,6 +96,7 @@ class Target(StrEnum):
     boards = "boards", _Recipe("reproduce_leaderboard:boards", 180, ("standard",), ("leaderboard",))
     handheld = "handheld", _Recipe("reproduce_leaderboard:handheld", 45, ("handheld",))
     footage = "footage", _Recipe("reproduce_leaderboard:footage", 110, ("footage", "standard"))
+    recorded = "recorded", _Recipe("reproduce_leaderboard:recorded", 40)
     everything = "everything"
 
 
@@ -126,6 +129,7 @@ def reproduce(
             "boards: the same of the tracks of frames, on the dataset standard. "
             "handheld: trajectories of whole sequences from hands. "
             "footage: what one camera's correctors make of pairs of frames. "
+            "recorded: our solvers on points under recorded motion. "
             "everything: all of these, one after the other, with the time that each took.",
         ),
     ] = None,

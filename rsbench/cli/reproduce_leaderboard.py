@@ -1,12 +1,15 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``: what comes with rsbench, on
-tracks."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``, ``recorded``: what comes
+with rsbench, on tracks."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from rsbench.benchmark.leaderboard.board import entries_of, splits_of, store
 from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES
@@ -20,13 +23,16 @@ from rsbench.cli.leaderboard import oracles, run, smoke
 from rsbench.cli.reproduce_correction import LAWS_FRAMES
 from rsbench.components.plugins import Kind, offers
 from rsbench.report.board_page import build_site
-from rsbench.storage.files import write_json
+from rsbench.report.recorded_page import by_recording, choices, write_page
+from rsbench.storage.files import write_bytes, write_json, write_table
 from rsbench.storage.untrusted_files import read_json
 from rsbench.vision.corrector import CORRECTORS, load_corrector
 from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
-BOARD, LAWS, HANDHELD, FOOTAGE = "leaderboard", "laws", "handheld", "footage"
+BOARD, LAWS, HANDHELD, FOOTAGE, RECORDED = "leaderboard", "laws", "handheld", "footage", "recorded"
 """Folders of the boards below ``--data``."""
+OWN_RECORDINGS = "euroc"
+"""Folder below ``--data`` of recordings that do not come with rsbench."""
 SAME_METHOD = {
     "rs-r6p-single": "rs-r6p",
     "rs-stereo-iterated": "rs-stereo-iterated-metric",
@@ -80,6 +86,28 @@ def footage(out: Path, data: Path, workers: int | None) -> None:
     publish(board, out / FOOTAGE, "rsbench reproduce footage")
 
 
+def recorded(out: Path, data: Path, workers: int | None) -> None:
+    """The track of points on recordings: on those that come with rsbench, and on the user's own copy of others."""
+    board, folder, own = data / f"{RECORDED}-board", out / RECORDED, data / OWN_RECORDINGS
+    if not own.is_dir():
+        echo(
+            f"{own}: is missing, so the drone is left out; cards/recordings/README.md says how to make it",
+            err=True,
+        )
+    track, errors, chosen = track_of_name("points-recorded"), list[pd.DataFrame](), list[pd.DataFrame]()
+    for given in (None, *([own] if own.is_dir() else [])):
+        run(track.name, entries_of_laws()["points-2"], str(board), given, workers=workers or os.cpu_count() or 1)
+        oracles(track.name, board, given)
+        split = track.split(given)
+        scores = {each.header.method: each.scores for each in entries_of(board, track.id, split.name)}
+        errors.append(by_recording(scores))
+        chosen.append(choices(split, scores, CHOOSES))
+    publish(board, folder, "rsbench reproduce recorded", tables_alone=True)
+    write_table(folder / "recordings.csv", pd.concat(errors))
+    write_table(folder / "choices.csv", pd.concat(chosen))
+    echo(f"page: {write_page(folder)}")
+
+
 def _fill(
     board: Path,
     entries: Mapping[str, Sequence[str]],
@@ -130,12 +158,21 @@ def entries_of_frames() -> dict[str, list[str]]:
     }
 
 
-def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboard") -> None:
-    """Write a board's site, and by what command and code each entry was made.
+def publish(
+    board: Path, out: Path, command: str = "rsbench reproduce leaderboard", *, tables_alone: bool = False
+) -> None:
+    """Write a board's site, or its tables alone, and by what command and code each entry was made.
 
     What is there of protocols that the board does not have stays: their tables do too.
     """
-    page = build_site(board, out / "site", problem_pages=False)
+    if tables_alone:
+        with tempfile.TemporaryDirectory() as folder:
+            build_site(board, Path(folder), problem_pages=False)
+            (out / "tables").mkdir(parents=True, exist_ok=True)
+            for table in sorted(Path(folder).glob("*.md")):
+                write_bytes(out / "tables" / table.name, table.read_bytes())
+    else:
+        echo(f"page: {build_site(board, out / 'site', problem_pages=False)}")
     path, splits = out / "provenance.json", splits_of(board)
     made = {
         f"{protocol}/{split}/{entry.header.method}": read_json(entry.folder / "entry.json").get("made")
@@ -153,4 +190,3 @@ def publish(board: Path, out: Path, command: str = "rsbench reproduce leaderboar
         and not (name in former and "commit" not in record)  # restored from its answers
     }
     write_json(path, {**provenance(command), "entries": dict(sorted((kept | brief).items()))})
-    echo(f"page: {page}")

@@ -269,13 +269,17 @@ def parts_along(
     check_amount(path, "sequences", count, _MOST_PARTS)
     rows = []
     for k in range(count):
-        zero = first + k * step * period_s
-        low, high = np.searchsorted(seconds, [zero + before, zero + after])
-        near = slice(max(int(low) - _AROUND, 0), int(high) + _AROUND)
-        times = (seconds[near] - zero) / period_s
-        rows.append(np.concatenate([times[:, None], trajectory.poses[near]], axis=1))
+        rows.append(poses_around(trajectory, first + k * step * period_s, period_s, span))
     places = [world_from_body(each, 0.0) for each in rows]
     return [Part(each, _start(place, places[0], card.absolute)) for each, place in zip(rows, places, strict=True)]
+
+
+def poses_around(trajectory: Trajectory, zero_s: float, period_s: float, span: tuple[float, float]) -> FloatArray:
+    """Poses (m, 8) as ``TrajectoryMotion`` takes them, for frame periods ``span`` from time ``zero_s`` on."""
+    low, high = np.searchsorted(trajectory.seconds, [zero_s + time * period_s for time in span])
+    near = slice(max(int(low) - _AROUND, 0), int(high) + _AROUND)
+    times = (trajectory.seconds[near] - zero_s) / period_s
+    return np.concatenate([times[:, None], trajectory.poses[near]], axis=1)
 
 
 def _start(place: Pose, first: Pose, absolute: bool) -> Start:

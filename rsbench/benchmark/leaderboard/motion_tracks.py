@@ -25,6 +25,7 @@ import pandas as pd
 from rsbench.benchmark.leaderboard.deviations import NOT_STATED, log_score, stated, vague_log_densities
 from rsbench.benchmark.leaderboard.inputs import read_frames, read_inputs, write_inputs
 from rsbench.benchmark.leaderboard.pictures import check_own
+from rsbench.benchmark.leaderboard.recorded import RecordedPoints
 from rsbench.benchmark.leaderboard.splits import POINTS_1, POINTS_2, Draws, Frames, SimulatedPoints, exact_problem
 from rsbench.benchmark.leaderboard.submissions import method_header, submission_text
 from rsbench.benchmark.leaderboard.track import (
@@ -64,7 +65,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
-from rsbench.core.spline_motion import SplineMotion
+from rsbench.core.spline_motion import SplineMotion, TrajectoryMotion
 from rsbench.dataset.matches import MATCHED, arranged, looks, seen_near
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.views import FAR
@@ -256,6 +257,9 @@ def rounded(answer: dict[str, Any]) -> dict[str, Any]:
 class _Motion(Answer):
     """An answer that is a motion."""
 
+    motion_model: str = ""
+    """Motion model by which the motion was found, where the method chooses one."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("w", "d"):
@@ -285,7 +289,7 @@ class MotionTrack(SolverTrack):
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
         seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
         found = solve_problem(problem, entry, RobustOptions(), runner, seed, _EXTRAS, model)
-        kept = {key: found[key] for key in _ANSWER_KEYS}
+        kept = {key: found[key] for key in (*_ANSWER_KEYS, *(["motion_model"] if model else []))}
         if found["success"]:
             length = math.hypot(*found["d"])
             if max(length, *map(abs, found["w"])) > LARGEST:
@@ -296,7 +300,8 @@ class MotionTrack(SolverTrack):
         return rounded(kept) if self.rounds else kept
 
     def row(self, truth: Truth, answer: Answer | None) -> Row:
-        return motion_row(truth, answer)
+        chosen = {"chosen": getattr(answer, "motion_model", "")} if self.choosing else {}
+        return motion_row(truth, answer) | chosen
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
         rows = super().rows(submission, split)
@@ -306,11 +311,11 @@ class MotionTrack(SolverTrack):
         return rows
 
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
-        if not isinstance(self.inputs, SimulatedPoints):
+        if split.draws is None:
             return {}
         pairs = "both" if {"left", "right"} <= set(uses) else "left"
         seen = "links" if "links" in uses else pairs
-        return bound_medians(self.inputs.draws, split.seed, len(split.truths), seen)
+        return bound_medians(split.draws, split.seed, len(split.truths), seen)
 
 
 def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:
@@ -415,9 +420,9 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
 def smooth(motion: Motion) -> Motion:
     """For a bound: of a spline with vibrations, the twist around which it vibrates, whose bound is within 5 %.
 
-    A derivative of a spline by its end takes a hundred times as long.
+    A derivative of a spline by its end takes a hundred times as long; that of a path through given poses has none.
     """
-    return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion) else motion
+    return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion | TrajectoryMotion) else motion
 
 
 def _median(axes: FloatArray, draws: FloatArray) -> float:
@@ -438,8 +443,7 @@ def bound_text(split: Split, folder: Path) -> str:
 
 
 def _at_the_bound(split: Split) -> Iterator[dict[str, Any]]:
-    assert isinstance(split.track.inputs, SimulatedPoints)
-    draws, seed = split.track.inputs.draws, split.seed
+    draws, seed = split.draws, split.seed
     for number, truth in enumerate(split.truths):
         exact, noise_px = exact_problem(seed, number, draws)
         bound = motion_bound(exact.correspondences, truth.rig, truth.shutter, smooth(truth.motion), noise_px)
@@ -468,9 +472,8 @@ def nearness(over: FloatArray) -> FloatArray:
 
 def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) -> None:
     """points-2: errors over their medians at the Cramer-Rao bound."""
-    assert isinstance(split.track.inputs, SimulatedPoints)
     numbers = [int(truth.name[1:]) for truth in split.truths]
-    bounds = bound_medians(split.track.inputs.draws, split.seed, max(numbers) + 1, "links")
+    bounds = bound_medians(split.draws, split.seed, max(numbers) + 1, "links")
     at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
     for row, R, T in zip(rows, at_R, at_T, strict=True):
         over_R, over_T = row["e_R_deg"] / R, row["e_T_deg"] / T
@@ -667,17 +670,14 @@ def pose_fields(inputs: Frames) -> dict[str, Any]:
     return _SHARED | _POSES | _SEVERAL_MODELS | {"inputs": inputs, "scores": scores}
 
 
-TRACKS: tuple[Track, ...] = (
-    MotionTrack(
-        **_SHARED
-        | _POINTS
-        | _SEVERAL_MODELS
-        | {"error": "over_bound", "error_title": "error over its median at the bound"},
-        name="points-2",
-        id="points-2",
-        title="Motion from simulated matches, under several laws of motion",
-        inputs=SimulatedPoints(POINTS_2),
-        scores=(
+_BOUNDED: dict[str, Any] = (
+    _SHARED
+    | _POINTS
+    | _SEVERAL_MODELS
+    | {
+        "error": "over_bound",
+        "error_title": "error over its median at the bound",
+        "scores": (
             Score(
                 "near_bound",
                 "near bound",
@@ -691,7 +691,25 @@ TRACKS: tuple[Track, ...] = (
             Score("over_T", "e_T / bound", "median of e_T over its median at the bound", "median"),
             *_SHOWN_TOO,
         ),
-        more_columns=_add_bound_columns,
+        "more_columns": _add_bound_columns,
+    }
+)
+
+
+TRACKS: tuple[Track, ...] = (
+    MotionTrack(
+        **_BOUNDED,
+        name="points-2",
+        id="points-2",
+        title="Motion from simulated matches, under several laws of motion",
+        inputs=SimulatedPoints(POINTS_2),
+    ),
+    MotionTrack(
+        **_BOUNDED | {"parting": "recording"},
+        name="points-recorded",
+        id="points-recorded-1",
+        title="Motion from simulated matches on recorded trajectories",
+        inputs=RecordedPoints(),
     ),
     MotionTrack(
         **_SHARED | _POINTS,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -66,6 +67,8 @@ class Draws:
     outlier_images: OutlierImages
     kinds: Callable[[int, int], dict[str, float | str]] = _no_kinds
     """Further properties, beside sizes, against which scores are plotted, by seed and number."""
+    moved: Callable[[int, int], Motion] | None = None
+    """Motion of a problem by seed and number, where it is not one of the setting's motion model."""
 
     def rng(self, seed: int, what: str, number: int) -> np.random.Generator:
         return generator(seed, *self.scope, what, number)
@@ -77,10 +80,12 @@ class Draws:
 
 @lru_cache(maxsize=512)  # a spline takes a tenth of a second
 def _motion(draws: Draws, seed: int, number: int) -> Motion:
+    if draws.moved is not None:
+        return draws.moved(seed, number)
     return draws.setting(seed, number).motion(draws.rng(seed, "motion", number))
 
 
-def _log_uniform(rng: np.random.Generator, sizes: Range) -> float:
+def log_uniform(rng: np.random.Generator, sizes: Range) -> float:
     return float(np.exp(rng.uniform(*np.log(sizes))))
 
 
@@ -92,10 +97,10 @@ def points_setting(seed: int, number: int) -> Setting:
         height=900,
         focal=810.0,
         depth=(2.0, 10.0),
-        rotation_deg=_log_uniform(rng, (0.2, 8.0)),
-        translation=_log_uniform(rng, (0.05, 0.5)),
-        baseline=_log_uniform(rng, (0.1, 0.6)),
-        noise_px=_log_uniform(rng, (0.05, 1.0)),
+        rotation_deg=log_uniform(rng, (0.2, 8.0)),
+        translation=log_uniform(rng, (0.05, 0.5)),
+        baseline=log_uniform(rng, (0.1, 0.6)),
+        noise_px=log_uniform(rng, (0.05, 1.0)),
         readout_ratio=float(rng.uniform(0.1, 1.0)),
         points=int(rng.integers(40, 201)),
         outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
@@ -167,14 +172,14 @@ def setting_by_kind(seed: int, number: int) -> Setting:
         height=kind.height,
         focal=kind.focal,
         depth=kind.depth,
-        rotation_deg=_log_uniform(rng, kind.rotation_deg),
-        translation=_log_uniform(rng, kind.translation),
+        rotation_deg=log_uniform(rng, kind.rotation_deg),
+        translation=log_uniform(rng, kind.translation),
         rotation_axis=tuple(about.tolist()) if kind.drives else None,
         translation_axis=tuple(ahead.tolist()) if kind.drives else None,
         motion_model=model,
         motion_parameters=parameters.get(model, {}),
-        baseline=_log_uniform(rng, kind.baseline),
-        noise_px=_log_uniform(rng, (0.05, 1.0)),
+        baseline=log_uniform(rng, kind.baseline),
+        noise_px=log_uniform(rng, (0.05, 1.0)),
         readout_ratio=float(rng.uniform(*_READOUT)),
         points=int(rng.integers(40, 201)),
         outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
@@ -196,38 +201,57 @@ POINTS_2 = Draws(
 )
 
 
-@dataclass(frozen=True)
-class SimulatedPoints(Inputs):
+class DrawnPoints(Inputs):
     """Tracks of random points: the split ``dev``, or with a secret seed the split ``test``."""
 
-    draws: Draws
     rendered = False
 
     def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
-        if data is not None:
-            raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
+        draws, seed = self.draws_of(data), seed_of(seed_file)
         if secret and seed_file is None:
             raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
-        seed, label = seed_of(seed_file), "dev" if seed_file is None else "test"
-        truths = tuple(self._truth(seed, number) for number in range(self.draws.problems))
-        return Split(track=track, label=label, public=seed_file is None, truths=truths, seed=seed)
+        label = "dev" if data is None else _checked_name(data.resolve().name, data)
+        label = label if seed_file is None else "test"
+        truths = tuple(_truth(draws, seed, number) for number in range(draws.problems))
+        return Split(track=track, label=label, public=seed_file is None, truths=truths, seed=seed, draws=draws)
 
     def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        seed = seed_of(seed_file)
-        return (simulated_problem(seed, number, self.draws) for number in range(count))
+        draws, seed = self.draws_of(data), seed_of(seed_file)
+        return (simulated_problem(seed, number, draws) for number in range(count))
 
-    def _truth(self, seed: int, number: int) -> Truth:
-        setting, motion, name = self.draws.setting(seed, number), self.draws.motion(seed, number), _name(number)
-        rig, shutter = setting.rig(), setting.shutter()
-        facts = {
-            **_sizes(motion, rig, shutter),
-            "noise_px": setting.noise_px,
-            "outliers": setting.outlier_ratio,
-            "points": setting.points,
-            "shape": setting.shape,
-            **self.draws.kinds(seed, number),
-        }
-        return Truth(name=name, rig=rig, shutter=shutter, motion=motion, scene=name, facts=facts)
+    @abstractmethod
+    def draws_of(self, data: Path | None) -> Draws:
+        """The problems, by the folder that the option ``--data`` names.
+
+        Raises:
+            RsbenchError: the track takes no folder, or this one is at fault.
+        """
+
+
+@dataclass(frozen=True)
+class SimulatedPoints(DrawnPoints):
+    """Points under motion models, from a seed alone."""
+
+    draws: Draws
+
+    def draws_of(self, data: Path | None) -> Draws:
+        if data is not None:
+            raise RsbenchError(f"--data {data}: the problems of points are simulated; leave it out")
+        return self.draws
+
+
+def _truth(draws: Draws, seed: int, number: int) -> Truth:
+    setting, motion, name = draws.setting(seed, number), draws.motion(seed, number), _name(number)
+    rig, shutter = setting.rig(), setting.shutter()
+    facts = {
+        **_sizes(motion, rig, shutter),
+        "noise_px": setting.noise_px,
+        "outliers": setting.outlier_ratio,
+        "points": setting.points,
+        "shape": setting.shape,
+        **draws.kinds(seed, number),
+    }
+    return Truth(name=name, rig=rig, shutter=shutter, motion=motion, scene=name, facts=facts)
 
 
 def seed_of(path: Path | None) -> int:
@@ -383,11 +407,14 @@ def _dataset_of(track: Track, data: Path | None, seed_file: Path | None) -> Path
 
 def label_of(folder: Path) -> str:
     """The label of a dataset's split: its name. Raises RsbenchError where that cannot be one, or is missing."""
-    name = read_dataset_manifest(folder).name
+    return _checked_name(read_dataset_manifest(folder).name, folder / "dataset.json")
+
+
+def _checked_name(name: str, where: Path) -> str:
     try:
         check_name(name)
     except ValueError as error:
-        raise RsbenchError(f"{folder / 'dataset.json'}: {error}") from error
+        raise RsbenchError(f"{where}: {error}") from error
     return name
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ _OF_SOLVE = (
     *("solver", "d_unit", "d_body", "motion_model", "shutter", "assumes", "inliers", "matches", "stereo_alone"),
     *("threshold_px", "iterations", "noise_px", "inlier_indices", "model_choice"),
 )
-"""Further keys of an answer of ``rsbench solve --json``, which are ignored."""
+"""Further keys of an answer of ``rsbench solve --json``, which are ignored where the track does not read them."""
 _NAMED = 3
 
 
@@ -143,7 +143,8 @@ def _header(text: str, where: str, split: Split) -> Header:
 
 
 def _answer(text: str, where: str, split: Split) -> Answer:
-    data: dict[str, Any] = {key: value for key, value in parse_json(text, where).items() if key not in _OF_SOLVE}
+    ignored = {*_OF_SOLVE} - {field.name for field in fields(split.track.answers)}
+    data: dict[str, Any] = {key: value for key, value in parse_json(text, where).items() if key not in ignored}
     name = data.get("name")
     if isinstance(name, str) and name not in split.by_name:
         near = choices(name, split.by_name).partition("; there are")[0]

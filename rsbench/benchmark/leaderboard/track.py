@@ -62,12 +62,13 @@ _ANNOUNCED = {
     "57af81babdeeb5d96992052241698c127f8a4e7fd716fc28f146bf858b8edb40": "7a998de400000000",
     "881e9e954f8a3cc3c1bd3d11fcca7277b3af27da058d3a2340487ac84d1e7c89": "292f151500000000",
     "792e3e2e7ccfbdaefda940050f3d95c9e814a517eb48c4e618b200bb37b608ee": "ba1e206a00000000",
+    "8e3e498cc845d26180c700acbb98147069d89a2cc0280f297b8456638ca1239a": "0bc5964200000000",
     "ee83b3153351ba62775f40dedeba0d2bfeb9c8c036fe6eefa6332c92b9e48b29": (
         "382c1320481b8b75aae3ba87190f80b7d671d73c323961e95e6bee131c507e77"
     ),
 }
-"""Announced fingerprints of the public points and of the motions of ``laws``. The key is the hash of the ground
-truth rounded to nine digits, which is the same on all processors."""
+"""Announced fingerprints of the public points and recordings, and of the motions of ``laws``. The key is the hash
+of the ground truth rounded to nine digits, which is the same on all processors."""
 Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Numbers = dict[str, float]
@@ -289,6 +290,8 @@ class Split:
     truths: tuple[Truth, ...]
     seed: int = PUBLIC_SEED
     """Seed of simulated problems."""
+    draws: Any = None
+    """How simulated problems are drawn, a ``splits.Draws``; None of rendered frames."""
 
     @cached_property
     def fingerprint(self) -> str:

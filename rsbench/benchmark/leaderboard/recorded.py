@@ -1,0 +1,147 @@
+"""Points on recorded trajectories: matches under motion that no solver's model describes.
+
+A recording is a file of poses of a camera in TUM's format, whose name begins with the kind of its device, as in
+``hand-rig.txt``. Those in cards/recordings come with rsbench; its README has their sources, licences and errors. A
+problem is a window of two frames of a recording, whose rows follow the spline through the poses; rig, depths,
+noise, outliers and number of points are drawn as in points-2.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsbench.benchmark.leaderboard.splits import KINDS, DrawnPoints, Draws, RigKind, log_uniform
+from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.components.cards import choices, shipped_folder
+from rsbench.components.motion_models import fixed_endpoint
+from rsbench.core.errors import RsbenchError
+from rsbench.core.motion import Motion
+from rsbench.core.spline_motion import TrajectoryMotion
+from rsbench.dataset.motion_cards import Trajectory, poses_around, read_trajectory
+
+DEVICES: dict[str, RigKind] = {"hand": KINDS["headset"], "car": KINDS["car"], "drone": KINDS["drone"]}
+"""Sizes of the rig of each kind of device; its motion is that of the recording."""
+OF_A_RECORDING = 60
+"""Problems of each recording."""
+_SCOPE = ("leaderboard", "points-recorded")
+_PERIOD_S = 1.0 / 30.0
+_LASTS = 2.0
+"""Frame periods from the first row of frame 0 to the last possible time of a row of frame 1."""
+_READOUT = (0.5, 1.0)
+
+
+def recordings_folder() -> Path:
+    """The recordings that come with rsbench."""
+    return shipped_folder("cards/recordings", "_cards/recordings")
+
+
+@lru_cache(maxsize=8)  # one object for a folder: problems and bounds are kept by it
+def recorded_draws(folder: Path) -> Draws:
+    """The problems of the recordings in a folder.
+
+    Raises:
+        RsbenchError: there are none, or a name begins with no kind of device.
+    """
+    names = recordings_in(folder)
+    return Draws(
+        scope=_SCOPE,
+        problems=OF_A_RECORDING * len(names),
+        setting=partial(_setting, folder),
+        outlier_images="all",
+        kinds=partial(_kinds, folder),
+        moved=partial(_motion, folder),
+    )
+
+
+@lru_cache(maxsize=8)
+def recordings_in(folder: Path) -> tuple[str, ...]:
+    """Names of the recordings in a folder, sorted; raises as ``recorded_draws``."""
+    names = tuple(sorted(path.stem for path in folder.glob("*.txt")))
+    if not names:
+        raise RsbenchError(
+            f"{folder}: has no recording; write poses in TUM's format into a file such as hand-mine.txt"
+        )
+    for name in names:
+        if (kind := name.partition("-")[0]) not in DEVICES:
+            raise RsbenchError(
+                f"{folder / name}.txt: its name begins with {kind!r}, not with a kind of device"
+                f"{choices(kind, DEVICES)}; rename it, as hand-{name}.txt"
+            )
+    return names
+
+
+@lru_cache(maxsize=16)
+def _trajectory(path: Path) -> Trajectory:
+    return read_trajectory(path, 1.0)
+
+
+@lru_cache(maxsize=8)
+def _order(folder: Path, seed: int) -> NDArray[Any]:
+    return generator(seed, *_SCOPE, "order").permutation(OF_A_RECORDING * len(recordings_in(folder)))
+
+
+def _window(folder: Path, seed: int, number: int) -> tuple[str, int]:
+    """Name of the recording of a problem, and which of its equal parts holds the window."""
+    names = recordings_in(folder)
+    part, which = divmod(int(_order(folder, seed)[number]), len(names))
+    return names[which], part
+
+
+@lru_cache(maxsize=512)
+def _motion(folder: Path, seed: int, number: int) -> Motion:
+    """A window at a random time within its part of the recording.
+
+    Raises:
+        RsbenchError: the recording is shorter than a window.
+    """
+    name, part = _window(folder, seed, number)
+    trajectory = _trajectory(folder / f"{name}.txt")
+    left = float(trajectory.seconds[-1]) - _LASTS * _PERIOD_S
+    if left <= 0.0:
+        raise RsbenchError(f"{folder / name}.txt: is shorter than two frame periods of 1/30 s; give more poses")
+    rng = generator(seed, *_SCOPE, "motion", number)
+    zero_s = left * (part + float(rng.uniform())) / OF_A_RECORDING
+    poses = poses_around(trajectory, zero_s, _PERIOD_S, (0.0, _LASTS))
+    w, d = fixed_endpoint("trajectory", {"poses": poses}) or (np.zeros(3), np.zeros(3))
+    return TrajectoryMotion(w, d, poses)
+
+
+@lru_cache(maxsize=512)
+def _setting(folder: Path, seed: int, number: int) -> Setting:
+    """The sizes of w and d are those of the window; its motion is not made by the setting."""
+    kind = DEVICES[_window(folder, seed, number)[0].partition("-")[0]]
+    motion, rng = _motion(folder, seed, number), generator(seed, *_SCOPE, "setting", number)
+    return Setting(
+        width=kind.width,
+        height=kind.height,
+        focal=kind.focal,
+        depth=kind.depth,
+        rotation_deg=float(np.rad2deg(np.linalg.norm(motion.w))),
+        translation=float(np.linalg.norm(motion.d)),
+        baseline=log_uniform(rng, kind.baseline),
+        noise_px=log_uniform(rng, (0.05, 1.0)),
+        readout_ratio=float(rng.uniform(*_READOUT)),
+        points=int(rng.integers(40, 201)),
+        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
+        shape="plane" if rng.random() < 0.2 else "box",
+    )
+
+
+def _kinds(folder: Path, seed: int, number: int) -> dict[str, float | str]:
+    return {"recording": _window(folder, seed, number)[0]}
+
+
+class RecordedPoints(DrawnPoints):
+    """Points on the recordings of a folder (``--data``), or on those that come with rsbench."""
+
+    def draws_of(self, data: Path | None) -> Draws:
+        folder = data or recordings_folder()
+        if not folder.is_dir():
+            raise RsbenchError(f"--data {folder}: is no folder of recordings, files such as hand-mine.txt")
+        return recorded_draws(folder.resolve())

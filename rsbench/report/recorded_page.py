@@ -1,0 +1,182 @@
+"""The tables and the page of points on recorded trajectories: errors, coverage, and what a method chose there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rsbench.benchmark.leaderboard.deviations import calibration, named_numbers
+from rsbench.benchmark.leaderboard.track import ORACLE, Split
+from rsbench.benchmark.statistics import format_interval, median_interval, share_interval
+from rsbench.capture.hypotheses import MODELS
+from rsbench.report.markup import table_lines
+from rsbench.storage.files import write_bytes
+
+SPLINE = "continuous"
+"""What is chosen where no motion model fits."""
+LIMITS = (0.0, 1.0, 3.0, 10.0, np.inf)
+"""Classes of the departure from an even turn, in standard deviations of the noise of a match."""
+_UNKNOWNS = 6
+
+
+def by_recording(entries: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """A row for each entry and recording: medians of the errors and coverage of what is stated, with intervals.
+
+    Args:
+        entries: tables of scores of the same problems by the name of the entry.
+    """
+    return pd.DataFrame(
+        {"method": name, "recording": recording, "problems": len(part), **_numbers(part)}
+        for name, scores in entries.items()
+        for recording, part in scores.groupby("recording")
+    )
+
+
+def choices(split: Split, entries: Mapping[str, pd.DataFrame], method: str) -> pd.DataFrame:
+    """A row for each problem: what a method chose, its errors, and how far the rows are from an even turn.
+
+    ``departure_px`` is the largest angle between the true pose of a row and that of an even turn by the true w,
+    times the focal length.
+    """
+    scores = entries[method][["problem", "recording", "chosen", "e_R_deg", "e_T_deg", "e_row_deg", "nees"]]
+    focal = np.array([truth.rig.camera.fx for truth in split.truths])
+    departure = focal * np.deg2rad(entries[ORACLE]["e_row_deg"].to_numpy(dtype=np.float64))
+    noise = np.array([float(truth.facts["noise_px"]) for truth in split.truths])
+    return scores.assign(departure_px=departure, noise_px=noise)
+
+
+def _numbers(scores: pd.DataFrame) -> dict[str, float]:
+    found: dict[str, float] = {"stated": int(scores["nees"].notna().sum())}
+    for key in ("e_R_deg", "e_T_deg"):
+        values = scores[key].to_numpy(dtype=np.float64)
+        found |= _triple(key, float(np.median(values)), *median_interval(values))
+    stated = named_numbers(calibration(scores.assign(scene=range(len(scores))), _UNKNOWNS), scored=False)
+    for key in ("nees_ratio", "covers_95"):
+        found |= _triple(key, *stated[key])
+    return found
+
+
+def _triple(name: str, *triple: float) -> dict[str, float]:
+    return {f"{name}{end}": value for end, value in zip(("", "_low", "_high"), triple, strict=True)}
+
+
+# The page
+
+
+def write_page(folder: Path) -> Path:
+    """README.md from recordings.csv, choices.csv and, if there, resampling.csv of a folder; returns it."""
+    recordings, chosen = (pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices"))
+    resampling = folder / "resampling.csv"
+    text = page(recordings, chosen, pd.read_csv(resampling) if resampling.is_file() else None)
+    write_bytes(folder / "README.md", text.encode())
+    return folder / "README.md"
+
+
+def page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFrame | None) -> str:
+    """The page in Markdown.
+
+    Args:
+        recordings: as of ``by_recording``.
+        chosen: as of ``choices``.
+        resampling: errors of the recordings, by benchmarks/recorded_motion.py; left out if None.
+    """
+    about = (
+        "The recordings (`benchmarks/recorded_motion.py`): *left out* is the error of a spline through every\n"
+        "second sample at the others, *noise* that of one sample, *path* that of the fitted path, *bend* the\n"
+        "median over windows of the largest angle between a row and an even turn, *noise's bend* that of noise\n"
+        "alone."
+    )
+    parts = [
+        "# Points on recorded trajectories",
+        "Made by `rsbench reproduce recorded`; all numbers are in [recordings.csv](recordings.csv) and\n"
+        "[choices.csv](choices.csv), the boards in [tables](tables). `drone-mav` does not come with rsbench:\n"
+        "cards/recordings/README.md says why, and how it is made.",
+        *([] if resampling is None else [about, _lines(_resampling(resampling))]),
+        "Every method on every recording, 60 windows each: medians, the share of stated 95 % ellipsoids that\n"
+        "contain the truth, and the median squared error by the stated covariance over that of a correct one.",
+        _lines(_methods(recordings)),
+        "Number of windows in which `rs-stereo-auto` chose a motion model, or a spline (`continuous`):",
+        _lines(_models(chosen)),
+        "Its errors and its coverage there:",
+        _lines(_kinds(chosen)),
+        "The same by the departure of the rows from an even turn, over the noise of a match:",
+        _lines(_departures(chosen)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _lines(table: pd.DataFrame) -> str:
+    return "\n".join(table_lines(list(table), table.itertuples(index=False)))
+
+
+def _resampling(table: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for row in table.to_dict("records"):
+        both = {
+            title: f"{row[f'{key}_deg']:.2g} deg, {row[f'{key}_mm']:.2g} mm"
+            for title, key in (("left out", "left_out"), ("noise", "noise"), ("path", "path"))
+        }
+        start = {
+            "recording": row["recording"],
+            "Hz": f"{row['rate_hz']:.0f}",
+            "knots (ms)": f"{row['interval_ms']:g}",
+        }
+        bends = {"bend (deg)": f"{row['bend_deg']:.2g}", "noise's bend (deg)": f"{row['noise_bend_deg']:.2g}"}
+        rows.append({**start, **both, **bends})
+    return pd.DataFrame(rows)
+
+
+def _methods(table: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for row in table.sort_values(["recording", "e_R_deg"]).to_dict("records"):
+        errors = {f"e\\_{key[2]} (deg)": _words(row, key) for key in ("e_R_deg", "e_T_deg")}
+        coverage = {"in 95 %": _words(row, "covers_95"), "NEES / right": _words(row, "nees_ratio")}
+        rows.append({"method": row["method"], "recording": row["recording"], **errors, **coverage})
+    return pd.DataFrame(rows)
+
+
+def _models(table: pd.DataFrame) -> pd.DataFrame:
+    counts = table.groupby(["recording", "chosen"]).size().unstack(fill_value=0)
+    return counts.reindex(columns=[*MODELS, SPLINE], fill_value=0).reset_index()
+
+
+def _kinds(table: pd.DataFrame) -> pd.DataFrame:
+    kind = np.where(table["chosen"] == SPLINE, "spline", "motion model")
+    rows = []
+    for (recording, chose), part in table.groupby(["recording", kind]):
+        whole = int(np.count_nonzero(table["recording"] == recording))
+        share = format_interval(len(part) / whole, *share_interval(len(part), whole))
+        rows.append({"recording": recording, "chosen": chose, "share": share, **_errors_and_coverage(part)})
+    return pd.DataFrame(rows)
+
+
+def _departures(table: pd.DataFrame) -> pd.DataFrame:
+    over = table["departure_px"] / table["noise_px"]
+    rows = []
+    for low, high in pairwise(LIMITS):
+        part = table[(over > low) & (over <= high)]
+        splines = int(np.count_nonzero(part["chosen"] == SPLINE))
+        title = f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
+        share = format_interval(splines / len(part), *share_interval(splines, len(part))) if len(part) else "-"
+        rows.append(
+            {"departure / noise": title, "windows": len(part), "spline": share, **_errors_and_coverage(part)}
+        )
+    return pd.DataFrame(rows)
+
+
+def _errors_and_coverage(part: pd.DataFrame) -> dict[str, str]:
+    numbers = _numbers(part) if len(part) else {}
+    words = {f"e\\_{key[2]} (deg)": _words(numbers, key) for key in ("e_R_deg", "e_T_deg")}
+    return {**words, "in 95 %": _words(numbers, "covers_95"), "NEES / right": _words(numbers, "nees_ratio")}
+
+
+def _words(row: Mapping[Any, Any], name: str) -> str:
+    value, low, high = (float(str(row.get(f"{name}{end}", "nan"))) for end in ("", "_low", "_high"))
+    if not np.isfinite(value):
+        return "-"
+    return format_interval(value, low, high) if np.isfinite([low, high]).all() else f"{value:.2g}"
