@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.console import echo, print_rows, progress_bar
+from rsbench.cli.console import echo, print_rows, progress_bar, say
 from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
@@ -35,7 +35,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench leaderboard submit mine.jsonl --board board
 
-  rsbench leaderboard run points --entry rs-stereo-refined --entry gs-8pt --board board
+  rsbench leaderboard run points --entry rs-stereo-refined --entry my_solver.py --board board
 
   rsbench leaderboard show --board board
 
@@ -180,7 +180,10 @@ def run(
         list[str],
         named(
             "solvers",
-            "Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
+            "Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory): "
+            "name, card or FILE.py; repeatable.",
+            "--entry",
+            "--solver",
         ),
     ],
     board: Annotated[
@@ -215,6 +218,7 @@ def run(
     from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
     from rsbench.benchmark.leaderboard.inputs import prepare_inputs
     from rsbench.benchmark.leaderboard.running import count_steps, load_cards, run_cards
+    from rsbench.benchmark.leaderboard.submissions import failure_reasons
     from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.benchmark.provenance import provenance
     from rsbench.storage.work_folder import work_folder
@@ -252,6 +256,9 @@ def run(
         parts = [each.scores[each.scores["problem"].isin(names)].reset_index(drop=True) for each in others]
         beside = [replace(each, scores=part) for each, part in zip(others, parts, strict=True)]
         _show(place, split.track.id, split.name, None, beside=beside)
+        for file in files:
+            if reasons := failure_reasons(file):
+                say(f"{file.parent.name}: {reasons}")
 
 
 def _stored(split: Split, folder: Path | None) -> list[Scored]:
@@ -567,14 +574,16 @@ def _show(
         echo(table(lines).to_csv(index=False, lineterminator="\n"), nl=False)
         return
     lines = [line for line in lines if method in (None, line.scored.header.method)]
-    stated = any(line.calibration for line in lines)
     for uses in dict.fromkeys(line.uses for line in lines):
-        rows = [_cells(line) | (line.stated_words if stated else {}) for line in lines if line.uses == uses]
+        group = [line for line in lines if line.uses == uses]
+        stated = any(line.calibration for line in group)
+        rows = [_cells(line) | (line.stated_words if stated else {}) for line in group]
         print_rows(
             f"{protocol}, split {split}, uses {uses}",
             list(rows[0]),
             [list(row.values()) for row in rows],
-            ("e_R",),
+            right=("e_R",),
+            solid=list(rows[0]),
         )
 
 

@@ -73,9 +73,9 @@ def complete(kind: str = "") -> Callable[[str], list[str]]:
     return names
 
 
-def named(kind: str, text: str) -> Any:
-    """An option that takes a name of one kind or the path of a card; ``text`` is its help."""
-    return typer.Option(help=text, autocompletion=complete(kind))
+def named(kind: str, text: str, *names: str) -> Any:
+    """An option that takes a name of one kind or a path; ``text`` is its help, ``names`` those of the option."""
+    return typer.Option(*names, help=text, autocompletion=complete(kind))
 
 
 def complete_kind(incomplete: str) -> list[str]:
