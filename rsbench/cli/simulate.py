@@ -117,31 +117,40 @@ GIVEN = {
 }
 
 
+_SMALL = 0.1
+"""Degrees: a column whose medians are all below it is in thousandths."""
+
+
 def show(card: SweepCard, table: pd.DataFrame) -> None:
     """The medians of each variant, with their intervals, as a terminal table."""
     from rsbench.benchmark.simulated.run_sweep import SUCCESS_DEG
     from rsbench.benchmark.statistics import format_interval
 
-    def cell(row: dict[Any, Any], name: str) -> str:
+    def cell(row: dict[Any, Any], name: str, unit: float) -> str:
         ends = [row[f"{name}_median{end}"] for end in ("", "_low", "_high")]
-        return "-" if any(end is None or end != end for end in ends) else format_interval(*ends)
+        return (
+            "-"
+            if any(end is None or end != end for end in ends)
+            else format_interval(*(end / unit for end in ends))
+        )
 
     axis = card.axis.replace("_", " ")
-    columns = (axis, "solver", "e_R", "e_T", "solved")
     for variant, rows in table.groupby("variant", sort=False):
         records = rows.to_dict("records")
+        units = {name: 1e-3 if rows[f"{name}_median"].max() < _SMALL else 1.0 for name in ("e_R", "e_T")}
+        errors = {name: f"{name} ({'deg' if unit == 1.0 else 'mdeg'})" for name, unit in units.items()}
         cells = [
             [
                 f"{row['value']:g}",
                 row["solver"],
-                cell(row, "e_R"),
-                cell(row, "e_T"),
+                *(cell(row, name, unit) for name, unit in units.items()),
                 f"{100 * row['success_share']:.0f} %",
             ]
             for row in records
         ]
-        title = f"{card.name}, {variant}: median errors in degrees [95 % interval], {card.trials} trials"
-        print_rows(title, columns, cells, right=(axis, "solved"), solid=("e_R", "e_T"))
+        title = f"{card.name}, {variant}: median errors [95 % interval], {card.trials} trials"
+        columns = (axis, "solver", *errors.values(), "solved")
+        print_rows(title, columns, cells, right=(axis, "solved"), solid=tuple(errors.values()))
         for row in records:
             if row["failures"]:
                 say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
