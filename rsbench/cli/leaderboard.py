@@ -584,10 +584,11 @@ def _show(
     lines = [line for line in lines if method in (None, line.scored.header.method)]
     for uses in dict.fromkeys(line.uses for line in lines):
         group = [line for line in lines if line.uses == uses]
+        among = next((f", ranked among {each.peers}" for each in group if each.rank and each.peers > 1), "")
         stated = any(line.calibration for line in group if line.scored.header.method in names)
         rows = [_cells(line) | (line.stated_words if stated else {}) for line in group]
         print_rows(
-            f"{protocol}, split {split}, uses {uses}",
+            f"{protocol}, split {split}, uses {uses}{among}",
             list(rows[0]),
             [list(row.values()) for row in rows],
             right=("e_R",),
@@ -599,7 +600,7 @@ def _cells(line: Standing) -> dict[str, str]:
     from rsbench.benchmark.statistics import format_interval
 
     primary = line.track.primary
-    cells = {"method": line.scored.header.method, "rank": line.rank_words}
+    cells = {"method": line.scored.header.method, "rank": line.rank_words.partition(" of ")[0]}
     cells[primary.title] = format_interval(*line.means[primary.key])
     for score in line.track.scores:
         if score.key in ("flip", *line.track.beside):

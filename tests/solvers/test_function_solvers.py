@@ -141,7 +141,8 @@ def test_commands_take_the_file(folder: Path) -> None:
     ends = [float(end) for end in re.findall(r"\[(.*?), (.*?)\]", row)[0]]
     np.testing.assert_allclose(ends, [by_function[f"e_R_median_{end}"] for end in ("low", "high")], rtol=0.1)
     run = ("leaderboard", "run", "points", "--solver", "by_function.py", "--problems", 2, "--workers", 1)
-    assert "by_function" in run_here(*run, "--board", "board").stdout
+    shown = run_here(*run, "--board", "board").stdout
+    assert {"by_function", "gs-8pt", "cramer-rao"} <= {*shown.split()} and "ranked among 4" in shown
 
 
 def test_further_parameters_are_those_of_a_card(folder: Path) -> None:
