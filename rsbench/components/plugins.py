@@ -218,7 +218,8 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
         return _from_python(kind, text, *python.groups(""))
     if kind.cards is not None and is_path(text):
         return _from_card(kind, card_path(kind.cards, text))
-    offer = _only_offer(kind, text, "; a path ends in .toml or .py" if kind.cards is not None else "")
+    near = next((f"; did you mean {text}{end}?" for end in (".py", ".toml") if os.path.isfile(text + end)), "")
+    offer = _only_offer(kind, text, (near or "; a path ends in .toml or .py") if kind.cards is not None else "")
     if offer.path is not None:
         return _from_card(kind, offer.path)
     cls, where = _offered_class(kind, offer)

@@ -238,7 +238,8 @@ def test_a_wrong_path_is_refused_in_one_line(folder: Path) -> None:
         "missing.py": "no such file",
         "by_function.py:nine": "defines no 'nine'",
         "mine.py:plain": "above def plain",
-        "by_function": "a path ends in .toml or .py",
+        "by_function": "did you mean by_function.py?",
+        "neither": "a path ends in .toml or .py",
     }.items():
         assert_refused(run_here("check-solver", path), words)
     (folder / "my-solver.py").write_text(FUNCTION, "utf-8")
