@@ -236,7 +236,7 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
         if kind not in kinds:
             raise RsbenchError(f"--kind {kind!r} does not exist{choices(kind, kinds)}")
         return [kind]
-    if name.endswith(".toml"):
+    if name.endswith((".toml", ".py")) or ".py:" in name:
         raise RsbenchError(f"{name}: give its kind: --kind {'|'.join(kinds)}")
     if Path(name).is_dir():
         raise RsbenchError(f"{name}: is a folder, and show takes names and cards; a dataset: rsbench view {name}")

@@ -158,6 +158,11 @@ def test_further_parameters_are_those_of_a_card(folder: Path) -> None:
         load_solver("double.toml")
 
 
+def test_samples_of_a_sensor_are_no_matches_to_draw(folder: Path) -> None:
+    name = written(folder, "@rsbench.solver(needs={'left', 'gyro'}, minimum=5)\ndef f(c, r, s): pass\n")
+    assert load_solver(name).spec.minimum == {"left": 5, "gyro": 2}
+
+
 def test_a_solver_of_a_function_is_sent_to_other_processes(folder: Path) -> None:
     solver = load_solver("by_function.py")
     assert pickle.loads(pickle.dumps(solver)) == solver

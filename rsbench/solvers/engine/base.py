@@ -354,7 +354,8 @@ def solver(
         function: ``w`` (3,) rotation vector, rad, ``d`` (3,) translation of the reference point, both of one frame
             period: ``X_body = exp([w]x) X_world + d``.
         needs: the sets of matches that it uses.
-        minimum: fewest matches of each, or of each set by its name; RANSAC draws samples of this size.
+        minimum: fewest matches of each, or of each set by its name; RANSAC draws samples of this size. A number
+            is not for the samples of sensors, of which two are needed.
         metric: whether d is in metres.
         motion_model, shutter, reference_point, cameras, reference: see ``SolverSpec``.
 
@@ -370,7 +371,7 @@ def solver(
         "assumes": "nothing else is stated",
     }
     sets: frozenset[Any] = frozenset([needs] if isinstance(needs, str) else needs)
-    least = dict.fromkeys(sets, minimum) if isinstance(minimum, int) else minimum
+    least = {each: 2 if each in SENSORS else minimum for each in sets} if isinstance(minimum, int) else minimum
 
     def mark(function: F) -> F:
         if not isinstance(function, FunctionType):
