@@ -719,8 +719,8 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
     cells += [{"value": _value(value), "text": _number(value), "bar": None} for value in line.medians.values()]
     if _stated(each):
         for triple in named_numbers(line.calibration, _log_scored(each)).values():
-            text = "–" if np.isnan(triple[0]) else format_interval(*triple)
-            cells.append({"value": _value(triple[0]), "text": text, "bar": None})
+            text = {"text": "–"} if np.isnan(triple[0]) else _apart(triple)
+            cells.append({"value": _value(triple[0]), **text, "bar": None})
         if _log_scored(each):
             place = "" if line.log_rank is None else line.log_rank.place
             cells.append({"value": place, "text": line.stated_words.get("log rank", "–"), "bar": None})
