@@ -179,6 +179,8 @@ def test_the_function_stays_one_and_is_a_solver_for_python() -> None:
     assert found.success and found.metric
     np.testing.assert_array_equal(found.d, [0.0, 0.0, 0.1])
     assert still(data.correspondences, RIG, ROLLING)[0] == [0.0, 0.0, 1e-3]
+    left = rsbench.solver(lambda matches, rig, shutter: (np.zeros(3), np.ones(3)), needs="left", minimum=5)
+    assert rsbench.estimate_motion(data.correspondences, RIG, ROLLING, left).estimate.metric is False
     with pytest.raises(ValueError, match=r"below @rsbench\.solver"):
         rsbench.estimate_motion(data.correspondences, RIG, ROLLING, print)
 

@@ -312,7 +312,19 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 @overload
-def solver(function: F, /) -> F: ...
+def solver(
+    function: F,
+    /,
+    *,
+    needs: MatchSet | Iterable[MatchSet] = ...,
+    minimum: int | Mapping[MatchSet, int] = ...,
+    metric: bool = ...,
+    motion_model: str = ...,
+    shutter: Literal["rolling", "global"] = ...,
+    reference_point: Literal["body", "left"] = ...,
+    cameras: Cameras = ...,
+    reference: str = ...,
+) -> F: ...
 @overload
 def solver(
     function: None = None,
@@ -342,7 +354,7 @@ def solver(
 ) -> Any:
     """Make a solver of a function ``(correspondences, rig, shutter)`` that returns w and d, or None.
 
-    It decorates the function, with or without options, and leaves it as it is. Then ``FILE.py`` is a solver for
+    It decorates the function, or is called with it, and leaves it as it is. Then ``FILE.py`` is a solver for
     all commands, and the function one for ``estimate_motion``. Further parameters of the function have defaults; a
     card may set them. Unless it needs tracks, links or affine frames, points tracked through all images are in
     ``.left`` and ``.right`` like the others, and there are no ``.tracks``.
