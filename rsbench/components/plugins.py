@@ -361,7 +361,7 @@ def _checked(kind: Kind[Component, Any], cls: object, where: str) -> type[Compon
     if _belongs(kind, cls):
         return cls  # pyrefly: ignore[bad-return]
     if kind.mark and inspect.isfunction(cls):
-        raise RsbenchError(f"{where}: is no {kind.singular} yet: write {kind.mark} above def {cls.__name__}")
+        raise RsbenchError(f"{where}: not a {kind.singular} yet: write {kind.mark} above def {cls.__name__}")
     base = f"{kind.base.__module__}.{kind.base.__qualname__}"
     missing = ", ".join(sorted(getattr(cls, "__abstractmethods__", ()))) if isinstance(cls, type) else ""
     lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # pyrefly: ignore[bad-argument-type]
