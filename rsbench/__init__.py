@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rsbench.core.rig import StereoRig
     from rsbench.core.shutter import RollingShutter
     from rsbench.core.spline_motion import SplineMotion
-    from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec, list_solvers, load_solver
+    from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec, list_solvers, load_solver, solver
 
 __all__ = [
     "AcceleratedMotion",
@@ -61,6 +61,7 @@ __all__ = [
     "read_dataset",
     "read_rig",
     "simulate",
+    "solver",
     "stereo_depth",
     "verify",
 ]
@@ -80,6 +81,7 @@ _HOMES = {
     "TwistMotion": "rsbench.components.motion_models",
     "list_solvers": "rsbench.solvers.engine.base",
     "load_solver": "rsbench.solvers.engine.base",
+    "solver": "rsbench.solvers.engine.base",
 }
 """Modules of the names that ``rsbench.api`` does not define itself."""
 

@@ -15,8 +15,9 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from commands import install_project
+from commands import install_project, run_here
 from documents import ROOT, blocks, write_blocks
+from programs import run_python
 
 import rsbench
 from rsbench.benchmark.simulated.contract import CHECKS, check_solver
@@ -260,7 +261,8 @@ def documented_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     write_blocks(ROOT / "docs" / "how-to" / "add-a-solver.md", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
-    sys.modules.pop("scipy_solver", None)
+    for name in ("scipy_solver", "my_solver"):
+        sys.modules.pop(name, None)
 
 
 def test_the_documented_solver_works(documented_solver: Path) -> None:
@@ -276,6 +278,25 @@ def test_the_documented_solver_works(documented_solver: Path) -> None:
     # Exact data: what remains is SciPy's own stopping rule.
     assert rotation_error(estimate.w, motion.w) < 1e-7
     assert translation_error(estimate.d, motion.d) < 1e-6
+
+
+def test_the_documented_function_keeps_the_contract(documented_solver: Path) -> None:
+    findings = check_solver(load_solver_entry(documented_solver / "my_solver.py"), isolated=False)
+    assert [finding for finding in findings if finding.verdict in ("failed", "skipped")] == []
+    assert "'e_R_deg': 0.1" in run_python("use_it.py", folder=documented_solver).stdout
+
+
+@pytest.mark.slow
+def test_the_page_of_solvers_shows_what_its_commands_print(
+    documented_solver: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(documented_solver)
+    for block in blocks(ROOT / "docs" / "how-to" / "add-a-solver.md", "console"):
+        command, *lines = block.splitlines()
+        shown = run_here(*command.split()[2:], COLUMNS="80").stdout
+        printed = {" ".join(line.split()) for line in shown.splitlines()}
+        for line in lines:
+            assert line == "..." or " ".join(line.split()) in printed or "ranked among" in line, (command, line)
 
 
 @pytest.mark.slow

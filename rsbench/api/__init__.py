@@ -6,6 +6,7 @@ Angles are radians, lengths metres unless a name says otherwise; frames and time
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as Series
 from os import PathLike
 from pathlib import Path
@@ -105,7 +106,7 @@ def estimate_motion(
     correspondences: Correspondences,
     rig: StereoRig,
     shutter: RollingShutter,
-    solver: str | Path | Solver = "rs-stereo-refined",
+    solver: str | Path | Solver | Callable[..., Any] = "rs-stereo-refined",
     *,
     motion_model: str | None = None,
     threshold_px: float | None = None,
@@ -116,7 +117,8 @@ def estimate_motion(
     Args:
         correspondences: matches, px.
         rig, shutter: the cameras and how they read their rows.
-        solver: a name of ``list_solvers``, the path of a card, or a solver.
+        solver: a name of ``list_solvers``, the path of a card or of a Python file, a ``Solver``, or a function
+            that ``rsbench.solver`` decorates.
         motion_model: ``auto``, the one that the matches prefer, or a name; None: the one that the solver assumes.
         threshold_px: largest error of an inlier; None follows the noise that the inliers show.
         seed: of the samples that the robust loop draws.

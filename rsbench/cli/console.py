@@ -152,12 +152,16 @@ def print_records(rows: Sequence[dict[str, str]], right: Iterable[str] = ()) -> 
 
 
 def print_rows(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], right: Iterable[str] = ()
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    right: Iterable[str] = (),
+    solid: Iterable[str] = (),
 ) -> None:
     """A table on stdout; the columns in ``right`` are aligned to the right.
 
     A table that is wider than the terminal is continued below, its key columns repeated, so that no word or number
-    is broken. Redirected output is as wide as needed, unless COLUMNS is set.
+    is broken, nor a cell in a ``solid`` column. Redirected output is as wide as needed, unless COLUMNS is set.
     """
     from rich import box
     from rich.cells import cell_len
@@ -169,7 +173,13 @@ def print_rows(
         return
     console, texts, right = Console(), [[printable(str(value)) for value in row] for row in rows], set(right)
     cells = [[column, *(row[k] for row in texts)] for k, column in enumerate(columns)]
-    words = [max((cell_len(word) for cell in each for word in cell.split()), default=0) for each in cells]
+    solid = set(solid)
+    words = [
+        max(
+            (cell_len(part) for cell in each for part in ([cell] if each[0] in solid else cell.split())), default=0
+        )
+        for each in cells
+    ]
     lines = [max(cell_len(line) for cell in each for line in cell.split("\n")) for each in cells]
     if not (console.is_terminal or "COLUMNS" in os.environ):
         console.width = max(80, sum(lines) + _GAP * len(lines) + 1)

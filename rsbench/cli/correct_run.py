@@ -127,7 +127,8 @@ def _say_four(out: Path, first: str, record: dict[str, Any]) -> None:
     echo(first)
     say_calibration(record)
     if motion is not None:
-        echo(f"motion in a frame period: {', '.join(sizes(motion))} (+-: one standard deviation)")
+        words = ", ".join(sizes(motion))
+        echo(f"motion in a frame period: {words}{' (+-: one standard deviation)' if '+-' in words else ''}")
         if motion["model_choice"]:
             echo(f"motion model: {motion['model_choice']['text']}")
         if motion["note"]:

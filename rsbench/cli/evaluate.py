@@ -47,7 +47,9 @@ def evaluate(
     ],
     solver: Annotated[
         list[str] | None,
-        named("solvers", "Solver to score, a name or a card; repeatable. Default: all that come with rsbench."),
+        named(
+            "solvers", "Solver to score: name, card or FILE.py; repeatable. Default: all that come with rsbench."
+        ),
     ] = None,
     correct_with: Annotated[
         str, named("solvers", "Solver whose motion the correction uses; it is scored too.")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.console import echo, print_rows, progress_bar
+from rsbench.cli.console import echo, late_progress, print_rows, progress_bar, say
 from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
@@ -35,7 +35,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench leaderboard submit mine.jsonl --board board
 
-  rsbench leaderboard run points --entry rs-stereo-refined --entry gs-8pt --board board
+  rsbench leaderboard run points --entry rs-stereo-refined --entry my_solver.py --board board
 
   rsbench leaderboard run points-recorded --data walks --entry rs-stereo-auto --board board
 
@@ -186,7 +186,10 @@ def run(
         list[str],
         named(
             "solvers",
-            "Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory); repeatable.",
+            "Solver, stereo matcher (depth), corrector (correction, -mono), method (trajectory): "
+            "name, card or FILE.py; repeatable.",
+            "--entry",
+            "--solver",
         ),
     ],
     board: Annotated[
@@ -204,7 +207,7 @@ def run(
             "--beside",
             metavar="DIR",
             help="Stored predictions to rank beside, not added to the board. "
-            "Default: those of this track in results/*/predictions of the working folder.",
+            "Default: those of this track that come with rsbench.",
         ),
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one per core.")] = None,
@@ -221,6 +224,7 @@ def run(
     from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
     from rsbench.benchmark.leaderboard.inputs import prepare_inputs
     from rsbench.benchmark.leaderboard.running import count_steps, load_cards, run_cards
+    from rsbench.benchmark.leaderboard.submissions import failure_reasons
     from rsbench.benchmark.leaderboard.track import Limits
     from rsbench.benchmark.provenance import provenance
     from rsbench.storage.work_folder import work_folder
@@ -231,7 +235,7 @@ def run(
     if problems is not None and problems > there:
         raise RsbenchError(f"--problems {problems}: split {whole.name} has {there}")
     split = whole if problems in (None, there) else replace(whole, truths=whole.truths[:problems])
-    others = _stored(whole, stored)
+    others = _stored(whole, split, stored)
     load_cards(split.track, entry)  # before anything is written
     limits = Limits(time_limit, memory)
     with results_at(board, scheduler) as place:
@@ -253,26 +257,27 @@ def run(
                 workers=processes,
                 step=step,
             )
-        # The others as if scored on the problems of a part of the split.
-        names = list(split.by_name)
-        parts = [each.scores[each.scores["problem"].isin(names)].reset_index(drop=True) for each in others]
-        beside = [replace(each, scores=part) for each, part in zip(others, parts, strict=True)]
-        _show(place, split.track.id, split.name, None, beside=beside)
+        _show(place, split.track.id, split.name, None, beside=others)
+        for file in files:
+            if reasons := failure_reasons(file):
+                say(f"{file.parent.name}: {reasons}")
 
 
-def _stored(split: Split, folder: Path | None) -> list[Scored]:
-    """Entries of stored predictions of a split: of a folder, or else of the working folder's results."""
+def _stored(whole: Split, split: Split, folder: Path | None) -> list[Scored]:
+    """Entries from stored predictions, of a folder or else those that come with rsbench, on a part of a split."""
     from rsbench.benchmark.leaderboard.board import restore
+    from rsbench.components.cards import shipped_folder
 
-    folders = [folder] if folder is not None else sorted(Path("results").glob(f"*/predictions/{split.track.id}"))
+    shipped = shipped_folder("results", "_results").glob(f"*/predictions/{split.track.id}")
     found: list[Scored] = []
-    for each in folders:
-        with tempfile.TemporaryDirectory() as board:
-            try:
-                found += restore(each, split, Path(board))
-            except RsbenchError:  # of another split
-                if folder is not None:
-                    raise
+    with late_progress("scoring stored entries") as step:
+        for each in sorted(shipped) if folder is None else [folder]:
+            with tempfile.TemporaryDirectory() as board:
+                try:
+                    found += restore(each, whole, Path(board), split, step)
+                except RsbenchError:  # of another split
+                    if folder is not None:
+                        raise
     return found
 
 
@@ -561,7 +566,10 @@ def _show(
     csv: bool = False,
     beside: Sequence[Scored] = (),
 ) -> None:
-    """Print a table; of one method, its line alone. Of ``beside`` those are in it whose name the board has not."""
+    """Print a table; of one method, its line alone.
+
+    Of ``beside`` those are in it whose name the board has not and with which an entry of the board is compared.
+    """
     from rsbench.benchmark.leaderboard.board import entries_of
     from rsbench.benchmark.leaderboard.standings import standings, table
 
@@ -572,15 +580,25 @@ def _show(
     if csv:
         echo(table(lines).to_csv(index=False, lineterminator="\n"), nl=False)
         return
+    if beside:
+        most = [set(each.header.uses) for each in entries]
+        lines = [
+            line
+            for line in lines
+            if line.rank is None or any(used >= set(line.scored.header.uses) for used in most)
+        ]
     lines = [line for line in lines if method in (None, line.scored.header.method)]
-    stated = any(line.calibration for line in lines)
     for uses in dict.fromkeys(line.uses for line in lines):
-        rows = [_cells(line) | (line.stated_words if stated else {}) for line in lines if line.uses == uses]
+        group = [line for line in lines if line.uses == uses]
+        among = next((f", ranked among {each.peers}" for each in group if each.rank and each.peers > 1), "")
+        stated = any(line.calibration for line in group if line.scored.header.method in names)
+        rows = [_cells(line) | (line.stated_words if stated else {}) for line in group]
         print_rows(
-            f"{protocol}, split {split}, uses {uses}",
+            f"{protocol}, split {split}, uses {uses}{among}",
             list(rows[0]),
             [list(row.values()) for row in rows],
-            ("e_R",),
+            right=("e_R",),
+            solid=list(rows[0]),
         )
 
 
@@ -588,7 +606,7 @@ def _cells(line: Standing) -> dict[str, str]:
     from rsbench.benchmark.statistics import format_interval
 
     primary = line.track.primary
-    cells = {"method": line.scored.header.method, "rank": line.rank_words}
+    cells = {"method": line.scored.header.method, "rank": line.rank_words.partition(" of ")[0]}
     cells[primary.title] = format_interval(*line.means[primary.key])
     for score in line.track.scores:
         if score.key in ("flip", *line.track.beside):

@@ -73,9 +73,9 @@ def complete(kind: str = "") -> Callable[[str], list[str]]:
     return names
 
 
-def named(kind: str, text: str) -> Any:
-    """An option that takes a name of one kind or the path of a card; ``text`` is its help."""
-    return typer.Option(help=text, autocompletion=complete(kind))
+def named(kind: str, text: str, *names: str) -> Any:
+    """An option that takes a name of one kind or a path; ``text`` is its help, ``names`` those of the option."""
+    return typer.Option(*names, help=text, autocompletion=complete(kind))
 
 
 def complete_kind(incomplete: str) -> list[str]:
@@ -236,7 +236,7 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
         if kind not in kinds:
             raise RsbenchError(f"--kind {kind!r} does not exist{choices(kind, kinds)}")
         return [kind]
-    if name.endswith(".toml"):
+    if name.endswith((".toml", ".py")) or ".py:" in name:
         raise RsbenchError(f"{name}: give its kind: --kind {'|'.join(kinds)}")
     if Path(name).is_dir():
         raise RsbenchError(f"{name}: is a folder, and show takes names and cards; a dataset: rsbench view {name}")

@@ -46,10 +46,17 @@ _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu
 
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
-    """The board of simulated points, which may have other entries too, and the scores of the smoke run."""
-    _fill(data / BOARD, {"points": own_solvers()}, workers)
-    smoke(out / "leaderboard" / "smoke", write=True)
-    publish(data / BOARD, out / "leaderboard")
+    """The board of simulated points, which may have other entries too, and the scores of the smoke run.
+
+    The answers are published too: ``leaderboard run points`` ranks beside them.
+    """
+    board, folder = data / BOARD, out / BOARD
+    _fill(board, {"points": own_solvers()}, workers)
+    smoke(folder / "smoke", write=True)
+    publish(board, folder)
+    for protocol, split in splits_of(board):
+        if protocol == "points-1":
+            store(board, protocol, split, folder / "predictions" / protocol)
 
 
 def laws(out: Path, data: Path, workers: int | None) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
-from rsbench.cli.console import echo, print_table, progress_bar, say
+from rsbench.cli.console import echo, print_rows, progress_bar, say
 from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
 
@@ -25,6 +25,8 @@ EPILOG = """[bold]Examples[/bold]
   rsbench simulate noise --out out/noise
 
   rsbench simulate rotation --set points=9 --trials 100 --solver gs-8pt --solver rs-stereo-linear --out out/nine
+
+  rsbench simulate rotation --solver my_solver.py --trials 50 --out out/mine   [dim](a function of yours)[/dim]
 
 DIR gets [bold]summary.csv[/bold] (median, mean, p90 with 95 % bootstrap intervals, success share, failures and
 their reasons), [bold]trials/*.npz[/bold] (truth and every prediction) and [bold]sweep.json[/bold] (the card).
@@ -48,7 +50,7 @@ def simulate(
     ],
     trials: Annotated[int | None, typer.Option(min=1, help="Repetitions per value instead of the card's.")] = None,
     solver: Annotated[
-        list[str] | None, named("solvers", "Solver card instead of the sweep's; repeatable.")
+        list[str] | None, named("solvers", "Solver instead of the sweep's: name, card or FILE.py; repeatable.")
     ] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="FIELD=VALUE to replace in the card's setting; repeatable.")
@@ -107,31 +109,59 @@ def run_and_summarise(
     return table
 
 
+GIVEN = {
+    "left pairs": "matches over time of the left camera",
+    "left and right pairs": "matches over time of both cameras",
+    "linked pairs": "matches over time of both cameras and between them",
+    "tracks": "tracks through all four images",
+}
+
+
+_SMALL = 0.1
+"""Degrees: a column whose medians are all below it is in thousandths."""
+
+
 def show(card: SweepCard, table: pd.DataFrame) -> None:
-    """The medians of each variant as a terminal table."""
-    given = {"left pairs": "L", "left and right pairs": "L+R", "linked pairs": "L+R linked", "tracks": "tracks"}
-    columns = {
-        "value": card.axis,
-        "solver": "solver",
-        "given": "given",
-        "e_R_median": "e_R",
-        "e_T_median": "e_T",
-        "success_share": "solved",
-        "failures": "fail",
-    }
-    digits = {card.axis: 4, "e_R": 4, "e_T": 4, "solved": 2}
-    table = table.assign(given=table.information.map(given))
+    """The medians of each variant, with their intervals, as a terminal table."""
+    from rsbench.benchmark.simulated.run_sweep import SUCCESS_DEG
+    from rsbench.benchmark.statistics import format_interval
+
+    def cell(row: dict[Any, Any], name: str, unit: float) -> str:
+        ends = [row[f"{name}_median{end}"] for end in ("", "_low", "_high")]
+        return (
+            "-"
+            if any(end is None or end != end for end in ends)
+            else format_interval(*(end / unit for end in ends))
+        )
+
+    axis = card.axis.replace("_", " ")
     for variant, rows in table.groupby("variant", sort=False):
-        title = f"{card.name}, {variant}: median errors in degrees, {card.trials} trials"
-        print_table(title, rows[list(columns)].rename(columns=columns), digits)
-        for row in rows[rows.failures > 0].to_dict("records"):
-            say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
+        records = rows.to_dict("records")
+        units = {name: 1e-3 if rows[f"{name}_median"].max() < _SMALL else 1.0 for name in ("e_R", "e_T")}
+        errors = {name: f"{name} ({'deg' if unit == 1.0 else 'mdeg'})" for name, unit in units.items()}
+        cells = [
+            [
+                f"{row['value']:g}",
+                row["solver"],
+                *(cell(row, name, unit) for name, unit in units.items()),
+                f"{100 * row['success_share']:.0f} %",
+            ]
+            for row in records
+        ]
+        title = f"{card.name}, {variant}: median errors [95 % interval], {card.trials} trials"
+        columns = (axis, "solver", *errors.values(), "solved")
+        print_rows(title, columns, cells, right=(axis, "solved"), solid=tuple(errors.values()))
+        for row in records:
+            if row["failures"]:
+                say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
     rolling = table[table.shutter == "rolling"]  # other shutters have no time between rows
     for (solver, assumed), rows in rolling.groupby(["solver", "assumed_motion"], sort=False):
         others = sorted(set(rows.motion_model) - {assumed})
         if others:
             say(f"{solver} assumes {assumed} motion; the data are of {' and '.join(others)} motion")
-    say("given: matches over time of the left camera (L) or of both (L+R), or tracks through all four images")
+    say("solved: share of trials with e_R below {:g} deg and e_T below {:g} deg".format(*SUCCESS_DEG))
+    for given, rows in table.groupby("information", sort=False):
+        say(f"given to {', '.join(dict.fromkeys(rows.solver))}: {GIVEN[str(given)]}")
 
 
 def _changes(assignments: list[str]) -> dict[str, object]:

@@ -121,6 +121,8 @@ CHECK_SOLVER_EPILOG = """[bold]Examples[/bold]
 
   rsbench check-solver gs-8pt
 
+  rsbench check-solver my_solver.py                  [dim](a function below @rsbench.solver)[/dim]
+
   rsbench check-solver ./my-solver.toml --json
 
 Other packages' solvers run in a child process. Exit code 1 when a check fails; warnings are yours to judge."""
@@ -130,7 +132,9 @@ def check_solver(
     solver: Annotated[
         str,
         typer.Argument(
-            metavar="NAME|CARD", help="Name of a solver or path to its card.", autocompletion=complete("solvers")
+            metavar="NAME|PATH",
+            help="Name of a solver, or path of its card or Python file (FILE.py or FILE.py:NAME).",
+            autocompletion=complete("solvers"),
         ),
     ],
     time_limit: Annotated[

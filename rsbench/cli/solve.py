@@ -40,7 +40,7 @@ More: [bold]rsbench docs problem-format[/bold]"""
 
 
 _MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
-_SOLVER = "Name of a solver (rsbench list solvers) or path of a card; repeatable. Default: rs-stereo-refined"
+_SOLVER = "Solver: name (rsbench list solvers), card or FILE.py; repeatable. Default: rs-stereo-refined"
 
 
 def solve(

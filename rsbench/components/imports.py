@@ -27,6 +27,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib import metadata, resources
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn
 
 from rsbench.core.errors import RsbenchError
@@ -237,6 +238,20 @@ def exception_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
+def import_file(file: Path) -> ModuleType:
+    """The module of a Python file, which other modules beside it may be part of.
+
+    Raises:
+        RsbenchError: no such file, a name that no module can have, or whatever importing it raises: one line.
+    """
+    if not file.is_file():
+        raise RsbenchError(f"{file}: no such file")
+    if not file.stem.isidentifier():
+        raise RsbenchError(f"{file}: is imported, so its name must be of letters, digits and '_': rename it")
+    with blaming(str(file), "cannot be imported"):
+        return _import_beside(file.stem, file.parent.resolve())
+
+
 def import_target(target: str, folder: Path | None, where: str) -> object:
     """The object that ``package.module:Class`` names, from what is installed or from modules in a folder."""
     module, _, name = target.partition(":")
@@ -385,7 +400,7 @@ def search(card: Path) -> None:
     _put_on_path(str(card.parent.resolve()))
 
 
-def _import_beside(module: str, folder: Path) -> object:
+def _import_beside(module: str, folder: Path) -> ModuleType:
     """Import a module that is installed or lies in a folder.
 
     The folder stays on the path, after everything that is installed, for later imports, in child processes too. A
@@ -438,7 +453,7 @@ def _refuse_other(name: str, beside: Path) -> None:
         spec = importlib.util.find_spec(name)
         other = Path(spec.origin).resolve() if spec is not None and spec.has_location and spec.origin else None
     if other is not None and other != beside.resolve():
-        raise ImportError(f"module {name!r} is taken by {other}: rename the one beside the card")
+        raise ImportError(f"module {name!r} is taken by {other}: rename {beside.name}")
 
 
 def _file_of(module: str) -> Path | None:

@@ -1,9 +1,10 @@
 """Components by name: cards that come with rsbench, a user's card, or an installed package's entry point.
 
 All kinds of components are found alike. A name is that of a card, of an entry point, or of a class of rsbench's
-own that needs no card; a value that ends in ``.toml`` is the path of a card. A card has ``class =
-"package.module:Class"``, may have ``description``, ``parameters`` and the options of its kind. A name that two
-packages claim is an error only when that name is used; an exception of a package becomes one line with its name.
+own that needs no card; a value that ends in ``.toml`` is the path of a card, and ``FILE.py`` or ``FILE.py:NAME`` a
+class or marked function of that file, with its default parameters. A card has ``class = "package.module:Class"``,
+may have ``description``, ``parameters`` and the options of its kind. A name that two packages claim is an error
+only when that name is used; an exception of a package becomes one line with its name.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import contextlib
 import dataclasses
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeGuard, TypeVar
 
 from pydantic.errors import PydanticUserError
 
@@ -37,6 +39,7 @@ from rsbench.components.imports import (
     component_key,
     entry_points_by_name,
     exception_text,
+    import_file,
     import_target,
     package_of,
     try_import,
@@ -45,6 +48,10 @@ from rsbench.core.errors import RsbenchError
 
 Component = TypeVar("Component")
 Options = TypeVar("Options")
+MARK = "rsbench_class"
+"""Attribute of a function that is a component: the class that calls it."""
+_PYTHON = re.compile(r"(.*\.py)(?::(.*))?", re.DOTALL)
+"""A Python file, and the name of something in it."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +93,8 @@ class Kind(Generic[Component, Options]):
     """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
     check: Callable[[Component], None] = _anything_goes
     """Raises ValueError for a component whose declarations are inconsistent."""
+    mark: str = ""
+    """How a function becomes one, such as ``@rsbench.solver``; empty where only classes do."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "group", self.group or f"rsbench.{self.cards}")
@@ -97,7 +106,7 @@ class Entry(Generic[Component, Options]):
 
     name: str
     path: Path | None
-    """Its card; None for an entry point."""
+    """Its card, or its Python file, which ``:NAME`` may follow; None for an entry point."""
     description: str
     component: Component
     options: Options
@@ -162,11 +171,11 @@ def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Componen
 
 
 def _without_card(
-    kind: Kind[Component, Options], component: Component, name: str, description: str
+    kind: Kind[Component, Options], component: Component, name: str, description: str, path: Path | None = None
 ) -> Entry[Component, Options]:
     return Entry(
         name=name,
-        path=None,
+        path=path,
         description=description,
         component=component,
         options=kind.options(),
@@ -192,17 +201,25 @@ def offers(kind: Kind[Any, Any]) -> list[Offer]:
     return sorted([*own, *installed], key=lambda offer: offer.name)
 
 
+def is_path(text: str) -> bool:
+    """Whether a component is given by the path of its card or Python file, not by its name."""
+    return text.endswith(".toml") or "/" in text or os.sep in text or _PYTHON.fullmatch(text) is not None
+
+
 def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entry[Component, Options]:
-    """A component by the name of a card or entry point, or by the path of a card.
+    """A component by the name of a card or entry point, by the path of a card, or by ``FILE.py[:NAME]``.
 
     Raises:
         RsbenchError: no such component, two of that name, or its card or class is wrong: one line that names
-            the card or the entry point.
+            the card, the file or the entry point.
     """
     text = os.fspath(name_or_path)
-    if kind.cards is not None and (text.endswith(".toml") or "/" in text or os.sep in text):
-        return _from_card(kind, card_path(kind.cards, name_or_path))
-    offer = _only_offer(kind, text, "; a path ends in .toml" if kind.cards is not None else "")
+    if kind.cards is not None and (python := _PYTHON.fullmatch(text)):
+        return _from_python(kind, text, *python.groups(""))
+    if kind.cards is not None and is_path(text):
+        return _from_card(kind, card_path(kind.cards, text))
+    near = next((f"; did you mean {text}{end}?" for end in (".py", ".toml") if os.path.isfile(text + end)), "")
+    offer = _only_offer(kind, text, (near or "; a path ends in .toml or .py") if kind.cards is not None else "")
     if offer.path is not None:
         return _from_card(kind, offer.path)
     cls, where = _offered_class(kind, offer)
@@ -288,6 +305,48 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
     )
 
 
+def _from_python(kind: Kind[Component, Options], text: str, file: str, name: str) -> Entry[Component, Options]:
+    """The only component of a Python file, or the one of that name; called like the file, or by that name."""
+    module = import_file(Path(file))
+    offered = {
+        cls: key
+        for key, value in vars(module).items()
+        if _belongs(kind, cls := class_of(value)) and cls.__module__ == module.__name__
+    }
+    if name and not hasattr(module, name):
+        raise RsbenchError(f"{text}: {file} defines no {name!r}{choices(name, offered.values())}")
+    if not name and not offered:
+        raise RsbenchError(f"{file}: defines no {kind.singular}: {_remedy(kind, module)}")
+    if not name and len(offered) > 1:
+        raise RsbenchError(
+            f"{file}: defines {len(offered)} {kind.cards}: name one, such as {file}:{min(offered.values())}"
+            f"{choices('', offered.values())}"
+        )
+    cls = _checked(kind, getattr(module, name) if name else next(iter(offered)), text)
+    component = make_component(kind, cls, {}, text)
+    return _without_card(kind, component, name or module.__name__, _first_paragraph(cls), Path(text))
+
+
+def class_of(value: object) -> object:
+    """The class behind a marked function; anything else as it is."""
+    return getattr(value, MARK, value) if inspect.isfunction(value) else value
+
+
+def _belongs(kind: Kind[Any, Any], cls: object) -> TypeGuard[type[Any]]:
+    return isinstance(cls, type) and issubclass(cls, kind.base) and not inspect.isabstract(cls)
+
+
+def _remedy(kind: Kind[Any, Any], module: object) -> str:
+    """What to write into a Python file that defines no component of a kind."""
+    own = [each for each in vars(module).values() if inspect.isfunction(each)]
+    own = [each for each in own if each.__module__ == getattr(module, "__name__", "")]
+    likely = max(own, key=lambda each: len(inspect.signature(each).parameters) == 3, default=None)
+    if kind.mark and likely is not None:
+        return f"write {kind.mark} above def {likely.__name__}{inspect.signature(likely)}"
+    base = f"a concrete subclass of {kind.base.__module__}.{kind.base.__qualname__}"
+    return f"write a function below {kind.mark}, or {base}" if kind.mark else f"write {base}"
+
+
 def _owner(offer: Offer) -> str:
     if offer.point is not None:
         return f"{offer.point.value} of {offer.origin}"
@@ -298,14 +357,17 @@ def _owner(offer: Offer) -> str:
 
 
 def _checked(kind: Kind[Component, Any], cls: object, where: str) -> type[Component]:
-    if not (isinstance(cls, type) and issubclass(cls, kind.base)) or inspect.isabstract(cls):
-        base = f"{kind.base.__module__}.{kind.base.__qualname__}"
-        missing = ", ".join(sorted(getattr(cls, "__abstractmethods__", ()))) if isinstance(cls, type) else ""
-        lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # pyrefly: ignore[bad-argument-type]
-        raise RsbenchError(
-            f"{where}: {cls!r} is not a {kind.singular}: it must be a concrete subclass of {base}{lacks}"
-        )
-    return cls
+    cls = class_of(cls)
+    if _belongs(kind, cls):
+        return cls  # pyrefly: ignore[bad-return]
+    if kind.mark and inspect.isfunction(cls):
+        raise RsbenchError(f"{where}: not a {kind.singular} yet: write {kind.mark} above def {cls.__name__}")
+    base = f"{kind.base.__module__}.{kind.base.__qualname__}"
+    missing = ", ".join(sorted(getattr(cls, "__abstractmethods__", ()))) if isinstance(cls, type) else ""
+    lacks = f"; it lacks {missing}" if missing and issubclass(cls, kind.base) else ""  # pyrefly: ignore[bad-argument-type]
+    raise RsbenchError(
+        f"{where}: {cls!r} is not a {kind.singular}: it must be a concrete subclass of {base}{lacks}"
+    )
 
 
 def make_component(

@@ -654,10 +654,18 @@ def _section(each: Board, ranked: bool) -> dict[str, Any]:
 
 
 def _columns(each: Board) -> list[dict[str, Any]]:
-    def column(key: str, title: str, first: str, hint: str, *, text: bool = False) -> dict[str, Any]:
-        return {"key": key, "title": title, "first": first, "hint": hint, "text": text}
+    track, parts = each.track, each.lines[0].parts
+    telling = {"method", "uses", "rank", track.primary.key, "flip", *track.beside, "assumes"}
+    telling |= {f"part_{name}" for name in parts}
+    if not parts:  # a page of 1280 pixels has no room for all of them
+        telling |= {*track.of_kind("median")[:BRIEF], "covers_95", "log_score", "log_rank"}
 
-    parts, part, primary = each.lines[0].parts, each.track.parting, each.track.primary.title
+    def column(key: str, title: str, first: str, hint: str, *, text: bool = False) -> dict[str, Any]:
+        """``more``: whether it is hidden until all columns are requested."""
+        more = key not in telling
+        return {"key": key, "title": title, "first": first, "hint": hint, "text": text, "more": more}
+
+    part, primary = track.parting, track.primary.title
     scores = sorted(each.track.scores, key=lambda score: score.kind == "median")  # in the order of the cells
     stated = [
         column("nees_ratio", "NEES", "up", "squared error by the stated covariance: 1 where that is right"),
@@ -700,25 +708,28 @@ def _log_scored(each: Board) -> bool:
 
 def _row(each: Board, line: Standing) -> dict[str, Any]:
     header, rank, primary = line.scored.header, line.rank, line.track.primary.key
+    position, of, peers = line.rank_words.partition(" of ")
     cells: list[dict[str, Any]] = [
-        {"value": "" if rank is None else rank.place, "text": line.rank_words, "bar": None}
+        {"value": "" if rank is None else rank.place, "text": position, "among": of + peers, "bar": None}
     ]
     for key, triple in line.means.items():
         drawn = bar(*triple) if key == primary else None
-        cells.append({"value": _value(triple[0]), "text": format_interval(*triple), "bar": drawn})
+        text = {"text": format_interval(*triple)} if key == primary else _apart(triple)
+        cells.append({"value": _value(triple[0]), **text, "bar": drawn})
     cells += [{"value": _value(value), "text": _number(value), "bar": None} for value in line.medians.values()]
     if _stated(each):
         for triple in named_numbers(line.calibration, _log_scored(each)).values():
-            text = "–" if np.isnan(triple[0]) else format_interval(*triple)
-            cells.append({"value": _value(triple[0]), "text": text, "bar": None})
+            text = {"text": "–"} if np.isnan(triple[0]) else _apart(triple)
+            cells.append({"value": _value(triple[0]), **text, "bar": None})
         if _log_scored(each):
             place = "" if line.log_rank is None else line.log_rank.place
             cells.append({"value": place, "text": line.stated_words.get("log rank", "–"), "bar": None})
     for triple in line.parts.values():
-        cells.append({"value": _value(triple[0]), "text": format_interval(*triple), "bar": None})
+        cells.append({"value": _value(triple[0]), **_apart(triple), "bar": None})
     return {
         "method": header.method,
         "uses": line.uses.replace(" + ", " "),
+        "among": peers,
         "oracle": rank is None,
         "handed_in": line.scored.handed_in,
         "doubt": line.scored.doubt,
@@ -726,6 +737,12 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
         "cells": cells,
         "words": [*([line.assumes] if line.parts else []), ", ".join(line.ties), header.tuned_on],
     }
+
+
+def _apart(triple: tuple[float, float, float]) -> dict[str, str]:
+    """The text of a number, and of its interval, which is shown with all columns."""
+    number, space, interval = format_interval(*triple).partition(" ")
+    return {"text": number, "interval": space + interval}
 
 
 def _value(value: float) -> str:

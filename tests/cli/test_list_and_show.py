@@ -165,9 +165,11 @@ def test_examples_work_away_from_the_repository(command: str) -> None:
         assert words[1] in commands(), example
         for option, word in itertools.pairwise(words):
             assert word.split("/")[0] not in folders or "/" not in word or word.startswith("results/"), example
-            if (kind := options.get(option)) is not None and not word.endswith(".toml"):
+            if (kind := options.get(option)) is not None and not word.endswith((".toml", ".py")):
                 assert word in names_of(kind), example
-        if words[1] in ("generate", "simulate", "show", "check-solver") and not words[2].endswith(".toml"):
+        if words[1] in ("generate", "simulate", "show", "check-solver") and not words[2].endswith(
+            (".toml", ".py")
+        ):
             assert words[2] in known, example
 
 

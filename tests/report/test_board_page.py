@@ -252,7 +252,8 @@ def test_the_keyboard_is_enough(page: Browser) -> None:
             break
         assert told[2] != "none", told
         reached.append(told[1])
-    links = page.run("document.querySelectorAll('a, button, input, [tabindex]').length")
+    every = "[...document.querySelectorAll('a, button, input, [tabindex]')]"
+    links = page.run(f"{every}.filter((each) => each.checkVisibility()).length")
     assert len(reached) >= links - 1  # the end of the page may be the browser's own
     page.run("document.querySelector('th[data-key=auc_5] button').focus()")
     page.press("Enter", text="\r")
@@ -274,6 +275,39 @@ def test_a_phone_scrolls_no_page_sideways(site: Path, page: Browser) -> None:
         assert wide[0] <= wide[1] == 375, path.name
         rows = page.run("[...document.querySelectorAll('tbody tr')].map((row) => row.clientHeight)")
         assert max(rows) < 60, (path.name, "names stand in a column of letters")
+
+
+COLUMNS = "[...document.querySelectorAll('thead th')].filter((h) => !h.hidden).map((h) => h.dataset.key)"
+
+
+def test_the_first_columns_fit_a_screen_and_all_are_one_click_away(page: Browser) -> None:
+    telling = ["method", "rank", "auc_5", "flip", "failure", "e_R_deg", "e_T_deg"]
+    telling += ["covers_95", "log_score", "log_rank"]
+    assert page.run(COLUMNS) == telling
+    for width in (1280, 768):
+        page.appear(width=width)
+        room = page.run(
+            "(({scrollWidth, clientWidth}) => [scrollWidth, clientWidth])(document.querySelector('.wide'))"
+        )
+        assert width < 1000 or room[0] <= room[1]
+        assert max(page.run("[...document.querySelectorAll('tr.entry')].map((row) => row.clientHeight)")) < 30
+    page.appear(width=390)
+    edge = page.run("document.querySelector('tr.entry td[data-value] + td').getBoundingClientRect().right")
+    assert edge <= 390  # name, rank and score
+    _click(page, "input.all")
+    assert page.run("location.hash") == f"#{ID}?columns=all"
+    assert set(telling) < {*page.run(COLUMNS)} and {"uses", "auc_1", "ties"} < {*page.run(COLUMNS)}
+
+
+def test_ranks_stand_below_what_their_group_uses(page: Browser) -> None:
+    """A rank counts among those that use no more; by another column all are sorted together, with their uses."""
+    shown = "[...document.querySelectorAll('tbody tr')].filter((r) => !r.hidden).map((r) => r.textContent.trim())"
+    _click(page, "th[data-key=rank] button")
+    heads = [row for row in page.run(shown) if row.startswith("uses")]
+    assert heads == ["uses left, ranked among 2", "uses left + readout, ranked among 3", "uses truth"]
+    assert page.run(SEEN) == ["best_one", "weak", "middle", "truth"] and "uses" not in page.run(COLUMNS)
+    _click(page, "th[data-key=auc_5] button")
+    assert not any(row.startswith("uses") for row in page.run(shown)) and "uses" in page.run(COLUMNS)
 
 
 AXE = find_spec("axe_core_python")

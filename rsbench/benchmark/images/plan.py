@@ -15,7 +15,7 @@ from rsbench.benchmark.images.store import Artefact, identity_of, records_below
 from rsbench.benchmark.metric_plugins import MetricEntry, load_metrics
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.components.cards import choices, list_cards
-from rsbench.components.plugins import Entry, Kind
+from rsbench.components.plugins import Entry, Kind, is_path
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.frame_depth import CorrectionOptions
@@ -315,7 +315,7 @@ def _recipe(chain: CorrectionOptions, record: Mapping[str, Any]) -> Recipe:
 
 def _named(load: Callable[[str], Component], source: str) -> Component:
     """The component that a record names. Cards run code and records are untrusted, so paths are refused."""
-    if not isinstance(source, str) or source.endswith(".toml") or "/" in source or os.sep in source:
+    if not isinstance(source, str) or is_path(source):
         raise RsbenchError(f"{source!r}: a card that this command does not name")
     return load(source)
 

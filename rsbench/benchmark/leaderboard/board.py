@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import json
 import lzma
 import os
 import tempfile
@@ -37,7 +38,7 @@ from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.process_jobs import Workers
 from rsbench.storage.files import read_table, write_bytes, write_json, write_table
-from rsbench.storage.untrusted_files import NAME, read_bytes, read_json
+from rsbench.storage.untrusted_files import NAME, parse_json, read_bytes, read_json
 from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
@@ -526,8 +527,14 @@ def store(board: Path, protocol: str, split: str, out: Path) -> list[Path]:
     return files
 
 
-def restore(stored: Path, split: Split, board: Path) -> list[Scored]:
+def restore(
+    stored: Path, split: Split, board: Path, part: Split | None = None, step: Step = lambda word: None
+) -> list[Scored]:
     """Entries of a board from what ``store`` wrote of this split, scored by the code of today.
+
+    Args:
+        part: the same split with fewer problems: the entries are then of these alone.
+        step: called with the name of each file.
 
     Raises:
         RsbenchError: there is nothing, or a file is damaged or of another split.
@@ -539,11 +546,22 @@ def restore(stored: Path, split: Split, board: Path) -> list[Scored]:
     with tempfile.TemporaryDirectory() as folder:
         for file in files:
             data, path = _unpacked(file), Path(folder) / file.name.removesuffix(SUFFIX) / FILES[0]
+            step(path.parent.name)
             path.parent.mkdir()
-            write_bytes(path, data)
-            made[ORACLES if ORACLE in read_submission(path, split).header.uses else RUN].append(path)
-        found = [add_all(board, paths, split, {"command": command}) for command, paths in made.items()]
+            write_bytes(path, data if part is None else _only(data, split, part, str(file)))
+            header = read_submission(path, part or split).header
+            made[ORACLES if ORACLE in header.uses else RUN].append(path)
+        found = [add_all(board, paths, part or split, {"command": command}) for command, paths in made.items()]
     return [each for entries in found for each in entries]
+
+
+def _only(data: bytes, split: Split, part: Split, where: str) -> bytes:
+    """Predictions of a split, of those problems alone that a part of it has."""
+    header, *answers = (parse_json(line, where) for line in data.decode().splitlines())
+    if header.get("split") == split.name:
+        header["split"] = part.name
+    kept = [header, *(answer for answer in answers if answer.get("name") in part.by_name)]
+    return "".join(f"{json.dumps(line)}\n" for line in kept).encode()
 
 
 def _unpacked(file: Path) -> bytes:

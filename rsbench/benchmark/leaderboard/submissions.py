@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -92,6 +93,18 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
     if hints:
         notes = [*_notes(submission, split, path), *notes]
     return Findings(submission=submission, faults=(), notes=tuple(notes))
+
+
+def failure_reasons(path: Path) -> str:
+    """How many answers of a file are failures and why, the most frequent reasons first; empty where none is."""
+    answers = [parse_json(text, f"{path}:{number}") for number, text in _lines(path)][1:]
+    reasons = Counter(str(each.get("reason", "")) for each in answers if each.get("success") is False)
+    if not reasons:
+        return ""
+    words = [f"{count} x {reason}" for reason, count in reasons.most_common(_NAMED)]
+    return (
+        f"{reasons.total()} of {len(answers)} failed: {'; '.join(words)}{'; ...' if len(reasons) > _NAMED else ''}"
+    )
 
 
 def protocol_of(path: Path) -> tuple[str, str]:

@@ -5,26 +5,29 @@ A solver is a final, frozen dataclass below ``Solver``; its fields are the param
 its ``spec`` declares what it needs and what it gives. A solver has no name: its card or entry point has
 (``SolverEntry``, see ``rsbench.components.plugins``). A solver that finds nothing returns a ``MotionEstimate``
 without success and with the reason: failure is never an exception and never an identity motion.
+
+The decorator ``solver`` makes such a class of a function that returns w and d.
 """
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Literal, get_args
+from types import FunctionType, MappingProxyType
+from typing import Any, ClassVar, Literal, TypeVar, get_args, overload
 
 import numpy as np
 
 from rsbench.components import plugins
 from rsbench.components.motion_models import check_parameters
-from rsbench.components.plugins import Entry, Kind
+from rsbench.components.plugins import MARK, Entry, Kind
 from rsbench.core import arguments
 from rsbench.core.arguments import name_or_path as name_or_path_of
 from rsbench.core.arguments import real_array, shown
-from rsbench.core.correspondences import Correspondences
+from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import UNALIGNED
 from rsbench.core.rig import StereoRig
@@ -258,6 +261,169 @@ class Solver(ABC):
         return None
 
 
+class _FunctionSolver(Solver):
+    """Calls a function, see ``solver``."""
+
+    function: ClassVar[Callable[..., Any]]
+
+    def estimate(
+        self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
+    ) -> MotionEstimate:
+        given, spec = correspondences, self.spec
+        if not spec.needs & {"tracks", "stereo", "affine"}:  # the rows of the last two belong to those of left
+            pairs = {side: temporal_pairs(given, side) for side in ("left", "right")}
+            none = {name: getattr(given, name)[:0] for name in ("tracks", "covariance", "affine")}
+            given = replace(given, **pairs, **none)
+        counts = {name: len(getattr(given, "stereo_0" if name == "stereo" else name)) for name in spec.minimum}
+        if short := spec.shortage(counts):
+            return short
+        parameters = {each.name: getattr(self, each.name) for each in fields(self)}  # pyrefly: ignore[bad-argument-type]
+        try:
+            found = type(self).function(given, rig, shutter, **parameters)
+        except np.linalg.LinAlgError as error:  # degenerate matches
+            return MotionEstimate.failed(f"LinAlgError: {error}")
+        return self._estimate_of(found)
+
+    def _estimate_of(self, found: object) -> MotionEstimate:
+        """Raises ValueError for what is no motion, a mistake in the function."""
+        if isinstance(found, MotionEstimate):
+            return found
+        if found is None:
+            return MotionEstimate.failed("it found no motion")
+        name = type(self).function.__name__
+        if not isinstance(found, Sequence) or len(found) != 2:
+            raise ValueError(f"{name} must return w and d, or None; it returned {shown(found)}")
+        motion = {"w": real_array("w", found[0]), "d": real_array("d", found[1])}
+        for key, value in motion.items():
+            if value.size != 3:
+                hint = "; of a matrix R: scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()"
+                raise ValueError(
+                    f"{name} returned {key} of shape {value.shape}: must be 3 numbers"
+                    f"{hint if key == 'w' and value.size == 9 else ''}"
+                )
+        if not all(np.all(np.isfinite(value)) for value in motion.values()):
+            return MotionEstimate.failed("w or d is not finite")
+        reason = "" if self.spec.metric else "length of d unknown"
+        w, d = (value.ravel() for value in motion.values())
+        return MotionEstimate(w=w, d=d, success=True, metric=self.spec.metric, reason=reason)
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@overload
+def solver(
+    function: F,
+    /,
+    *,
+    needs: MatchSet | Iterable[MatchSet] = ...,
+    minimum: int | Mapping[MatchSet, int] = ...,
+    metric: bool = ...,
+    motion_model: str = ...,
+    shutter: Literal["rolling", "global"] = ...,
+    reference_point: Literal["body", "left"] = ...,
+    cameras: Cameras = ...,
+    reference: str = ...,
+) -> F: ...
+@overload
+def solver(
+    function: None = None,
+    /,
+    *,
+    needs: MatchSet | Iterable[MatchSet] = ...,
+    minimum: int | Mapping[MatchSet, int] = ...,
+    metric: bool = ...,
+    motion_model: str = ...,
+    shutter: Literal["rolling", "global"] = ...,
+    reference_point: Literal["body", "left"] = ...,
+    cameras: Cameras = ...,
+    reference: str = ...,
+) -> Callable[[F], F]: ...
+def solver(
+    function: Any = None,
+    /,
+    *,
+    needs: MatchSet | Iterable[MatchSet] = ("left", "right"),
+    minimum: int | Mapping[MatchSet, int] = 9,
+    metric: bool = False,
+    motion_model: str = "linear",
+    shutter: Literal["rolling", "global"] = "rolling",
+    reference_point: Literal["body", "left"] = "body",
+    cameras: Cameras = "ideal",
+    reference: str = "",
+) -> Any:
+    """Make a solver of a function ``(correspondences, rig, shutter)`` that returns w and d, or None.
+
+    It decorates the function, or is called with it, and leaves it as it is. Then ``FILE.py`` is a solver for
+    all commands, and the function one for ``estimate_motion``. Further parameters of the function have defaults; a
+    card may set them. Unless it needs tracks, links or affine frames, points tracked through all images are in
+    ``.left`` and ``.right`` like the others, and there are no ``.tracks``.
+
+    A failure is None, a number that is not finite, or a ``numpy.linalg.LinAlgError``. The function may return a
+    ``MotionEstimate`` too, such as one with a covariance.
+
+    Args:
+        function: ``w`` (3,) rotation vector, rad, ``d`` (3,) translation of the reference point, both of one frame
+            period: ``X_body = exp([w]x) X_world + d``.
+        needs: the sets of matches that it uses.
+        minimum: fewest matches of each, or of each set by its name; RANSAC draws samples of this size. A number
+            is not for the samples of sensors, of which two are needed.
+        metric: whether d is in metres.
+        motion_model, shutter, reference_point, cameras, reference: see ``SolverSpec``.
+
+    Raises:
+        ValueError: no function of three arguments, or an option out of its range.
+    """
+    options: dict[str, Any] = {
+        "metric": metric,
+        "motion_model": motion_model,
+        "shutter": shutter,
+        "reference_point": reference_point,
+        "cameras": cameras,
+        "assumes": "nothing else is stated",
+    }
+    sets: frozenset[Any] = frozenset([needs] if isinstance(needs, str) else needs)
+    least = {each: 2 if each in SENSORS else minimum for each in sets} if isinstance(minimum, int) else minimum
+
+    def mark(function: F) -> F:
+        if not isinstance(function, FunctionType):
+            raise ValueError(f"solver: must decorate a function, got {shown(function)}")
+        name, signature = function.__name__, inspect.signature(function)
+        try:
+            signature.bind(None, None, None)
+        except TypeError as error:
+            raise ValueError(
+                f"{name}{signature}: a solver has the arguments correspondences, rig and shutter, "
+                f"and defaults for all others ({error})"
+            ) from error
+        doc = inspect.getdoc(function) or ""
+        words = reference or " ".join(doc.partition("\n\n")[0].split()) or f"the function {name}"
+        spec = SolverSpec(needs=sets, minimum=least, reference=words, **options)
+        empty = inspect.Parameter.empty
+        own = [
+            (each.name, type(each.default) if each.annotation is empty else each.annotation, each.default)
+            for each in list(signature.parameters.values())[3:]
+            if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+        ]
+        for key, _, _ in own:
+            if hasattr(_FunctionSolver, key):
+                raise ValueError(f"{name}{signature}: rename the parameter {key!r}, which solvers have already")
+        cls = make_dataclass(
+            name,
+            own,
+            bases=(_FunctionSolver,),
+            frozen=True,
+            kw_only=True,
+            namespace={"__doc__": doc, "spec": spec},
+        )
+        cls.function = staticmethod(function)
+        cls.__module__, cls.__qualname__ = function.__module__, f"{function.__qualname__}.{MARK}"
+        setattr(function, MARK, cls)
+        return function
+
+    return mark if function is None else mark(function)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
     """Keys of a solver's card beside its parameters."""
@@ -290,6 +456,7 @@ SOLVERS: Kind[Solver, SolverOptions] = Kind(
     base=Solver,
     options=SolverOptions,
     check=_check_spec,
+    mark="@rsbench.solver",
 )
 
 
@@ -308,10 +475,10 @@ def list_solvers() -> list[str]:
 
 
 def load_solver(name_or_path: str | Path) -> Solver:
-    """A solver by the name of a card or entry point, or by the path of a card.
+    """A solver by the name of a card or entry point, by the path of a card, or by ``FILE.py[:NAME]``.
 
     Raises:
-        RsbenchError: no such solver, two of that name, or its card or class is wrong.
+        RsbenchError: no such solver, two of that name, or its card, file or class is wrong.
     """
     return load_solver_entry(name_or_path_of("name_or_path", name_or_path)).solver
 
@@ -329,7 +496,7 @@ def load_solver_entries(names_or_paths: Sequence[str]) -> list[SolverEntry]:
         if entry.name in entries:
             raise RsbenchError(
                 f"solver {text!r} and solver {given[entry.name]!r} are both named {entry.name!r}: "
-                "leave one out, or rename its card"
+                "leave one out, or rename its card or file"
             )
         entries[entry.name], given[entry.name] = entry, text
     return list(entries.values())
@@ -340,16 +507,19 @@ def load_solver_entry(name_or_path: str | Path) -> SolverEntry:
     return SolverEntry(**vars(plugins.load_entry(SOLVERS, name_or_path)))
 
 
-def entry_of(solver: str | Path | Solver) -> SolverEntry:
-    """The entry of a solver by its name, the path of its card, or itself, which its class then names.
+def entry_of(solver: str | Path | Solver | Callable[..., Any]) -> SolverEntry:
+    """The entry of a solver by its name, the path of its card or file, or itself, which its class then names.
 
     Raises:
         ValueError: it is none of them.
     """
     if isinstance(solver, str | Path):
         return load_solver_entry(solver)
+    if isinstance(cls := plugins.class_of(solver), type) and issubclass(cls, Solver):
+        solver = cls()
     if not isinstance(solver, Solver):
         raise ValueError(
-            f"solver: must be a name, the path of a card or an rsbench.Solver, got {arguments.shown(solver)}"
+            "solver: must be a name, the path of a card or file, an rsbench.Solver or a function below "
+            f"@rsbench.solver, got {arguments.shown(solver)}"
         )
     return SolverEntry(**vars(plugins.wrap(SOLVERS, solver)))

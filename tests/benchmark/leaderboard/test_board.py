@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from commands import assert_refused, run_here
+from commands import assert_refused, refused, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from leaderboards import (
@@ -34,13 +34,18 @@ from leaderboards import (
 )
 
 from rsbench.benchmark.leaderboard import running
-from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore, splits_of
+from rsbench.benchmark.leaderboard.board import ORACLES, add, entries_of, merge, rescore, restore, splits_of, store
 from rsbench.benchmark.leaderboard.inputs import write_inputs
 from rsbench.benchmark.leaderboard.motion_tracks import AUC_DEG, motion_row, uses_of
 from rsbench.benchmark.leaderboard.running import run_cards
 from rsbench.benchmark.leaderboard.splits import simulated_problem
 from rsbench.benchmark.leaderboard.standings import standings, table
-from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_template
+from rsbench.benchmark.leaderboard.submissions import (
+    check_submission,
+    failure_reasons,
+    read_submission,
+    write_template,
+)
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Limits, Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.cards import parse_card
@@ -563,3 +568,24 @@ def test_answers_of_solve_may_be_handed_in(tmp_path: Path) -> None:
     extra = {"solver": "x", "d_unit": "m", "d_body": None, "inliers": 9, "matches": 10, "stereo_alone": 0}
     path = write(tmp_path / "mine.jsonl", [HEAD, *({**line, **extra} for line in TRUTH[1:])])
     assert check_submission(path, SPLIT).faults == ()
+
+
+def test_stored_predictions_are_scored_on_a_part_of_their_split(tmp_path: Path) -> None:
+    part, stored = replace(SPLIT, truths=SPLIT.truths[:5]), tmp_path / "stored"
+    add(tmp_path / "board", write(tmp_path / "x.jsonl", named(_noisy(0.01), "mine")), SPLIT, {})
+    store(tmp_path / "board", SPLIT.track.id, SPLIT.name, stored)
+    (whole,) = restore(stored, SPLIT, tmp_path / "whole")
+    (first,) = restore(stored, SPLIT, tmp_path / "part", part)
+    assert first.header.split == part.name != SPLIT.name
+    pd.testing.assert_frame_equal(first.scores, whole.scores[:5])
+    with refused("split"):
+        restore(stored, replace(SPLIT, truths=SPLIT.truths[:7]), tmp_path / "other", part)
+
+
+def test_a_run_tells_why_problems_failed(tmp_path: Path) -> None:
+    lines = named(
+        [TRUTH[0], *({"name": each["name"], "success": False, "reason": "dark"} for each in TRUTH[1:3])], "x"
+    )
+    path = write(tmp_path / "x.jsonl", [*lines, *TRUTH[3:]])
+    assert failure_reasons(path) == f"2 of {len(TRUTH) - 1} failed: 2 x dark"
+    assert failure_reasons(write(tmp_path / "y.jsonl", TRUTH)) == ""
