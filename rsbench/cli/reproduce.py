@@ -80,7 +80,7 @@ class Target(StrEnum):
     image_claims = "image-claims", _Recipe("reproduce_simulated:image_claims", 1, folders=("claims",))
     readings = "readings", _Recipe("reproduce_simulated:readings", 8)
     sweeps = "sweeps", _Recipe("reproduce_simulated:sweeps", 9)
-    fig4 = "fig4", _Recipe("reproduce_correction:fig4", 9, ("paper", "moderate", "aggressive"))
+    fig4 = "fig4", _Recipe("reproduce_correction:fig4", 2, ("paper", "moderate", "aggressive"))
     fig4_literal = "fig4-literal", _Recipe("reproduce_correction:fig4_literal", 1, ("paper",), ("fig4",))
     correction = (
         "correction",
