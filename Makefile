@@ -33,7 +33,7 @@ help:
 	@sed -n 's/^# \(make [a-z-]* \)/\1/p' $(firstword $(MAKEFILE_LIST))
 
 demo: $(STAMP)
-	@$(BIN)/rsbench demo
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/rsbench demo
 
 # Types are checked while kernels are compiled and the first tests run, in two processes, the longest tests first.
 # Bytecode is kept whatever the environment says, since each process that a test starts would compile it again.
@@ -78,6 +78,7 @@ here:
 	@if [ -x $(BIN)/python ]; then $(BIN)/python -I -c '$(OURS)'; fi
 
 # What users need; a killed `python -m venv` leaves a venv without a working pip: it is made again.
+# Without bytecode, which Python makes of what a command imports: of everything it takes 150 MB and ten seconds.
 $(STAMP): constraints.txt pyproject.toml | here
 	@if ! $(PIP) --version >/dev/null 2>&1; then \
 	  for python in $(CANDIDATES); do \
@@ -90,7 +91,7 @@ $(STAMP): constraints.txt pyproject.toml | here
 	  "$$found" -m venv --clear $(VENV); \
 	fi
 	@echo "Installing the locked dependencies into $(VENV) (a minute or two the first time)"
-	@$(PIP) install --quiet --require-hashes -r constraints.txt
+	@$(PIP) install --quiet --no-compile --require-hashes -r constraints.txt
 	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 

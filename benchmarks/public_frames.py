@@ -57,10 +57,10 @@ from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.interop.readers.calibration_parts import Assumptions, resized
 from rsbench.interop.readers.calibrations import read_calibration
-from rsbench.pipeline.footage import FrameSource, RigCard, read_frame
+from rsbench.pipeline.footage import FrameSource, OneCameraCard, RigCard, read_frame
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.mono_camera import OneCameraCard, find_camera_alone
+from rsbench.pipeline.mono_camera import find_camera_alone
 from rsbench.pipeline.mono_correction import find_own_motion
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint

@@ -32,7 +32,8 @@ from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.mono_camera import OneCameraCard, find_camera_alone, find_shutter
+from rsbench.pipeline.footage import OneCameraCard
+from rsbench.pipeline.mono_camera import find_camera_alone, find_shutter
 from rsbench.pipeline.mono_sequence import correct_frames
 from rsbench.solvers.engine.robust_motion import RobustOptions
 

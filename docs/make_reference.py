@@ -267,8 +267,7 @@ def card_classes() -> dict[str, list[tuple[str, type]]]:
     from rsbench.components.plugins import CardContent
     from rsbench.components.rig_tables import RigTables
     from rsbench.dataset.card import DatasetCard
-    from rsbench.pipeline.footage import RigCard
-    from rsbench.pipeline.mono_camera import OneCameraCard
+    from rsbench.pipeline.footage import OneCameraCard, RigCard
     from rsbench.renderers.options import RendererOptions
     from rsbench.scenes.load import SceneCard
 

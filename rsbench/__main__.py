@@ -6,11 +6,14 @@ import os
 import signal
 import sys
 
+_LOADED_OBJECTS = 250_000
+"""More than the largest command has loaded."""
+
 
 def main() -> None:
     """Run the command line; a signal while it is loaded ends the process in one line, or without one."""
     _open_streams()
-    gc.set_threshold(10_000, 20, 10)  # loading makes many objects and no garbage: looking for it takes a tenth
+    _collect_late()
     heard = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN]
     for number in heard:
         signal.signal(number, signal.SIG_DFL)
@@ -26,12 +29,25 @@ def main() -> None:
     try:
         run()
     except SystemExit as end:
+        gc.freeze()  # Python's end looks for garbage among all objects several times: a tenth of a short command
         if end.code not in [128 + number for number in heard] and not _waits_for_components():
             raise
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(int(end.code or 0))  # all is closed but Python, which takes a second for its modules
+
+
+def _collect_late() -> None:
+    """Loading makes many objects and no garbage: look for it first when a command has made more than it loads."""
+
+    def loaded(phase: str, _: dict[str, int]) -> None:
+        if phase == "stop":
+            gc.callbacks.remove(loaded)
+            gc.set_threshold(10_000, 20, 10)
+
+    gc.set_threshold(_LOADED_OBJECTS)
+    gc.callbacks.append(loaded)
 
 
 def _waits_for_components() -> bool:

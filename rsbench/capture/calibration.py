@@ -20,10 +20,6 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.dense_matcher import stereo_by_flow
-from rsbench.vision.feature_matcher import undistorted
-from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match
-from rsbench.vision.images import eight_bit
 
 TERMS = (
     "offset",
@@ -262,6 +258,12 @@ def check_rig(left: NDArray[np.generic], right: NDArray[np.generic], rig: Stereo
     Raises:
         RefusedFramesError: the sides are exchanged, lens distortion was not removed, or the rows do not agree.
     """
+    # Matches alone need none of these, and loading them takes a tenth of a solve.
+    from rsbench.vision.dense_matcher import stereo_by_flow
+    from rsbench.vision.feature_matcher import undistorted
+    from rsbench.vision.features import ROW_TOLERANCE_PX, Gate, MatchOptions, detect, match
+    from rsbench.vision.images import eight_bit
+
     options, reach = MatchOptions(), float(max(left.shape[:2]))
     eyes = [rig.eye(side) for side in SIDES]
     levels = list(zip(eight_bit([left, right]), eyes, strict=True))
@@ -287,6 +289,8 @@ def _within_images(stereo: FloatArray, eyes: Sequence[PinholeCamera | AlignedCam
 
 def _flow_agrees(stereo: FloatArray, rig: StereoRig) -> bool:
     """Whether dense-flow matches (n, 4) suffice to show a rectified pair in the right order."""
+    from rsbench.vision.features import ROW_TOLERANCE_PX
+
     if len(stereo) < _MANY_FLOW:
         return False
     pattern = row_pattern(stereo, rig) if rig.rectified else None

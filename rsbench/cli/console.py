@@ -114,20 +114,26 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
 @contextmanager
 def late_progress(label: str) -> Iterator[Callable[[str], None]]:
     """A counter of steps on stderr of a terminal, for work of more than two seconds; stdout is not used."""
-    # Without redirection, since a command's output would go to stderr with the bar.
-    progress = _progress(transient=True, redirect_stdout=False, redirect_stderr=False)
-    task = progress.add_task(label, total=None, word="")
-    start = time.monotonic()
+    start, steps, progress = time.monotonic(), 0, None
 
     def advance(word: str) -> None:
-        progress.update(task, advance=1, word=printable(word))
-        if not _quiet and progress.console.is_terminal and time.monotonic() - start > 2.0:
-            progress.start()
+        nonlocal steps, progress
+        steps += 1
+        if _quiet or time.monotonic() - start <= 2.0:
+            return
+        if progress is None:
+            # Without redirection, since a command's output would go to stderr with the bar.
+            progress = _progress(transient=True, redirect_stdout=False, redirect_stderr=False)
+            progress.add_task(label, total=None, word="")
+            progress.tasks[0].start_time = start
+            if progress.console.is_terminal:
+                progress.start()
+        progress.update(progress.task_ids[0], completed=steps, word=printable(word))
 
     try:
         yield advance
     finally:
-        if progress.live.is_started:
+        if progress is not None and progress.live.is_started:
             progress.stop()
 
 

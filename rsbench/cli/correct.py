@@ -148,9 +148,6 @@ def correct(
         given_camera,
         given_frames,
     )
-    from rsbench.cli.correct_run import correct_given, without_filling
-    from rsbench.pipeline.arrays import options_of
-    from rsbench.pipeline.mono_sequence import options_of_camera
 
     log = GyroscopeOptions(file=gyro, fps=fps, offset_s=gyro_offset)
     readout = ReadoutOptions(readout_ratio=readout_ratio, shutter=shutter, fps=fps)
@@ -165,11 +162,19 @@ def correct(
         # With inputs that only recent versions accept, the middle row, to whose time rows move least.
         row = target or ("middle" if given.words else "first")
         alone = given_camera(given, camera, fov, out, log, readout)
+
+        from rsbench.cli.correct_run import correct_given
+        from rsbench.pipeline.mono_sequence import options_of_camera
+
         correct_given(alone, row, options_of_camera(inpaint, seed, 0.0), inpaint is None)
         return
     if fov is not None:
         raise RsbenchError("--fov: has no effect with --rig, whose calibration gives focal lengths; leave it out")
     both = given_frames(given, rig, out, log, readout, row_poses, side_by_side)
+
+    from rsbench.cli.correct_run import correct_given, without_filling
+    from rsbench.pipeline.arrays import options_of
+
     others = {"find_sky": sky, "inpaint": bool(inpaint), "seed": seed, "one_time": rectify}
     options = options_of(solver, motion_model, matcher, features, corrector, **others)
     options = options if fill else replace(options, corrector=without_filling(options.corrector))

@@ -1,4 +1,7 @@
-"""The input of ``rsbench correct``: frames of a rig, its card, a gyroscope's log and the target row."""
+"""The input of ``rsbench correct``: frames of a rig, its card, a gyroscope's log and the target row.
+
+What a function alone needs is imported there, so that a wrong command line is refused at once.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,19 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rsbench.cli.console import echo
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
-from rsbench.dataset.corrected_frames import is_video, page_of_video, said_fps
-from rsbench.dataset.layout import picture_file
-from rsbench.dataset.sequence import Sequence, read_dataset_manifest, read_sequence
-from rsbench.interop.readers.gyro_log import read_gyro_log
-from rsbench.interop.readers.rig_files import Readout, read_camera_file, read_rig_file
-from rsbench.pipeline.footage import IMAGE_SUFFIXES, FrameSource, Part, RigCard, rig_card_of
-from rsbench.pipeline.mono_camera import OneCameraCard
-from rsbench.pipeline.mono_gyro import FARTHEST_S
-from rsbench.pipeline.sequence_capture import Gyroscope
+from rsbench.pipeline.footage import IMAGE_SUFFIXES, FrameSource, OneCameraCard, Part, RigCard, rig_card_of
 from rsbench.storage.files import check_out as can_be_written
+from rsbench.storage.videos import said_fps, written_as_video
+
+if TYPE_CHECKING:
+    from rsbench.dataset.sequence import Sequence
+    from rsbench.interop.readers.rig_files import Readout
+    from rsbench.pipeline.sequence_capture import Gyroscope
 
 _MOST = 1e9
 _SAME_RATE = 0.01
@@ -50,6 +52,10 @@ class GyroscopeOptions:
         fps, offset_s = self._fps(source, None if period is None else 1.0 / period), self.offset_s or 0.0
         if not abs(offset_s) < _MOST:
             raise RsbenchError(f"--gyro-offset {offset_s:g}: must lie within {_MOST:g} seconds")
+        from rsbench.interop.readers.gyro_log import read_gyro_log
+        from rsbench.pipeline.mono_gyro import FARTHEST_S
+        from rsbench.pipeline.sequence_capture import Gyroscope
+
         samples = read_gyro_log(self.file).samples(fps, offset_s)
         last = max(source.count, 2)
         if samples[-1, 0] <= 0.0 or samples[0, 0] >= last:
@@ -89,6 +95,8 @@ class ReadoutOptions:
         Raises:
             RsbenchError: options that exclude each other, or ``--fps`` that nothing needs.
         """
+        from rsbench.interop.readers.rig_files import Readout
+
         tables = path is None or path.suffix == ".toml"
         if tables and not gyro and self.fps is not None and self.shutter is None:
             raise RsbenchError("--fps: needs --gyro or --shutter; a .toml file says its own seconds")
@@ -238,7 +246,7 @@ def check_out(out: Path) -> None:
     Raises:
         RsbenchError: the ending of an image or of a video that is not written, or a file where a folder has to be.
     """
-    video = is_video(out)
+    video = written_as_video(out)
     if _is_image(out):
         raise RsbenchError(f"--out {out}: several frames are no image; give a folder, or a video (.mp4)")
     place = out.resolve().parent if video else out.resolve()
@@ -276,11 +284,13 @@ class CorrectInput:
     @property
     def video(self) -> bool:
         """Whether the result is a video."""
-        return is_video(self.out)
+        return written_as_video(self.out)
 
     @property
     def page(self) -> Path:
         """Where the page will be."""
+        from rsbench.dataset.corrected_frames import page_of_video
+
         return page_of_video(self.out) if self.video else self.out / "report.html"
 
     def sources(self) -> list[FrameSource]:
@@ -298,6 +308,8 @@ def given_camera(
     readout: ReadoutOptions,
 ) -> CorrectInput:
     """The frames of one camera; RsbenchError for options that do not go together."""
+    from rsbench.interop.readers.rig_files import read_camera_file
+
     files: list[Path] | Path = given.frames if given.frames is not None else given.left or Path()
     source = frame_source(files)
     stated = readout.beside(camera, gyro.file is not None, source.path)
@@ -351,6 +363,8 @@ def given_frames(
     for option, wanted in (("--row-poses", row_poses), ("--gyro", gyro.file is not None)):
         if wanted and frames:
             raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
+    from rsbench.interop.readers.rig_files import read_rig_file
+
     stated = readout.beside(rig, gyro.file is not None, left)
     card, notes = read_rig_file(rig, stated, size_of(frames or left or [], "left" if side_by_side else "whole"))
     say_notes("--rig", notes)
@@ -370,6 +384,8 @@ def given_frames(
 
 def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> CorrectInput:
     """The rolling-shutter frames of a sequence of a dataset."""
+    from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
+
     if not (folder / "sequence.json").is_file():
         names = read_dataset_manifest(folder).sequences
         if len(names) > 1:
@@ -384,6 +400,8 @@ def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: boo
 
 def sequence_files(sequence: Sequence) -> list[list[Path] | Path]:
     """The rolling-shutter frames of the left and the right camera of a rendered sequence."""
+    from rsbench.dataset.layout import picture_file
+
     frames = range(sequence.frames)
     return [[sequence.folder / picture_file("rs", side, frame) for frame in frames] for side in SIDES]
 

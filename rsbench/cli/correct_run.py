@@ -38,7 +38,7 @@ from rsbench.pipeline.chain import check_cameras, correct_four
 from rsbench.pipeline.footage import FORECAST, FrameSource, RigCard, read_four
 from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.isolated_components import Isolation
+from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope, know_capture, with_found_camera
 from rsbench.pipeline.sequence_correction import correct_sequence, takes_gyro
 from rsbench.report.corrected_page import (

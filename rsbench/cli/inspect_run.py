@@ -23,7 +23,7 @@ from rsbench.interop.readers.rig_files import read_rig_file
 from rsbench.pipeline.footage import FrameSource, check_alike
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.isolated_components import Isolation
+from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.problem import read_problems
 from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
 from rsbench.vision.feature_matcher import load_features

@@ -82,7 +82,7 @@ class Target(StrEnum):
     image_claims = "image-claims", _Recipe("reproduce_simulated:image_claims", 1, folders=("claims",))
     readings = "readings", _Recipe("reproduce_simulated:readings", 8)
     sweeps = "sweeps", _Recipe("reproduce_simulated:sweeps", 9)
-    fig4 = "fig4", _Recipe("reproduce_correction:fig4", 9, ("paper", "moderate", "aggressive"))
+    fig4 = "fig4", _Recipe("reproduce_correction:fig4", 2, ("paper", "moderate", "aggressive"))
     fig4_literal = "fig4-literal", _Recipe("reproduce_correction:fig4_literal", 1, ("paper",), ("fig4",))
     correction = (
         "correction",
@@ -155,7 +155,7 @@ def reproduce(
         for each in Target:
             of = _ORDER if each is Target.everything else (each,)
             needs = [_first(each, data)] if each is not Target.everything else []
-            echo(f"{each}: about {sum(one.recipe.minutes for one in of)} minutes on two cores{''.join(needs)}")
+            echo(f"{each}: {_about(sum(one.recipe.minutes for one in of))}{''.join(needs)}")
         return
     check_out(out)
     _make(_ORDER if target is Target.everything else (target,), out, data, workers, seeds, width)
@@ -181,8 +181,12 @@ def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
     """About how long the next target, and all of them, take by the pace of those that were made so far."""
     made = [pace for pace in paces if pace > _KEPT]
     minutes = [each.recipe.minutes * (statistics.median(made) if made else 1.0) for each in targets]
-    begin = f"about {minutes[0]:.0f} minutes on two cores"
+    begin = _about(minutes[0])
     return begin if len(targets) == 1 else f"{begin}; with what follows {sum(minutes) / 60.0:.1f} hours"
+
+
+def _about(minutes: float) -> str:
+    return f"about {minutes:.0f} minute{'' if round(minutes) == 1 else 's'} on two cores"
 
 
 def _first(target: Target, data: Path) -> str:

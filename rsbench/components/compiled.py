@@ -16,6 +16,7 @@ import contextlib
 import functools
 import hashlib
 import logging
+import os
 import platform
 import re
 import tempfile
@@ -170,8 +171,15 @@ _STOPWATCH = _Stopwatch()
 def source_version() -> str:
     """Hash of all sources of rsbench that hold compiled code."""
     package = Path(str(resources.files("rsbench")))
-    texts = {path: path.read_bytes() for path in sorted(package.rglob("*.py"))}
-    return hash_of_files(package, [path for path, text in texts.items() if any(mark in text for mark in _MARKS)])
+    # By text, not by ``Path``, since each command does this before it loads compiled code.
+    files = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names if name.endswith(".py"))
+    return hash_of_files(package, sorted(Path(file) for file in files if _holds_compiled_code(file)))
+
+
+def _holds_compiled_code(file: str) -> bool:
+    with open(file, "rb", buffering=0) as opened:
+        text = opened.read()
+    return any(mark in text for mark in _MARKS)
 
 
 @functools.cache

@@ -34,7 +34,7 @@ from rsbench.pipeline.frame_motion import FoundMotion
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import CONTRADICTED
 from rsbench.storage.files import read_depth, read_json, read_png, write_bytes, write_depth, write_json, write_png
-from rsbench.storage.videos import UPRIGHT, VideoFile, write_frames, written_as_video
+from rsbench.storage.videos import UPRIGHT, VideoFile, said_fps, write_frames, written_as_video
 from rsbench.storage.work_folder import (
     HIDDEN,
     WORK,
@@ -379,14 +379,9 @@ DEFAULT_FPS = 30.0
 """Frame rate, frames/s, of inputs that state none."""
 
 
-def is_video(out: Path) -> bool:
-    """Whether the ending of a name is that of a video that is written; RsbenchError of another video."""
-    return written_as_video(out)
-
-
 def refuse_video(out: Path) -> None:
     """Raise RsbenchError for a name that looks like a video where frames are no video."""
-    if is_video(out):
+    if written_as_video(out):
         raise RsbenchError(f"--out {out}: four images are no video; give a folder, or --left and --right")
 
 
@@ -481,8 +476,3 @@ def write_video(
 def fps_of(path: Path) -> float:
     """Frames per second of a video file; a default for a folder or where the file does not say."""
     return said_fps(path) or DEFAULT_FPS
-
-
-def said_fps(path: Path) -> float | None:
-    """Frames per second of a video file; None for a folder or where the file does not say."""
-    return VideoFile.open(path).rate if path.is_file() else None

@@ -169,7 +169,7 @@ def matched_frames(geometry: Geometry, first: int, images: Images, entry: Featur
     """
     from rsbench.pipeline.frame_capture import find_matches_of_rig
     from rsbench.pipeline.frame_depth import CorrectionOptions
-    from rsbench.pipeline.isolated_components import Isolation
+    from rsbench.pipeline.isolated_chain import Isolation
 
     levels = {(side, frame): images[side, first + frame] for side, frame in VIEWS}
     with Isolation() as isolation:

@@ -24,12 +24,11 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
-from rsbench.pipeline.footage import ImageSource
+from rsbench.pipeline.footage import ImageSource, OneCameraCard
 from rsbench.pipeline.frame_capture import find_matches
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import model_to_use
-from rsbench.pipeline.isolated_components import Isolation
-from rsbench.pipeline.mono_camera import OneCameraCard
+from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.mono_sequence import options_of_camera
 from rsbench.pipeline.sequence_capture import FEWEST_FRAMES, Gyroscope, know_capture, with_found_camera
 from rsbench.pipeline.sequence_correction import correct_sequence

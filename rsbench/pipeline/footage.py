@@ -1,4 +1,4 @@
-"""A user's own footage: the rig's card, and frames from files, folders and videos.
+"""A user's own footage: the card of its rig or camera, and frames from files, folders and videos.
 
 Frames are read as the sensor delivered them, and orientation tags are ignored: rotating an image would turn its
 rows, which a rolling shutter reads one after the other, into columns.
@@ -16,32 +16,35 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.capture.calibration import CardSigma, offset_error
-from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.cards import SHUTTER_KEY, card_path, parse_card, read_toml
 from rsbench.components.rig_tables import CameraTable, RightFromLeft, Size, rig_of_tables, tables_of, with_readouts
 from rsbench.core.arguments import LARGEST_M, LARGEST_SIZE, check_number, check_positive
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, StereoRig, View
-from rsbench.core.shutter import RollingShutter, Scanning, StatedShutter
+from rsbench.core.shutter import RollingShutter, Scan, Scanning, StatedShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.storage.untrusted_files import check_image_size, read_bytes
 from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, Times, VideoFile
 
+if TYPE_CHECKING:
+    from rsbench.capture.hypotheses import KnownInputs
+
 _SMALLEST = 32
 """Least length of the shorter side, pixels; smaller images have too little to match."""
 _LARGEST_OFFSET_PX = 10.0
+_WIDEST_DEG = 170.0
+DEFAULT_FOCAL = 1.0
+"""Focal length in widths of the image if none is given: a horizontal field of view of 53 degrees."""
 _LONGEST_S = 1e4
 """Longest frame period, seconds."""
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"}
-_READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
@@ -141,6 +144,8 @@ class RigCard(StatedShutter):
     @property
     def inputs(self) -> KnownInputs:
         """The values that the card gives to the estimation of a capture."""
+        from rsbench.capture.hypotheses import KnownInputs  # slow to load, for a card that may be refused
+
         errors = None if self.disparity_offset is None else offset_error(self.disparity_offset)
         return KnownInputs(readout_ratio=self.readout_ratio, scanning=self.scanning, calibration=errors)
 
@@ -184,6 +189,67 @@ class RigCard(StatedShutter):
         except ValueError as error:
             words = " and ".join(dict.fromkeys(f"{width} x {height}" for width, height in sizes))
             raise RsbenchError(f"--rig: for images of {words} pixels: {error}") from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneCameraCard:
+    """Calibration and shutter of a camera whose frames are corrected alone; its size comes from the images."""
+
+    SHORTHANDS: ClassVar = SHUTTER_KEY
+
+    readout_ratio: float | None = None
+    """Readout time divided by frame period, 0 to 1. Absent: estimated from the frames."""
+    frame_period_s: float | None = None
+    """Time between frames, seconds, if it is not that of the mode that ``shutter`` names. A video with another
+    frame rate is recognised."""
+    scan: Scan | None = None
+    """Side of the image at which the readout begins. Absent: estimated with the readout ratio, else ``top``."""
+    fov_deg: float | None = None
+    """Horizontal field of view, degrees, in place of ``camera``. Without both, the focal length is estimated from
+    the frames; if they do not determine it, the width of the image is used."""
+    camera: CameraCard | None = None
+    """Intrinsics."""
+
+    def __post_init__(self) -> None:
+        if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
+            raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1]")
+        if self.frame_period_s is not None and not self.frame_period_s > 0.0:
+            raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
+        if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
+            raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
+        if self.fov_deg is not None and self.camera is not None:
+            raise ValueError("fov_deg: leave it out, since [camera] gives the focal length")
+        if self.camera is not None and self.camera.sigma:
+            raise ValueError("camera.focal_sigma, k1_sigma: leave them out; neither is estimated for one camera")
+
+    @classmethod
+    def of(cls, camera: PinholeCamera | float | None, readout_ratio: float | None) -> OneCameraCard:
+        """The card for intrinsics, a field of view in degrees, or neither; RsbenchError if impossible."""
+        known: dict[str, Any] = {} if camera is None else {"fov_deg": camera}
+        if isinstance(camera, PinholeCamera):
+            c = camera
+            known = {"camera": CameraCard(fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)}
+        try:
+            return cls(readout_ratio=readout_ratio, **known)
+        except ValueError as error:
+            raise RsbenchError(str(error)) from error
+
+    @property
+    def focal_unknown(self) -> bool:
+        """Whether no focal length is given."""
+        return self.camera is None and self.fov_deg is None
+
+    def camera_of(self, width: int, height: int) -> PinholeCamera:
+        """The camera for images of this size, with ``DEFAULT_FOCAL`` if no focal length is given."""
+        if self.camera is not None:
+            try:
+                return self.camera.camera((width, height))
+            except ValueError as error:
+                raise RsbenchError(f"--camera: for images of {width} x {height} pixels: {error}") from error
+        if self.fov_deg is not None:
+            focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
+            return PinholeCamera.centred(width, height, focal)
+        return PinholeCamera.centred(width, height, DEFAULT_FOCAL * width)
 
 
 def _within(centre: float) -> int:
@@ -230,9 +296,12 @@ def read_frame(path: Path) -> NDArray[Any]:
     Raises:
         RsbenchError: the file is missing, not an image, too small, too large, or of another type.
     """
+    import cv2
+
     data = read_bytes(path)
     check_image_size(data, path)
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _READ)
+    how = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
     if pixels is None:
         raise RsbenchError(f"{path}: cannot be decoded as an image")
     return _checked(pixels, str(path))
@@ -240,6 +309,8 @@ def read_frame(path: Path) -> NDArray[Any]:
 
 def _checked(pixels: NDArray[Any], where: str) -> NDArray[Any]:
     """Check an image of OpenCV, BGR or grey, and convert it to RGB or grey."""
+    import cv2
+
     if pixels.dtype not in (np.uint8, np.uint16):
         raise RsbenchError(f"{where}: has {pixels.dtype} pixels; 8 and 16 bit are allowed")
     _checked_size(pixels, where)

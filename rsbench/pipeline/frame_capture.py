@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,14 +32,12 @@ from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.frame_depth import CorrectionOptions, Images
-from rsbench.pipeline.mono_gyro import Clock
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.refined import RefinedSolver
-from rsbench.vision.dense_matcher import forget_matches
-from rsbench.vision.feature_matcher import find_correspondences
-from rsbench.vision.features import ROW_TOLERANCE_PX
-from rsbench.vision.images import eight_bit
+
+if TYPE_CHECKING:  # what works on images is loaded where images are given, and not for matches alone
+    from rsbench.pipeline.frame_depth import CorrectionOptions, Images
+    from rsbench.pipeline.mono_gyro import Clock
 
 BACKWARDS = (
     "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to the "
@@ -97,6 +96,8 @@ def know_four(
         given = inputs if right.aligned else replace(inputs, calibration=inputs.calibration or NO_ERRORS)
         matches, capture = know_matches(matches, right, given, options, doubt)
         return matches, replace(capture, rig_found=found)
+
+    from rsbench.vision.dense_matcher import forget_matches
 
     forget_matches()
     check, found, doubt = matches is None, None, None
@@ -202,6 +203,9 @@ def find_matches(
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
     """
+    from rsbench.vision.feature_matcher import find_correspondences
+    from rsbench.vision.images import eight_bit
+
     levels = eight_bit([images[side, frame] for frame in (0, 1) for side in sides])
     names = [(side, frame) for frame in (0, 1) for side in SIDES]
     return find_correspondences(options.features, dict(zip(names, levels, strict=True)), rig)
@@ -386,6 +390,8 @@ def match_given(
 
 def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
     """The matches without tracks whose left and right points are on different rows."""
+    from rsbench.vision.features import ROW_TOLERANCE_PX
+
     tracks = without_lens(Correspondences(tracks=matches.tracks), rig).tracks
     off = np.maximum(np.abs(tracks[:, 1] - tracks[:, 3]), np.abs(tracks[:, 5] - tracks[:, 7]))
     near = off <= ROW_TOLERANCE_PX

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,11 +29,13 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.frame_capture import BACKWARDS, KnownCapture, compared_models
-from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
+
+if TYPE_CHECKING:
+    from rsbench.pipeline.frame_depth import CorrectionOptions
 
 
 def body_motion(estimate: MotionEstimate, spec: SolverSpec, rig: StereoRig) -> Motion | str:

@@ -1,12 +1,11 @@
-"""The card of a camera whose frames are corrected alone, and the estimate of what the card does not give."""
+"""The estimate of what the card of a camera whose frames are corrected alone does not give."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,81 +32,14 @@ from rsbench.capture.shutter_decision import (
     shutter_alone,
 )
 from rsbench.capture.two_frame_estimate import Capture, Window
-from rsbench.components.cards import SHUTTER_KEY
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.footage import CameraCard, check_alike
+from rsbench.pipeline.footage import OneCameraCard, check_alike
 from rsbench.pipeline.mono_correction import STILL, flow_matches, refusal, trajectory_matches
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
-
-DEFAULT_FOCAL = 1.0
-"""Focal length in widths of the image if none is given: a horizontal field of view of 53 degrees."""
-_WIDEST_DEG = 170.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class OneCameraCard:
-    """Calibration and shutter of a camera whose frames are corrected alone; its size comes from the images."""
-
-    SHORTHANDS: ClassVar = SHUTTER_KEY
-
-    readout_ratio: float | None = None
-    """Readout time divided by frame period, 0 to 1. Absent: estimated from the frames."""
-    frame_period_s: float | None = None
-    """Time between frames, seconds, if it is not that of the mode that ``shutter`` names. A video with another
-    frame rate is recognised."""
-    scan: Scan | None = None
-    """Side of the image at which the readout begins. Absent: estimated with the readout ratio, else ``top``."""
-    fov_deg: float | None = None
-    """Horizontal field of view, degrees, in place of ``camera``. Without both, the focal length is estimated from
-    the frames; if they do not determine it, the width of the image is used."""
-    camera: CameraCard | None = None
-    """Intrinsics."""
-
-    def __post_init__(self) -> None:
-        if self.readout_ratio is not None and not 0.0 <= self.readout_ratio <= 1.0:
-            raise ValueError(f"readout_ratio = {self.readout_ratio}: must lie in [0, 1]")
-        if self.frame_period_s is not None and not self.frame_period_s > 0.0:
-            raise ValueError(f"frame_period_s = {self.frame_period_s}: must be positive")
-        if self.fov_deg is not None and not 0.0 < self.fov_deg <= _WIDEST_DEG:
-            raise ValueError(f"fov_deg = {self.fov_deg}: must lie in (0, {_WIDEST_DEG:g}]")
-        if self.fov_deg is not None and self.camera is not None:
-            raise ValueError("fov_deg: leave it out, since [camera] gives the focal length")
-        if self.camera is not None and self.camera.sigma:
-            raise ValueError("camera.focal_sigma, k1_sigma: leave them out; neither is estimated for one camera")
-
-    @classmethod
-    def of(cls, camera: PinholeCamera | float | None, readout_ratio: float | None) -> OneCameraCard:
-        """The card for intrinsics, a field of view in degrees, or neither; RsbenchError if impossible."""
-        known: dict[str, Any] = {} if camera is None else {"fov_deg": camera}
-        if isinstance(camera, PinholeCamera):
-            c = camera
-            known = {"camera": CameraCard(fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, lens=c.lens)}
-        try:
-            return cls(readout_ratio=readout_ratio, **known)
-        except ValueError as error:
-            raise RsbenchError(str(error)) from error
-
-    @property
-    def focal_unknown(self) -> bool:
-        """Whether no focal length is given."""
-        return self.camera is None and self.fov_deg is None
-
-    def camera_of(self, width: int, height: int) -> PinholeCamera:
-        """The camera for images of this size, with ``DEFAULT_FOCAL`` if no focal length is given."""
-        if self.camera is not None:
-            try:
-                return self.camera.camera((width, height))
-            except ValueError as error:
-                raise RsbenchError(f"--camera: for images of {width} x {height} pixels: {error}") from error
-        if self.fov_deg is not None:
-            focal = 0.5 * width / math.tan(math.radians(0.5 * self.fov_deg))
-            return PinholeCamera.centred(width, height, focal)
-        return PinholeCamera.centred(width, height, DEFAULT_FOCAL * width)
-
 
 # The shutter of a video, from its camera's card or estimated from its frames.
 

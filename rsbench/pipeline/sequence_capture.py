@@ -29,7 +29,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.footage import FrameSource, Progress, RigCard, check_alike, no_progress
+from rsbench.pipeline.footage import FrameSource, OneCameraCard, Progress, RigCard, check_alike, no_progress
 from rsbench.pipeline.frame_capture import (
     KnownCapture,
     compared_models,
@@ -41,7 +41,7 @@ from rsbench.pipeline.frame_capture import (
 )
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, OneCameraCard, find_camera_alone, find_shutter
+from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, find_camera_alone, find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
 from rsbench.pipeline.mono_gyro import pair_rates, with_clock_corrected

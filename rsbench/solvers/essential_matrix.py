@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
-import cv2
 import numpy as np
 
 from rsbench.core import so3
@@ -141,6 +140,8 @@ class OpenCvFivePointSolver(Solver):
 
     def _motions(self, matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
         """Motions of every essential matrix that OpenCV returns: several for five matches, one for more."""
+        import cv2
+
         try:
             stacked, _ = cv2.findEssentialMat(
                 np.ascontiguousarray(matches[:, :2]),

@@ -18,7 +18,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -476,6 +475,8 @@ def planar_motions(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """
     if len(pairs) < 4:
         return []
+    import cv2
+
     x, y = np.ascontiguousarray(pairs[:, :2]), np.ascontiguousarray(pairs[:, 2:4])
     H, _ = cv2.findHomography(x, y, 0)
     if H is None or not np.all(np.isfinite(H)):

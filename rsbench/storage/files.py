@@ -23,7 +23,6 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -90,6 +89,8 @@ _PNG_HEAD = 33
 
 def write_png(path: Path, image: NDArray[np.uint8], orientation: int = 1) -> None:
     """8-bit image (H, W, 3) RGB or (H, W), with EXIF's number of how it is to be turned for a person."""
+    import cv2  # here and below: a solve reads files, and OpenCV is a fortieth of its time
+
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     ok, data = cv2.imencode(".png", pixels)
     if not ok:
@@ -112,6 +113,8 @@ def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint
     Raises:
         RsbenchError: missing, not an image or of another size.
     """
+    import cv2
+
     pixels = _decoded(path, size, cv2.IMREAD_COLOR)
     if pixels is None:
         raise RsbenchError(f"{path}: cannot be decoded as an image")
@@ -119,6 +122,8 @@ def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint
 
 
 def _decoded(path: Path, size: tuple[int, int] | None, mode: int) -> NDArray[Any] | None:
+    import cv2
+
     data = read_bytes(path)
     check_image_size(data, path, size)
     return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
@@ -126,6 +131,8 @@ def _decoded(path: Path, size: tuple[int, int] | None, mode: int) -> NDArray[Any
 
 def write_png16(path: Path, image: NDArray[np.uint16]) -> None:
     """16-bit image (H, W)."""
+    import cv2
+
     write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
 
 
@@ -135,6 +142,8 @@ def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal
     Raises:
         RsbenchError: missing, not such an image, or of another size.
     """
+    import cv2
+
     pixels = _decoded(path, size, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.dtype(f"uint{bits}") or pixels.ndim != 2:
         raise RsbenchError(f"{path}: must be a grey image of {bits} bits")

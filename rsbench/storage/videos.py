@@ -86,6 +86,11 @@ def written_as_video(out: Path) -> bool:
     return suffix in _CODECS
 
 
+def said_fps(path: Path) -> float | None:
+    """Frames per second of a video file; None for a folder or where the file does not say."""
+    return VideoFile.open(path).rate if path.is_file() else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Times:
     """The frames of a video by their time."""

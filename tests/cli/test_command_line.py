@@ -26,6 +26,33 @@ def test_help_loads_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize(
+    ("words", "heavy"),
+    [
+        (("correct", "nowhere.png"), ("numba", "cv2", "scipy.special", "pandas", "av", "mitsuba", "matplotlib")),
+        (
+            ("solve", str(EXAMPLE)),
+            ("cv2", "numba.np.arraymath", "scipy.stats", "pandas", "rich.progress", "av", "mitsuba"),
+        ),
+    ],
+)
+def test_a_command_loads_nothing_heavy_that_it_does_not_use(
+    words: tuple[str, ...], heavy: tuple[str, ...]
+) -> None:
+    run_here(*words)  # compiling loads more, and takes so long that progress is shown
+    code = f"""
+import sys
+from rsbench.cli.main import run
+sys.argv = ["rsbench", *{words!r}]
+try:
+    run()
+except SystemExit:
+    print("loaded:", [name for name in {heavy!r} if name in sys.modules])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "loaded: []"
+
+
 def test_unknown_card_is_refused_with_the_names_that_exist(tmp_path: Path) -> None:
     # In a process of its own: exit code and line are those of the program, not of a function.
     result = run_apart("generate", "papre", "--out", tmp_path / "x")

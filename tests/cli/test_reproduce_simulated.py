@@ -103,8 +103,8 @@ def test_everything_makes_each_folder_of_results_once(
     assert lines[0].startswith(f"[1 of {len(made)}] {made[0]}: about 3 minutes on two cores; with what follows 12")
     assert lines[::2][:-1] == [each for each in lines if each.startswith("[")]
     assert lines[-3].endswith(
-        "image-claims: about 1 minutes on two cores; judges what the other targets have written: make them first"
+        "image-claims: about 1 minute on two cores; judges what the other targets have written: make them first"
     )
     printed = [line.partition(":")[0] for line in lines if not line.startswith("[")]
     assert printed == [*made, "everything"]
-    assert command._left([Target.fig4, Target.sgm], [0.0, 2.0]).startswith("about 18 minutes")
+    assert command._left([Target.fig4, Target.sgm], [0.0, 2.0]).startswith("about 4 minutes")

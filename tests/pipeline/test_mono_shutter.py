@@ -12,7 +12,8 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_camera as mono_shutter
-from rsbench.pipeline.mono_camera import OneCameraCard, find_shutter
+from rsbench.pipeline.footage import OneCameraCard
+from rsbench.pipeline.mono_camera import find_shutter
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CAMERA = PinholeCamera.centred(640, 480, 500.0)

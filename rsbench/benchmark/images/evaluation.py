@@ -32,7 +32,8 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs
-from rsbench.pipeline.isolated_components import Caller, Isolation, SolverRunner, as_entry_failure
+from rsbench.pipeline.isolated_chain import Caller, Isolation
+from rsbench.pipeline.isolated_components import SolverRunner, as_entry_failure
 from rsbench.storage.files import HASHES, FileHashes, read_json, read_table, write_json, write_table
 from rsbench.storage.work_folder import work_folder
 

@@ -49,7 +49,7 @@ from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, run_jobs
 from rsbench.pipeline.chain import Given
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
-from rsbench.pipeline.isolated_components import Isolation
+from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.problem import Problem
 from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import read_bytes

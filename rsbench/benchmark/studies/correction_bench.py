@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -193,12 +194,28 @@ class Bench:
         self.matches = find_matches(self.images, self.options)
         self._seed = seed
         self.found = self._found("rs", self.options)
-        self.scaled = self._found("gs-scaled", self._own_law(_SCALED))
-        self.of_law = {law: self._found("rs", self._own_law(name)) for law, name in _OF_LAW.items()}
-        rng = generator(seed, "study", sequence.name, "gs")
-        self.gs_motion = global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
         self.sgm = frame_pairs(self.images, self.rig, self.options)
-        self.true = true_pairs(sequence, self.images)
+
+    @cached_property
+    def scaled(self) -> FoundMotion | None:
+        """The global-shutter motion of matches scaled to one frame period."""
+        return self._found("gs-scaled", self._own_law(_SCALED))
+
+    @cached_property
+    def of_law(self) -> dict[str, FoundMotion | None]:
+        """Motions by the motion model that is assumed."""
+        return {law: self._found("rs", self._own_law(name)) for law, name in _OF_LAW.items()}
+
+    @cached_property
+    def gs_motion(self) -> Motion | None:
+        """The global-shutter motion."""
+        rng = generator(self._seed, "study", self.sequence.name, "gs")
+        return global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
+
+    @cached_property
+    def true(self) -> Pairs:
+        """The frames with their true depth."""
+        return true_pairs(self.sequence, self.images)
 
     def _own_law(self, solver: str) -> CorrectionOptions:
         """Options with a solver that keeps its own motion model, whichever model fits the matches best."""

@@ -31,7 +31,7 @@ from rsbench.vision.correction import correct_frame
 from rsbench.vision.corrector import load_corrector
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.fusion import Fused, Origin
-from rsbench.vision.quality import psnr
+from rsbench.vision.quality import Picture, psnr, psnr_within
 from rsbench.vision.stereo_depth import depth_metrics
 from rsbench.vision.stereo_matcher import load_matcher
 
@@ -94,7 +94,8 @@ def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tupl
     uncorrected frame on the same pixels stands beside it. Where no motion is found, the scores are the worst.
     """
     images = {view: sequence.image("rs", *view) for view in VIEWS}
-    truths = {view: sequence.image("gs", *view) for view in VIEWS}
+    rolling = {view: Picture(image) for view, image in images.items()}
+    truths = {view: Picture(sequence.image("gs", *view)) for view in VIEWS}
     visible = visible_pixels(sequence, true_pairs(sequence, images), VIEWS)
     rig, shutter = sequence.rig, sequence.shutter
     matches = find_matches(images, literal_options(0))
@@ -116,9 +117,12 @@ def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tupl
                 "success": motion is not None,
                 "share_drawn": float(drawn.mean()),
             }
-            for name, part in (("drawn", drawn), ("visible", visible[view]), ("all", np.ones_like(drawn))):
-                row[f"psnr_rolling_{name}"] = psnr(images[view], truths[view], part)
-                row[f"psnr_{name}"] = WORST["psnr"] if motion is None else psnr(fused.image, truths[view], part)
+            parts = {"drawn": drawn, "visible": visible[view], "all": np.ones_like(drawn)}
+            shown = (rolling[view], fused.image)
+            before, after = (psnr_within(image, truths[view], [*parts.values()]) for image in shown)
+            for name, *values in zip(parts, before, after, strict=True):
+                row[f"psnr_rolling_{name}"] = values[0]
+                row[f"psnr_{name}"] = WORST["psnr"] if motion is None else values[1]
             rows.append(row)
         panels = _compare(sequence, seed, motion, frames[VIEW], pairs)
         yield rows, replace(panels, numbers={**panels.numbers, **LITERAL})

@@ -76,8 +76,7 @@ from rsbench.interop.readers.calibrations import (
     colmap_poses,
     kalibr_in_body,
 )
-from rsbench.pipeline.footage import read_frame
-from rsbench.pipeline.mono_camera import DEFAULT_FOCAL
+from rsbench.pipeline.footage import DEFAULT_FOCAL, read_frame
 from rsbench.storage.files import read_grey_png
 from rsbench.storage.untrusted_files import NUMBER, inside, read_bytes, read_text
 

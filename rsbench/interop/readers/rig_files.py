@@ -17,8 +17,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.shutter import Scanning
 from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table, refuse_unseen
 from rsbench.interop.readers.calibrations import read_calibration
-from rsbench.pipeline.footage import RigCard, rig_path
-from rsbench.pipeline.mono_camera import OneCameraCard
+from rsbench.pipeline.footage import OneCameraCard, RigCard, rig_path
 
 _READOUTS = ("readout_ratio", "shutter", "line_delay_s")
 

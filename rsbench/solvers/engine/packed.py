@@ -707,16 +707,18 @@ def _descend(
         for k in range(6):
             theta[k] = out[s, k]
         track_terms(theta, kernel, chosen, focal, h, baseline, squares, H, gradient, want)
-        cost = squares.sum()
+        cost = _sum(squares)
         for _ in range(iterations):
             if not damped_step(H, gradient, damping, step):
                 theta[:] = np.nan
                 break
-            trial = theta + step
+            trial = np.zeros(6)
+            for k in range(6):
+                trial[k] = theta[k] + step[k]
             trial_H[:], trial_gradient[:] = 0.0, 0.0
             track_terms(trial, kernel, chosen, focal, h, baseline, squares, trial_H, trial_gradient, want)
-            if squares.sum() <= cost:
-                cost = squares.sum()
+            if _sum(squares) <= cost:
+                cost = _sum(squares)
                 theta, H, trial_H, gradient, trial_gradient = trial, trial_H, H, trial_gradient, gradient
                 damping *= 0.1
             else:
@@ -724,6 +726,15 @@ def _descend(
         # Copying by elements, and swapping above: the error of a copy between slices takes a second to compile.
         for k in range(6):
             out[s, k] = theta[k]
+
+
+@compiled
+def _sum(values: FloatArray) -> float:
+    """As ``values.sum()``. Here and above, code that Numba has of arrays would load ``scipy.linalg`` and more."""
+    total = 0.0
+    for k in range(len(values)):
+        total += values[k]
+    return total
 
 
 @compiled
