@@ -12,6 +12,7 @@ to the same time, where its place was measured.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -214,7 +215,7 @@ class MonoFusion:
             empty, stretched = origin == Origin.NOBODY, (origin == Origin.GUESSED) & (pair is self)
             if not np.any(empty | stretched):
                 continue
-            other, behind, how = pair._drawn(1 - same, tau, measured=True)
+            other, behind, how = pair._drawn(1 - same, tau, empty | stretched)
             behind *= _unit(self._layers[frame].rho, pair._layers[same].rho)
             # An edge uncovers what is farther than itself.
             take = (how == Origin.HERE) & (empty | (stretched & (behind <= _BEHIND * buffer)))
@@ -252,24 +253,28 @@ class MonoFusion:
         return [_layer(swept[frame], offs[frame], *met[frame], leaves[frame], shape, same) for frame in FRAMES]
 
     def _drawn(
-        self, frame: int, target_tau: float, measured: bool = False
+        self, frame: int, target_tau: float, wanted: Mask | None = None
     ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
-        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame, or of its ``measured`` pixels, at a time.
+        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame at a time.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
+
+        Args:
+            wanted: (H, W) pixels that are drawn, by ``measured`` pixels alone and nowhere stretched; None: all.
         """
-        moved = self.places(frame, target_tau)
-        if measured:
+        moved, tears = self.places(frame, target_tau), self.own.motion is not None
+        if wanted is not None:
             moved[~self._layers[frame].measured] = np.nan
-        whole, stretched = draw_within(moved, np.inf), np.zeros(moved.shape[:2], dtype=np.bool_)
-        source_map, buffer = whole
-        if self.own.motion is not None:
-            near, torn = draw_within(moved, _STRETCH)
-            known = torn >= 0.0
-            stretched = ~known & (buffer >= 0.0)
-            source_map, buffer = np.where(known[..., None], near, source_map), np.where(known, torn, buffer)
+            if tears:
+                moved[~_reaching(moved, wanted)] = np.nan
+        source_map, buffer = draw_within(moved, _STRETCH if tears else np.inf)
         origin = np.where(buffer >= 0.0, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
-        origin[stretched] = Origin.GUESSED
+        if tears and wanted is None:
+            moved[~_beside_tears(moved)] = np.nan
+            whole, behind = draw_within(moved, np.inf)
+            stretched = (buffer < 0.0) & (behind >= 0.0)
+            source_map[stretched], buffer[stretched] = whole[stretched], behind[stretched]
+            origin[stretched] = Origin.GUESSED
         return resample(self.images[frame], source_map, self.options.warp.interpolation), buffer, origin
 
     def places(self, frame: int, target_tau: float) -> FloatArray:
@@ -315,6 +320,38 @@ def _weigh(
             places[y, x, 0] = of_flow * (x + share * flow[y, x, 0]) + (1.0 - of_flow) * moved[0, y, x]
             places[y, x, 1] = of_flow * (y + share * flow[y, x, 1]) + (1.0 - of_flow) * moved[1, y, x]
             places[y, x, 2] = of_flow * rho[y, x] + (1.0 - of_flow) * moved[2, y, x]
+
+
+def _reaching(moved: FloatArray, wanted: Mask) -> Mask:
+    """(H, W) the corners of all quads of ``moved`` (H, W, 3) that may cover ``wanted`` pixels (H, W)."""
+    side = 2 * math.ceil(2.0 * _STRETCH) + 1
+    near = cv2.dilate(wanted.astype(np.uint8), np.ones((side, side), np.uint8))
+    reaching = np.zeros(wanted.shape, np.uint8)
+    _fill_reaching(moved, near, reaching)
+    return np.asarray(cv2.dilate(reaching, np.ones((3, 3), np.uint8)) > 0)
+
+
+@compiled(error_model="numpy")
+def _fill_reaching(moved: FloatArray, near: NDArray[np.uint8], reaching: NDArray[np.uint8]) -> None:
+    height, width = near.shape
+    for y in range(reaching.shape[0]):
+        for x in range(reaching.shape[1]):
+            u, v = moved[y, x, 0], moved[y, x, 1]
+            if abs(u) < 1e9 and abs(v) < 1e9:
+                i, j = min(max(int(u), 0), width - 1), min(max(int(v), 0), height - 1)
+                reaching[y, x] = near[j, i]
+
+
+def _beside_tears(moved: FloatArray) -> Mask:
+    """(H, W) the corners of all quads of ``moved`` (H, W, 3) of which a side is longer than ``_STRETCH``."""
+    beside = np.zeros(moved.shape[:2], np.uint8)
+    for axis in (0, 1):
+        steps = np.diff(moved[..., :2], axis=axis)
+        long = ~(np.hypot(steps[..., 0], steps[..., 1]) <= _STRETCH)
+        first, second = (np.moveaxis(beside, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        long = np.moveaxis(long, axis, 0)
+        first[long], second[long] = 1, 1
+    return np.asarray(cv2.dilate(beside, np.ones((3, 3), np.uint8)) > 0)
 
 
 def _unit(rho: F32, other: F32) -> np.float32:
