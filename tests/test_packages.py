@@ -72,9 +72,11 @@ def test_packages_are_small_and_hold_no_tests_results_or_data(built: Built) -> N
     with tarfile.open(built.sdist) as archive:
         names = archive.getnames()
     assert {name.split("/")[1] for name in names if "/" in name} <= {
-        *("rsbench", "scenes", "renderers", "solvers", "cards", "docs", "examples"),
+        *("rsbench", "scenes", "renderers", "solvers", "cards", "docs", "examples", "results"),
         *("README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "PKG-INFO", "pyproject.toml", ".gitignore"),
     }
+    stored = [name for name in names if name.split("/")[1:2] == ["results"] and not name.endswith(".jsonl.xz")]
+    assert not stored, "answers to rank beside are the only results"
     names += zipfile.ZipFile(built.wheel).namelist()
     wrong = re.compile(r"__pycache__|\.(exr|npz|parquet|pyc)$|/tests?/|dataset\.json$")
     assert [name for name in names if wrong.search(name)] == []

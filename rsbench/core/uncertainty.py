@@ -28,7 +28,8 @@ function here.
    shifts of ``SHIFT_PX`` of all matches in a tile, each view and axis by itself, do to the estimate.
 5. The hypothesis itself is uncertain. The covariance of a mixture adds the squared distances between what the
    hypotheses give, weighted by their probabilities (``spread_about``; J. Hoeting, D. Madigan, A.
-   Raftery, C. Volinsky, Statistical Science 1999, eq. 3).
+   Raftery, C. Volinsky, Statistical Science 1999, eq. 3). A motion may also depart from all motion models;
+   ``capture.two_frame_spline.departure`` adds what shakes do that the matches need not show.
 
 A likelihood that is not Gaussian (a bound, two optima, a long tail) is not stated as one.
 
