@@ -411,11 +411,11 @@ def video_place(out: Path, run: str = "") -> Iterator[Path]:
 def _refuse_other_video(out: Path) -> None:
     """What is to be replaced must be a video of this command, which its record lies beside."""
     record = record_of_video(out)
-    if not out.exists() and not record.exists():
-        return
-    ours = out.is_file() and record.is_file() and read_json(record).get("video") == out.name
-    if not ours:
+    ours = record.is_file() and read_json(record).get("video") == out.name
+    if out.exists() and not (ours and out.is_file()):
         raise RsbenchError(f"{out}: exists and was not written by 'rsbench correct'; choose another --out")
+    if record.exists() and not ours:
+        raise RsbenchError(f"{record}: exists and is no record of {out.name}; choose another --out")
 
 
 def page_of_video(out: Path) -> Path:

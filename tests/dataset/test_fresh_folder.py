@@ -9,7 +9,7 @@ import pytest
 from commands import rename_failing
 
 from rsbench.core.errors import RsbenchError
-from rsbench.dataset.corrected_frames import fresh_folder
+from rsbench.dataset.corrected_frames import fresh_folder, video_place
 
 
 def write(out: Path, text: str) -> None:
@@ -73,6 +73,21 @@ def test_a_folder_with_a_motion_file_of_others_is_not_ours(tmp_path: Path) -> No
     with pytest.raises(RsbenchError, match="was not written by 'rsbench correct'"):
         write(tmp_path / "out", "first")
     assert texts(tmp_path / "out") == {"motion.json": "{}"}
+
+
+def test_a_deleted_video_is_written_again_and_files_of_others_stay(tmp_path: Path) -> None:
+    video, record = tmp_path / "out.mp4", tmp_path / "out.json"
+    record.write_text('{"video": "out.mp4"}')
+    with video_place(video):
+        pass
+    record.write_text("{}")
+    with pytest.raises(RsbenchError, match=r"out\.json: exists and is no record of out\.mp4"), video_place(video):
+        pass
+    record.unlink()
+    video.write_text("mine")
+    with pytest.raises(RsbenchError, match=r"out\.mp4: exists and was not written by"), video_place(video):
+        pass
+    assert texts(tmp_path) == {"out.mp4": "mine"}
 
 
 def test_two_commands_do_not_share_a_folder(out: Path) -> None:
