@@ -86,8 +86,8 @@ class Outcome:
     """Of one frame."""
     lost: float = _NAN
     """dB below the correction that is fed with the truth, mean over the frames."""
-    inside: float = _NAN
-    """1 if the ellipsoid of 95 % of the stated motion contains the true one, otherwise 0."""
+    square: float = _NAN
+    """Squared error of the motion by its stated covariance: 6 on average if that is right."""
     off: tuple[float, ...] = ()
     """Errors of the calibration that was found, in stated deviations."""
     seconds: float = _NAN
@@ -225,7 +225,7 @@ def outcome(row: str, seed: int, folder: Path, way: str, again: bool, model: str
     fair = row in RIGS and way != "rectified" and (folder / "near.npz").is_file()
     lost = _lost(folder, corrected, correct_by_truth(row, seed, folder)) if fair else _NAN
     estimated = found["readout_ratio_estimated"]
-    inside = _inside(found["motion"], truth["motions"][0]) if truth["frames"] == 2 and new is None else _NAN
+    square = _square(found["motion"], truth["motions"][0]) if truth["frames"] == 2 and new is None else _NAN
     return Outcome(
         **known,
         message=_remark(found, message, code),
@@ -237,18 +237,18 @@ def outcome(row: str, seed: int, folder: Path, way: str, again: bool, model: str
         gain=float(np.mean(gains)),
         worst_gain=float(np.min(gains)),
         lost=lost,
-        inside=inside,
+        square=square,
         off=_calibration_errors(folder, found.get("rig_errors", {})) if way == "loose" else (),
         seconds=seconds,
     )
 
 
-def _inside(motion: dict[str, Any], truth: dict[str, Any]) -> float:
-    """1 if the 95 % ellipsoid of the stated motion contains the true one, 0 if not; NaN: none is stated."""
+def _square(motion: dict[str, Any], truth: dict[str, Any]) -> float:
+    """The error of w and d, squared and normalised by the stated covariance; NaN: none is stated."""
     if not motion.get("covariance_w_d"):
         return _NAN
     off = np.concatenate(_vectors(motion)) - np.concatenate(_vectors(truth))
-    return float(off @ np.linalg.solve(np.array(motion["covariance_w_d"]), off) <= chi2.ppf(0.95, 6))
+    return float(off @ np.linalg.solve(np.array(motion["covariance_w_d"]), off))
 
 
 def _calibration_errors(folder: Path, found: dict[str, dict[str, float]]) -> tuple[float, ...]:
@@ -353,6 +353,7 @@ def _of_rigs(outcomes: Sequence[Outcome]) -> list[str]:
         "worst",
         "median s",
         "in 95 %",
+        "axes",
         "calibration within 3 deviations",
         "",
     )
@@ -367,9 +368,11 @@ def _of_rigs(outcomes: Sequence[Outcome]) -> list[str]:
             cells += [f"{np.median(e_R):.4f}", f"{np.max(e_R):.4f}", f"{np.median(e_T):.3f}", f"{np.max(e_T):.3f}"]
             cells += [_median([one.psnr for one in done], 2), _median([one.lost for one in done], 2)]
             cells += [_median(more, 2), _number(max(more, default=_NAN), 2), _median([o.seconds for o in done], 1)]
-            stated = [one.inside for one in done if np.isfinite(one.inside)]
+            squares = np.array([one.square for one in done if np.isfinite(one.square)])
+            inside = np.count_nonzero(squares <= chi2.ppf(0.95, 6))
             off = np.array([each for one in done for each in one.off])
-            cells.append(f"{sum(stated):.0f} of {len(stated)}" if stated else "-")
+            cells.append(f"{inside} of {len(squares)}" if len(squares) else "-")
+            cells.append(f"{np.sqrt(chi2.ppf(0.5, 6) / np.median(squares)):.2f}" if len(squares) else "-")
             cells.append(f"{np.count_nonzero(np.abs(off) <= 3.0)} of {len(off)}" if len(off) else "-")
             found = {"e_R": np.median(e_R), "e_T": np.median(e_T), "worst e_T": np.max(e_T)}
             beyond = [name for name, value in found.items() if value > LIMITS[name]]
