@@ -53,6 +53,7 @@ from rsbench.capture.trajectory_tracks import (
     Tails,
     TimedTracks,
     add_tracks,
+    inverse_depths,
     is_of_one_camera,
     observed,
     thinned,
@@ -96,6 +97,11 @@ _WEAKEST = 100.0
 a precision of 0.1 would hardly do so at the length ``_SHORT``."""
 _SUSPECT = 4.0
 """A window's own motion is wrong if its error is this many times that of the motion of its neighbours."""
+_TRIED, _TRIED_KNOTS, _STEPS_TRIED, _STEPS_ADDED, _TRIED_TAILS = 4, 0.5, 12, 3, Tails(3.0, 0.3)
+"""Number of windows in which directions of one camera's translation are tried, the knots and steps of that, the
+steps for each further window, and the error distribution."""
+_DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
+"""(n, 3) axes and diagonals; their opposites are as good."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Candidates for ``Prior.memory``, frame periods."""
 _PRECISION = 1e12
@@ -467,6 +473,52 @@ def first_curve(
         errors.append(np.array([float(np.median(each)) if len(each) else 0.0 for each in chosen]))
     known &= ~(errors[0] > _SUSPECT * errors[1])
     return _spline_through(_interpolated(rates, known), span, interval, times)
+
+
+def first_curve_of_camera(
+    motions: Sequence[Motion | None],
+    tracks: TimedTracks,
+    span: tuple[float, float],
+    interval: float,
+    prior: Prior,
+    times: FloatArray | None = None,
+) -> Curve:
+    """``first_curve`` for one camera, near the minimum of the cost.
+
+    Motions of single windows, which assume a constant speed, are often so wrong that a fit from them ends in a
+    local minimum. So several directions of translation are tried in some windows in the middle, and the best fit
+    to these is extended to the other windows one by one: points that are seen again determine them. A trajectory
+    with all translations and inverse depths negated fits as well; in the returned one most points are in front of
+    the camera.
+
+    Args:
+        tracks: tracks that extend over several windows.
+
+    Raises:
+        NotDefiniteError: the tracks do not determine the spline.
+    """
+    count = len(tracks.members)
+    times = np.arange(count + 1.0) if times is None else times
+    start, first = first_curve(motions, tracks, span, _TRIED_KNOTS, times), max((count - _TRIED) // 2, 0)
+    last, ahead = min(first + _TRIED, count), start.first + start.interval * (np.arange(len(start.p)) - 1.0)
+    ahead, turn = ahead - times[first], evaluate(start, times[first : first + 1])[0].R[0]
+
+    def fitted(curve: Curve, steps: int) -> _Place:
+        counts = np.ones(len(tracks))
+        for own in (*tracks.members[:first], *tracks.members[last:]):
+            counts[own] = 0.0
+        descent = Descent(tracks, _TRIED_TAILS, prior, counts)
+        return descend(descent, descent.place(curve, None), steps, DAMPING)
+
+    speeds = _SHORT * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)) @ turn
+    tried = (make_curve(start.first, start.interval, start.R, ahead[:, None] * speed) for speed in speeds)
+    curve = min((fitted(each, _STEPS_TRIED) for each in tried), key=lambda each: each.equations.cost).curve
+    while last - first < count:
+        first, last = max(first - 1, 0), min(last + 1, count)
+        curve = fitted(curve, _STEPS_ADDED).curve
+    if np.mean(np.sign(inverse_depths(curve, tracks.ends, tracks.starts, tracks.focal))) < 0.0:
+        curve = from_pose_at(make_curve(curve.first, curve.interval, curve.R, -curve.p), 0.0)
+    return approximated(lambda tau: evaluate(curve, tau)[0], (curve.first, curve.last), interval)
 
 
 def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:

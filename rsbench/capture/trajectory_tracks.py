@@ -159,6 +159,19 @@ def add_tracks(
 
 
 @compiled(error_model="numpy")
+def inverse_depths(curve: Curve, ends: FloatArray, starts: NDArray[np.int64], focal: FloatArray) -> FloatArray:
+    """(n,) inverse depth of each track's point at its first observation; arguments: ``add_tracks``."""
+    most = 0
+    for k in range(len(starts) - 1):
+        most = max(most, starts[k + 1] - starts[k])
+    scratch, out = _scratch(int(most), 1), np.zeros(len(starts) - 1)
+    for k in range(len(out)):
+        _explain(curve, ends[starts[k] : starts[k + 1]], focal, scratch)
+        out[k] = scratch.point[2]
+    return out
+
+
+@compiled(error_model="numpy")
 def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> float:
     """Estimate the point of a track; returns the squared error, px^2."""
     count = len(track)

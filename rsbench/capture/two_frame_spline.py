@@ -26,6 +26,7 @@ from rsbench.capture.trajectory_fit import (
     covariance_band,
     expected_equations,
     first_curve,
+    first_curve_of_camera,
     fit,
     normal_equations,
     right_tracks,
@@ -53,7 +54,15 @@ from rsbench.capture.trajectory_spline import (
     roughness,
     span_of,
 )
-from rsbench.capture.trajectory_tracks import REACH, Tails, TimedTracks, informative, pack_windows
+from rsbench.capture.trajectory_tracks import (
+    REACH,
+    Tails,
+    TimedTracks,
+    informative,
+    pack_windows,
+    thinned,
+    thinned_chains,
+)
 from rsbench.components.motion_models import has_kernel, make_motion
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
@@ -94,8 +103,9 @@ those that move an image by half a pixel to those that rows always show; and of 
 _MEMORIES = (0.25, 1.0)
 """Their memories, equally probable."""
 _ROWS = 24
-_FIRST_MATCHES = 150
-"""Approximate number of matches per window from which the prior is estimated and the inliers are chosen."""
+_FIRST_MATCHES, _FIRST_CHAINED = 150, 80
+"""Approximate number of matches, of two frames and per window of more, from which the prior is estimated and the
+inliers are chosen."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -418,8 +428,14 @@ def _fitted(
         matches = [Correspondences(left=one) for one in each]
         return pack_windows(matches, rig, shutter, right, share=share, times=times)
 
-    few = packed([each[:: max(len(each) // _FIRST_MATCHES, 1)] for each in windows])
-    start = first_curve(motions, few, span_of(float(times[-1]), shutter), _KNOTS, times)
+    matches, span = [Correspondences(left=each) for each in windows], span_of(float(times[-1]), shutter)
+    if len(windows) > 1:
+        some = [each.left for each in thinned_chains(matches, _FIRST_CHAINED)]
+        few = packed(some, [np.ones(len(each)) for each in some])
+        start = first_curve_of_camera(motions, few, span, _KNOTS, _PRIOR, times)
+    else:
+        few = packed([each.left for each in thinned(matches, _FIRST_MATCHES)])
+        start = first_curve(motions, few, span, _KNOTS, times)
     first = fit(start, few, _PRIOR)
     tracks = packed(windows)
     trust = right_tracks(first, tracks)

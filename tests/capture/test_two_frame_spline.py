@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -373,6 +375,45 @@ def test_a_way_follows_what_a_camera_trembles(shake: float) -> None:
         last = place(np.array([k + 1.0]), shake).R[0] @ -V
         assert np.linalg.norm(motion.d) == pytest.approx(1.0, abs=1e-9)
         assert motion.d @ last / np.linalg.norm(V) > np.cos(np.deg2rad(1.0))
+
+
+def hand(seed: int) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """Rotations (n, 3, 3) and positions (n, 3), metres, of a hand-held camera that walks, at times (n,)."""
+    rng = np.random.default_rng(seed)
+    cycles, phases = rng.uniform(0.01, 0.13, (6, 6)), rng.uniform(0.0, 2.0 * np.pi, (6, 6))
+    sizes = (
+        rng.uniform(0.4, 1.0, (6, 6)) * np.array([0.05, 0.07, 0.05, 0.08, 0.06, 0.05])[:, None] / (30.0 * cycles)
+    )
+
+    def at(tau: FloatArray) -> tuple[FloatArray, FloatArray]:
+        six = np.sum(sizes * np.sin(2.0 * np.pi * cycles * tau[:, None, None] + phases), axis=-1)
+        return so3.exp(six[:, :3]), six[:, 3:] + tau[:, None] * [0.003, 0.0, 0.008]
+
+    return at
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_directions_of_a_hand_held_camera_do_not_depend_on_the_start(seed: int) -> None:
+    """From a start with one direction, a fit had directions wrong by 100 deg for seed 3 and all opposite for 4."""
+    camera, at, rng = PinholeCamera.centred(640, 480, 540.0), hand(seed), np.random.default_rng(seed)
+    points, frames = rng.uniform([-4.0, -3.0, 2.5], [4.0, 3.0, 7.0], (900, 3)), list[FloatArray]()
+    for frame in range(13):
+        pixels = np.full((len(points), 2), 240.0)
+        for _ in range(10):
+            R, centres = at(SHUTTER.pixel_time(pixels, frame, "left"))
+            seen_from = np.einsum("nji,nj->ni", R, points - centres)
+            pixels = camera.project(seen_from)
+        inside = np.all((pixels > 0.0) & (pixels < [639.0, 479.0]), axis=1) & (seen_from[:, 2] > 0.3)
+        frames.append(np.where(inside[:, None], pixels + rng.normal(0.0, 0.1, pixels.shape), np.nan))
+    pairs = [np.concatenate(pair, axis=1) for pair in pairwise(frames)]
+    windows = [pair[np.all(np.isfinite(pair), axis=1)] for pair in pairs]
+    start = make_motion("linear", np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    found = camera_trajectory(windows, [start] * 12, StereoRig.of_one(camera).about("left"), SHUTTER)
+    assert found is not None
+    R, centres = at(np.arange(13.0))
+    truths = (R[1:].swapaxes(1, 2) @ (centres[:-1] - centres[1:])[..., None])[..., 0]
+    angles = [translation_error(motion.d, truth) for motion, truth in zip(found, truths, strict=True)]
+    assert np.rad2deg(max(angles)) < 5.0
 
 
 def law_of(matches: FloatArray) -> InertialMotion:
