@@ -112,6 +112,7 @@ def _boards(site: Path) -> list[str]:
 def test_every_board_of_frames_and_points_opens_in_the_page_of_the_boards(site: Path) -> None:
     found = _boards(site)
     assert {each.split("/")[1] for each in found} == {"laws", "leaderboard", "footage", "handheld"}
+    assert (site / found[0]).is_file()
     for address in found[1:]:
         file, anchor = urldefrag(address)
         assert f'<section class="split" id="{anchor}"' in (site / file).read_text("utf-8"), address
