@@ -131,20 +131,20 @@ def compared(methods: Sequence[str], boards: Sequence[Score], beside: Sequence[s
     Args:
         methods: in the order of the first board.
         boards: the first has all methods.
-        beside: columns of the first board that stand before its score.
+        beside: other columns of the first board.
         words: what the picture shows.
     """
     tables = [each.rows() for each in boards]
     rows = [
         [
             method,
-            *(tables[0][method][column] or "-" for column in beside),
             *(marked(rows.get(method), each.column) for each, rows in zip(boards, tables, strict=True)),
+            *(tables[0][method][column] or "-" for column in beside),
         ]
         for method in methods
     ]
     picture = dots([each.panel for each in boards], list(headed(methods, tables[0], boards)))
-    head = ["method", *beside, *(each.head for each in boards)]
+    head = ["method", *(each.head for each in boards), *beside]
     return Part(table_lines(head, rows), picture, words, boards)
 
 
@@ -201,9 +201,11 @@ def correction() -> Part:
             for each, cells in zip(boards, both, strict=True)
             for cell in (marked(cells, each.column), cells["PSNR (dB)"] if cells else "-")
         ]
-        lines.append([method, tables[0][method]["uses"], *scores])
-    head = ["method", "uses"] + [f"{each.title}: {x}" for each in boards for x in (each.column, "PSNR (dB)")]
-    return Part(table_lines(head, lines), picture, "Scores of correctors on two boards", boards)
+        lines.append([method, *scores, tables[0][method]["uses"]])
+    scores = [f"{each.title}: {column}" for each in boards for column in (each.column, "PSNR (dB)")]
+    return Part(
+        table_lines(["method", *scores, "uses"], lines), picture, "Scores of correctors on two boards", boards
+    )
 
 
 def rectifying() -> Part:

@@ -116,7 +116,11 @@ def test_every_board_of_frames_and_points_opens_in_the_page_of_the_boards(site: 
     for address in found[1:]:
         file, anchor = urldefrag(address)
         assert f'<section class="split" id="{anchor}"' in (site / file).read_text("utf-8"), address
-    assert len(found) > 10
+    protocols = {urldefrag(each)[1].partition("--")[0] for each in found[1:]}
+    assert protocols == {
+        *("points-1", "points-2", "pose-1", "pose-2", "readout-1", "readout-3", "depth-1"),
+        *("correction-1", "correction-3", "correction-mono-1", "trajectory-1"),
+    }, "of recordings there are tables alone"
 
 
 # In a browser

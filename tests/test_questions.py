@@ -80,9 +80,9 @@ def by(folder: str, board: str, method: str, fact: str, column: int = 2) -> dict
 def test_cells_are_the_numbers_of_the_boards() -> None:
     """Independent of the Markdown tables that the pages take them from."""
     sources = {
-        "one-camera": ((3, POINTS, "near_bound"), (4, FRAMES, "auc_apart")),
-        "two-cameras": ((3, POINTS, "near_bound"), (4, FRAMES, "auc_apart")),
-        "correction": ((2, CORRECTED, "corrected"), (4, csv_of("leaderboard", "correction-1"), "ssim")),
+        "one-camera": ((1, POINTS, "near_bound"), (2, FRAMES, "auc_apart")),
+        "two-cameras": ((1, POINTS, "near_bound"), (2, FRAMES, "auc_apart")),
+        "correction": ((1, CORRECTED, "corrected"), (3, csv_of("leaderboard", "correction-1"), "ssim")),
         "readout": ((1, RATIO, "skill"), (2, RATIO, "right"), (3, RATIO, "wrong"), (5, RATIO, "covers_95")),
     }
     for name, columns in sources.items():
@@ -96,7 +96,7 @@ def test_cells_are_the_numbers_of_the_boards() -> None:
 def test_bold_are_scores_that_no_ranked_peer_beats() -> None:
     for name in ("one-camera", "two-cameras"):
         for cells in rows(MADE[f"results-{name}.md"])[2:]:
-            for column, table in ((3, POINTS), (4, FRAMES)):
+            for column, table in ((1, POINTS), (2, FRAMES)):
                 best = cells[0] in table and table[cells[0]]["rank_low"] == "1"
                 assert cells[column].startswith("**") == best, cells
 
