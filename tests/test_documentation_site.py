@@ -158,8 +158,12 @@ def test_a_board_fits_its_frame(site: Path, page: Browser, width: int) -> None:
     page.appear(width=frame)
     for board in sorted({urldefrag(each)[0] for each in _boards(site)}):
         page.open((site / board).as_uri())
-        wide = page.run("[...document.querySelectorAll('.wide')].map((e) => [e.scrollWidth, e.clientWidth])")
-        assert width < DESKTOP or all(needed <= room for needed, room in wide), (board, wide)
+        room = "[...document.querySelectorAll('.wide')].map((e) => [e.scrollWidth, e.clientWidth])"
+        score = "th[data-key=failure] button"
+        sort = f"document.querySelectorAll('section').forEach((each) => each.querySelector('{score}').click())"
+        for click in ("", f"{sort}, ", "document.querySelectorAll('.reset').forEach((each) => each.click()), "):
+            wide = page.run(f"({click}{room})")
+            assert width < DESKTOP or all(needed <= has for needed, has in wide), (board, wide)
         edges = page.run(
             "[...document.querySelectorAll('table')].map((each) =>"
             " each.querySelector('tr.entry td[data-value] + td').getBoundingClientRect().right)"
