@@ -6,7 +6,7 @@
 # make attack     kills, failing file operations, damaged inputs, faults for verify: takes hours
 # make sample     the release's sample of data, build/rsbench-sample.zip
 # make docs       the documentation site, in build/docs; warnings are errors
-# make reference  docs/reference/commands.md and cards.md from the code
+# make reference  commands.md and cards.md from the code, tables and pictures of results-*.md from results/
 # make lock       renew both files of constraints from pyproject.toml (needs uv)
 # make clean      remove .venv and caches
 # Needs Python >= 3.11 with pip and venv. `make demo PYTHON=/path/to/python` chooses one.
@@ -71,6 +71,7 @@ docs: $(TOOLS)
 
 reference: $(STAMP)
 	@$(BIN)/python docs/make_reference.py
+	@$(BIN)/python docs/make_results.py
 
 # Refuse a .venv whose rsbench is that of another checkout, or that was moved with its checkout: installing would
 # change what the other one runs.

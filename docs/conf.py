@@ -61,28 +61,44 @@ def _name_aliases(
 
 
 _REPOSITORY = "https://github.com/rsbench/rsbench/"
-_BOARD = _REPOSITORY + "blob/main/results/leaderboard/site/"
+_BOARD = re.compile(_REPOSITORY + r"blob/main/results/(?P<folder>\w+)/site/(?:(?P<table>.+)\.md|(?P<page>.+))")
+_FRAME = "results-leaderboard"
+"""The page in which boards are shown."""
 
 
 def _take_results_along(app: Sphinx, doctree: nodes.document) -> None:
     """Documents name results by their address in the repository: they are also installed without it. The site has
-    copies of the pictures and of the leaderboard, and links to those."""
+    copies of the pictures and of the boards, and links to those: to the interactive one instead of a table."""
     for image in doctree.findall(nodes.image):
         image["uri"] = image["uri"].replace(f"{_REPOSITORY}raw/main/", "/../")
+    up = "../" * app.env.docname.count("/")
     for link in doctree.findall(nodes.reference):
-        if link.get("refuri", "").startswith(_BOARD):
-            link["refuri"] = "leaderboard/" + link["refuri"].removeprefix(_BOARD)
+        board = _BOARD.fullmatch(link.get("refuri", ""))
+        if board and (board["page"] or board["table"] in _interactive(app, board["folder"])):
+            link["refuri"] = f"{up}boards/{board['folder']}/{board['page'] or 'index.html#' + board['table']}"
+            if app.env.docname == _FRAME:
+                link["target"] = "board"
 
 
-def _copy_leaderboard(app: Sphinx, exception: Exception | None) -> None:
-    site = Path(app.srcdir).parent / "results" / "leaderboard" / "site"
-    if exception is None and app.builder.format == "html" and site.is_dir():
-        shutil.copytree(site, Path(app.outdir) / "leaderboard", dirs_exist_ok=True)
+def _sites(app: Sphinx) -> Path:
+    return Path(app.srcdir).parent / "results"
+
+
+def _interactive(app: Sphinx, folder: str) -> list[str]:
+    """Tables on the first page of a board: of some splits there is a table alone."""
+    page = _sites(app) / folder / "site" / "index.html"
+    return re.findall(r'<section class="split" id="([^"]+)"', page.read_text("utf-8")) if page.is_file() else []
+
+
+def _copy_boards(app: Sphinx, exception: Exception | None) -> None:
+    if exception is None and app.builder.format == "html":
+        for site in sorted(_sites(app).glob("*/site")):
+            shutil.copytree(site, Path(app.outdir) / "boards" / site.parent.name, dirs_exist_ok=True)
 
 
 def setup(app: Sphinx) -> None:
     app.connect("doctree-read", _take_results_along, priority=400)  # before images are collected
-    app.connect("build-finished", _copy_leaderboard)
+    app.connect("build-finished", _copy_boards)
     app.connect("autodoc-process-docstring", _keep_attribute, priority=400)
     app.connect("autodoc-process-docstring", _restore_attribute, priority=600)
     app.connect("autodoc-process-signature", _name_aliases)

@@ -76,8 +76,8 @@ def test_every_public_name_is_in_the_reference(site: Path) -> None:
 
 
 def _own(site: Path) -> list[Path]:
-    """Pages of the documents; the leaderboard's own are tested where they are made."""
-    return [path for path in site.rglob("*.html") if path.relative_to(site).parts[0] != "leaderboard"]
+    """Pages of the documents; the boards' own are tested where they are made."""
+    return [path for path in site.rglob("*.html") if path.relative_to(site).parts[0] != "boards"]
 
 
 def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
@@ -102,6 +102,27 @@ def test_links_and_their_anchors_lead_somewhere(site: Path) -> None:
     assert broken == []
 
 
+def _boards(site: Path) -> list[str]:
+    """What the page of the boards shows in its frame: addresses below the site."""
+    text = (site / "results-leaderboard.html").read_text("utf-8")
+    (first,) = re.findall(r'<iframe class="board" name="board" [^>]*src="([^"]+)"', text)
+    return [first, *re.findall(r'href="([^"]+)" target="board"', text)]
+
+
+def test_every_board_of_frames_and_points_opens_in_the_page_of_the_boards(site: Path) -> None:
+    found = _boards(site)
+    assert {each.split("/")[1] for each in found} == {"laws", "leaderboard", "footage", "handheld"}
+    assert (site / found[0]).is_file()
+    for address in found[1:]:
+        file, anchor = urldefrag(address)
+        assert f'<section class="split" id="{anchor}"' in (site / file).read_text("utf-8"), address
+    protocols = {urldefrag(each)[1].partition("--")[0] for each in found[1:]}
+    assert protocols == {
+        *("points-1", "points-2", "pose-1", "pose-2", "readout-1", "readout-3", "depth-1"),
+        *("correction-1", "correction-3", "correction-mono-1", "trajectory-1"),
+    }, "of recordings there are tables alone"
+
+
 # In a browser
 
 
@@ -124,6 +145,31 @@ def test_no_page_scrolls_sideways(site: Path, page: Browser) -> None:
             if found[0] > found[1]:
                 wide.append((str(path.relative_to(site)), found))
     assert wide == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [PHONE, DESKTOP])
+def test_a_board_fits_its_frame(site: Path, page: Browser, width: int) -> None:
+    """On a screen no column is cut; on a phone name, rank and score are seen, and names keep to few lines."""
+    page.appear(width=width)
+    page.open((site / "results-leaderboard.html").as_uri())
+    frame = page.run("document.querySelector('iframe.board').clientWidth")
+    assert frame >= min(width, 0.75 * DESKTOP)
+    page.appear(width=frame)
+    for board in sorted({urldefrag(each)[0] for each in _boards(site)}):
+        page.open((site / board).as_uri())
+        room = "[...document.querySelectorAll('.wide')].map((e) => [e.scrollWidth, e.clientWidth])"
+        score = "th[data-key=failure] button"
+        sort = f"document.querySelectorAll('section').forEach((each) => each.querySelector('{score}').click())"
+        for click in ("", f"{sort}, ", "document.querySelectorAll('.reset').forEach((each) => each.click()), "):
+            wide = page.run(f"({click}{room})")
+            assert width < DESKTOP or all(needed <= has for needed, has in wide), (board, wide)
+        edges = page.run(
+            "[...document.querySelectorAll('table')].map((each) =>"
+            " each.querySelector('tr.entry td[data-value] + td').getBoundingClientRect().right)"
+        )
+        rows = page.run("[...document.querySelectorAll('tr.entry')].map((row) => row.clientHeight)")
+        assert max(edges) <= frame and max(rows) < 60, board
 
 
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])

@@ -1,4 +1,4 @@
-"""Drawings of the leaderboard as SVG: intervals in a table, errors against what problems are, calibration."""
+"""Drawings of results as SVG: intervals in a table and beside each other, errors by problem, calibration."""
 
 from __future__ import annotations
 
@@ -67,11 +67,15 @@ class _Axis:
 
     low: float
     high: float
-    logarithmic: bool
+    logarithmic: bool = False
 
     def down(self, value: float) -> float:
+        return _TOP + (1.0 - self.share(value)) * (_HEIGHT - _TOP - _BOTTOM)
+
+    def share(self, value: float) -> float:
+        """Where a value is between the ends, 0 to 1."""
         low, high, at = (self._place(x) for x in (self.low, self.high, min(max(value, self.low), self.high)))
-        return _TOP + (high - at) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
+        return (at - low) / (high - low)
 
     def _place(self, value: float) -> float:
         return math.log10(value) if self.logarithmic else value
@@ -288,3 +292,105 @@ def reliability(covers: Sequence[Triple]) -> Markup:
         x, y = place(level, share).split()
         parts.append(f'<circle cx="{x}" cy="{y}" r="3" fill="currentColor"/>')
     return Markup("".join(parts) + "</svg>")
+
+
+# Dots with intervals, a row for each of what is compared: the pictures of pages of results
+
+_PLOT, _ROW, _HEAD, _INSET = 540, 20, 34, 12
+"""Width, height of a row and of the titles, inset of a panel, px: on a phone letters of 12 px are 8 px high."""
+_SERIES = (("#0072b2", _MARKS[0]), ("#c44e00", _MARKS[1]))
+_INK = (
+    "text{font:12px system-ui,sans-serif;fill:#1d2126;paint-order:stroke;stroke:#fff;stroke-width:4px}"
+    ".h{font-weight:600}.s{fill:#56606b}"
+)
+
+
+class DotRow(NamedTuple):
+    """A row of a plot of dots; without values the heading of the rows below."""
+
+    label: str
+    values: Sequence[Sequence[Triple]] = ()
+    """For each panel the value of each series with the ends of its interval; NaN where there is none."""
+
+
+class DotPanel(NamedTuple):
+    """A panel of a plot of dots."""
+
+    title: str
+    scale: str
+    """What its axis measures."""
+    low: float = 0.0
+    high: float = 1.0
+    logarithmic: bool = False
+
+
+def dots(panels: Sequence[DotPanel], rows: Sequence[DotRow], series: Sequence[str] = ()) -> Markup:
+    """Panels beside each other with the same rows: a file of its own, black on white.
+
+    Args:
+        panels: from the left.
+        rows: from the top.
+        series: names of the values in a row, if there are several.
+    """
+    left = 8.0 + 6.7 * max(len(row.label) for row in rows if row.values)
+    width = (_PLOT - left) / len(panels)
+    top = _HEAD + (_ROW if series else 0)
+    bottom = top + _ROW * len(rows)
+    height = bottom + 42
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_PLOT} {height}" width="{_PLOT}" '
+        f'height="{height}"><style>{_INK}</style><rect width="{_PLOT}" height="{height}" fill="#fff"/>'
+    ]
+    middles = [top + _ROW * (k + 0.5) for k in range(len(rows))]
+    parts += [f'<path d="M0 {y:.0f}H{_PLOT}" stroke="#eef1f4"/>' for y in middles]
+    for number, panel in enumerate(panels):
+        start = left + number * width + _INSET
+        parts += _panel(panel, start, width - 2 * _INSET, (top, bottom))
+        for row, y in zip(rows, middles, strict=True):
+            shown = row.values[number] if row.values else ()
+            for k, triple in enumerate(shown):
+                apart = 6.0 * k - 3.0 * (len(series) - 1) if series else 0.0
+                parts += _whisker(panel, start, width - 2 * _INSET, y + apart, triple, k)
+    for row, y in zip(rows, middles, strict=True):
+        heading = "" if row.values else ' class="h"'
+        parts.append(f'<text x="4" y="{y + 4:.0f}"{heading}>{escape(row.label)}</text>')
+    for k, name in enumerate(series):
+        x = left + _INSET + k * (40.0 + 6.7 * max(map(len, series)))
+        parts.append(f'{_dot(x, 14.0, k)}<text x="{x + 10:.0f}" y="18">{escape(name)}</text>')
+    return Markup("".join(parts) + "</svg>\n")
+
+
+def _panel(panel: DotPanel, start: float, width: float, ends: tuple[int, int]) -> list[str]:
+    """Titles and grid."""
+    middle, (top, bottom) = start + 0.5 * width, ends
+    parts = [
+        f'<text x="{middle:.0f}" y="{top - 12}" text-anchor="middle">{escape(panel.title)}</text>',
+        f'<text x="{middle:.0f}" y="{bottom + 34}" text-anchor="middle" class="s">{escape(panel.scale)}</text>',
+    ]
+    if panel.logarithmic:
+        decades = range(math.ceil(math.log10(panel.low)), math.floor(math.log10(panel.high)) + 1)
+        ticks = [10.0**e for e in decades]
+    else:
+        ticks = [tick for tick in (-0.5, 0.0, 0.5, 1.0) if panel.low <= tick <= panel.high]
+    for tick in ticks:
+        x = start + width * _share(panel, tick)
+        parts.append(f'<path d="M{x:.1f} {top}V{bottom}" stroke="#cfd6dc"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle" class="s">{tick:g}</text>')
+    return parts
+
+
+def _share(panel: DotPanel, value: float) -> float:
+    return _Axis(low=panel.low, high=panel.high, logarithmic=panel.logarithmic).share(value)
+
+
+def _whisker(panel: DotPanel, start: float, width: float, y: float, triple: Triple, series: int) -> list[str]:
+    """A value and its interval; nothing where there is none."""
+    x, a, b = (start + width * _share(panel, each) if np.isfinite(each) else math.nan for each in triple)
+    line = f"M{a:.1f} {y:.1f}H{b:.1f}M{a:.1f} {y - 3:.1f}v6M{b:.1f} {y - 3:.1f}v6"
+    parts = [f'<path d="{line}" stroke="{_SERIES[series][0]}" fill="none"/>'] if np.isfinite([a, b]).all() else []
+    return parts + [_dot(x, y, series)] * bool(np.isfinite(x))
+
+
+def _dot(x: float, y: float, series: int) -> str:
+    colour, mark = _SERIES[series]
+    return f'<path transform="translate({x:.1f} {y:.1f}) scale(.8)" d="{mark}" fill="{colour}"/>'

@@ -1,4 +1,4 @@
-"""The paper's Figure 3: eight panels from stored summaries, for one reading of the noise and one statistic."""
+"""The paper's Figures 3 and 4, from stored summaries and panels."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from rsbench.storage.files import read_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SWEEPS = ("noise", "baseline", "translation", "rotation", "readout")
 CENTRES: tuple[Centre, ...] = ("median", "mean")
@@ -44,17 +45,28 @@ _STYLES: dict[str, dict[str, Any]] = {
     "rs-stereo-iterated": {"color": "#E69F00", "linestyle": "-.", "marker": "P"},
     "rs-stereo-refined-pairs": {"color": "#0072B2", "linestyle": "-", "marker": "D"},
 }
-_PAPERS = ("rs-stereo-linear", "rs-stereo-linear-symmetric", "gs-8pt")
-"""What the paper compares; the others stand below, outside its terms."""
-_BOUND: dict[str, Any] = {"color": "0.45", "linestyle": ":", "linewidth": 2.0, "zorder": 1}
+_BOUND: dict[str, Any] = {"color": "0.45", "linestyle": ":", "zorder": 3}
 _OTHER = {"color": "#009E73", "linestyle": ":", "marker": "x"}
 _LABELS = {
     "rs-stereo-linear": "paper's solver, literal",
-    "rs-stereo-linear-symmetric": "paper's solver, w from the symmetric part of E",
-    "gs-8pt": "global-shutter 8-point",
-    "rs-stereo-iterated": "iterated linear (not the paper's)",
-    "rs-stereo-refined-pairs": "refined (non-linear: outside the paper's terms)",
+    "rs-stereo-linear-symmetric": "paper's solver, symmetric part",
+    "gs-8pt": "global shutter, 8 points",
+    "rs-stereo-iterated": "linear, iterated *",
+    "rs-stereo-refined-pairs": "maximum likelihood *",
 }
+COLUMN_MM = 88.0
+"""Width of a column in print."""
+_INCH_MM = 25.4
+_COLUMN_IN, _WIDE_IN = (COLUMN_MM / _INCH_MM, 6.3), (13.2, 6.0)
+_COLUMN: dict[str, Any] = {
+    "font.size": 6.5,
+    "lines.linewidth": 0.9,
+    "lines.markersize": 2.5,
+    "axes.linewidth": 0.5,
+}
+_COLUMN |= {"xtick.major.width": 0.5, "ytick.major.width": 0.5, "xtick.major.pad": 2.0, "ytick.major.pad": 1.5}
+_COLUMN |= {"axes.titlesize": 7, "axes.labelpad": 1.5}
+_TICK_DECADES = 2
 
 
 def read_summaries(folder: Path, sweeps: tuple[str, ...]) -> dict[str, pd.DataFrame]:
@@ -85,116 +97,99 @@ def draw_fig3(folder: Path) -> list[Path]:
     return paths
 
 
-# The paper's arrangement. Its first column shows e_R and e_T in one panel; here such a panel has two halves.
-_PANELS = (
-    (("a", "noise", "e_R e_T"), ("b", "translation", "e_R"), ("c", "rotation", "e_R"), ("d", "readout", "e_R")),
-    (("e", "baseline", "e_R e_T"), ("f", "translation", "e_T"), ("g", "rotation", "e_T"), ("h", "readout", "e_T")),
-)
-
-
 def _draw_fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, stem: Path) -> list[Path]:
-    with _style() as plt:
-        figure = plt.figure(figsize=(13.2, 10.2))
-        grid = figure.add_gridspec(2, 4, left=0.052, right=0.992, bottom=0.05, top=0.87, wspace=0.25, hspace=0.17)
-        for row, panels in enumerate(_PANELS):
-            for column, (letter, name, measures) in enumerate(panels):
-                table = tables[name]
-                chosen = table if name == "noise" else table[table.variant == variant]
-                halves = grid[row, column].subgridspec(len(measures.split()), 1, hspace=0.12)
-                for number, measure in enumerate(measures.split()):
-                    parts = halves[number].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.06)
-                    upper, lower = (figure.add_subplot(part) for part in parts)
-                    _comparison(upper, chosen, name, measure, centre)
-                    _beyond(lower, chosen, name, measure, centre)
-                    if name == "noise":
-                        for axes in (upper, lower):
-                            axes.axvline(READINGS[variant], color="0.5", linewidth=0.9, zorder=0)
-                    if number == 0:
-                        upper.set_title(f"({letter}) {name}", loc="left")
-                    if number < len(measures.split()) - 1:
-                        lower.set_xlabel("")
-                        lower.tick_params(labelbottom=False)
-        _title(figure, tables, variant, centre)
-        paths = [stem.with_suffix(ending) for ending in (".pdf", ".png")]
-        figure.savefig(paths[0], metadata={"CreationDate": None, "Producer": None, "Creator": None})
-        figure.savefig(paths[1], dpi=130, metadata={"Software": None})
-        plt.close(figure)
+    """For a column in print as PDF, and for a screen as PNG."""
+    paths = [stem.with_suffix(ending) for ending in (".pdf", ".png")]
+    with _style(_COLUMN):
+        metadata: dict[str, Any] = {"CreationDate": None, "Producer": None, "Creator": None}
+        fig3(tables, variant, centre, upright=True).savefig(paths[0], metadata=metadata)
+    with _style():
+        fig3(tables, variant, centre, upright=False).savefig(paths[1], dpi=130, metadata={"Software": None})
     return paths
 
 
-def _comparison(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Centre) -> None:
-    """What the paper draws: its solver against the global-shutter algorithm."""
-    _curves(axes, table[table.solver.isin(_PAPERS)], measure, centre)
-    _scales(axes, table, name)
-    axes.set_ylabel(_Y_LABELS[measure], labelpad=1)
-    axes.tick_params(labelbottom=False)
+def fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, *, upright: bool) -> Figure:
+    """The figure: sweeps in the order of the paper's columns, rotation beside direction, one scale for each.
 
+    Args:
+        tables: of ``read_summaries``.
+        variant: reading of the noise.
+        centre: what is drawn of the trials.
+        upright: a row for each sweep, else a column.
+    """
+    from matplotlib.figure import Figure
 
-def _beyond(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Centre) -> None:
-    """Solvers outside the paper's terms on an axis of their own, and the bound of the same statistic."""
-    _curves(axes, table[~table.solver.isin(_PAPERS)], measure, centre)
-    limit = table[table.solver == OURS]
-    axes.plot(limit.value, limit[f"{measure}_bound_{centre}"], label=f"{centre} at the Cramér-Rao bound", **_BOUND)
-    axes.set_facecolor("0.96")
-    _scales(axes, table, name)
-    axes.set_xlabel(_X_LABELS[name])
+    figure = Figure(figsize=_COLUMN_IN if upright else _WIDE_IN, layout="constrained")
+    shape, along = (len(SWEEPS), len(_Y_LABELS)), ("row", "col")
+    panels = figure.subplots(
+        *(shape if upright else shape[::-1]),
+        sharex=along[not upright],
+        sharey=along[upright],
+        squeeze=False,
+    )
+    for row, name in zip(panels if upright else panels.T, SWEEPS, strict=True):
+        table = tables[name] if name == "noise" else tables[name][tables[name].variant == variant]
+        for axes, measure in zip(row, _Y_LABELS, strict=True):
+            _curves(axes, table, measure, centre)
+            _scales(axes, table, name)
+            axes.set_xlabel(_X_LABELS[name])
+            if name == "noise":
+                axes.axvline(READINGS[variant], color="0.5", linewidth=0.7, zorder=0)
+                axes.set(**{"title" if upright else "ylabel": _Y_LABELS[measure]})
+    for axes in panels.flat:
+        _tick_decades(axes)
+        if not upright:
+            axes.label_outer()
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    trials = int(tables["noise"].trials.iloc[0])
+    words = "$10^{-3}$ px" if variant == "1e-3 px" else "$10^{-3}$ of the image plane = 0.81 px"
+    title = f"Noise read as {words}: {centre} of {trials} trials, 95 % interval"
+    columns = 2 if upright else len(labels)
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, title=title)
+    return figure
 
 
 def _curves(axes: Axes, table: pd.DataFrame, measure: str, centre: Centre) -> None:
-    """Curves with 95 % bands over the values of one sweep."""
+    """Curves with 95 % bands over the values of one sweep, and the bound of the same statistic."""
     for solver, rows in table.groupby("solver", sort=False):
         style = _STYLES.get(str(solver), _OTHER)
         key = f"{measure}_{centre}"
-        given = rows["information"].iloc[0]
-        axes.plot(rows.value, rows[key], label=f"{_LABELS.get(str(solver), solver)} ({given})", **style)
+        axes.plot(rows.value, rows[key], label=_LABELS.get(str(solver), str(solver)), **style)
         axes.fill_between(
             rows.value, rows[f"{key}_low"], rows[f"{key}_high"], color=style["color"], alpha=0.2, linewidth=0
         )
+    limit = table[table.solver == OURS]
+    axes.plot(limit.value, limit[f"{measure}_bound_{centre}"], label="at the Cramér-Rao bound *", **_BOUND)
 
 
 def _scales(axes: Axes, table: pd.DataFrame, name: str) -> None:
     axes.set_yscale("log")
-    _label_decades(axes)
     if name in _LOG_X:
         axes.set_xscale("log")
     if name in ("rotation", "translation", "readout"):
         values = sorted(set(table.value))
         axes.set_xticks(values, [f"{value:g}" for value in values])
-        axes.minorticks_off()
-    axes.grid(True, which="major", color="0.88", linewidth=0.6)
+        axes.xaxis.minorticks_off()
+    axes.grid(True, which="major", color="0.88", linewidth=0.5)
 
 
-def _label_decades(axes: Axes) -> None:
-    """Ticks that fit: decades where there are some, else 1, 2 and 5 of each, else three or four even ones."""
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
+def _tick_decades(axes: Axes) -> None:
+    """Every other decade: panels are low, and share their scale."""
+    from matplotlib.ticker import FixedLocator, NullFormatter
 
-    low, high = axes.get_ylim()
-    if high < 50 * low:
-        locator = MaxNLocator(3) if high < 4 * low else LogLocator(subs=(1.0, 2.0, 5.0))
-        axes.yaxis.set_major_locator(locator)
-        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _title(figure: Any, tables: dict[str, pd.DataFrame], variant: str, centre: Centre) -> None:
-    for axes, height in ((figure.axes[0], 0.965), (figure.axes[1], 0.94)):
-        handles, labels = axes.get_legend_handles_labels()
-        place = (0.5, height)
-        figure.legend(handles, labels, loc="upper center", ncol=len(labels), frameon=False, bbox_to_anchor=place)
-    trials = int(tables["noise"].trials.iloc[0])
-    words = "$10^{-3}$ px" if variant == "1e-3 px" else "$10^{-3}$ of the normalised image plane = 0.81 px"
-    figure.suptitle(
-        f"Figure 3, noise read as {words}: {centre} of {trials} trials with 95 % interval; no RANSAC", y=0.985
+    low, high = (math.log10(end) for end in axes.get_ylim())
+    first = _TICK_DECADES * math.ceil(low / _TICK_DECADES)
+    axes.yaxis.set_major_locator(
+        FixedLocator([10.0**e for e in range(first, math.floor(high) + 1, _TICK_DECADES)])
     )
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.minorticks_off()
 
 
 @contextmanager
-def _style() -> Iterator[Any]:
-    """matplotlib without a screen, the user's settings and anything that differs between runs."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
+def _style(more: dict[str, Any] | None = None) -> Iterator[None]:
+    """matplotlib without the user's settings and anything that differs between runs."""
+    from matplotlib import rc_context, style
 
     settings: Any = {
         "font.size": 9,
@@ -206,8 +201,8 @@ def _style() -> Iterator[Any]:
         "svg.hashsalt": "rsbench",
         "pdf.fonttype": 42,
     }
-    with plt.style.context("default"), plt.rc_context(settings):
-        yield plt
+    with style.context("default"), rc_context(settings | (more or {})):
+        yield
 
 
 def setting_table(cards: list[SweepCard]) -> pd.DataFrame:
@@ -238,23 +233,25 @@ _PAGE = """# The paper's Figure 3, made again
 Made by `rsbench reproduce fig3`: simulated points, bare solvers without RANSAC, the same scenes and the same
 noise for all of them. The paper's noise of "10^-3" has no unit, so each figure exists for both readings; the
 paper plots means, which a few flipped translations can dominate, so medians stand beside them. Bands are 95 %
-bootstrap intervals, 10 000 draws. Upper halves: what the paper compares, its solver (read literally, and with w
-from the symmetric part of E) against the global-shutter eight-point algorithm. Lower halves, with an axis of
-their own: what lies outside the paper's terms, which exclude non-linear optimisation, and the same statistic of
-a solver whose errors are Gaussian and at the Cramer-Rao bound of the left and right pairs. The vertical line
-marks the reading. Every row is one draw of its trials and none was drawn again, so that of the ratios of a solver
-at its bound one in forty lies below 1 with its interval; rows of one sweep share scenes and noise, and do so
-together. The eight-point algorithm, which is biased, is below in places.
+bootstrap intervals, 10 000 draws. All panels of an error share one scale. With a star: what lies outside the
+paper's terms, which exclude non-linear optimisation, and the same statistic of a solver whose errors are
+Gaussian and at the Cramer-Rao bound of the left and right pairs. The vertical line marks the reading. Every row
+is one draw of its trials and none was drawn again, so that of the ratios of a solver at its bound one in forty
+lies below 1 with its interval; rows of one sweep share scenes and noise, and do so together. The eight-point
+algorithm, which is biased, is below in places.
 
 | | 10^-3 px | 10^-3 of the normalised image plane, 0.81 px |
 |---|---|---|
 | median | ![median, 10^-3 px](fig3-px-median.png) | ![median, 0.81 px](fig3-normalised-median.png) |
 | mean | ![mean, 10^-3 px](fig3-px-mean.png) | ![mean, 0.81 px](fig3-normalised-mean.png) |
 
-The panels stand where the paper has them; its first column shows both errors in one panel, which has two halves
-here. Where the two readings of the paper's solver agree, as in most e_T, the second covers the first. The baseline
-is the distance between the cameras; the paper may mean half of it. The eight-point algorithm sees the left camera
-alone and is scored against that camera's own translation.
+Each is also a PDF for a column of 88 mm, with a row for each sweep: [median](fig3-px-median.pdf) and
+[mean](fig3-px-mean.pdf) of 10^-3 px, [median](fig3-normalised-median.pdf) and [mean](fig3-normalised-mean.pdf) of
+0.81 px. Sweeps stand in the order of the paper's columns: noise and baseline, whose panels hold both errors there,
+translation, rotation, readout. Where the two readings of the paper's solver agree, as in most e_T, the second
+covers the first; *symmetric part* reads w from the symmetric part of E. The baseline is the distance between the
+cameras; the paper may mean half of it. The eight-point algorithm sees the left camera alone and is scored against
+that camera's own translation; the others see left and right pairs.
 The tables `<sweep>.csv` hold all figures, also of scale, failures and error over bound.
 [trials.npz](trials.npz) holds what they summarise, the errors of every trial in single precision:
 `<sweep>_e_R_deg` and `<sweep>_e_T_deg` (rows, trials), whose row k is that of the table; NumPy reads it.

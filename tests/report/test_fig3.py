@@ -14,7 +14,7 @@ from rsbench.benchmark.simulated.sweep_card import load_sweep
 from rsbench.benchmark.studies.claims import READINGS
 from rsbench.core.errors import RsbenchError
 from rsbench.report import paper_figures
-from rsbench.report.paper_figures import SWEEPS, draw_fig3, setting_table
+from rsbench.report.paper_figures import SWEEPS, draw_fig3, fig3, read_summaries, setting_table
 
 SOLVERS = {"rs-stereo-linear": 0.5, "rs-stereo-refined-pairs": 0.01, "gs-8pt": 1.0, "somebody-elses": 0.3}
 
@@ -58,6 +58,31 @@ def test_equal_summaries_give_equal_bytes_without_dates(tmp_path: Path, monkeypa
             assert b"/Subtype /Image" not in content and b"/FontFile2" in content
             streams = [_inflated(s) for s in re.findall(rb"stream\r?\n(.*?)endstream", content, re.DOTALL)]
             assert any(b" l\n" in stream for stream in streams)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_an_error_has_one_scale_that_holds_all_of_it(upright: bool) -> None:
+    """Panels stand in the order of the paper's columns: noise and baseline, translation, rotation, readout."""
+    folder = Path(__file__).parents[2] / "results" / "fig3"
+    tables = read_summaries(folder, SWEEPS)
+    panels = fig3(tables, "0.81 px", "mean", upright=upright).axes
+    by_error = [panels[0::2], panels[1::2]] if upright else [panels[:5], panels[5:]]
+    for measure, row in zip(("e_R", "e_T"), by_error, strict=True):
+        ((low, high),) = {axes.get_ylim() for axes in row}
+        for axes, name in zip(row, ("noise", "baseline", "translation", "rotation", "readout"), strict=True):
+            table = tables[name] if name == "noise" else tables[name][tables[name].variant == "0.81 px"]
+            wanted = {tuple(rows[f"{measure}_mean"]) for _, rows in table.groupby("solver")}
+            curves = {tuple(np.asarray(line.get_ydata())) for line in axes.lines}
+            assert wanted <= curves, (name, measure)
+            every = table[[f"{measure}_mean", f"{measure}_mean_low", f"{measure}_mean_high"]].to_numpy()
+            assert low < np.min(every) and np.max(every) < high
+
+
+def test_the_committed_pdf_fits_a_column() -> None:
+    for path in (Path(__file__).parents[2] / "results" / "fig3").glob("*.pdf"):
+        (box,) = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", path.read_bytes())
+        width, height = (float(each) * 25.4 / 72.0 for each in box)
+        assert abs(width - 88.0) < 0.01 and height < 235.0, "a page of A4 between its margins"
 
 
 def _inflated(stream: bytes) -> bytes:
