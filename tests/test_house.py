@@ -190,6 +190,10 @@ def test_links_between_documents_lead_somewhere() -> None:
     broken = []
     for document in DOCUMENTS:
         prose = re.sub(r"```.*?```|`[^`]*`", "", document.read_text("utf-8"), flags=re.DOTALL)
+        named = set(re.findall(r"^\[([^\]]+)\]: ", prose, re.MULTILINE))
+        broken += [
+            f"{document.name}: [{name}]" for name in re.findall(r"\]\[([^\]]+)\]", prose) if name not in named
+        ]
         for target in re.findall(r"\]\(([^)#\s]+)", prose):
             path = ROOT / repository.sub("", target) if repository.match(target) else None
             if path is None and "://" not in target:
