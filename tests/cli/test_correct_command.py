@@ -270,6 +270,8 @@ def test_a_gyroscope_that_contradicts_the_frames_is_told_and_left_out(
     given = ("--gyro", log, "--fps", 20, "--motion-model", "linear")
     assert_refused(correct(*footage, tmp_path / "no", *given), "--gyro", "four frames and more")
     assert_refused(correct(*footage, tmp_path / "no", *given[:4], "--gyro-offset", 90), "--gyro-offset")
+    given = ("--row-poses", "--motion-model", "linear")
+    assert_refused(correct(*footage, tmp_path / "no", *given), "--row-poses", "four frames and more")
 
 
 def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Path], rig: Path) -> None:
