@@ -187,7 +187,7 @@ def test_dataset_cards_name_cards_that_exist() -> None:
 def test_links_between_documents_lead_somewhere() -> None:
     """Those in docs/ stay in it, or are addresses: it is installed, and made into a site, without the rest."""
     repository = re.compile(r"https://github\.com/rsbench/rsbench/(blob|raw)/main/")
-    broken = []
+    broken: list[str] = []
     for document in DOCUMENTS:
         prose = re.sub(r"```.*?```|`[^`]*`", "", document.read_text("utf-8"), flags=re.DOTALL)
         named = set(re.findall(r"^\[([^\]]+)\]: ", prose, re.MULTILINE))
