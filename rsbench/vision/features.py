@@ -176,9 +176,11 @@ def refine_matches(
         ]
         found = list(
             pool.map(
-                lambda t: aligned(
-                    smooth[t[0]], smooth[t[1]], t[2], t[3], across if t[0][0] != t[1][0] else np.eye(2)
-                )[0],
+                lambda t: (
+                    align(
+                        smooth[t[0]], smooth[t[1]], t[2], t[3], across if t[0][0] != t[1][0] else np.eye(2)
+                    ).places
+                ),
                 tasks,
             )
         )
@@ -217,19 +219,6 @@ class Aligned(NamedTuple):
     correlates the residuals: this common factor is not included."""
 
 
-def aligned(
-    a: F32, b: F32, points_a: FloatArray, points_b: FloatArray, start: FloatArray | None = None
-) -> tuple[FloatArray, BoolArray]:
-    """Places (n, 2) in b of the patches at points of a, from places nearby, and which of them were aligned.
-
-    Args:
-        a, b: (H, W) images from ``smoothed``.
-        points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
-        start: (2, 2) approximate affine map from the pixels around a point of a to those of b; None: the identity.
-    """
-    return align(a, b, points_a, points_b, start)[:2]
-
-
 def align(
     a: F32,
     b: F32,
@@ -239,9 +228,12 @@ def align(
     most_px: float = _MOST_PX,
     most_sigma: float = _MOST_SIGMA_PX,
 ) -> Aligned:
-    """``aligned`` with the covariances.
+    """Align patches at points of a with places in b nearby.
 
     Args:
+        a, b: (H, W) images from ``smoothed``.
+        points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
+        start: (2, 2) approximate affine map from the pixels around a point of a to those of b; None: the identity.
         most_px: largest change of a place.
         most_sigma: largest standard deviation of an accepted place, px.
     """
