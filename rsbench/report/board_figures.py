@@ -1,4 +1,5 @@
-"""Drawings of the leaderboard as SVG: intervals in a table, errors against what problems are, calibration."""
+"""Drawings of the leaderboard as SVG: intervals in a table, errors over properties of the problems,
+calibration."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ _WIDTH, _HEIGHT = 300, 190
 _LEFT, _BOTTOM, _TOP, _RIGHT = 44, 24, 8, 12
 _BINS = 5
 _APART = 2.5
-"""Px between the intervals of two lines at one place."""
+"""Distance between the intervals of two entries at the same value, px."""
 _SEED = 0
 _DASHES = ("", "6 3", "2 2", "8 3 2 3", "1 3", "10 4")
 _MARKS = (
@@ -33,10 +34,10 @@ _MARKS = (
     "M0 4L4 -3H-4z",
     "M-3 -3L3 3M-3 3L3 -3",
 )
-"""Colours of board.css.j2 suit any colour vision; marks and dashes differ too."""
+"""Styles of entries: colours of board.css.j2 for any colour vision; marks and dashes differ too."""
 MOST_LINES = len(_MARKS)
 _NOTHING = 1e-6
-"""The truth errs by less, and is not drawn: it would stretch the axis."""
+"""Largest error of an entry that is not drawn: the truth has only rounding errors and would stretch the axis."""
 
 
 class ErrorLine(NamedTuple):
@@ -44,9 +45,9 @@ class ErrorLine(NamedTuple):
 
     name: str
     errors: FloatArray
-    """(n,) in the order of the problems."""
+    """(n,) errors in the order of the problems."""
     grey: bool
-    """Whether it is drawn grey, as an oracle."""
+    """Whether it is an oracle, which is drawn in grey."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +59,7 @@ class _Curve:
     at: FloatArray
     """Medians (parts,)."""
     ends: FloatArray
-    """Ends (parts, 2) of their intervals; infinite where the values bound nothing."""
+    """Ends (parts, 2) of their intervals; infinite if there are too few values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +91,7 @@ class _Axis:
 
 
 def bar(value: float, low: float, high: float) -> Markup:
-    """A value in [0, 1] with its interval; what it shows stands beside it as text."""
+    """Drawing of a value in [0, 1] with its interval; a text beside it has the numbers."""
     x, a, b = (1.0 + _BAR * min(max(each, 0.0), 1.0) for each in (value, low, high))
     return Markup(
         f'<svg width="{_BAR + 2}" height="12" aria-hidden="true"><path d="M1 6H{_BAR + 1}" stroke="currentColor" '
@@ -103,7 +104,7 @@ def bar(value: float, low: float, high: float) -> Markup:
 
 
 def legend(lines: Sequence[ErrorLine]) -> Markup:
-    """Which mark is whose."""
+    """Marks of the entries, for a legend."""
     items = []
     for line, (style, dash, mark) in zip(lines, _styles(lines), strict=True):
         drawn = f'<path d="M0 7h34" {_stroke(style, dash)}/>{_mark(17.0, 7.0, style, mark)}'
@@ -112,21 +113,21 @@ def legend(lines: Sequence[ErrorLine]) -> Markup:
 
 
 def drawable(lines: Sequence[ErrorLine]) -> list[ErrorLine]:
-    """The first ``MOST_LINES`` entries, and oracles that err."""
+    """The first ``MOST_LINES`` entries, and oracles with errors."""
     ranked = [line for line in lines if not line.grey][:MOST_LINES]
     return ranked + [line for line in lines if line.grey and np.median(line.errors) > _NOTHING]
 
 
 def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) -> Markup | None:
-    """Median errors with their intervals in parts of the problems: by words, by few values, else by fifths.
+    """Median errors with their intervals in parts of the problems: by words, by few values, otherwise by fifths.
 
     Args:
         facts: (n,) numbers or words of the problems.
-        lines: what ``drawable`` gives.
-        scenes: (n,) of the problems: their intervals keep those of a scene together.
+        lines: result of ``drawable``.
+        scenes: (n,) of the problems: their intervals resample whole scenes.
 
     Returns:
-        None where the problems have fewer than two values.
+        None if the problems have fewer than two values.
     """
     parts = _parts(facts)
     if parts is None or not lines:
@@ -142,7 +143,7 @@ def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) 
 
 
 def _parts(facts: pd.Series) -> tuple[NDArray[np.intp], Sequence[float | str]] | None:
-    """The part of each problem, and what the parts are called: words, or medians."""
+    """The part of each problem, and the labels of the parts: words, or medians."""
     if not pd.api.types.is_numeric_dtype(facts):
         words, part = np.unique(facts.astype(str).to_numpy(), return_inverse=True)
         return None if len(words) < 2 else (part, [str(word) for word in words])
@@ -168,12 +169,12 @@ def _typical(errors: FloatArray, where: NDArray[np.bool_], clusters: NDArray[np.
 
 @lru_cache
 def _bracket(n: int) -> Interval:
-    """Ranks, from 0, of the ends of the exact interval of a median; infinite where there is none."""
+    """Ranks, from 0, of the ends of the exact interval of a median; infinite if there is none."""
     return median_interval(np.arange(n))
 
 
 def _styles(lines: Sequence[ErrorLine]) -> list[tuple[str, str, str]]:
-    """Colour, dash and mark of each."""
+    """Colour, dash and mark of each entry."""
     coloured = iter([(f"var(--c{k})", _DASHES[k], _MARKS[k]) for k in range(MOST_LINES)])
     return [("var(--grey)", "", "") if line.grey else next(coloured) for line in lines]
 
@@ -204,7 +205,7 @@ def _drawn(labels: Sequence[float | str], drawn: Sequence[_Curve]) -> Markup:
 
 
 def _across(labels: Sequence[float | str]) -> FloatArray:
-    """Places of the parts, px."""
+    """Horizontal positions of the parts, px."""
     words = isinstance(labels[0], str)
     inset = 0.5 * (_WIDTH - _LEFT - _RIGHT) / len(labels) if words else 12.0
     x = np.array([k if isinstance(label, str) else label for k, label in enumerate(labels)], dtype=np.float64)
@@ -214,7 +215,7 @@ def _across(labels: Sequence[float | str]) -> FloatArray:
 
 
 def _axis(drawn: Sequence[_Curve]) -> _Axis:
-    """Axis that shows all medians and the finite ends of their intervals; logarithmic where nothing is 0."""
+    """Axis that shows all medians and the finite ends of their intervals; logarithmic if no value is 0."""
     every = np.concatenate([np.concatenate([each.at, each.ends.ravel()]) for each in drawn])
     known = every[np.isfinite(every)]
     low, high = float(np.min(known)), float(np.max(known))
@@ -261,7 +262,7 @@ def _mark(a: float, b: float, style: str, mark: str) -> str:
 
 
 def reliability(covers: Sequence[Triple]) -> Markup:
-    """Shares of truths within the ellipsoids of the levels, against those that should be."""
+    """Coverage of the ellipsoids of the levels over the nominal coverage."""
     side, width = 150.0, 190
 
     def place(x: float, y: float) -> str:
