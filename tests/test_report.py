@@ -131,6 +131,11 @@ def corrections() -> Iterator[str]:
     for title, key in methods.items():
         values = " | ".join(f"{rows[stratum, key]:.1f}" for stratum in ("mild", "moderate", "aggressive"))
         yield f"| {title} | {values} |"
+    (board,) = (ROOT / "results/laws/site").glob("correction-3--*.csv")
+    table = {row["method"]: row for row in results(f"laws/site/{board.name}")}
+    one, two = (float(table[name]["corrected"]) for name in ("mono-fusion", "fusion"))
+    assert "mono-fusion" in table["fusion"]["ties"].split()
+    yield f"it scores {one:.2f} and two cameras {two:.2f}, which is not a significant difference"
 
 
 def test_every_figure_of_the_report_is_one_of_the_results() -> None:
