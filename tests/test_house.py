@@ -205,6 +205,24 @@ def test_links_between_documents_lead_somewhere() -> None:
     assert not broken
 
 
+def test_links_to_sections_lead_to_one() -> None:
+    """By the anchors that GitHub and the site give to headings."""
+
+    def anchors(document: Path) -> set[str]:
+        text = re.sub(r"^```.*?^```", "", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+        titles = (re.sub(r"[^\w\- ]", "", title).strip() for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+        return {title.lower().replace(" ", "-") for title in titles}
+
+    broken = []
+    for document in DOCUMENTS:
+        prose = re.sub(r"```.*?```|`[^`]*`", "", document.read_text("utf-8"), flags=re.DOTALL)
+        for path, section in re.findall(r"\]\(([^)#\s:]*)#([^)\s]+)\)", prose):
+            target = document.parent / path if path else document
+            if target.suffix == ".md" and section not in anchors(target):
+                broken.append(f"{document.name}: {path}#{section}")
+    assert broken == []
+
+
 def test_the_table_of_packages_has_all_of_them_in_the_order_of_the_layers() -> None:
     contract = read_toml(ROOT / "pyproject.toml")["tool"]["importlinter"]["contracts"][0]
     layers = [re.findall(r"rsbench\.(\w+)", line) for line in contract["layers"]]
