@@ -1,5 +1,4 @@
-"""Drawings of the leaderboard as SVG: intervals in a table, errors over properties of the problems,
-calibration."""
+"""Drawings of the leaderboard as SVG: intervals in a table, errors against what problems are, calibration."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ _WIDTH, _HEIGHT = 300, 190
 _LEFT, _BOTTOM, _TOP, _RIGHT = 44, 24, 8, 12
 _BINS = 5
 _APART = 2.5
-"""Distance between the intervals of two entries at the same value, px."""
+"""Px between the intervals of two lines at one place."""
 _SEED = 0
 _DASHES = ("", "6 3", "2 2", "8 3 2 3", "1 3", "10 4")
 _MARKS = (
@@ -34,10 +33,10 @@ _MARKS = (
     "M0 4L4 -3H-4z",
     "M-3 -3L3 3M-3 3L3 -3",
 )
-"""Styles of entries: colours of board.css.j2 for any colour vision; marks and dashes differ too."""
+"""Colours of board.css.j2 suit any colour vision; marks and dashes differ too."""
 MOST_LINES = len(_MARKS)
 _NOTHING = 1e-6
-"""Largest error of an entry that is not drawn: the truth has only rounding errors and would stretch the axis."""
+"""The truth errs by less, and is not drawn: it would stretch the axis."""
 
 
 class ErrorLine(NamedTuple):
@@ -45,9 +44,9 @@ class ErrorLine(NamedTuple):
 
     name: str
     errors: FloatArray
-    """(n,) errors in the order of the problems."""
+    """(n,) in the order of the problems."""
     grey: bool
-    """Whether it is an oracle, which is drawn in grey."""
+    """Whether it is drawn grey, as an oracle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,7 @@ class _Curve:
     at: FloatArray
     """Medians (parts,)."""
     ends: FloatArray
-    """Ends (parts, 2) of their intervals; infinite if there are too few values."""
+    """Ends (parts, 2) of their intervals; infinite where the values bound nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +90,7 @@ class _Axis:
 
 
 def bar(value: float, low: float, high: float) -> Markup:
-    """Drawing of a value in [0, 1] with its interval; a text beside it has the numbers."""
+    """A value in [0, 1] with its interval; what it shows stands beside it as text."""
     x, a, b = (1.0 + _BAR * min(max(each, 0.0), 1.0) for each in (value, low, high))
     return Markup(
         f'<svg width="{_BAR + 2}" height="12" aria-hidden="true"><path d="M1 6H{_BAR + 1}" stroke="currentColor" '
@@ -104,7 +103,7 @@ def bar(value: float, low: float, high: float) -> Markup:
 
 
 def legend(lines: Sequence[ErrorLine]) -> Markup:
-    """Marks of the entries, for a legend."""
+    """Which mark is whose."""
     items = []
     for line, (style, dash, mark) in zip(lines, _styles(lines), strict=True):
         drawn = f'<path d="M0 7h34" {_stroke(style, dash)}/>{_mark(17.0, 7.0, style, mark)}'
@@ -113,21 +112,21 @@ def legend(lines: Sequence[ErrorLine]) -> Markup:
 
 
 def drawable(lines: Sequence[ErrorLine]) -> list[ErrorLine]:
-    """The first ``MOST_LINES`` entries, and oracles with errors."""
+    """The first ``MOST_LINES`` entries, and oracles that err."""
     ranked = [line for line in lines if not line.grey][:MOST_LINES]
     return ranked + [line for line in lines if line.grey and np.median(line.errors) > _NOTHING]
 
 
 def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) -> Markup | None:
-    """Median errors with their intervals in parts of the problems: by words, by few values, otherwise by fifths.
+    """Median errors with their intervals in parts of the problems: by words, by few values, else by fifths.
 
     Args:
         facts: (n,) numbers or words of the problems.
-        lines: result of ``drawable``.
-        scenes: (n,) of the problems: their intervals resample whole scenes.
+        lines: what ``drawable`` gives.
+        scenes: (n,) of the problems: their intervals keep those of a scene together.
 
     Returns:
-        None if the problems have fewer than two values.
+        None where the problems have fewer than two values.
     """
     parts = _parts(facts)
     if parts is None or not lines:
@@ -143,7 +142,7 @@ def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) 
 
 
 def _parts(facts: pd.Series) -> tuple[NDArray[np.intp], Sequence[float | str]] | None:
-    """The part of each problem, and the labels of the parts: words, or medians."""
+    """The part of each problem, and what the parts are called: words, or medians."""
     if not pd.api.types.is_numeric_dtype(facts):
         words, part = np.unique(facts.astype(str).to_numpy(), return_inverse=True)
         return None if len(words) < 2 else (part, [str(word) for word in words])
@@ -169,12 +168,12 @@ def _typical(errors: FloatArray, where: NDArray[np.bool_], clusters: NDArray[np.
 
 @lru_cache
 def _bracket(n: int) -> Interval:
-    """Ranks, from 0, of the ends of the exact interval of a median; infinite if there is none."""
+    """Ranks, from 0, of the ends of the exact interval of a median; infinite where there is none."""
     return median_interval(np.arange(n))
 
 
 def _styles(lines: Sequence[ErrorLine]) -> list[tuple[str, str, str]]:
-    """Colour, dash and mark of each entry."""
+    """Colour, dash and mark of each."""
     coloured = iter([(f"var(--c{k})", _DASHES[k], _MARKS[k]) for k in range(MOST_LINES)])
     return [("var(--grey)", "", "") if line.grey else next(coloured) for line in lines]
 
@@ -205,7 +204,7 @@ def _drawn(labels: Sequence[float | str], drawn: Sequence[_Curve]) -> Markup:
 
 
 def _across(labels: Sequence[float | str]) -> FloatArray:
-    """Horizontal positions of the parts, px."""
+    """Places of the parts, px."""
     words = isinstance(labels[0], str)
     inset = 0.5 * (_WIDTH - _LEFT - _RIGHT) / len(labels) if words else 12.0
     x = np.array([k if isinstance(label, str) else label for k, label in enumerate(labels)], dtype=np.float64)
@@ -215,7 +214,7 @@ def _across(labels: Sequence[float | str]) -> FloatArray:
 
 
 def _axis(drawn: Sequence[_Curve]) -> _Axis:
-    """Axis that shows all medians and the finite ends of their intervals; logarithmic if no value is 0."""
+    """Axis that shows all medians and the finite ends of their intervals; logarithmic where nothing is 0."""
     every = np.concatenate([np.concatenate([each.at, each.ends.ravel()]) for each in drawn])
     known = every[np.isfinite(every)]
     low, high = float(np.min(known)), float(np.max(known))
@@ -262,7 +261,7 @@ def _mark(a: float, b: float, style: str, mark: str) -> str:
 
 
 def reliability(covers: Sequence[Triple]) -> Markup:
-    """Coverage of the ellipsoids of the levels over the nominal coverage."""
+    """Shares of truths within the ellipsoids of the levels, against those that should be."""
     side, width = 150.0, 190
 
     def place(x: float, y: float) -> str:

@@ -45,7 +45,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "rs-stereo-refined-pairs": {"color": "#0072B2", "linestyle": "-", "marker": "D"},
 }
 _PAPERS = ("rs-stereo-linear", "rs-stereo-linear-symmetric", "gs-8pt")
-"""Solvers that the paper compares; the others are drawn below."""
+"""What the paper compares; the others stand below, outside its terms."""
 _BOUND: dict[str, Any] = {"color": "0.45", "linestyle": ":", "linewidth": 2.0, "zorder": 1}
 _OTHER = {"color": "#009E73", "linestyle": ":", "marker": "x"}
 _LABELS = {
@@ -123,7 +123,7 @@ def _draw_fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, st
 
 
 def _comparison(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Centre) -> None:
-    """Draw the paper's comparison: its solver and the global-shutter algorithm."""
+    """What the paper draws: its solver against the global-shutter algorithm."""
     _curves(axes, table[table.solver.isin(_PAPERS)], measure, centre)
     _scales(axes, table, name)
     axes.set_ylabel(_Y_LABELS[measure], labelpad=1)
@@ -131,7 +131,7 @@ def _comparison(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre
 
 
 def _beyond(axes: Axes, table: pd.DataFrame, name: str, measure: str, centre: Centre) -> None:
-    """Draw the other solvers on a separate axis, and the bound of the same statistic."""
+    """Solvers outside the paper's terms on an axis of their own, and the bound of the same statistic."""
     _curves(axes, table[~table.solver.isin(_PAPERS)], measure, centre)
     limit = table[table.solver == OURS]
     axes.plot(limit.value, limit[f"{measure}_bound_{centre}"], label=f"{centre} at the Cramér-Rao bound", **_BOUND)
@@ -165,8 +165,7 @@ def _scales(axes: Axes, table: pd.DataFrame, name: str) -> None:
 
 
 def _label_decades(axes: Axes) -> None:
-    """Set ticks that fit: decades if there are any, otherwise 1, 2 and 5 of each, otherwise three or four evenly
-    spaced ones."""
+    """Ticks that fit: decades where there are some, else 1, 2 and 5 of each, else three or four even ones."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
     low, high = axes.get_ylim()
@@ -191,7 +190,7 @@ def _title(figure: Any, tables: dict[str, pd.DataFrame], variant: str, centre: C
 
 @contextmanager
 def _style() -> Iterator[Any]:
-    """Settings of matplotlib without a screen, the user's settings and anything that differs between runs."""
+    """matplotlib without a screen, the user's settings and anything that differs between runs."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -212,7 +211,7 @@ def _style() -> Iterator[Any]:
 
 
 def setting_table(cards: list[SweepCard]) -> pd.DataFrame:
-    """Table of the fixed settings of each sweep; the paper does not give most of them."""
+    """What each sweep holds fixed; most of it is not in the paper."""
     rows = []
     for card in cards:
         s: Setting = card.setting
@@ -279,9 +278,9 @@ TITLES = (
     "(f) depth error",
 )
 ERROR_M = (0.001, 2.0)
-"""Ends of the logarithmic scale of depth errors, metres: below usual errors indoors, and the paper's limit."""
+"""Ends of the logarithmic scale of depth errors, metres: less than is usual indoors, and the paper's limit."""
 INVENTED = (0, 190, 255)
-"""Colour of depth where there is no surface, which the scale does not contain."""
+"""Colour of depth where there is no surface; none of the scale's."""
 _COLOURS = 256
 _PIXELS = {"pdf": 210, "jpg": 250}
 _JPEG = {"subsampling": 0, "optimize": True}
@@ -338,7 +337,7 @@ def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int, quality: int)
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """A colour scale: its ends, in the unit of the drawn values, and its ticks."""
+    """A colour scale: its ends in what is drawn, and the ticks there."""
 
     low: float
     high: float
@@ -347,7 +346,7 @@ class Scale:
 
 
 def depth_scale(panels: Panels) -> Scale:
-    """Scale of inverse depth, 1/m, without the nearest and the farthest 1 % of the surfaces; ticks in metres."""
+    """Scale of inverse depth, 1/m, without the nearest and farthest hundredth of the surfaces; ticks in metres."""
     low, high = np.nanpercentile(1.0 / panels.true_depth, [1, 99])
     even = (low + np.linspace(0.0, 1.0, 4) * (high - low)).tolist()
     texts = [f"{1.0 / value:.2g} m" if k == 0 else f"{1.0 / value:.2g}" for k, value in enumerate(even)]
@@ -380,7 +379,7 @@ def _draw_scale(figure: Any, place_in: tuple[float, float, float, float], scale:
 def panel_images(panels: Panels) -> list[Image]:
     """The six panels as RGB images."""
     depth, error = depth_scale(panels), _error_scale()
-    # An error of 0 is clipped to the lower end of the scale.
+    # No error at all is below the scale, as its smallest value is.
     size = np.log10(np.maximum(panels.depth_error, ERROR_M[0]))
     errors = pictures.colour_map(size, error.low, error.high, error.colours)
     errors[np.isinf(panels.depth_error)] = INVENTED
@@ -395,7 +394,7 @@ def panel_images(panels: Panels) -> list[Image]:
 
 
 def caption(name: str, n: dict[str, Any]) -> tuple[str, ...]:
-    """The caption below a row."""
+    """The lines under a row."""
     filled = n["share_other_camera"] + n["share_other_frame"]
     literal = ", ".join(n[option] for option in LITERAL if option in n)
     holes, by = ("black", f" ({literal})") if literal else ("inpainted", "")
@@ -427,7 +426,7 @@ def _percent(share: float) -> str:
 
 
 def few_colours(image: Image) -> Image:
-    """The image in 256 colours: a third of the bytes, without visible differences at the size of a panel."""
+    """The image in 256 colours: a third of the bytes in a file, and no difference at the size of a panel."""
     from PIL import Image as Pillow
 
     reduced = Pillow.fromarray(image).quantize(_COLOURS, method=Pillow.Quantize.MEDIANCUT)
