@@ -149,6 +149,7 @@ def _wrapped(text: str) -> str:
 
 def _filled(text: str) -> str:
     indent = "  " if text.startswith("- ") else ""
+    text = re.sub(r"\n +", " ", text)
     return textwrap.fill(text, 100, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 

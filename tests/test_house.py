@@ -187,9 +187,13 @@ def test_dataset_cards_name_cards_that_exist() -> None:
 def test_links_between_documents_lead_somewhere() -> None:
     """Those in docs/ stay in it, or are addresses: it is installed, and made into a site, without the rest."""
     repository = re.compile(r"https://github\.com/rsbench/rsbench/(blob|raw)/main/")
-    broken = []
+    broken: list[str] = []
     for document in DOCUMENTS:
         prose = re.sub(r"```.*?```|`[^`]*`", "", document.read_text("utf-8"), flags=re.DOTALL)
+        named = set(re.findall(r"^\[([^\]]+)\]: ", prose, re.MULTILINE))
+        broken += [
+            f"{document.name}: [{name}]" for name in re.findall(r"\]\[([^\]]+)\]", prose) if name not in named
+        ]
         for target in re.findall(r"\]\(([^)#\s]+)", prose):
             path = ROOT / repository.sub("", target) if repository.match(target) else None
             if path is None and "://" not in target:
@@ -199,6 +203,24 @@ def test_links_between_documents_lead_somewhere() -> None:
             if path is not None and (leaves or not path.exists()):
                 broken.append(f"{document.name}: {target}")
     assert not broken
+
+
+def test_links_to_sections_lead_to_one() -> None:
+    """By the anchors that GitHub and the site give to headings."""
+
+    def anchors(document: Path) -> set[str]:
+        text = re.sub(r"^```.*?^```", "", document.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+        titles = (re.sub(r"[^\w\- ]", "", title).strip() for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+        return {title.lower().replace(" ", "-") for title in titles}
+
+    broken = []
+    for document in DOCUMENTS:
+        prose = re.sub(r"```.*?```|`[^`]*`", "", document.read_text("utf-8"), flags=re.DOTALL)
+        for path, section in re.findall(r"\]\(([^)#\s:]*)#([^)\s]+)\)", prose):
+            target = document.parent / path if path else document
+            if target.suffix == ".md" and section not in anchors(target):
+                broken.append(f"{document.name}: {path}#{section}")
+    assert broken == []
 
 
 def test_the_table_of_packages_has_all_of_them_in_the_order_of_the_layers() -> None:

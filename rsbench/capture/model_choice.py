@@ -34,6 +34,8 @@ class ModelChoice:
     """Probability of each model that was compared, in descending order."""
     decided: bool
     """Whether the used model has a probability of 0.95 or more."""
+    requested: bool = False
+    """Whether the used model was given, not chosen by the matches."""
     rival: str
     """The most probable of the other models; empty if none was compared."""
     d_angle_deg: float
@@ -60,6 +62,8 @@ class ModelChoice:
         likely = [(name, p) for name, p in list(self.probability.items())[:3] if p >= 0.001]
         shares = ", ".join(f"{name} {100.0 * p:.1f} %" if p <= 0.999 else f"{name} > 99.9 %" for name, p in likely)
         head = self.used if self.decided else f"cannot tell, so {self.used} is used"
+        if self.requested:
+            head = f"{self.used}, as requested"
         if not self.rival:
             return head
         if self.d_angle_deg < _SAME_DEG and abs(self.d_length_percent) < _SAME_PERCENT:
@@ -94,6 +98,7 @@ def choose_model(capture: Capture, requested: str = AUTO) -> ModelChoice | None:
         parameters=_parameters(capture.peaks[used]),
         probability=probability,
         decided=probability[used] >= CERTAIN,
+        requested=requested != AUTO,
         rival=rival,
         d_angle_deg=angle,
         d_length_percent=percent,

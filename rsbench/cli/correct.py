@@ -23,7 +23,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench correct l0.png r0.png l1.png r1.png --rig rig.toml --out corrected --motion-model twist
 
-  rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, which knows its rig)[/dim]
+  rsbench correct data/footage/castle --out corrected     [dim](a sequence of a dataset, with its rig)[/dim]
 
 RIG is a calibration of Kalibr, OpenCV, ROS, ZED, DepthAI, RealSense, COLMAP, Basalt or OpenVINS as it is, a file
 or a folder of files that belong together ([bold]rsbench rig RIG[/bold] shows what is understood), or rig.toml,

@@ -99,7 +99,7 @@ class ReadoutOptions:
 
         tables = path is None or path.suffix == ".toml"
         if tables and not gyro and self.fps is not None and self.shutter is None:
-            raise RsbenchError("--fps: needs --gyro or --shutter; a .toml file says its own seconds")
+            raise RsbenchError("--fps: needs --gyro or --shutter; a .toml file has frame_period_s instead")
         fps = self.fps if not tables or self.shutter is not None else None
         if fps is None and footage is not None and not tables:
             fps = said_fps(footage)
@@ -317,7 +317,7 @@ def given_camera(
     say_notes("--camera", notes)
     if fov is not None:
         if not card.focal_unknown:
-            raise RsbenchError("--fov: leave it out; the camera's file says the focal length")
+            raise RsbenchError("--fov: leave it out; the camera's file gives the focal length")
         try:
             card = replace(card, fov_deg=fov)
         except ValueError as error:
@@ -356,7 +356,7 @@ def given_frames(
     frames, left, right = given.frames, given.left, given.right
     if frames is not None and len(frames) == 1 and is_rendered(frames[0]):
         if rig or left or right or readout.any:
-            raise RsbenchError(f"{frames[0]}: is a sequence, which knows its frames and rig; leave the others out")
+            raise RsbenchError(f"{frames[0]}: is a sequence with its own frames and rig; leave the others out")
         return _of_sequence(frames[0], out, gyro, row_poses)
     if rig is None:
         raise RsbenchError("--rig: is required")

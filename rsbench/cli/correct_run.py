@@ -141,10 +141,11 @@ def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptio
     sources, card, out, lines = given.sources(), given.card, given.out, list[str]()
     if given.rectify and given.video:
         raise RsbenchError(f"--rectify: --out {out} is a video; give a folder, for pairs with their calibration")
-    if given.gyro.file is not None and not given.one_camera and not takes_gyro(sources[0], options):
-        raise RsbenchError(
-            "--gyro: is used for the trajectory of four frames and more, with the motion model auto; leave it out"
-        )
+    for option, wanted in (("--gyro", given.gyro.file is not None), ("--row-poses", given.row_poses)):
+        if wanted and not given.one_camera and not takes_gyro(sources[0], options):
+            raise RsbenchError(
+                f"{option}: needs the trajectory of four frames and more, with the motion model auto; leave it out"
+            )
     gyro = given.gyro.read(sources[0], given.one_camera)
     first = [next(iter(source)) for source in sources]
     options = replace(options, target_row=target_row(target, first[0].shape[0]))

@@ -61,7 +61,7 @@ def export(
         Path,
         typer.Argument(metavar="DIR", help="Folder with a dataset.json, or of corrected footage (motion.json)."),
     ],
-    to: Annotated[Target, typer.Option(help="Format; the document 'export' says what each holds.")],
+    to: Annotated[Target, typer.Option(help="Format; the document 'export' describes each.")],
     out: Annotated[Path, typer.Option(help="Folder that appears when all is written.")],
     images: Annotated[
         Pictures | None,
@@ -88,7 +88,7 @@ def export(
         )
     for sentence in notes:
         say(f"note: {sentence}")
-    echo(f"{out}: {to}; README.txt says what it holds")
+    echo(f"{out}: {to}; README.txt describes it")
 
 
 VIEW_EPILOG = """[bold]Examples[/bold]
@@ -128,7 +128,7 @@ def view(
     chosen = chosen_sequences(folder, tuple(sequence or ()))[: None if sequence else 1]
     if save is not None:
         if len(chosen) != 1:
-            raise RsbenchError(f"--save {save}: holds one sequence, not {len(chosen)}: give one --sequence")
+            raise RsbenchError(f"--save {save}: is for one sequence, not {len(chosen)}: give one --sequence")
         if save.is_dir():
             raise RsbenchError(f"--save {save}: is a folder, not a file")
         check_out(save.parent)

@@ -52,7 +52,7 @@ def inspect(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per rig, each on a line.")] = False,
     fps: Annotated[
         float | None,
-        typer.Option(help="Frames a second, for a calibration's line delay. Default: what the video says."),
+        typer.Option(help="Frames per second, for a calibration's line delay. Default: that of the video."),
     ] = None,
     readout_ratio: Annotated[
         float | None, typer.Option(help="Readout time over frame period, to compare with, in place of the rig's.")

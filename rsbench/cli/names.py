@@ -127,7 +127,7 @@ def list_(
         kind or "kinds", columns, [[", ".join(x) if isinstance(x, list) else x for x in row] for row in texts]
     )
     if kind is None:
-        say("rsbench list KIND lists them; rsbench show NAME tells more")
+        say("rsbench list KIND lists them; rsbench show NAME prints one")
     elif cards := [row["card"] for row in rows if row["card"]]:
         folder = cards[0].rpartition("/")[0]
         say(f"cards: {folder}; copy one, edit it, and pass its path (ending in .toml) instead of a name")

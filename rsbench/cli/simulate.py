@@ -64,7 +64,9 @@ def simulate(
             min=0.001, help="Seconds per problem for solvers of other packages, instead of their cards'."
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Do all again, whatever DIR holds.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Repeat everything, and replace the results in DIR.")
+    ] = False,
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
     from rsbench.benchmark.simulated.sweep_card import load_sweep, with_options

@@ -138,7 +138,7 @@ def check_solver(
         ),
     ],
     time_limit: Annotated[
-        float | None, typer.Option(min=0.1, help="Seconds for one problem; by default what the card says.")
+        float | None, typer.Option(min=0.1, help="Seconds for one problem; by default those of the card.")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Findings as one JSON object.")] = False,
 ) -> None:

@@ -43,30 +43,30 @@ from rsbench.storage.files import write_bytes
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A split with its lines, and the published facts of its problems."""
+    """A split with the entries of its table, and the published properties of its problems."""
 
     track: Track
     split: str
     fingerprint: str
     lines: list[Standing]
     facts: pd.DataFrame
-    """Facts by the name of the problem; without columns where they are secret."""
+    """Properties, with the names of the problems as index; no columns if they are secret."""
     problem_pages: bool = True
     """Whether rendered sequences may have pages of their own."""
 
     @property
     def id(self) -> str:
-        """Name of its section of the index, of its files, and of the folder of its pages."""
+        """Identifier: the section of the index, the file names, and the folder of the pages use it."""
         return f"{self.track.id}--{self.split}"
 
     @property
     def secret(self) -> bool:
-        """Whether single problems are not shown: from a few exact errors of one the truth can be computed."""
+        """Whether single problems are hidden: the truth of a problem can be computed from a few exact errors."""
         return self.facts.columns.empty
 
     @cached_property
     def problems(self) -> list[str]:
-        """Names, in the order of scores."""
+        """Names of the problems, in the order of the scores."""
         return [str(name) for name in self.lines[0].scored.scores["problem"]]
 
     @cached_property
@@ -76,21 +76,22 @@ class Board:
 
     @property
     def several(self) -> bool:
-        """Whether scenes have several problems."""
+        """Whether any scene has several problems."""
         return len(set(self.scenes)) < len(self.scenes)
 
     @property
     def pages(self) -> bool:
-        """Whether its problems have pages: simulated ones, of which nothing is to be seen, have a row."""
+        """Whether each problem has a page; simulated problems, which have no pictures, have a row of a table
+        instead."""
         return self.problem_pages and self.track.inputs.rendered and not self.secret
 
     def page_of(self, problem: str) -> str:
-        """Page or row of a problem, from the folder of the index."""
+        """Link to the page or row of a problem, relative to the folder of the index."""
         return f"{self.id}/problem/{problem}.html" if self.pages else f"{self.named['problems']}#{problem}"
 
     @property
     def named(self) -> dict[str, str]:
-        """Words of its own, for all pages."""
+        """The identifiers and titles of the split that all its pages show."""
         return {
             "id": self.id,
             "title": self.track.title,
@@ -102,19 +103,20 @@ class Board:
         }
 
     def known(self) -> list[tuple[str, pd.Series]]:
-        """What is known of the problems, in their order: numbers and words, each with its name, and the scene."""
+        """Properties of the problems, each with its name: numbers or words in the order of the problems; also the
+        scene."""
         found = [(str(name), self.facts[name].reindex(self.problems)) for name in self.facts.columns]
         return [*found, ("scene", pd.Series(self.scenes))] if self.several else found
 
     @property
     def by_score(self) -> list[Standing]:
-        """Lines that have a rank, the best first, whatever they use."""
+        """Entries that have a rank, from the best, regardless of their inputs."""
         primary = self.track.primary
         ranked = [line for line in self.lines if line.rank is not None]
         return sorted(ranked, key=lambda line: -primary.sign * line.means[primary.key][0])
 
     def figures(self, lines: Sequence[Standing]) -> dict[str, Any]:
-        """Errors of some of its lines against what is known of the problems."""
+        """Figures of the errors of some entries over each property of the problems."""
         shown = drawable([self._line(line) for line in lines])
         drawn = [(fact_title(name), curves(values, shown, self.scenes)) for name, values in self.known()]
         return {
@@ -123,7 +125,7 @@ class Board:
         }
 
     def figures_within(self, lines: Sequence[Standing]) -> dict[str, Any]:
-        """Errors of some of its lines in parts of the pictures, where stored scores have them."""
+        """Figures of the errors of some entries in parts of the pictures, if the stored scores have them."""
         track, drawn, shown = self.track, list[dict[str, Any]](), list[ErrorLine]()
         if not isinstance(track, PictureTrack):
             return {"legend": legend(shown), "drawn": drawn, "error": ""}
@@ -152,7 +154,7 @@ class Board:
 
 
 def read_split(board: Path, protocol: str, split: str) -> Board:
-    """A split of a board; without lines where it has no entries.
+    """Read a split of a board; its list of lines is empty if it has no entries.
 
     Raises:
         RsbenchError: an entry or the record of the split is damaged.
@@ -174,16 +176,16 @@ def fact_title(name: str) -> str:
 
 
 BRIEF = 2
-"""Medians of the tables that show few numbers."""
+"""Number of medians in short tables."""
 
 
 def as_csv(lines: Sequence[Standing], secret: bool) -> str:
-    """All numbers of a table, with all their digits; no cell begins as a formula does, since names do not."""
+    """All numbers of a table with all digits. No cell begins like a formula, because names cannot."""
     return table(lines, worst=not secret).to_csv(index=False, lineterminator="\n")
 
 
 def as_markdown(lines: Sequence[Standing]) -> str:
-    """The most telling columns; names of methods hold nothing that Markdown reads, but underscores."""
+    """The most important columns; in names of methods, only underscores have a meaning in Markdown."""
     head, *rows = _brief(lines)
     return "\n".join(table_lines(head, rows)).replace("_", r"\_") + "\n"
 
@@ -197,7 +199,7 @@ def as_latex(lines: Sequence[Standing]) -> str:
 
 
 def brief_medians(track: Track) -> list[str]:
-    """Titles of the most telling ones."""
+    """Titles of the medians that short tables show."""
     return [score.title for score in track.scores if score.kind == "median"][:BRIEF]
 
 
@@ -220,7 +222,7 @@ def _brief(lines: Sequence[Standing]) -> list[list[str]]:
 
 
 DEPTH_PX, FRAME_LEVELS = 3.0, 64.0
-"""Errors that have the last colour: of disparity, and of the mean over the colours in 8-bit levels."""
+"""Errors at which the colour scale ends: of disparity, px, and of the mean over the colours, 8-bit levels."""
 _DIFFERENCE = f"difference, 0 (dark) to {FRAME_LEVELS:g} of 255 levels or more (bright); grey: not drawn"
 ERRORS = {
     "depth": f"error, 0 (dark) to {DEPTH_PX:g} px of disparity or more (bright); grey: unknown, or no surface",
@@ -228,7 +230,7 @@ ERRORS = {
     "correction-mono": _DIFFERENCE,
 }
 Named = tuple[str, str, Image]
-"""Stem of the file, words, picture."""
+"""Stem of the file name, caption, picture."""
 
 
 def true_images(track: str, pictures: TruePictures) -> Iterator[Named]:
@@ -241,7 +243,7 @@ def true_images(track: str, pictures: TruePictures) -> Iterator[Named]:
 
 
 def answer_images(track: str, entry: Scored, truth: Truth) -> Iterator[Named]:
-    """The pictures that an entry submitted for a problem, and their errors; nothing of a failure.
+    """The pictures that an entry submitted for a problem, and their errors; empty if the entry failed.
 
     Raises:
         RsbenchError: a picture is missing, or damaged.
@@ -272,13 +274,13 @@ def _row_name(stem: str) -> str:
 
 
 def _depth_image(depth: NDArray[np.float32], truth: NDArray[np.float32]) -> Image:
-    """Inverse depth in the range of the true one; unknown is grey."""
+    """Picture of inverse depth, scaled to the range of the true one; unknown is grey."""
     low, high = np.quantile(1.0 / truth[truth > 0.0], [0.01, 0.99]) if np.any(truth > 0.0) else (0.0, 1.0)
     return colour_map(_inverse(depth), float(low), float(high))
 
 
 def _inverse(depth: NDArray[np.float32]) -> FloatArray:
-    """NaN where it is not known."""
+    """Inverse depth; NaN where the depth is unknown."""
     return np.divide(1.0, depth, where=depth > 0.0, out=np.full(depth.shape, np.nan))
 
 
@@ -297,7 +299,7 @@ def frame_error_image(image: Image, drawn: NDArray[np.bool_], truth: Image) -> I
 
 
 _LONGEST, _QUALITY = 400, 78
-"""Px, and of JPEG: 10 to 35 kB."""
+"""Longest side, px, and JPEG quality of a picture, which then has 10 to 35 kB."""
 _THUMB = 120
 _MOST_BYTES = 11_000_000
 """Largest size of all pictures of a site, which stays below 15 MB."""
@@ -312,25 +314,26 @@ class Album:
         self._sequences = {} if folder is None else {sequence.name: sequence for sequence in read_pairs(folder)}
         self._out, self.prefix = out, f"{each.id}/pictures"
         self.allowance = _MOST_BYTES
-        """Bytes of the pictures of a problem."""
+        """Largest number of bytes of the pictures of one problem."""
 
     def __len__(self) -> int:
-        """How many problems it shows."""
+        """Number of problems with pictures."""
         return len(self._sequences)
 
     @property
     def errors(self) -> str:
-        """What the colours of error maps mean; nothing where there are none."""
+        """Explanation of the colours of error maps; empty if there are none."""
         return ERRORS.get(self._each.track.name, "") if self._sequences else ""
 
     def thumb(self, problem: str) -> str:
-        """Path from the folder of the index, or nothing."""
+        """Path of the thumbnail, relative to the folder of the index; empty if there is none."""
         return f"{self.prefix}/{problem}/thumb.jpg" if problem in self._sequences else ""
 
     def pictures(self, problem: str) -> list[dict[str, str]]:
-        """Frames, truth and answers, written, with a thumbnail; of the last entries if there is room.
+        """Write frames, truth and answers, and a thumbnail; answers of the last entries only if the size allows
+        it.
 
-        Returns the ``title`` of each, and its ``file`` below the folder of the problem's pictures.
+        Returns the ``title`` of each picture, and its ``file`` below the folder of the problem's pictures.
         """
         if problem not in self._sequences:
             return []
@@ -348,12 +351,14 @@ class Album:
         return found
 
     def compared(self, problem: str) -> tuple[int, int]:
-        """Which pictures stand at the divider first: the frame as it was and the best answer, or two frames."""
+        """Indices of the two pictures that are compared at first: the input frame and the best answer, or both
+        frames."""
         truth = None if self._split is None else self._split.by_name[problem]
         return (0, 1) if truth is None or truth.pictures is None else (1, 2 + len(truth.pictures.requested))
 
     def _groups(self, problem: str) -> Iterator[list[Named]]:
-        """What stands or falls together: frames with the truth, then each entry, the best first."""
+        """Groups of pictures that are written together or not at all: the frames with the truth, then each entry,
+        the best first."""
         assert self._split is not None
         sequence, truth, track = self._sequences[problem], self._split.by_name[problem], self._each.track.name
         frames = [sequence.image("rs", "left", frame) for frame in (0, 1)]
@@ -378,7 +383,7 @@ class Album:
 
 
 def albums(boards: Sequence[Board], out: Path, data: Sequence[Path]) -> list[Album]:
-    """One for each split; together they keep below the bound."""
+    """One album for each split; all together are smaller than ``_MOST_BYTES``."""
     found = [Album(each, out, data) for each in boards]
     for album in found:
         album.allowance = _MOST_BYTES // max(sum(map(len, found)), 1)
@@ -386,10 +391,10 @@ def albums(boards: Sequence[Board], out: Path, data: Sequence[Path]) -> list[Alb
 
 
 def _at_hand(each: Board, data: Sequence[Path]) -> tuple[Split | None, Path | None]:
-    """A public split with its dataset, where that is at hand.
+    """A public split and the folder of its dataset; None for each that is not available.
 
     Raises:
-        RsbenchError: there is no dataset in a folder.
+        RsbenchError: a folder contains no dataset.
     """
     if each.pages and not each.facts.empty:
         for folder in data:
@@ -398,7 +403,7 @@ def _at_hand(each: Board, data: Sequence[Path]) -> tuple[Split | None, Path | No
             except RsbenchError:
                 if not (folder / "dataset.json").is_file():
                     raise
-                continue  # of cameras that this track does not ask
+                continue  # whose cameras this track does not support
             if split.fingerprint == each.fingerprint:
                 return split, folder
     return None, None
@@ -454,7 +459,7 @@ def _by(each: Board, line: Standing, name: str, kinds: pd.Series) -> dict[str, A
     for kind, part in scores.groupby(kinds.astype(str).to_numpy()):
         primary = part[track.primary.key].to_numpy()
         value, low, high = score_interval(primary, list(part["scene"]), track.primary.kind == "share")
-        # One scene bounds nothing: an interval of it would only round its value away.
+        # One scene has no interval; format_interval would round its value to nothing.
         share = f"{value:.3g}" if part["scene"].nunique() == 1 else format_interval(value, low, high)
         medians = (f"{part[key].median():.3g}" for key in track.of_kind("median")[:BRIEF])
         rows.append([str(kind), len(part), share, *medians, int(part["failure"].sum())])
@@ -535,7 +540,7 @@ def matrix_context(each: Board, album: Album) -> dict[str, Any]:
 
 
 def _shades(errors: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """0 for the smallest errors to ``_SHADES`` - 1 for the largest: as many of each."""
+    """Shade of each error: 0 for the smallest ones to ``_SHADES`` - 1 for the largest; equally many of each."""
     inner = np.quantile(errors, np.linspace(0.0, 1.0, _SHADES + 1)[1:-1], method="inverted_cdf")
     return np.searchsorted(inner, errors, side="left")
 
@@ -552,7 +557,7 @@ def _fact(each: Board, name: str, problem: str) -> dict[str, str]:
 
 
 def problem_contexts(each: Board, album: Album) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Names of rendered sequences, and for each the context of the template board_problem.html.j2."""
+    """Names of the rendered sequences, each with the context of the template board_problem.html.j2."""
     if not each.pages:
         return
     for k, problem in enumerate(each.problems):
@@ -584,11 +589,11 @@ def _problem_row(each: Board, line: Standing, k: int) -> dict[str, Any]:
 def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pages: bool = True) -> Path:
     """Write the site of a board into a folder; returns its first page.
 
-    Tables of other splits that the folder has already stay, on the first page too.
+    Tables of other splits that are already in the folder are kept, also on the first page.
 
     Args:
-        data: datasets, of which pages of their problems show pictures.
-        problem_pages: without them the site is a tenth as large; the table of all problems has their errors too.
+        data: datasets whose pictures the pages of problems show.
+        problem_pages: if False, the site is a tenth as large; the table of all problems then has their errors.
 
     Raises:
         RsbenchError: it is no board, an entry or a dataset is damaged, or the folder cannot be written.
@@ -624,7 +629,7 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
 
 
 def _other_sections(out: Path, names: Collection[str]) -> list[dict[str, Any]]:
-    """Sections of the first page in a folder, without those of these names and of tables that are gone."""
+    """Sections of an existing first page, without those named, and without those whose table no longer exists."""
     path = out / "index.html"
     page = path.read_text("utf-8") if path.is_file() else ""
     found = re.findall(r'<section class="split" id="([^"]+)".*?</section>', page, re.DOTALL)
@@ -637,7 +642,8 @@ def _other_sections(out: Path, names: Collection[str]) -> list[dict[str, Any]]:
 
 
 def _section(each: Board, ranked: bool) -> dict[str, Any]:
-    """Context of a section of the first page; ``ranked``: whether the protocol has a secret split, which ranks."""
+    """Context of a section of the first page; ``ranked``: whether a secret split of the protocol is on the board,
+    which then decides the ranks."""
     used = {name for line in each.lines for name in line.scored.header.uses}
     return {
         **each.named,
@@ -661,7 +667,7 @@ def _columns(each: Board) -> list[dict[str, Any]]:
         telling |= {*track.of_kind("median")[:BRIEF], "covers_95", "log_score", "log_rank"}
 
     def column(key: str, title: str, first: str, hint: str, *, text: bool = False) -> dict[str, Any]:
-        """``more``: whether it is hidden until all columns are requested."""
+        """``more``: whether the column is hidden until all columns are requested."""
         more = key not in telling
         return {"key": key, "title": title, "first": first, "hint": hint, "text": text, "more": more}
 
@@ -740,18 +746,18 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
 
 
 def _apart(triple: tuple[float, float, float]) -> dict[str, str]:
-    """The text of a number, and of its interval, which is shown with all columns."""
+    """Text of a number, and of its interval, which is shown only with all columns."""
     number, space, interval = format_interval(*triple).partition(" ")
     return {"text": number, "interval": space + interval}
 
 
 def _value(value: float) -> str:
-    """Number as JavaScript reads it, with all digits of the CSV file."""
+    """The number as JavaScript text, with all digits of the CSV file."""
     return "" if np.isnan(value) else "Infinity" if np.isinf(value) else repr(float(value))
 
 
 def _first_of_groups(lines: Sequence[Standing]) -> list[Standing]:
-    """The best of each group that uses the same first, then the second ones."""
+    """Sort entries: the best of each group with the same inputs first, then the second of each, and so on."""
     seen: dict[str, int] = {}
     places = []
     for line in lines:

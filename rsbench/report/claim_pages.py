@@ -56,7 +56,7 @@ def summary(best: pd.DataFrame) -> list[str]:
 
 
 def _overview(best: pd.DataFrame) -> list[str]:
-    """The same with the share of the readings that hold, and ours."""
+    """The same with the share of readings for which the claim holds, and ours."""
     lines = []
     for row in best.to_dict("records"):
         holding = f"{row['holding']} of {row['readings']} hold"
@@ -154,7 +154,7 @@ SHOWN_NOISE_PX = 0.3
 
 
 def sweeps_page(cards: list[SweepCard], tables: Mapping[str, pd.DataFrame]) -> str:
-    """Markdown that says what each table holds, with the figures that README shows."""
+    """Markdown that describes each table, with the figures that README shows."""
     lines = [*_solvers(tables["solvers"]), "", *_bound(tables["limit"]), "", *_wrong(tables["wrong-readout"])]
     lines += ["", *_wrong_motion(tables["wrong-motion"])]
     head = ("table", "what", "varies", "noise (px)", "trials", "RANSAC")
@@ -182,7 +182,7 @@ def _solvers(table: pd.DataFrame) -> list[str]:
 
 
 def _figures(table: pd.DataFrame, head: Sequence[str], figures: Sequence[str], names: Sequence[str]) -> list[str]:
-    """A line for each row: what it is of, and figures with their intervals."""
+    """A line for each row: its subject, and figures with their intervals."""
     rows = table.to_dict("records")
     named = [[f"{row[name]:g}" if name == "value" else row[name] for name in names] for row in rows]
     return table_lines(
@@ -199,7 +199,7 @@ def _bound(table: pd.DataFrame) -> list[str]:
 
 
 def _wrong(table: pd.DataFrame) -> list[str]:
-    """Errors when the solver is given a wrong readout ratio."""
+    """Errors with a wrong given readout ratio."""
     noise = "0.1 px, 2 deg, 0.3 m, 100 matches per camera, or tracks; medians."
     head = ("solver", "sees", "given minus true", "e_R (deg)", "e_T (deg)")
     figures = _figures(table, head, ("e_R_median", "e_T_median"), ("solver", "information", "value"))
@@ -207,7 +207,7 @@ def _wrong(table: pd.DataFrame) -> list[str]:
 
 
 def _wrong_motion(table: pd.DataFrame) -> list[str]:
-    """Errors when the data move otherwise than the solver assumes."""
+    """Errors on data that follow another motion model than the solver's."""
     solvers = list(table.solver.unique())
     lines = [
         "## Data of another motion model",

@@ -1,4 +1,4 @@
-"""The page of ``rsbench correct``: every frame before and after, from what was stored."""
+"""The page of ``rsbench correct``: frames before and after, from the stored results."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from rsbench.vision.fusion import Fused, Origin
 
 _WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
 _SIGNIFICANT = 3.0
-"""Standard deviations from which on a quantity counts as different from 0."""
+"""Number of standard deviations at which a quantity counts as different from 0."""
 _AXIS_COLOURS = {"x": "#c0392b", "y": "#27855a", "z": "#0b6bcb"}
 
 
 def draw_trajectory(poses: FloatArray, frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Drawings (SVG) of rotation and position, and their caption; None where there is no trajectory.
+    """Drawings (SVG) of rotation and position, and their caption; None without a trajectory.
 
     Args:
-        poses: (n, 8) of the body at the starts of frames, as TUM's format has them: tau, position, quaternion.
-        frames: what motion.json says of each.
+        poses: (n, 8) of the body at the starts of frames, in TUM's format: tau, position, quaternion.
+        frames: the entries of the frames in motion.json.
     """
     if len(poses) < 2:
         return None
@@ -55,10 +55,10 @@ def draw_own_motion(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any] | Non
     """Drawings (SVG) of one camera's rotation and direction of translation, and their caption.
 
     Args:
-        frames: what motion.json says of each.
+        frames: the entries of the frames in motion.json.
 
     Returns:
-        As ``draw_trajectory``; None where fewer than two frames have a motion.
+        As ``draw_trajectory``; None if fewer than two frames have a motion.
     """
     moving = [frame for frame in frames if "w" in (frame.get("motion") or {})]
     if len(moving) < 2:
@@ -85,7 +85,7 @@ def _caption(frames: Sequence[Mapping[str, Any]], bridged: Sequence[int]) -> str
     ]
     text = "Red x, green y, blue z."
     if motions:
-        # Of each frame: deviations about or along the worst axis, motion, and what an even one is off by.
+        # For each frame: deviation along the worst axis, motion, and difference from a uniform motion.
         deviations = [np.sqrt(np.diagonal(np.array(each["covariance_w_d"]))).reshape(2, 3) for each in motions]
         w, d = np.max(np.stack(deviations), axis=2).T
         text += (
@@ -97,7 +97,8 @@ def _caption(frames: Sequence[Mapping[str, Any]], bridged: Sequence[int]) -> str
 
 
 def _kind(motions: Sequence[Mapping[str, Any]], w: FloatArray, d: FloatArray) -> str:
-    """Whether a rig stands, coasts or shakes, by the deviations (n,) of its motions, radians and metres."""
+    """Description of the motion (static, uniform or shaking) by the deviations (n,) of its motions, radians and
+    metres."""
     moved = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in motions]).T
     uneven = [each["uneven"] for each in motions]
     off = np.array([[np.deg2rad(each["rotation_deg"]), each["translation"]] for each in uneven]).T
@@ -168,13 +169,13 @@ _LONGEST = 900
 
 
 _KNOWN = 0.5
-"""Share of the pixels whose depth is known, from which on depth is shown."""
+"""Least share of pixels with known depth for which the depth is shown."""
 
 
 def card_of(
     title: str, before: NDArray[Any], fused: Fused, unit: str = " m", orientation: int = UPRIGHT
 ) -> dict[str, Any]:
-    """One frame of the page: its pictures as URIs, small enough to carry many; ``unit`` of depth."""
+    """A frame of the page, with its pictures as URIs that are small enough for many frames; ``unit`` of depth."""
     finite = np.isfinite(fused.depth) & (fused.depth > 0)
     known = float(np.mean(finite))
     inverse = np.where(finite, 1.0 / np.where(finite, fused.depth, 1.0), np.nan)
@@ -214,12 +215,12 @@ def write_page(
     record: Mapping[str, Any] | None = None,
     video: str = "",
 ) -> None:
-    """report.html: opens from disk, needs no other file.
+    """Write report.html, which opens from disk without other files.
 
     Args:
-        trajectory: of ``draw_trajectory`` or ``draw_own_motion``.
+        trajectory: result of ``draw_trajectory`` or ``draw_own_motion``.
         page: another place for it.
-        record: what motion.json says, where it is not in ``folder``.
+        record: content of motion.json, if it is not in ``folder``.
         video: name of a video beside it that shows the frames before and after.
     """
     record = read_json(folder / MARKER) if record is None else record
@@ -239,7 +240,7 @@ def write_page(
 
 
 def _left_alone(frames: Any) -> list[tuple[str, str]]:
-    """Numbers of frames that are as they were read, and why, of each reason."""
+    """Numbers of the frames that were not corrected, by the reason."""
     reasons = dict[str, list[int]]()
     for each in frames if isinstance(frames, list) else []:
         if "reason" in each:
@@ -248,7 +249,7 @@ def _left_alone(frames: Any) -> list[tuple[str, str]]:
 
 
 def ranges(numbers: Sequence[int]) -> str:
-    """Increasing numbers in words, such as "0 to 4, 7"."""
+    """Increasing numbers as text, such as "0 to 4, 7"."""
     runs = list[list[int]]()
     for number in numbers:
         if runs and runs[-1][-1] == number - 1:
@@ -259,15 +260,16 @@ def ranges(numbers: Sequence[int]) -> str:
 
 
 _WIDEST = 1920
-"""Columns of a comparison."""
+"""Largest width of a comparison, px."""
 _COARSE = 4
-"""Pixels for one by which changes are measured."""
+"""Step between pixels at which changes are measured."""
 
 
 def comparison(
     pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]], orientation: int, changed: list[float]
 ) -> Iterator[Image]:
-    """Frames before and after, side by side as they are shown; ``changed`` gets the grey levels between both."""
+    """Frames before and after, side by side in display orientation; their mean difference in grey levels is
+    appended to ``changed``."""
     for before, after in pairs:
         both = _eight_bit(np.stack([before, after]) if before.ndim == 3 else np.stack([before, after])[..., None])
         old, new = both if before.ndim == 3 else np.repeat(both, 3, axis=-1)
@@ -280,7 +282,7 @@ def comparison(
 
 
 def most_changed(changed: Sequence[float], count: int) -> list[int]:
-    """Numbers of at most so many frames that changed most, in order, some frames apart."""
+    """Numbers of the frames that changed most, at most this many, in order and some frames apart."""
     chosen = list[int]()
     apart = max(len(changed) // (4 * count), 1)
     for number in np.argsort(changed)[::-1].tolist():
@@ -290,7 +292,7 @@ def most_changed(changed: Sequence[float], count: int) -> list[int]:
 
 
 def _one_motion(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The motion of four frames; of a sequence that of its only window, and None where it has several."""
+    """The motion of four frames, or of the only window of a sequence; None if it has several."""
     if (motion := record.get("motion")) is not None:
         return motion
     found = [each["motion"] for each in record.get("frames", ()) if isinstance(each, dict) and each.get("motion")]
@@ -298,7 +300,7 @@ def _one_motion(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _eight_bit(image: NDArray[Any]) -> Image:
-    """RGB uint8, grey of more than two axes as it is; 16 bits, which may be used in part, up to the brightest."""
+    """Convert an image to RGB uint8; 16 bits, which may be used only in part, are scaled by their maximum."""
     if image.dtype != np.uint8:
         top = max(float(np.percentile(image, 99.9)), 1.0)
         image = np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)

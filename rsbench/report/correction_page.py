@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _TITLES = {method.key: method.title for method in (*METHODS, *ON_REQUEST)}
 _BOUNDED = 6
-"""Sequences of a stratum below which a median has no interval, so that nothing is judged by one."""
+"""Least number of sequences of a stratum for a median with an interval; with fewer, nothing is judged."""
 SIZES = ("moderate", "aggressive")
 """Sizes of the motions of the card ``laws``."""
 _LINES = {
@@ -55,13 +55,13 @@ def _page(folder: Path, text: str) -> Path:
 
 
 def write_study(folder: Path) -> list[Path]:
-    """README.md and rows.svg from the tables in ``folder``; returns the files."""
+    """Write README.md and rows.svg from the tables in ``folder``; returns the files."""
     page = _page(folder, study_page(pd.read_csv(folder / "views.csv"), pd.read_csv(folder / "summary.csv")))
     return [page, _draw_rows(pd.read_csv(folder / "rows.csv"), folder / "rows.svg")]
 
 
 def write_laws(folder: Path) -> Path:
-    """README.md from the tables in ``folder``: ``by_law``, ``by_sequence``, and the errors of motions."""
+    """Write README.md from the tables in ``folder``: ``by_law``, ``by_sequence``, and the errors of motions."""
     tables = [pd.read_csv(folder / f"{name}.csv") for name in ("summary", "sequences", "motions")]
     return _page(folder, laws_page(*tables))
 
@@ -70,7 +70,7 @@ def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFr
     """The page of frames under several laws of motion, as Markdown.
 
     Args:
-        summary, sequences: as of ``by_law`` and ``by_sequence``.
+        summary, sequences: results of ``by_law`` and ``by_sequence``.
         motions: errors of the estimated motions, a row for each sequence.
     """
     return rendered(
@@ -82,7 +82,7 @@ def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFr
 
 
 def worst_table(sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
-    """A row for each law and size: the sequence that ours corrects worst, and the one with its largest e_T."""
+    """A row for each law and size: the sequence with our lowest score, and the one with our largest e_T."""
     wide = sequences.pivot(index="sequence", columns="method", values="psnr_covered")
     errors = motions.set_index("sequence")
     head = (
@@ -117,7 +117,7 @@ def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
 
 
 def law_table(laws: pd.DataFrame, size: str) -> str:
-    """Covered PSNR, dB, of motions of one size by law, and in brackets what ours gains, paired."""
+    """Covered PSNR, dB, for motions of one size by law; in brackets the paired gain of ours."""
     own = laws[laws["stratum"].str.endswith(f", {size}")]
     strata = list(dict.fromkeys(own["stratum"]))
     names = [stratum.partition(",")[0] for stratum in strata]
@@ -151,7 +151,7 @@ def _sections(images: pd.DataFrame, summary: pd.DataFrame, stratum: str) -> dict
 
 
 def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
-    """Covered PSNR / PSNR of all pixels by scene, dB; and by how much ours is above each method, dB, covered."""
+    """Covered PSNR / PSNR of all pixels by scene, dB; and the gain of ours over each method, dB, covered."""
     names = list(dict.fromkeys(scenes["scene"]))
     counts = scenes.groupby("scene")["sequences"].first()
     headings = [f"{name} ({counts[name]})" for name in names]
@@ -178,7 +178,7 @@ _COLUMNS: dict[str, Callable[[pd.Series], str]] = {
     "FLIP covered": lambda row: _with_interval(row, "flip_covered", 4),
     "own pixels": lambda row: f"{100 * row['coverage']:.1f} %",
 }
-"""Columns of the table over all sequences, after the method's."""
+"""Columns of the table over all sequences, after that of the method."""
 
 
 def _correction_table(summary: pd.DataFrame) -> str:
@@ -186,7 +186,7 @@ def _correction_table(summary: pd.DataFrame) -> str:
     for _, row in summary.iterrows():
         name = _TITLES[str(row["method"])] + (f" ({row['failures']:.0f} failed)" if row["failures"] else "")
         if row["method"] == "ours":
-            name = f"**{name}**"  # the name alone: bold figures would read as the best ones
+            name = f"**{name}**"  # only the name: bold figures would look like the best ones
         rows.append([name, *(cell(row) for cell in _COLUMNS.values())])
     return "\n".join(table_lines(["method", *_COLUMNS], rows))
 
@@ -195,7 +195,7 @@ def _with_interval(row: pd.Series, name: str, digits: int) -> str:
     value, low, high = (round(float(row[key]), digits) + 0.0 for key in (name, f"{name}_low", f"{name}_high"))
     if np.isnan(value):  # computed for the strongest of each family only
         return "–"
-    if np.isinf(low):  # fewer than six sequences bound no median
+    if np.isinf(low):  # fewer than six sequences give no interval of a median
         return f"{value:.{digits}f}"
     return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"  # + 0.0: no minus sign before zero
 
@@ -231,7 +231,7 @@ def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
 
 @contextmanager
 def _drawn(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
-    """A figure to draw on, which is then written: SVG with text, equal bytes for equal data."""
+    """Context of a figure, which is written at the end: SVG with text; equal data give equal bytes."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -266,7 +266,8 @@ _LONGEST = 560
 
 
 def write_real_page(folder: Path, card: dict[str, Any]) -> Path:
-    """README.md from motions.csv and summary.csv in ``folder``; ``card`` is that of the real camera's dataset."""
+    """Write README.md from motions.csv and summary.csv in ``folder``; ``card`` is that of the real camera's
+    dataset."""
     summary, motions = pd.read_csv(folder / "summary.csv"), pd.read_csv(folder / "motions.csv")
     return _page(folder, real_page(summary, motions, card))
 
@@ -324,7 +325,7 @@ def _errors(summary: pd.DataFrame) -> str:
 
 
 def draw_frames(frames: dict[str, NDArray[np.uint8]], path: Path) -> Path:
-    """Pictures of one size side by side, each under its name."""
+    """Draw pictures of one size side by side, each below its name."""
     small = [pictures.label(pictures.shrink(frame, _LONGEST).copy(), name) for name, frame in frames.items()]
     white = np.full((small[0].shape[0], _GAP, 3), 255, dtype=np.uint8)
     row = [part for image in small for part in (image, white)][:-1]
@@ -336,7 +337,7 @@ _STYLES = {"mild": ("#0072B2", "o"), "moderate": ("#D55E00", "s"), "aggressive":
 
 
 def write_sgm_page(folder: Path) -> list[Path]:
-    """README.md and sgm.svg from sgm.csv in ``folder``; returns the files."""
+    """Write README.md and sgm.svg from sgm.csv in ``folder``; returns the files."""
     table = pd.read_csv(folder / "sgm.csv")
     return [_page(folder, sgm_page(table)), _draw(table, folder / "sgm.svg")]
 
@@ -363,7 +364,7 @@ def sgm_page(table: pd.DataFrame) -> str:
 
 
 def _underestimate(delayed: pd.DataFrame) -> dict[str, Any]:
-    """Where the first-order formula, with the matcher's own error, falls short most."""
+    """The case in which the first-order formula, with the matcher's own error, underestimates most."""
     floors = delayed[delayed["delay"] == 0.0].set_index(["stratum", "sequence"])["error_px"]
     later = delayed[delayed["delay"] > 0.0]
     floor = floors.loc[list(zip(later["stratum"], later["sequence"], strict=True))].to_numpy()
@@ -373,7 +374,7 @@ def _underestimate(delayed: pd.DataFrame) -> dict[str, Any]:
 
 
 def _tolerable(delayed: pd.DataFrame) -> str:
-    """Delay of 0.1 px per sequence: the predicted error is proportional to it."""
+    """Delay that causes an error of 0.1 px in each sequence: the predicted error is proportional to it."""
     longest = delayed[delayed["delay"] == max(DELAYS)]
     parts = []
     for _, row in longest.iterrows():

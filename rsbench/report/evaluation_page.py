@@ -38,11 +38,11 @@ from rsbench.storage.work_folder import HIDDEN, files_below, listed, named
 from rsbench.vision.fusion import Origin
 
 _LONGEST = 640
-"""Pixels of a picture in the page; enough to see a shift of two pixels at 900."""
+"""Width of a picture in the page, px: a shift of two pixels at 900 px remains visible."""
 _SHOWN: View = ("left", 1)
-"""The frame that is drawn."""
+"""Frame that is shown."""
 _DEPTH_ERROR_M = 2.0
-"""End of the scale of depth errors: the paper's limit of a good depth."""
+"""Upper end of the scale of depth errors, metres: the paper's limit of a good depth."""
 
 Drawn = dict[str, tuple[Image, str]]
 
@@ -86,7 +86,7 @@ def _corrected_stem(folder: Path, chosen: dict[str, str]) -> Path:
 
 
 def _files_drawn(folder: Path, chosen: dict[str, str]) -> list[Path]:
-    """Predictions that pictures come from."""
+    """Predictions that the pictures show."""
     stem, depth = _corrected_stem(folder, chosen), folder / "depth" / f"{chosen['matcher']}.npz"
     corrected = [stem.with_name(f"{stem.name}{end}.png") for end in ("", "-origin")]
     inliers = folder / "motion" / f"{chosen['solver']}-inliers.npz"
@@ -94,7 +94,7 @@ def _files_drawn(folder: Path, chosen: dict[str, str]) -> list[Path]:
 
 
 def draw_sequence(sequence: Sequence, folder: Path, chosen: dict[str, str]) -> Drawn:
-    """Pictures of the left camera's frame 1, as far as there are predictions: name to image and caption."""
+    """Pictures of the left camera's frame 1 for which there are predictions, with their captions, by name."""
     rolling, truth = sequence.image("rs", *_SHOWN), sequence.image("gs", *_SHOWN)
     drawn: Drawn = {
         "rolling": (rolling, "Rolling-shutter frame (left, frame 1); hover: global-shutter truth"),
@@ -168,12 +168,12 @@ def _draw_depth(sequence: Sequence, folder: Path, matcher: str) -> Drawn:
 
 
 _OVERVIEW = 360
-"""Pixels of a picture in the overview."""
+"""Width of a picture in the overview, px."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SummaryTable:
-    """A table for the page, and its most telling columns for an 80-column terminal."""
+    """A table for the page, and its most important columns for an 80-column terminal."""
 
     title: str
     note: str
@@ -182,7 +182,7 @@ class SummaryTable:
 
 
 def summary_tables(out: Path) -> list[SummaryTable]:
-    """Pose, depth, correction and failures in the form that people read; errors as ``read_scores``."""
+    """Tables of pose, depth, correction and failures for readers; errors as ``read_scores``."""
     tables = [_pose_table(out), _depth_table(out), _correction_table(out), _failure_table(out)]
     return [table for table in tables if len(table.frame) > 0]
 
@@ -211,7 +211,7 @@ def _pose_table(out: Path) -> SummaryTable:
 
 
 def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame, str]:
-    """Medians with quartiles over the runs of each solver, and what the note says of them."""
+    """Medians with quartiles over the runs of each solver, and the note about them."""
     numbers = [*metrics, "inliers", "matches", "iterations"]
     runs = scores.assign(failures=~scores["success"].astype(bool)).groupby(["sequence", "solver"], sort=False)
     medians = runs[numbers].median()
@@ -231,7 +231,7 @@ def _over_seeds(scores: pd.DataFrame, metrics: list[str]) -> tuple[pd.DataFrame,
 
 
 def _mean(scores: pd.DataFrame, keys: list[str], numbers: list[str]) -> pd.DataFrame:
-    """Mean over the views, with the number of them that failed."""
+    """Mean over the views, and the number of failed views."""
     scores = scores.assign(failures=~scores["success"].astype(bool))
     how = dict.fromkeys(numbers, "mean") | {"failures": "sum"}
     return scores.groupby(keys, as_index=False, sort=False).agg(how)
@@ -335,10 +335,11 @@ def write_overview(out: Path) -> Path:
 
 
 def publish(evaluation: Path, out: Path) -> Path:
-    """Copy what is small of an evaluation: scores, motions, pictures, an overview and the tables in Markdown.
+    """Copy the small files of an evaluation: scores, motions, pictures, an overview and the tables in Markdown.
 
     Raises:
-        RsbenchError: ``out`` holds scores, motions or pictures that the evaluation has not; nothing is removed.
+        RsbenchError: ``out`` contains scores, motions or pictures that the evaluation does not have; nothing is
+            removed.
     """
     names = ["provenance.json", *_motions(evaluation), *_files(evaluation, "scores", "pictures")]
     there = _files(out, "scores", "pictures", "predictions")
@@ -359,7 +360,7 @@ def publish(evaluation: Path, out: Path) -> Path:
 
 
 def _files(folder: Path, *parts: str) -> list[str]:
-    """Files in some parts of a folder, by their paths below it; without those that a killed run was writing."""
+    """Files in some parts of a folder, by their paths below it; without incomplete files of a killed run."""
     there = [part for part in parts if (folder / part).exists()]
     paths = (f"{part}/{path}" for part in there for path in files_below(folder / part))
     return [path for path in paths if not path.endswith(".partial")]

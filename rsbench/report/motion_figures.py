@@ -1,4 +1,5 @@
-"""How well a motion is known: two drawings (SVG), of the odds of its law and of the direction of d, and words.
+"""Uncertainty of a motion: two drawings (SVG), of the probabilities of its models and of the direction of d, with
+captions.
 
 They are made from a motion of motion.json (``rsbench.dataset.corrected_frames.motion_record``).
 """
@@ -17,15 +18,16 @@ from rsbench.core.so3 import FloatArray
 _ACCENT, _GREY, _LINE = "#0b6bcb", "#aab3bd", "#d8dde2"
 _WIDE, _ROW, _LEFT, _BAR = 420.0, 24.0, 96.0, 220.0
 _SIDE, _INSET = 240.0, 52.0
-"""Side of the square in which directions are drawn, and width of its labels, px."""
+"""Side of the square for directions, and width of its labels, px."""
 _LEAST = 1e-3
-"""Smaller probabilities are called less than this."""
+"""Smaller probabilities are labelled as less than this."""
 _WIDEST_DEG = 30.0
-"""Deviation from which on a direction is called unknown: its tangent plane no longer is the sphere."""
+"""Standard deviation at which a direction counts as unknown: the tangent plane then no longer approximates the
+sphere."""
 
 
 def draw_certainty(motion: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """The drawings of a motion with their captions; without those for which it states nothing."""
+    """The drawings of a motion with their captions, without those for which the motion has no data."""
     if motion is None:
         return []
     found, choice = list[dict[str, Any]](), motion.get("model_choice")
@@ -52,7 +54,7 @@ def draw_certainty(motion: Mapping[str, Any] | None) -> list[dict[str, Any]]:
 
 
 def sizes(motion: Mapping[str, Any]) -> tuple[str, str]:
-    """Rotation and translation of a frame period in words, with one standard deviation each where it is stated."""
+    """Rotation and translation of a frame period as text, each with its standard deviation if it is stated."""
     found = list[str]()
     covariance = motion.get("covariance_w_d")
     for part, (key, name, unit) in enumerate((("w", "rotation_deg", "deg"), ("d", "translation", "m"))):
@@ -73,8 +75,8 @@ def direction_covariance(d: FloatArray, covariance: FloatArray) -> tuple[FloatAr
         covariance: (3, 3) of d, in its unit squared.
 
     Returns:
-        Two unit vectors (2, 3) across d, the covariance (2, 2) of the direction along them, deg^2, and the names
-        of the body's axes towards which they point: those two that are least along d.
+        Two unit vectors (2, 3) perpendicular to d, the covariance (2, 2) of the direction along them, deg^2, and
+            the names of the two body axes that they are closest to.
     """
     ahead = d / np.linalg.norm(d)
     first, second = sorted(np.argsort(np.abs(ahead), kind="stable")[:2])
@@ -88,7 +90,7 @@ def direction_covariance(d: FloatArray, covariance: FloatArray) -> tuple[FloatAr
 
 
 def _odds(probability: Mapping[str, float], used: str) -> Markup:
-    """A bar for each law, the most probable first."""
+    """A bar for each motion model, the most probable first."""
     rows = []
     for number, (name, p) in enumerate(probability.items()):
         y = _ROW * number
@@ -108,7 +110,7 @@ def _odds(probability: Mapping[str, float], used: str) -> Markup:
 
 
 def _ellipses(covariance: FloatArray, names: tuple[str, str]) -> Markup:
-    """Ellipses of one deviation and of 95 %, about the estimate; one scale in both directions."""
+    """Ellipses of one standard deviation and of 95 % about the estimate; one scale in both directions."""
     values, vectors = np.linalg.eigh(covariance)
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(turn), np.sin(turn)])
@@ -141,7 +143,7 @@ def _ellipses(covariance: FloatArray, names: tuple[str, str]) -> Markup:
 
 
 def _svg(wide: float, high: float, label: str, inner: str) -> Markup:
-    """A drawing in its own size, at most as wide as its place."""
+    """A drawing in its own size, at most as wide as its container."""
     return Markup(
         f'<svg viewBox="0 0 {wide:g} {high:g}" width="{wide:g}" style="max-width: 100%" font-size="12" role="img" '
         f'aria-label="{escape(label)}">{inner}</svg>'

@@ -114,7 +114,7 @@ def _move_row(maps: LineMaps, y: int, rho: F32, out: F64) -> None:
     if maps.columns:
         for x in range(rho.shape[1]):
             out[x, 0], out[x, 1], out[x, 2] = move(maps, True, x, y, rho[y, x])
-    else:  # apart, so that the row's map is loaded once
+    else:  # separate function, so that the row's map is loaded once
         for x in range(rho.shape[1]):
             out[x, 0], out[x, 1], out[x, 2] = move(maps, False, x, y, rho[y, x])
 
@@ -123,7 +123,7 @@ def _move_row(maps: LineMaps, y: int, rho: F32, out: F64) -> None:
 def draw_mesh(rho: F32, joined: U8, maps: LineMaps, source_map: F32, buffer: F32) -> None:
     """Draw the triangles of all joined neighbours into ``source_map`` (H, W, 2) and ``buffer`` (H, W).
 
-    ``buffer`` holds inverse depth at the target, -1 where nothing is drawn yet; the larger one wins.
+    ``buffer`` holds inverse depth at the target, -1 where nothing is drawn yet; the larger value wins.
     """
     height, width = rho.shape
     rows = np.zeros((2, width, 3))
@@ -152,7 +152,8 @@ def _draw_strip(upper: F64, lower: F64, joined: U8, y: int, source_map: F32, buf
 
 @compiled(error_model="numpy", inline="always")
 def _covered(a: float, b: float, c: float, d: float, size: int) -> tuple[int, int]:
-    """First and last pixel between the corners' coordinates; none when one is NaN or they are too far apart."""
+    """First and last pixel between the corners' coordinates; an empty range if one is NaN or they are too far
+    apart."""
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     if not high - low <= _MAX_STRETCH:
         return 1, 0
@@ -168,7 +169,7 @@ def _quad(
     ``first`` has its right angle at (near, y), ``second`` at (far, y + 1). ``upper`` and ``lower`` (W, 3) hold
     (target x, y, inverse depth) of the two rows.
     """
-    # Scalars, because numba counts the references of every view it makes.
+    # Scalars, because numba counts references of every array view.
     ax, ay, az = upper[near, 0], upper[near, 1], upper[near, 2]
     bx, by, bz = upper[far, 0], upper[far, 1], upper[far, 2]
     cx, cy, cz = lower[near, 0], lower[near, 1], lower[near, 2]
@@ -234,7 +235,7 @@ def draw_cells(rho: F32, joined: U8, maps: LineMaps, source_map: F32, buffer: F3
 def _cell(
     rho: F32, x: int, y: int, along: tuple[float, float], maps: LineMaps, source_map: F32, buffer: F32
 ) -> None:
-    """Draw the parallelogram that the square of half a pixel around source pixel (x, y) becomes.
+    """Draw the parallelogram to which the square of half a pixel around source pixel (x, y) is moved.
 
     ``along`` are the steps of inverse depth to the next column and row.
     """
@@ -275,18 +276,16 @@ def _cell(
 
 @compiled(error_model="numpy")
 def draw_moved(moved: F64, joined: U8, source_map: F32, buffer: F32) -> None:
-    """``draw_mesh`` of pixel centres that are moved already: ``moved`` (H, W, 3) target x, y and inverse depth.
-
-    Whatever moved them; NaN is not drawn.
-    """
+    """``draw_mesh`` for pixel centres that were already moved: ``moved`` (H, W, 3) has target x, y and inverse
+    depth; NaN is not drawn."""
     for y in range(1, len(joined)):
         _draw_strip(moved[y - 1], moved[y], joined, y, source_map, buffer)
 
 
 def draw_within(moved: F64, stretch: float) -> tuple[F32, F32]:
-    """Source pixel (H, W, 2) and inverse depth (H, W), -1 for none, of the mesh of ``moved`` (H, W, 3).
+    """Source pixel (H, W, 2) and inverse depth (H, W), -1 if there is none, of the mesh of ``moved`` (H, W, 3).
 
-    Without what joins neighbours that are more than ``stretch`` px apart.
+    Neighbours that are more than ``stretch`` px apart are not joined.
     """
     joined = np.zeros(moved.shape[:2], dtype=np.uint8)
     _join(moved, stretch, joined)
@@ -315,13 +314,13 @@ _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 
 @dataclass(frozen=True, kw_only=True)
 class WarpOptions:
-    """How the source image becomes the target image."""
+    """Options of the warp from the source image to the target image."""
 
     interpolation: Interpolation = "cubic"
     """Interpolation of colours between the source image's pixels."""
     tear_px: float = 0.2
-    """Two neighbours are torn apart when a step of depth between them, which neither side's surface explains,
-    moves them apart by more than this many px; so the mesh is at most this wrong between surfaces."""
+    """Two neighbours are not joined if a step of depth between them that neither side's surface explains moves
+    them apart by more than this, px; the mesh between surfaces thus errs by at most this."""
 
     def __post_init__(self) -> None:
         if self.interpolation not in get_args(Interpolation):
@@ -332,7 +331,7 @@ class WarpOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LineView:
-    """A frame each of whose lines has a pose of its own."""
+    """A frame whose lines have separate poses."""
 
     image: NDArray[Any]
     """(H, W) or (H, W, C) of uint8, uint16 or float32."""
@@ -341,7 +340,8 @@ class LineView:
     poses: Pose
     """``cam_from_world`` of every line, (lines, 3, 3) and (lines, 3)."""
     camera: PinholeCamera | None = None
-    """Where it is not the target's: of a rig of two cameras, or one whose disparities are off."""
+    """Camera of the frame if it is not that of the target: in a rig of two different cameras, or if disparities
+    have an offset."""
     columns: bool = False
     """Whether lines are columns."""
 
@@ -353,7 +353,7 @@ class Corrected:
     image: NDArray[Any]
     """(H, W) or (H, W, C), type of the source; 0 where the mask is False."""
     mask: NDArray[np.bool_]
-    """(H, W) what the source frame saw."""
+    """(H, W) mask of the pixels that the source frame saw."""
     source_map: NDArray[np.float32]
     """(H, W, 2) source pixel (x, y) of every target pixel; NaN where the mask is False."""
     depth: NDArray[np.float32]
@@ -367,10 +367,10 @@ def line_maps(
     columns: bool = False,
     source_camera: PinholeCamera | None = None,
 ) -> LineMaps:
-    """Where the pixels of a frame, one pose per line, lie in ``camera`` at the target pose.
+    """Maps from the pixels of a frame, one pose per line, to those of ``camera`` at the target pose.
 
     Poses are ``cam_from_world``, of every line and of the target; either may be the one that has lines.
-    ``source_camera`` is the frame's when it is another one.
+    ``source_camera`` is the frame's camera if it differs.
     """
     R, t = compose(target_pose, inverse(source_poses))
     K = camera.ideal.K
@@ -380,7 +380,8 @@ def line_maps(
 
 
 def warp_gain(camera: PinholeCamera, source_poses: Pose, target_pose: Pose, columns: bool = False) -> FloatArray:
-    """(H, 1) px m, (1, W) of ``columns``: a step of inverse depth moves a pixel by about this times it, f |t|."""
+    """(H, 1) px m, or (1, W) for ``columns``: approximate displacement of a pixel divided by a step of its inverse
+    depth, f |t|."""
     lengths = np.linalg.norm(compose(target_pose, inverse(source_poses)).t, axis=-1)
     gain = np.asarray(max(camera.fx, camera.fy) * lengths)
     return gain[np.newaxis] if columns else gain[:, np.newaxis]

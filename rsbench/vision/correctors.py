@@ -1,8 +1,8 @@
-"""Our correctors: the whole fusion, and what simpler assumptions leave of it.
+"""Our correctors: the complete fusion, and correctors with simpler assumptions.
 
-Things that move by themselves in front of a moving rig are found where flow contradicts geometry. Their depth
-comes from two cameras at one time and is right; the rig's motion does not predict where a row sees them at another
-time. Their flow does, scaled by the times of the rows: even motion in the image.
+Independently moving objects in front of a moving rig are found where flow contradicts geometry. Their depth comes
+from two cameras at one time and is right, but the motion of the rig does not predict their position at another
+time. Their flow does, scaled by the times of the rows, if they move uniformly in the image.
 """
 
 from __future__ import annotations
@@ -29,39 +29,42 @@ from rsbench.vision.reprojection import reproject_pixels, reprojection_of
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 _RETURNS_PX = 1.0
-"""Distance from a pixel to where flow there and back ends, below which it is believed."""
+"""Largest distance, px, between a pixel and the end of its flow there and back, for flow that is trusted."""
 _MOVED_PX = 2.0
-"""Distance between the end of the flow and where geometry puts a still point, above which it moved."""
+"""Least distance, px, between the end of the flow and the place of a static point, for a pixel that moved."""
 _DISPARITY_PX = 1.0
-"""Error of depth: a point at rest may be so much farther or nearer."""
+"""Relative error of depth by which a static point may be farther or nearer."""
 _NOISE_LEVELS, _CLEARLY = 1.0, 0.7
-"""Grey levels that differ anyway, and the part of the difference where geometry leads that must be left."""
+"""Difference of grey levels that is always tolerated, and the share of the difference at the place by geometry
+that the place by flow may have."""
 _MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
-"""Sides, px, of the windows in which most must move, and all; how far beyond, px, a thing goes on."""
+"""Sides, px, of the windows in which most or all pixels must move, and distance, px, by which an object is
+extended."""
 _LEAST = 0.004
-"""Share of the image's area: smaller things are left to geometry, which errs in such spots too."""
+"""Least share of the image's area: smaller objects are left to geometry, because errors also occur in such
+spots."""
 _SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
-"""Relative difference of inverse depth to the nearest certain pixel of a thing, up to which one is part of it, and
-of flow, up to which its own is kept."""
+"""Largest relative difference of inverse depth from the nearest certain pixel of an object, for a pixel that
+belongs to it; and of flow, for a pixel that keeps its own."""
 _EDGE = 7
-"""Side, px, of the window in which what is nearest may hide a point: depth errs at edges."""
+"""Side, px, of the window whose nearest surface may hide a point: depth has errors at edges."""
 _SMALLEST = 12
-"""Side of an image, px, that dense flow takes (OpenCV 5.0)."""
+"""Least side of an image, px, for dense flow (OpenCV 5.0)."""
 _STRETCH_PX = 2.5
-"""Between neighbours at the target, above which what lies between them is not drawn."""
+"""Largest distance, px, between neighbours at the target for which the area between them is drawn."""
 _AGREE = 0.03
-"""Relative difference of depth, below which what moves lies on what stands, and is seen."""
+"""Relative difference of depth below which a moving object lies on a static surface, and is visible."""
 _FLOW_BYTES = 100.0
 
 
 class _Still(NamedTuple):
-    """Motion of points at rest: (H, W, 2) px, NaN where unknown, and (H, W) whether they are hidden there."""
+    """Motion of static points: (H, W, 2) px, NaN where it is unknown, and (H, W) whether they are hidden there."""
 
     far: F32
-    """(H, W, 2) px that a point at rest moves if it is somewhat farther."""
+    """(H, W, 2) displacement, px, of a static point that is somewhat farther."""
     near: F32
     hidden: Mask
-    """Hidden by something nearer, so that the other frame's colour there is not the point's."""
+    """Whether a nearer surface hides the point, so that the other frame shows another colour there."""
 
     def half(self) -> _Still:
         """The same at half the image's size."""
@@ -69,7 +72,7 @@ class _Still(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """Things that move by themselves in a frame."""
+    """Independently moving objects in a frame."""
 
     mask: Mask
     """(H, W)."""
@@ -84,9 +87,10 @@ def find_moving(
     rig: StereoRig,
     shutter: RollingShutter,
 ) -> dict[View, Moving]:
-    """Things that move by themselves in four frames (H, W[, 3]), by depth (H, W) and the lines' poses; or empty.
+    """Find independently moving objects in four frames (H, W[, 3]), by depth (H, W) and the lines' poses; there
+    may be none.
 
-    Of most scenes a look at a frame of half the size says that.
+    In most scenes, half-size frames suffice to exclude them.
     """
     size = max(rig.sensor(side).width * rig.sensor(side).height for side in SIDES)
     grids = {side: rig.sensor(side).pixel_grid().astype(np.float32) for side in SIDES}
@@ -124,14 +128,14 @@ def find_moving(
 
 
 def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: _Still, least: float) -> Mask:
-    """(H, W) large regions whose consistent flow ends off the curves on which points at rest move.
+    """(H, W) large regions whose consistent flow ends off the curves on which static points move.
 
-    And where it leads is clearly more like what is there: flow errs too.
+    The place by flow must also look clearly more similar: flow has errors too.
     """
     far, along = still.far, still.near - still.far
     share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
     nearest = far + np.clip(share, 0.0, 1.0)[..., None] * along
-    moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False of NaN
+    moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False for NaN
     moved &= (returns_px(flow, back) < _RETURNS_PX) & ~still.hidden
     dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
@@ -146,12 +150,13 @@ def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: _Sti
 
 
 def _unlike(greys: Sequence[NDArray[np.uint8]], flow: F32) -> F32:
-    """(H, W) grey levels by which a frame differs from the other one where ``flow`` (H, W, 2) px leads."""
+    """(H, W) difference of grey levels between a frame and the other one at the end of ``flow`` (H, W, 2), px."""
     return np.abs(followed(greys[1], flow, cv2.BORDER_CONSTANT).astype(np.float32) - greys[0])
 
 
 def _outlined(moving: Moving, rho: F32) -> Moving:
-    """Things as far as their own depth goes, and the flow of what they are near: flow runs over edges."""
+    """Objects extended to the limits of their own depth, with the flow of nearby pixels: flow extends over
+    edges."""
     core = cv2.erode(moving.mask.astype(np.uint8), np.ones((_CORE, _CORE), np.uint8)) & np.isfinite(rho)
     if not np.any(core):
         return Moving(np.zeros_like(moving.mask), moving.flow)
@@ -176,12 +181,12 @@ def draw_moving(
     target_tau: float,
     interpolation: Interpolation,
 ) -> Fused:
-    """A corrected frame with what moves by itself in it, before what is farther.
+    """Draw independently moving objects into a corrected frame, in front of farther surfaces.
 
     Args:
-        fused: without it, see ``find_moving``.
+        fused: the frame without them, see ``find_moving``.
         image, depth: (H, W[, 3]), (H, W) of the frame of the ``view``.
-        moving: in that frame.
+        moving: the objects in that frame.
         target_tau: time of the corrected frame, frame periods.
     """
     mask = moving.mask & (depth > 0.0)
@@ -192,7 +197,7 @@ def draw_moving(
     flow = moving.flow[y, x]
     start = shutter.pixel_time(here, view[1], view[0])
     passed = shutter.pixel_time(here + flow, 1 - view[1], view[0]) - start
-    with np.errstate(divide="ignore", invalid="ignore"):  # what ends when it began has no speed, and is not drawn
+    with np.errstate(divide="ignore", invalid="ignore"):  # flow between equal times has no speed, and is not drawn
         share = (target_tau - start) / passed
     moved = np.full((*mask.shape, 3), np.nan)
     moved[y, x, :2] = here + share[:, None] * flow
@@ -215,22 +220,22 @@ def _other(view: View) -> View:
 _NEAREST_SHARE = 0.999
 _PLANE_ROUNDS = 8
 _NEARER = 0.5
-"""Pixels without depth may be nearer than the nearest with one: down to this share of its depth."""
+"""Pixels without depth may be nearer than the nearest known one: down to this share of its depth."""
 _FUSION_BYTES = 150.0
-"""Per pixel of a frame: what is carried over from the four, float32 and float64."""
+"""Bytes per pixel of a frame, for data from all four frames, float32 and float64."""
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
 class FusionCorrector(Corrector):
-    """Every pixel moved by its depth and its row's pose; holes filled from the other frames."""
+    """Move every pixel by its depth and the pose of its row; fill holes from the other frames."""
 
     use_other_views: bool = True
-    """Fill what the frame did not see from the other three."""
+    """Fill areas that the frame did not see from the other three."""
     guess_depth: bool = True
-    """Where no depth was found, take that of the farther neighbour in the row."""
+    """Where depth is unknown, use that of the farther neighbour in the row."""
     moving: bool = True
-    """Whether to find things that move by themselves, and to move them by their flow."""
+    """Whether to find independently moving objects, and to move them by their flow."""
     warp: WarpOptions = field(default_factory=WarpOptions)
     """How pixels are taken from the source image."""
 
@@ -263,7 +268,7 @@ class FusionCorrector(Corrector):
         return dict(zip(views, found, strict=True))
 
     def _sources(self, problem: CorrectionProblem, view: View, poses: Mapping[View, Pose]) -> list[SourceView]:
-        """The images that a corrected view is made of, in the order in which they are trusted."""
+        """The source images of a corrected view, from the most to the least trusted."""
         side, frame = view
         other: Side = "right" if side == "left" else "left"
         order = [(view, Origin.HERE)]
@@ -284,7 +289,7 @@ class FusionCorrector(Corrector):
         ]
 
     def _placed(self, problem: CorrectionProblem, view: View, source: SourceView) -> SourceView:
-        """The frame with a depth in the lines where no depth would move a pixel by more than ``tear_px``."""
+        """The frame with a depth in those lines where any depth moves a pixel by less than ``tear_px``."""
         known = source.depth[source.depth > 0.0]
         if problem.guess is None or known.size == 0:
             return source
@@ -296,7 +301,7 @@ class FusionCorrector(Corrector):
 
 
 def _standing(problem: CorrectionProblem, moving: Mapping[View, Moving]) -> CorrectionProblem:
-    """Without the depth of what moves."""
+    """Depth without that of moving objects."""
 
     def still(depth: Depths | None) -> Depths | None:
         if depth is None:
@@ -321,7 +326,7 @@ def _depths(problem: CorrectionProblem, origin: Origin = Origin.HERE) -> Depths:
 @final
 @dataclass(frozen=True, kw_only=True)
 class RotationCorrector(Corrector):
-    """Everything at infinity, which moves by the rotation alone: one homography per row."""
+    """Treat everything as being at infinity: only the rotation moves it, by one homography per row."""
 
     warp: WarpOptions = field(default_factory=WarpOptions)
     """How pixels are taken from the source image."""
@@ -340,7 +345,7 @@ class RotationCorrector(Corrector):
 @final
 @dataclass(frozen=True, kw_only=True)
 class PlaneCorrector(Corrector):
-    """Everything on the plane that fits the depth of the frame best: one homography per row."""
+    """Treat everything as lying on the plane that fits the depth of the frame best: one homography per row."""
 
     warp: WarpOptions = field(default_factory=WarpOptions)
     """How pixels are taken from the source image."""
@@ -387,7 +392,7 @@ def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32
 
 
 def turned(problem: CorrectionProblem, view: View, options: WarpOptions) -> Fused:
-    """A frame as the rotation of the problem's motion alone moves it: everything is at infinity."""
+    """A frame moved only by the rotation of the problem's motion: everything is at infinity."""
     camera = problem.rig.sensor(view[0])
     far = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     return _alone(problem, view, far, options)

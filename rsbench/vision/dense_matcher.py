@@ -1,12 +1,12 @@
 """Tracks of a stereo rig over two frames from dense flow and disparity, aligned on the levels of a pyramid.
 
-Where frames are blurred or noisy, a detector finds few keypoints. Dense flow has an answer at every pixel, right
-to a pixel or two or wrong; here it is the start of an alignment of patches (``features.align``), whose predicted
-deviation decides which points are taken. A coarse level has less blur and less noise: patches can be aligned there
-that cannot at full size. An affine map of the whole image, from the correlation of blocks, is the start of the
-flow where that is beyond its search.
+In blurred or noisy frames a detector finds few keypoints. Dense flow gives a value for every pixel, either right
+to one or two pixels or wrong. Here it is the start of an alignment of patches (``features.align``), whose
+predicted deviation decides which points are used. A coarse level has less blur and less noise, so that patches can
+be aligned there that cannot be aligned at full size. If the displacement is beyond the search range of the flow,
+the flow starts from an affine map of the whole image, which is estimated by correlation of blocks.
 
-All is done in ideal pixels, in which both ends of a left-right match lie on one row, whatever the rig.
+All steps use ideal pixels, in which both ends of a left-right match are in one row for any rig.
 
 Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016 (OpenCV); Shi, Tomasi, "Good features to
 track", CVPR 1994.
@@ -59,23 +59,24 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class DenseOptions:
-    """Where tracks are looked for, and which are taken. A pixel of level l is 2^l px."""
+    """Options of the search for tracks. A pixel of level l is 2^l px."""
 
     points: int = 2000
-    """Places that are tried on each level: the best one of each of so many cells."""
+    """Number of places that are tried on each level: the best corner of each of this many cells."""
     levels: int = 3
-    """Levels of the pyramid, from the full size on."""
+    """Number of levels of the pyramid, from the full size on."""
     enough: int = 400
-    """Tracks with which no coarser level is tried."""
+    """Number of tracks with which no coarser level is used."""
     most_deviation: float = 0.1
-    """Predicted standard deviation of an end, in pixels of its level, at most."""
+    """Largest predicted standard deviation of an end, in pixels of its level."""
     row_tolerance: float | None = 1.0
-    """Left-right ends differ by at most this many rows of the level: both cameras read a row at the same time.
-    None, where they do not."""
+    """Largest difference of rows of left-right ends, in rows of the level, if both cameras read a row at the same
+    time. None if they do not."""
     fewest: int = 700
-    """Tracks below which SIFT's, aligned, are added, which thin and near things have more of; 0: never."""
+    """With fewer tracks than this, aligned SIFT tracks are added, of which more lie on thin and near objects; 0:
+    never."""
     half: bool = False
-    """Work on images of half the size: faster, and less accurate."""
+    """Use images of half the size: faster, and less accurate."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -84,7 +85,7 @@ class DenseOptions:
 @final
 @dataclass(frozen=True, kw_only=True)
 class DenseMatcher(DenseOptions, FeatureMatcher):
-    """Tracks with their covariance by ``dense_tracks``; where these are few, with those of SIFT."""
+    """Tracks with their covariance from ``dense_tracks``; if there are few, also SIFT tracks."""
 
     def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
         return self._matched(images, None)
@@ -108,7 +109,7 @@ class DenseMatcher(DenseOptions, FeatureMatcher):
         else:
             straight = {view: undistorted(image, rig.eye(view[0])) for view, image in images.items()}
             found = of_sensors(dense_tracks(straight, self), rig, _BORDER_PX)
-            if not self.half:  # interpolating has moved what is seen by hundredths of a pixel
+            if not self.half:  # interpolation moved the content by hundredths of a pixel
                 alone = refine_matches(images, Correspondences(tracks=found.tracks), None if rig.aligned else rig)
                 found = replace(found, tracks=alone.tracks)
         if len(found.tracks) < self.fewest or still(found):
@@ -123,7 +124,7 @@ class DenseMatcher(DenseOptions, FeatureMatcher):
 
 
 def _halves(tracks: FloatArray, more: Correspondences | None = None) -> dict[str, FloatArray]:
-    """The pairwise sets: what the tracks hold of them, after those of others."""
+    """The pairwise sets: the given matches, followed by the pairs of the tracks."""
     own = {"left": track_pairs(tracks, "left"), "right": track_pairs(tracks, "right")}
     own |= {"stereo_0": tracks[:, :4], "stereo_1": tracks[:, 4:]}
     return own if more is None else {name: np.concatenate([getattr(more, name), own[name]]) for name in own}
@@ -131,28 +132,28 @@ def _halves(tracks: FloatArray, more: Correspondences | None = None) -> dict[str
 
 _FLOW_BLUR_PX = 1.0
 _BORDER_PX = 8
-"""Half of a patch, which must not hold the mirror of an image's border."""
+"""Half the size of a patch, which must not contain mirrored pixels beyond the border of an image."""
 _MOST_PX = 1.5
-"""By which the alignment moves an end, pixels of the level, at most."""
+"""Largest change of an end by the alignment, pixels of the level."""
 _RETURN_PX = 1.0
-"""Distance of a flow there and back, pixels of the level, at most."""
+"""Largest distance between a pixel and the end of its flow there and back, pixels of the level."""
 _FLAT = 0.002
-"""Corners are at least so strong, as a share of strong ones."""
+"""Least strength of a corner, as a share of that of strong ones."""
 _FLOOR_PX = 0.02
-"""Deviation of an end that no grey levels predict."""
+"""Standard deviation of an end that grey levels do not predict."""
 _SMALLEST, _SMALLEST_CELL = 64, 6
-"""Width or height of a level, and of a cell, px."""
+"""Least width or height of a level, and of a cell, px."""
 _TRIED = 2.5
-"""Places that are tried for each requested track."""
+"""Number of places that are tried for each requested track."""
 _REMEMBERED, _LARGE = 4, 2_500_000
-"""Pairs of images whose flow is remembered, and pixels above which it is not."""
+"""Number of image pairs whose flow is cached, and number of pixels above which it is not cached."""
 
 
 def dense_tracks(images: Mapping[View, NDArray[Any]], options: DenseOptions | None = None) -> Correspondences:
     """Tracks, with their covariance, of four images (H, W[, 3]) of one size, uint8 or uint16, in ideal pixels.
 
-    The covariance is the mean of those of the three later ends against the first one. There may be none.
-    Raises ValueError when the images differ in size or are of another type.
+    The covariance is the mean of those of the three later ends relative to the first one. There may be no tracks.
+    Raises ValueError if the images differ in size or are of another type.
     """
     options = options or DenseOptions()
     grey = {view: grey_u8(images[view]) for view in VIEWS}
@@ -185,7 +186,7 @@ def dense_tracks(images: Mapping[View, NDArray[Any]], options: DenseOptions | No
 
 
 def _worth_taking(covariance: FloatArray, least: int) -> NDArray[np.int64]:
-    """The tracks, ``least`` and more, with which a mean without weights would have the smallest variance."""
+    """Mask of the tracks, at least ``least``, for which an unweighted mean would have the smallest variance."""
     variance = 0.5 * (covariance[:, 0] + covariance[:, 2]) + _FLOOR_PX**2
     order, count = np.argsort(variance, kind="stable"), np.arange(1, len(variance) + 1)
     of_mean = np.cumsum(variance[order]) / count**2
@@ -218,13 +219,13 @@ _KEPT: Recent[_Pair] = Recent(_REMEMBERED)
 
 
 def forget_matches() -> None:
-    """Forget features and flows of all images, so that later calls compute them again: for timings."""
+    """Clear the caches of features and flows, so that later calls compute them again: for timings."""
     forget_features()
     _KEPT.clear()
 
 
 def _both_ways(first: U8, second: U8, along_rows: bool) -> _Pair:
-    """Flow from one grey image to another and back; remembered, for neighbouring windows share a frame."""
+    """Flow from one grey image to another and back, cached because neighbouring windows share a frame."""
     if first.size > _LARGE:
         return _found_both_ways(first, second, along_rows)
     key = content_key(first), content_key(second), along_rows
@@ -239,10 +240,10 @@ def _found_both_ways(first: U8, second: U8, along_rows: bool) -> _Pair:
 
 
 def stereo_by_flow(left: NDArray[Any], right: NDArray[Any]) -> FloatArray:
-    """Matches (n, 4), px, of two images (H, W[, 3]) of one size, on any rows, right to a fraction of a pixel.
+    """Matches (n, 4), px, of two images (H, W[, 3]) of one size, on any rows, accurate to a fraction of a pixel.
 
-    They begin at corners and are ends of flows that return, those that ``dense_tracks`` of these images uses too.
-    There are none in small images.
+    They begin at corners and end where flows end that lead back to their start; ``dense_tracks`` of these images
+    uses the same flows. Small images have none.
     """
     a, b = grey_u8(left), grey_u8(right)
     if min(a.shape) < _SMALLEST:
@@ -257,7 +258,7 @@ def _returns(back: F32, ends: FloatArray, points: FloatArray, most: float) -> Bo
 
 
 class _Found(NamedTuple):
-    """Of one level, in pixels of the images."""
+    """Results of one level, in pixels of the images."""
 
     tracks: FloatArray
     """(n, 8)"""
@@ -292,7 +293,7 @@ def _of_level(grey: Mapping[View, U8], flows: _Flows, level: int, options: Dense
     for view, ends in ((("right", 0), r0), (("left", 1), l1), (("right", 1), r1)):
         near = (ends[left] + 0.5) / scale - 0.5
         found = _aligned(smooth["left", 0], smooth[view], source[left], near, options.most_deviation)
-        left = left[found.done]  # what one image has lost is not looked for in the next one
+        left = left[found.done]  # points lost in one image are not searched in the next one
         places[view][left] = found.places[found.done]
         covariance[left] += found.covariance[found.done] / 3.0
     tracks = np.concatenate([places[side, frame][left] for frame in (0, 1) for side in SIDES], axis=1)
@@ -305,7 +306,7 @@ def _of_level(grey: Mapping[View, U8], flows: _Flows, level: int, options: Dense
 
 
 def _aligned(a: F32, b: F32, points_a: FloatArray, points_b: FloatArray, most_deviation: float) -> Aligned:
-    """``align``, by threads."""
+    """``align`` in several threads."""
     parts = [np.array_split(points, os.cpu_count() or 1) for points in (points_a, points_b)]
     with ThreadPoolExecutor() as pool:
         found = pool.map(lambda p, q: align(a, b, p, q, None, _MOST_PX, most_deviation), *parts)
@@ -313,9 +314,9 @@ def _aligned(a: F32, b: F32, points_a: FloatArray, points_b: FloatArray, most_de
 
 
 def corners(image: F32, most: int) -> FloatArray:
-    """Pixels (n, 2), at most as many as ``most``: of each of so many cells the best corner by Shi and Tomasi.
+    """Pixels (n, 2), at most ``most``: the best corner, by Shi and Tomasi, of each of that many cells.
 
-    ``image`` (H, W) are grey levels. Cells without any texture have none, nor has the border.
+    ``image`` (H, W) are grey levels. Cells without texture, and the border, have none.
     """
     height, width = image.shape
     strength = cv2.cornerMinEigenVal(cv2.GaussianBlur(image, (0, 0), _FLOW_BLUR_PX), 7, ksize=3)
@@ -330,21 +331,22 @@ def corners(image: F32, most: int) -> FloatArray:
 
 
 _BLOCKS = (7, 5)
-"""Across and down."""
+"""Numbers of blocks across and down."""
 _REACH = 0.3
-"""Widths of the image within which a block is looked for."""
+"""Reach of the search for a block, in widths of the image."""
 _TEXTURE, _ALIKE = 4.0, 0.6
-"""Of a block: deviation of its grey levels, and correlation, at least."""
+"""Least standard deviation of the grey levels of a block, and least correlation."""
 _FEWEST_BLOCKS, _BLOCK_PX = 6, 3.0
-"""Blocks that an affine map is made of, at least, and their distance from it, small pixels."""
+"""Least number of blocks for an affine map, and their largest distance from it, pixels of the small image."""
 _MOVED = 0.02
-"""Widths of the image by which a corner moves, below which flow needs no start."""
+"""Displacement of a corner, in widths of the image, below which flow needs no start."""
 
 
 def start_of_flow(first: U8, second: U8, along_rows: bool = False) -> FloatArray | None:
-    """Affine map (2, 3), px, from one grey image (H, W) to another; None where it is unknown or near no motion.
+    """Affine map (2, 3), px, from one grey image (H, W) to another; None if it is unknown or close to no motion.
 
-    Blocks are found by normalised correlation at a quarter or an eighth of the size; ``along_rows``: on their row.
+    Blocks are searched by normalised correlation at a quarter or an eighth of the size; ``along_rows``: only in
+    their row.
     """
     height, width = first.shape
     shape = tuple(side // (8 if width > 1000 else 4) for side in first.shape)
@@ -389,7 +391,7 @@ def _field(affine: FloatArray, shape: tuple[int, ...]) -> F32:
 
 
 def _at(field: F32, points: FloatArray) -> FloatArray:
-    """Values (n, 2) of a flow at points (n, 2), px; beyond the border those of the border."""
+    """Values (n, 2) of a flow at points (n, 2), px; beyond the border the value at the border."""
     places = points.astype(np.float32)[:, None]
     if len(points) == 0:
         return np.zeros((0, 2))
@@ -398,20 +400,20 @@ def _at(field: F32, points: FloatArray) -> FloatArray:
 
 
 def _reduced(image: U8, shape: tuple[int, ...]) -> F32:
-    """Grey levels at a smaller shape (h, w), or at the same: means, not rounded."""
+    """Grey levels averaged to a smaller or equal shape (h, w), not rounded."""
     return np.asarray(cv2.resize(image.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA))
 
 
 def _scale(shape: tuple[int, ...], small: tuple[int, ...]) -> FloatArray:
-    """(2,) px in x and y of a pixel of the smaller image."""
+    """(2,) size in x and y, px, of a pixel of the smaller image."""
     return np.array([shape[1] / small[1], shape[0] / small[0]])
 
 
 def _resized(points: FloatArray, scale: FloatArray) -> FloatArray:
-    """Points (n, 2 k), px of a smaller image, in those of the larger one."""
+    """Convert points (n, 2 k), px of a smaller image, to px of the larger one."""
     return ((points.reshape(-1, 2) + 0.5) * scale - 0.5).reshape(points.shape)
 
 
 def _products(scale: FloatArray) -> FloatArray:
-    """(3,) what xx, xy, yy grow by."""
+    """(3,) factors of xx, xy, yy."""
     return np.array([scale[0] ** 2, scale[0] * scale[1], scale[1] ** 2])

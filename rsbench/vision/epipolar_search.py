@@ -1,11 +1,13 @@
-"""Depth from a camera's own known motion: a search along every pixel's epipolar curve.
+"""Depth from the known motion of one camera: a search along the epipolar curve of each pixel.
 
-Dense flow follows gradients and loses what moves by more than its own size: posts, signs, branches. Where the
-motion is known the flow of a pixel has one unknown, its inverse depth. Values of it, evenly apart, are tried, and
-each is compared with the other frame (census and the truncated difference of grey levels). A result counts where
-the other frame's search agrees. ``depth_from_motion`` searches single pixels that need a depth, and averages costs
-over those in a small window; ``sweep_frames`` searches both frames at a fraction of the size and aggregates costs
-semi-globally (``plane_sweep.aggregated``).
+Dense flow follows gradients and loses objects that move by more than their own size: posts, signs, branches. If
+the motion is known, the flow of a pixel has one unknown, its inverse depth. Evenly spaced values of it are
+compared with the other frame (census and the truncated difference of grey levels). A result is used if the search
+in the other frame agrees.
+
+``depth_from_motion`` searches single pixels that need a depth, and averages costs over a small window of them;
+``sweep_frames`` searches both frames at a fraction of their size and aggregates costs semi-globally
+(``plane_sweep.aggregated``).
 
 Costs: Zabih, Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994.
 """
@@ -48,15 +50,15 @@ _REACH = 0.2
 """Largest parallax that is searched, as a share of the image's longer side."""
 _WINDOW = 5
 _PLAIN = 1, 1, 40
-"""Costs of a differing bit of 24, of a grey level, and of a place outside the other frame."""
+"""Cost of each of 24 bits that differs, of a grey level of difference, and of a place outside the other frame."""
 _LEVELS = 16
-"""Grey levels that count at most."""
+"""Largest difference of grey levels that counts."""
 _BAND = 32
-"""Rows whose costs of all depths are kept at a time."""
+"""Number of rows for which the costs of all depths are stored at a time."""
 _ALIKE = 14.0
-"""Largest mean cost in the window of a depth that counts; unlike places cost about 20."""
+"""Largest mean cost, in the window, of an accepted depth; at wrong places it is about 20."""
 _CHORD = 16
-"""Steps along the curve between places that are computed, if there is a lens."""
+"""Number of steps along the curve between exactly computed places, for a camera with a lens."""
 _BETTER = 6.0
 """Least difference of mean costs at which a found depth replaces a known one."""
 _WORSE = 0.5
@@ -75,17 +77,17 @@ def depth_from_motion(
     wanted: tuple[int, ...] = (0, 1),
     replace_unlike: bool = False,
 ) -> tuple[F32, F32]:
-    """Depth (H, W), metres, of the pixels of both frames of one camera whose depth is 0; 0 where it stays unknown.
+    """Depth (H, W), metres, for pixels of both frames of one camera whose depth is 0; 0 where it stays unknown.
 
-    ``images`` (H, W[, 3]) are uint8 or uint16, ``depths`` (H, W) what is known of both; inf is infinitely far. The
-    warp moves a pixel by less than its parallax between the frames, so the depth is as good as the correction
-    needs it, however small the parallax.
+    ``images`` (H, W[, 3]) are uint8 or uint16, ``depths`` (H, W) the known depths of both frames; inf is
+    infinitely far. The warp moves a pixel by less than its parallax between the frames, so the depth is accurate
+    enough for the correction, however small the parallax is.
 
     Args:
-        wanted: frames whose depth is needed; that of the others stays unknown.
-        replace_unlike: also search the depth of pixels whose known depth leads to a place of the other frame that
-            looks different, and return it if it leads to one that looks much more alike. Stereo errs so on texture
-            that runs along the baseline.
+        wanted: frames whose depth is needed; the depth of the others stays unknown.
+        replace_unlike: also search pixels whose known depth leads to a place of the other frame that looks
+            different, and replace it if another depth leads to a place that looks much more similar. Such errors
+            of stereo occur on texture along the baseline.
     """
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
@@ -128,9 +130,9 @@ def stereo_contradicts(
     side: Side,
     frame: int,
 ) -> Mask:
-    """(H, W) whether a pixel fits the other camera's image clearly worse at the depth ``found`` than at ``known``.
+    """(H, W) whether the depth ``found`` of a pixel fits the other camera's image clearly worse than ``known``.
 
-    So it is with things that move by themselves, whose depth stereo shows and the motion of the rig does not.
+    This is the case for independently moving objects: stereo gives their depth, the motion of the rig does not.
 
     Args:
         images: (H, W[, 3]) of that camera and of the other one, at one frame time; sizes may differ.
@@ -202,8 +204,8 @@ def _search(
     step: float,
     most: F32,
 ) -> F32:
-    """Inverse depth (n,) at which pixels (n,), in order of rows, look most alike, of multiples of ``step``; NaN:
-    none costs at most ``most`` (n,)."""
+    """Multiple (n,) of ``step`` that is the best inverse depth of each pixel (n,), in order of rows; NaN: none
+    costs at most ``most`` (n,)."""
     numbers = np.full(both[0].shape, -1, dtype=np.int64)
     numbers[y, x] = np.arange(len(y))
     best, costs = np.zeros(len(y), dtype=np.int64), np.zeros((len(y), 3), dtype=np.float32)
@@ -218,7 +220,7 @@ def _search(
 
 
 def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """(H, W) of 24 bits: which of the 5 x 5 neighbours are darker than the pixel."""
+    """(H, W) census of 24 bits: which of the 5 x 5 neighbours are darker than the pixel."""
     padded = cv2.copyMakeBorder(grey, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
     height, width = grey.shape
     bits = np.zeros(grey.shape, dtype=np.uint32)
@@ -270,8 +272,8 @@ def _find_best(
     best: NDArray[np.int64],
     costs: F32,
 ) -> None:
-    """Number of the best inverse depth of each pixel (n,), and the mean costs in its window (n, 3) of that before
-    it, of itself, and of that after it; infinite of none.
+    """Index of the best inverse depth of each pixel (n,), and mean costs (n, 3) in its window for the index before
+    it, for it, and for the one after it; infinite if there is none.
 
     Args:
         numbers: (H, W) of the pixels, -1 of those that are not searched.
@@ -307,7 +309,7 @@ def _find_best(
 
 @compiled(error_model="numpy")
 def _least(total: NDArray[np.uint16], weight: np.float32, costs: F32) -> int:
-    """The first number of the least cost; fills it and those beside it."""
+    """Index of the least cost; fills that cost and its neighbours."""
     best = 0
     for k in range(1, len(total)):
         if total[k] < total[best]:
@@ -332,10 +334,11 @@ def _fill_costs(
     prices: tuple[int, int, int],
     cost: NDArray[np.uint8],
 ) -> None:
-    """Cost of each inverse depth 0, step, 2 step, ... (count,) at a pixel of grey ``level`` and census ``bits``.
+    """Fill the cost of each inverse depth 0, step, 2 step, ... (count,) for a pixel of grey ``level`` and census
+    ``bits``.
 
     Args:
-        far: places at least so many lines above the frame, or twice as many below its top, are not followed.
+        far: places more lines above the frame than this, or twice as many below its top, are not followed.
         prices: of a bit that differs, of a grey level, and of a place outside the other frame.
     """
     height, width = other.shape
@@ -346,7 +349,7 @@ def _fill_costs(
     for k in range(len(cost)):
         if maps.lens is None:
             u, v, _ = land(M, b, k * step, maps.lens)
-            # One step along the curve changes the line by one at most: its pose is that of the last landing.
+            # A step along the curve changes the line by at most one, so the pose of the last place is used.
             along = across_lines(maps.there, u, v)
             seen_by = min(max(int(along + 0.5), 0), last) if -far < along < 2 * far else line
             if seen_by != line:
@@ -370,7 +373,7 @@ def _fill_costs(
 
 @compiled(error_model="numpy")
 def _land_on_line(x: int, y: int, rho: float, line: int, far: int, maps: Reprojection) -> tuple[float, float, int]:
-    """Where the other frame sees a pixel, by the pose of a line near ``line`` that sees it; and that line."""
+    """Place of a pixel in the other frame, by the pose of a line near ``line`` that sees it; and that line."""
     last, u, v = len(maps.A) - 1, np.nan, np.nan
     for _ in range(3):
         u, v, _ = reproject(x, y, rho, line, maps)
@@ -384,7 +387,7 @@ def _land_on_line(x: int, y: int, rho: float, line: int, far: int, maps: Reproje
 
 @compiled(error_model="numpy")
 def _keep_agreeing(rho: F32, other: F32, wanted: Mask, maps: Reprojection, tolerance: float, depth: F32) -> None:
-    """Write the depth of ``wanted`` pixels whose inverse depth the other frame confirms where it sees them."""
+    """Write the depth of ``wanted`` pixels if the inverse depth of the other frame at their places confirms it."""
     height, width = rho.shape
     for y in range(height):
         for x in range(width):
@@ -398,7 +401,7 @@ def _keep_agreeing(rho: F32, other: F32, wanted: Mask, maps: Reprojection, toler
 
 @compiled(error_model="numpy")
 def _mark(rho: F32, wanted: Mask, maps: Reprojection, marks: NDArray[np.uint8]) -> None:
-    """Mark where the other frame sees ``wanted`` pixels."""
+    """Mark the places of ``wanted`` pixels in the other frame."""
     height, width = rho.shape
     for y in range(height):
         for x in range(width):
@@ -410,7 +413,7 @@ def _mark(rho: F32, wanted: Mask, maps: Reprojection, marks: NDArray[np.uint8]) 
 
 @compiled(error_model="numpy")
 def _seen_at(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float, float]:
-    """Where the other frame sees a pixel, and its inverse depth there by that here."""
+    """Place of a pixel in the other frame, and its inverse depth there, for a given inverse depth here."""
     lines = len(maps.A)
     line, u, v, s = line_of(maps.columns, x, y), np.nan, np.nan, np.nan
     for _ in range(6):
@@ -427,37 +430,39 @@ def _seen_at(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, flo
 
 U8 = NDArray[np.uint8]
 _AGGREGATED = 6, 4, 90
-"""Costs of a differing bit of 24, of a grey level, of which at most ``_LEVELS`` count, 208 together, and of a
-place outside the other frame, between those of like and of unlike places."""
+"""Cost of each of 24 bits that differs, of a grey level of difference (of at most ``_LEVELS``; 208 together), and
+of a place outside the other frame, between the costs of right and of wrong places."""
 _MEDIAN = 5
 _FEWEST = 4
 _COARSE, _COARSE_REACH = 4, 0.2
-"""Shrinking of the first search, at options of half the size, and its parallax, of the image's longer side."""
+"""Factor by which the first search shrinks frames, with the options at half the size, and its largest parallax, as
+a share of the image's longer side."""
 _TEXTURED, _TEXTURE_LEVELS = 5, 5.0
-"""Side of a window, px, and the deviation of its grey levels; in a smooth sky anything looks alike."""
+"""Side of a window, px, and least standard deviation of its grey levels; without texture, as in a smooth sky, any
+places look alike."""
 _NEAREST, _MARGIN, _MARGIN_PX = 0.998, 1.2, 2.0
 _BYTES = 500.0
-"""Per pixel of the swept frame: the volume and its sums."""
+"""Bytes per pixel of the searched frame: the cost volume and its sums."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
-    """The search along the curves."""
+    """Options of the search along the curves."""
 
     shrink: int = 2
     """Factor by which frames are shrunk before they are compared."""
     step_px: float = 1.0
-    """Parallax between two planes at that size."""
+    """Parallax between two planes at the reduced size, px."""
     planes: int = 128
     """Largest number of planes."""
     window: int = 3
     """Side, px, of the square over which costs are averaged."""
     p1: int = 48
-    """Cost of a step to the next plane, of 255."""
+    """Cost of a step to the next plane, on a scale of 255."""
     p2: int = 255
     """Cost of larger steps."""
     agree_px: float = 1.0
-    """Largest difference of parallax to the other frame's, at that size."""
+    """Largest difference of parallax from the other frame's, px, at the reduced size."""
 
     def __post_init__(self) -> None:
         if not (self.shrink >= 1 and self.step_px > 0.0 and self.planes >= _FEWEST and self.agree_px > 0.0):
@@ -522,10 +527,11 @@ def sweep_frames(
 def largest_seen(
     greys: Sequence[U8], rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, options: SweepOptions
 ) -> float:
-    """Largest inverse depth of textured places that both frames show, with a margin; arguments: ``sweep_frames``.
+    """Largest inverse depth of textured places that both frames show, with a margin; 0 if there are none.
+    Arguments as in ``sweep_frames``.
 
-    By a search at a quarter of the size, as far as things are expected to move: where flow lost a near thing, its
-    depth would not be searched. 0 where there is none.
+    It is searched at a quarter of the size and over the largest expected parallax: flow may have lost near
+    objects, whose depth would then not be searched.
     """
     poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
     maps = [reprojection_of(rig.sensor(side), poses[frame], poses[1 - frame]) for frame in FRAMES]
@@ -543,17 +549,18 @@ def largest_seen(
 
 
 def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int]:
-    """Rows and columns at which frames (H, W) are compared."""
+    """Numbers of rows and columns at which frames (H, W) are compared."""
     shrink = options.shrink * reduction(shape)
     return max(shape[0] // shrink, 8), max(shape[1] // shrink, 8)
 
 
 _ENOUGH = 1 << 21
-"""Pixels, just above 1920 x 1080; more show motion and depth no better (``benchmarks/footage_sizes.py``)."""
+"""Largest number of pixels, just above 1920 x 1080: more do not improve motion and depth
+(``benchmarks/footage_sizes.py``)."""
 
 
 def reduction(shape: tuple[int, ...]) -> int:
-    """The factor by which frames (H, W[, C]) are shrunk before motion and depth are found: 2 of 4K, 1 of HD."""
+    """Factor by which frames (H, W[, C]) are shrunk before motion and depth are estimated: 2 for 4K, 1 for HD."""
     return max(math.ceil(math.sqrt(shape[0] * shape[1] / _ENOUGH) - 1e-9), 1)
 
 
@@ -566,7 +573,7 @@ def _poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, 
 
 
 def _agrees(rho: F32, other: F32, maps: Reprojection, tolerance: float) -> Mask:
-    """(h, w) whether the other frame's inverse depth is the same within ``tolerance`` where it sees the point."""
+    """(h, w) whether the other frame's inverse depth there is equal to within ``tolerance``."""
     height, width = rho.shape
     places, factors = reproject_pixels(maps, rho, np.indices(rho.shape, dtype=np.int32)[0])
     seen = np.isfinite(places[..., 0])
@@ -585,7 +592,7 @@ def _fill_volume(
     step: float,
     volume: U8,
 ) -> None:
-    """Costs (h, w, n) of the inverse depths 0, step, 2 step, ... of every pixel."""
+    """Fill the costs (h, w, n) of the inverse depths 0, step, 2 step, ... of every pixel."""
     last = len(maps.A) - 1
     for y in range(len(grey)):
         for x in range(grey.shape[1]):

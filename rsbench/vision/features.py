@@ -52,10 +52,11 @@ def best_two(
     dx: tuple[float, float],
     dy: tuple[float, float],
 ) -> Found:
-    """Best candidate in b of each of a, its and the runner-up's squared distance, and the best in a of each of b.
+    """For each descriptor in a: its best candidate in b, and the squared distances of the best and the
+    second-best; for each in b: the best in a.
 
     Points (n, 2) must be sorted by y; the candidates b of a point a are those with b - a within ``dx`` and ``dy``
-    (px, both ends included). Indices are -1 and distances inf where there is no candidate.
+    (px, both ends included). Indices are -1 and distances inf if there is no candidate.
     """
     n, m = len(points_a), len(points_b)
     best, nearest = np.full(n, -1, dtype=np.int64), np.full(n, np.inf, dtype=np.float32)
@@ -113,7 +114,7 @@ def _scan(
         for c in range(columns):
             j = low + c
             distance = norms_a[i] + norms_b[j] - np.float32(2.0) * products[r, c]
-            # Most candidates improve on nothing; where they lie matters for the others only.
+            # Most candidates improve nothing; only the others are tested against the window.
             if distance >= second[i] and distance >= back_nearest[j]:
                 continue
             dx, dy = points_b[j, 0] - x, points_b[j, 1] - y
@@ -129,15 +130,17 @@ def _scan(
 
 
 BLUR_PX = 0.8
-"""Standard deviation of the smoothing before: the cubic kernel interpolates what is left without a bias."""
+"""Standard deviation of the smoothing of images, px: the cubic kernel interpolates the smoothed image without a
+bias."""
 _HALF = 7
 """Patches are 2 _HALF + 1 px wide, with Gaussian weights."""
 _SPREAD = 0.6 * _HALF
 _ROUNDS, _CONVERGED_PX = 12, 1e-3
 _MOST_PX, _MOST_SHEAR, _MOST_GAIN = 1.0, 0.5, 0.5
-"""Changes, at most: of the place, of an element of the affine map, and of the contrast."""
+"""Largest changes: of the place, of an element of the affine map, and of the contrast."""
 _MOST_SIGMA_PX = 0.1
-"""Standard deviation, as the patch's gradients and what the fit leaves say, of a place that is taken."""
+"""Largest standard deviation of an accepted place, px, computed from the gradients and the residuals of the patch.
+"""
 _PARAMETERS = 8
 _LEFT: Side = "left"
 _RIGHT: Side = "right"
@@ -146,15 +149,15 @@ _RIGHT: Side = "right"
 def refine_matches(
     images: Mapping[View, NDArray[Any]], matches: Correspondences, rig: StereoRig | None = None
 ) -> Correspondences:
-    """The matches with their later ends aligned to their first one; where that fails they stay as they are.
+    """Align the later ends of matches to their first ends; an end that cannot be aligned stays as it is.
 
-    The first end is the left one of frame 0 where there is such, then the right one, then the left one of frame 1.
-    What several sets hold of one track stays one. The order within a set may change but for ``left`` with affine
-    frames, whose ends stay in place.
+    The first end is the one in the left image of frame 0, otherwise in the right one, otherwise in the left image
+    of frame 1. Copies of a track in several sets remain equal. The order within a set may change, except in
+    ``left`` if it has affine frames.
 
     Args:
-        images: (H, W) or (H, W, 3), uint8 or uint16, of both sides and frames, in whose pixels the matches are.
-        rig: whose cameras may differ in scale and orientation; None: they are alike.
+        images: (H, W) or (H, W, 3), uint8 or uint16, of both cameras and frames, in whose pixels the matches are.
+        rig: its cameras may differ in scale and orientation; None: they are equal.
     """
     across = np.eye(2) if rig is None else rig.right_by_left()
     with ThreadPoolExecutor() as pool:
@@ -173,9 +176,11 @@ def refine_matches(
         ]
         found = list(
             pool.map(
-                lambda t: aligned(
-                    smooth[t[0]], smooth[t[1]], t[2], t[3], across if t[0][0] != t[1][0] else np.eye(2)
-                )[0],
+                lambda t: (
+                    align(
+                        smooth[t[0]], smooth[t[1]], t[2], t[3], across if t[0][0] != t[1][0] else np.eye(2)
+                    ).places
+                ),
                 tasks,
             )
         )
@@ -191,40 +196,27 @@ def refine_matches(
 
 
 def _not_of_tracks(matches: Correspondences, frame: int) -> FloatArray:
-    """The left-right matches of a frame that no track repeats."""
+    """The left-right matches of a frame that are not part of a track."""
     rows = matches.stereo_1 if frame else matches.stereo_0
     half = matches.tracks[:, 4 * frame : 4 * frame + 4]
     return rows[unlinked_pairs(Correspondences(left=rows, tracks=half[:, [0, 1, 0, 1, 2, 3, 2, 3]]), _LEFT)]
 
 
 def smoothed(image: NDArray[Any]) -> F32:
-    """Grey levels (H, W) as patches are cut from them."""
+    """Smoothed grey levels (H, W), from which patches are taken."""
     return np.asarray(cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), BLUR_PX))
 
 
 class Aligned(NamedTuple):
-    """Where patches of one image lie in another."""
+    """Places of patches of one image in another image."""
 
     places: FloatArray
-    """(n, 2) px; of a patch that cannot be aligned the given one."""
+    """(n, 2) px; the given place if the patch cannot be aligned."""
     done: BoolArray
-    """(n,) which were aligned."""
+    """(n,) whether the patch was aligned."""
     covariance: FloatArray
-    """(n, 3) xx, xy, yy, px^2, by the patch's gradients and what the fit leaves; of those that were aligned.
-    Smoothing correlates what is left: a scale that all share is not in them."""
-
-
-def aligned(
-    a: F32, b: F32, points_a: FloatArray, points_b: FloatArray, start: FloatArray | None = None
-) -> tuple[FloatArray, BoolArray]:
-    """The places (n, 2) in b of what is at points a, from places near them, and which of them were aligned.
-
-    Args:
-        a, b: (H, W) of ``smoothed``.
-        points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
-        start: (2, 2) affine map from the pixels around a point of a to those of b, about; None: the identity.
-    """
-    return align(a, b, points_a, points_b, start)[:2]
+    """(n, 3) xx, xy, yy, px^2, from the gradients and residuals of the patch; valid for aligned patches. Smoothing
+    correlates the residuals: this common factor is not included."""
 
 
 def align(
@@ -236,11 +228,14 @@ def align(
     most_px: float = _MOST_PX,
     most_sigma: float = _MOST_SIGMA_PX,
 ) -> Aligned:
-    """``aligned`` with the covariances.
+    """Align patches at points of a with places in b nearby.
 
     Args:
-        most_px: change of a place, at most.
-        most_sigma: standard deviation, px, of a place that is taken, at most.
+        a, b: (H, W) images from ``smoothed``.
+        points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
+        start: (2, 2) approximate affine map from the pixels around a point of a to those of b; None: the identity.
+        most_px: largest change of a place.
+        most_sigma: largest standard deviation of an accepted place, px.
     """
     out = np.array(points_b, dtype=np.float64)
     done, covariance = np.zeros(len(out), dtype=np.bool_), np.zeros((len(out), 3))
@@ -252,7 +247,7 @@ def align(
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _sample(image: F32, x: float, y: float) -> np.float32:
-    """The image at a place whose window of 4 x 4 px lies inside it."""
+    """The interpolated image at a place whose window of 4 x 4 px lies inside it."""
     i, j = int(x), int(y)
     wx, wy = keys_weights(np.float32(x - i)), keys_weights(np.float32(y - j))
     total = np.float32(0.0)
@@ -317,7 +312,7 @@ def _align(
     place: FloatArray,
     covariance: FloatArray,
 ) -> bool:
-    """Move one place (2,) to where the patch fits; False, and no move, where it cannot be."""
+    """Move one place (2,) to the best fit of the patch; return False, without a move, if there is none."""
     count = len(J)
     H = np.zeros((_PARAMETERS, _PARAMETERS))
     for k in range(count):
@@ -387,7 +382,7 @@ T = TypeVar("T")
 
 
 class Recent(Generic[T]):
-    """At most so many results, the last requested ones; threads may share one cache.
+    """Cache of the most recently requested results, with a limited number; threads may share it.
 
     Two threads that request the same at the same time both compute it.
     """
@@ -410,7 +405,7 @@ class Recent(Generic[T]):
         return found
 
     def clear(self) -> None:
-        """Keep nothing."""
+        """Remove all results."""
         with self._lock:
             self._kept.clear()
 
@@ -426,7 +421,7 @@ _MOST_FEATURES = 100_000
 ROW_TOLERANCE_PX = 1.5
 _STILL_PX = 0.01
 _DETECTION_BYTES = 300.0
-"""Per pixel: the pyramids of twice the size, float32, and of their differences."""
+"""Bytes per pixel: the float32 pyramids of twice the size, and of their differences."""
 _RANGES = {
     "max_features": (0, _MOST_FEATURES),
     "contrast_threshold": (0.0, 1.0),
@@ -442,35 +437,36 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions:
-    """What counts as a feature and what as a match; distances between descriptors are SIFT's, 0 to about 720."""
+    """Options of features and matches; distances between descriptors are SIFT's, 0 to about 720."""
 
     max_features: int = 6000
-    """Strongest features kept per image; 0 keeps all, 100 000 at most."""
+    """Number of strongest features kept per image; 0 keeps all, 100 000 at most."""
     contrast_threshold: float = 0.04
-    """OpenCV's threshold of SIFT: fainter features are dropped."""
+    """OpenCV's contrast threshold of SIFT: features with less contrast are dropped."""
     edge_threshold: float = 10.0
-    """OpenCV's threshold of SIFT: features more edge-like than this are dropped."""
+    """OpenCV's edge threshold of SIFT: features more edge-like than this are dropped."""
     ratio: float = 0.8
     """Largest ratio of the best to the second-best distance."""
     max_distance: float = 300.0
     """Largest distance of a match; the ratio does not apply where there is only one candidate."""
     search_radius: float | None = None
-    """Temporal matches move by at most this many px in x and in y; None searches the whole image."""
+    """Largest displacement of temporal matches in x and in y, px; None searches the whole image."""
     row_tolerance: float | None = ROW_TOLERANCE_PX
-    """Left-right matches differ by at most this many rows: both cameras read a row at the same time. None, where
-    they do not: a partner may lie anywhere."""
+    """Largest difference of rows of left-right matches if both cameras read a row at the same time. None if they
+    do not: the partner may lie anywhere."""
     max_disparity: float | None = None
     """Largest disparity of left-right matches, px; None is the image width."""
     drop_contradicted: bool = True
-    """Drop a temporal match when its loop through the other camera ends elsewhere."""
+    """Drop a temporal match if its loop through the other camera ends at another place."""
     refine: bool = False
     """Align the ends of matches by the grey levels around them, see ``refine_matches``."""
     enough_tracks: int = 0
-    """Return tracks alone where there are at least this many, which is faster; 0 returns all matches."""
+    """Return only tracks if there are at least this many, which is faster; 0 returns all matches."""
     half: bool = False
-    """Find features at half the size: faster, and fewer; meant for matches that are aligned (``refine``)."""
+    """Find features at half the size, which is faster but gives fewer; for matches that are then aligned
+    (``refine``)."""
     affine: bool = False
-    """Add affine frames to left matches: the similarity of the keypoints' sizes and orientations."""
+    """Add affine frames to left matches: similarities from the sizes and orientations of the keypoints."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -510,7 +506,7 @@ class SiftMatcher(MatchOptions, FeatureMatcher):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """Keypoints of one image, in order of the rows of their places."""
+    """Keypoints of one image, sorted by the rows of their places."""
 
     points: FloatArray
     """(n, 2) px."""
@@ -519,26 +515,27 @@ class Features:
     descriptors: NDArray[np.float32]
     """(n, 128), whole numbers from 0 to 255."""
     frames: FloatArray
-    """(n, 2) what turns and scales the unit square into the keypoint's, as the first column of that matrix: its
-    diameter, px, times the cosine and the sine of its orientation, from x towards y."""
+    """(n, 2) first column of the matrix that rotates and scales the unit square to the keypoint: its diameter, px,
+    times the cosine and the sine of its orientation, from x towards y."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """Where the partner of a keypoint may lie: bounds, px, of partner minus keypoint."""
+    """Region of the partner of a keypoint: bounds, px, of partner minus keypoint."""
 
     dx: tuple[float, float]
     dy: tuple[float, float]
 
 
 _DETECTED, _PAIRED = Recent[Features](28), Recent[Indices](42)
-"""A sequence asks for each image in two windows, and again after its shutter is known: of 12 windows at most."""
+"""Sizes for 12 windows: a sequence requests each image in two windows, and again after its shutter was estimated.
+"""
 _REMEMBERED = 10_000
-"""Images with more features are not cached: 6 MB."""
+"""Images with more features, 6 MB, are not cached."""
 
 
 def forget_features() -> None:
-    """Forget all features, so that later calls compute them again: for timings."""
+    """Clear the cache of features, so that later calls compute them again: for timings."""
     _DETECTED.clear()
     _PAIRED.clear()
 
@@ -549,7 +546,7 @@ def detect(
     """SIFT features of an image (H, W) or (H, W, 3), uint8 or uint16; none in an image without texture.
 
     Args:
-        camera: whose image it is; None: its pixels are ideal. Features of which it shows no ray are dropped.
+        camera: the camera of the image; None: its pixels are ideal. Features without a ray in it are dropped.
     """
     options, grey = options or MatchOptions(), grey_u8(image)
     if not 0 < options.max_features <= _REMEMBERED:
@@ -589,10 +586,11 @@ def _detected(
 
 
 def match(a: Features, b: Features, gate: Gate, options: MatchOptions | None = None) -> Indices:
-    """Mutual nearest neighbours (m, 2), indices into ``a`` and ``b``, each the best of its candidates in the gate.
+    """Mutual nearest neighbours (m, 2), indices into ``a`` and ``b``; each is the best of its candidates in the
+    gate.
 
     The ratio test compares with the second-best candidate in the gate. Points with several orientations give the
-    same match several times; it is kept once.
+    same match several times; only one is kept.
     """
     options = options or MatchOptions()
     if max(len(a.points), len(b.points)) > _REMEMBERED:
@@ -623,9 +621,9 @@ def match_stereo_frames(
 ) -> Correspondences:
     """Correspondences of the four images (H, W[, 3]), uint8 or uint16, of a rig over two frames.
 
-    Of images of the cameras of ``rig``, in their own pixels; the bounds of the options are in ideal pixels.
-    Tracks are points whose four matches close the loop L0-R0-R1-L1-L0. Sets may come out empty. Raises ValueError
-    when the images differ in size or are of another type.
+    With ``rig``, images and matches are in the pixels of its cameras, and the bounds of the options in ideal
+    pixels. Tracks are points whose four matches close the loop L0-R0-R1-L1-L0. Sets may be empty. Raises
+    ValueError if the images differ in size or are of another type.
     """
     options = options or MatchOptions()
     images = {"left_0": left_0, "right_0": right_0, "left_1": left_1, "right_1": right_1}
@@ -642,7 +640,7 @@ def match_stereo_frames(
     beside = anywhere
     if tolerance is not None:
         beside = Gate(dx=(-disparity, -np.finfo(np.float64).tiny), dy=(-tolerance, tolerance))
-    # OpenCV, the BLAS and the compiled loop let go of the GIL.
+    # OpenCV, the BLAS and the compiled loop release the GIL.
     pixels = left_0.shape[0] * left_0.shape[1]
     eyes = [None if rig is None else rig.eye(side) for side in (*SIDES, *SIDES)]
     l0, r0, l1, r1 = map_frames(
@@ -668,16 +666,17 @@ def match_stereo_frames(
 
 
 def still(matches: Correspondences) -> bool:
-    """Whether nothing moves over time: errors that are all alike would leave solvers no noise to judge by."""
+    """Whether nothing moves between the frames: equal errors of all matches would leave solvers no noise to
+    estimate."""
     pairs = matches.left, matches.right, matches.tracks[:, [0, 1, 4, 5]]
     moved = np.concatenate([each[:, 2:] - each[:, :2] for each in pairs])
     return len(moved) == 0 or float(np.median(np.abs(moved))) < _STILL_PX
 
 
 def _similarities(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Affine frames (m, 4) that turn and scale keypoints' frames a (m, 2) into b: quotients of complex numbers.
+    """Affine frames (m, 4) that rotate and scale keypoint frames a (m, 2) to b: quotients of complex numbers.
 
-    What a surface's slant does to its image is not in them.
+    They do not include the effect of a slanted surface.
     """
     first = a / np.sum(a * a, axis=1, keepdims=True)
     c = np.sum(first * b, axis=1)
@@ -694,7 +693,8 @@ def close_loops(left: Indices, right: Indices, stereo_0: Indices, stereo_1: Indi
 
 
 def _agreeing(left: Indices, right: Indices, stereo_0: Indices, stereo_1: Indices) -> tuple[Indices, Indices]:
-    """The temporal matches that no loop contradicts: open loops are kept, closed ones that end elsewhere go."""
+    """The temporal matches that no loop contradicts: open loops are kept, loops that close at another place are
+    dropped."""
     wanted = _lookup(stereo_1, left[:, 1])
     found = _lookup(right, _lookup(stereo_0, left[:, 0]))
     keep_left = (wanted < 0) | (found < 0) | (wanted == found)
@@ -706,7 +706,7 @@ def _agreeing(left: Indices, right: Indices, stereo_0: Indices, stereo_1: Indice
 
 
 def _lookup(pairs: Indices, keys: Indices) -> Indices:
-    """Second entries of the pairs whose first entry is the key, -1 where there is none."""
+    """Second entries of the pairs whose first entry is the key; -1 if there is none."""
     size = 1 + max(int(pairs[:, 0].max(initial=-1)), int(keys.max(initial=-1)), 0)
     table = np.full(size + 1, -1, dtype=np.int64)
     table[pairs[:, 0]] = pairs[:, 1]

@@ -1,4 +1,4 @@
-"""Dense optical flow between two frames of a camera, and the depth that it means."""
+"""Dense optical flow between two frames of a camera, and depth from it."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ F32 = NDArray[np.float32]
 def dense_flow(first: NDArray[Any], second: NDArray[Any], start: F32 | None = None, *, quick: bool = False) -> F32:
     """Displacement (H, W, 2), px, from ``first`` to ``second`` (H, W[, 3]), uint8 or uint16.
 
-    Args:
-        start: (H, W, 2) px near it; None: no motion.
-        quick: a fifth of the time, and coarser: as the start of an alignment.
-
     Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016 (OpenCV).
+
+    Args:
+        start: (H, W, 2) px, an approximation; None: no motion.
+        quick: take a fifth of the time, with less accuracy: as the start of an alignment.
     """
     presets = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
     dis = cv2.DISOpticalFlow.create(presets[quick])
-    near = None if start is None else start.copy()  # which is overwritten
+    near = None if start is None else start.copy()  # OpenCV overwrites it
     return np.asarray(dis.calc(grey_u8(first), grey_u8(second), near), dtype=np.float32)
 
 
 def returns_px(flow: F32, back: F32) -> F32:
-    """Distance (H, W), px, from a pixel to the end of its flow there and back, that of the border beyond it."""
+    """Distance (H, W), px, from a pixel to the end of its flow there and back; flow that leaves the image
+    continues as at its border."""
     there = followed(back, flow, cv2.BORDER_REPLICATE)
     return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
 
 
 def followed(image: NDArray[Any], flow: F32, border: int) -> NDArray[Any]:
-    """Values of an image (H, W[, C]) where a flow (H, W, 2), px, leads; ``border``: OpenCV's mode beyond it."""
+    """Values of an image (H, W[, C]) at the ends of a flow (H, W, 2), px; ``border``: OpenCV's mode beyond it."""
     height, width = flow.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.asarray(cv2.remap(image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=border))
@@ -58,10 +59,10 @@ def flow_depth(
 ) -> tuple[FloatArray, FloatArray]:
     """Depth (...) of pixels (..., 2) of a frame from their flow (..., 2), px, to the other frame of that camera.
 
-    The two rays, each at the time of its own row, are brought closest; parallel or diverging rays put the point at
-    infinity. Returns the depth in the unit of the motion's translation, in the row's own camera, and how far, px,
-    the flow ends from where the motion takes that point (infinite behind the camera): the flow's error across the
-    epipolar curve.
+    The point closest to both rays, each at the time of its own row, is used; parallel or diverging rays put the
+    point at infinity. Returns the depth in the unit of the motion's translation, in the row's own camera, and the
+    distance, px, from the end of the flow to the place to which the motion moves that point (infinite behind the
+    camera), which is the flow's error across the epipolar curve.
     """
     targets = pixels + flow
     here = rig.cam_from_world(motion, shutter.pixel_time(pixels, frame, side), side)
@@ -86,14 +87,14 @@ def monocular_depth(
 ) -> F32:
     """Depth (H, W) of every pixel of a frame from the flow (H, W, 2) to the other one, in the motion's unit.
 
-    inf where the rays do not meet in front of the camera. Median-filtered in inverse depth.
+    inf if the rays do not meet in front of the camera. The inverse depth is median-filtered.
     """
     grid = rig.sensor(side).pixel_grid()
     rho = np.zeros(flow.shape[:2], dtype=np.float32)
     for start in range(0, len(rho), _CHUNK_ROWS):
         rows = slice(start, start + _CHUNK_ROWS)
         rho[rows] = 1.0 / flow_depth(grid[rows], flow[rows], rig, shutter, motion, side, frame)[0]
-    # One pixel near the focus of expansion must not swallow the picture.
+    # A pixel near the focus of expansion must not cover the whole image.
     rho = cv2.medianBlur(np.minimum(rho, np.float32(np.quantile(rho, _NEAREST_SHARE))), 5)
     with np.errstate(divide="ignore"):
         return np.where(rho > 0.0, 1.0 / rho, np.inf).astype(np.float32)

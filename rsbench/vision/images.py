@@ -1,9 +1,9 @@
-"""What images may be, their grey values, half sizes and values between pixels; and work on several frames at once.
+"""Allowed types of images, their grey values, half sizes and values between pixels; and processing of several
+frames at once.
 
 The cubic kernel is Keys' with a = -1/2, the only one of its family that reproduces straight lines and parabolas.
-OpenCV's has a = -3/4: on a plain ramp it is wrong by up to 0.035 px, as much as a good disparity map.
-
-Keys, "Cubic convolution interpolation for digital image processing", ASSP 1981.
+OpenCV's has a = -3/4: on a plain ramp it errs by up to 0.035 px, as much as a good disparity map. Keys, "Cubic
+convolution interpolation for digital image processing", ASSP 1981.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def grey_u8(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
-    """Images for matching; 16-bit ones are brought to 8 bits by one factor, for they may use few of their bits."""
+    """Images for matching; 16-bit ones are scaled to 8 bits by one common factor, because they may use few of
+    their bits."""
     if images[0].dtype == np.uint8:
         return images
     top = max(float(np.percentile(image, _BRIGHT)) for image in images)
@@ -53,7 +54,7 @@ def eight_bit(images: list[NDArray[Any]]) -> list[NDArray[np.uint8]]:
 
 
 def local_variance(image: NDArray[Any]) -> NDArray[np.float32]:
-    """(H, W) of the grey levels around each pixel of an 8-bit image (H, W[, 3])."""
+    """(H, W) variance of the grey levels around each pixel of an 8-bit image (H, W[, 3])."""
     grey = grey_u8(image).astype(np.float32)
     mean, square = (cv2.blur(each, (_WINDOW, _WINDOW)) for each in (grey, grey * grey))
     return np.asarray(square - mean * mean)
@@ -64,23 +65,24 @@ U8 = NDArray[np.uint8]
 
 
 def halved(image: U8) -> U8:
-    """A grey image (H, W) at half the size, at least 1 x 1: each pixel the mean of those that it covers."""
+    """A grey image (H, W) at half the size, at least 1 x 1: each pixel is the mean of those that it covers."""
     height, width = (max(side // 2, 1) for side in image.shape)
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def at_full_size(points: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Points (n, 2) px of the halved image on one of this shape (H, W); the top-left pixel's centre is (0, 0)."""
+    """Convert points (n, 2), px of the halved image, to px of an image of this shape (H, W); (0, 0) is the centre
+    of the top-left pixel."""
     scale = np.array([side / max(side // 2, 1) for side in shape[1::-1]])
     return (points + 0.5) * scale - 0.5
 
 
 def guided_upsample(values: F32, small: U8, grey: U8) -> F32:
-    """Values (h, w) of the halved image ``small`` on the pixels (H, W) of ``grey``; NaN is unknown.
+    """Upsample values (h, w) of the halved image ``small`` to the pixels (H, W) of ``grey``; NaN is unknown.
 
-    Each pixel takes the value of that one of the four half-size pixels around it whose grey is nearest to its own,
-    of equals the nearest one: borders lie where the image has them (J. Kopf et al., Joint bilateral upsampling,
-    SIGGRAPH 2007, with a window of two pixels and the largest weight alone).
+    Each pixel gets the value of the one of the four half-size pixels around it whose grey level is most similar to
+    its own, or the nearest of equal ones: thus borders lie where the image has them (J. Kopf et al., Joint
+    bilateral upsampling, SIGGRAPH 2007, with a window of two pixels and only the largest weight).
     """
     (height, width), (h, w) = grey.shape, small.shape
     y, x = ((np.arange(n) + 0.5) * (m / n) - 0.5 for n, m in ((height, h), (width, w)))
@@ -105,7 +107,7 @@ def _farther_neighbour(places: FloatArray) -> NDArray[Any]:
 
 Interpolation = Literal["cubic", "linear"]
 _FEW, _PACKED = 4, 512
-"""Positions for one that is not NaN, below which these are sampled in rows of so many."""
+"""If fewer than one in this many positions is not NaN, these are sampled in rows of the second length."""
 Weights = tuple[np.float32, np.float32, np.float32, np.float32]
 
 
@@ -130,14 +132,14 @@ def resample(image: NDArray[Any], positions: F32, interpolation: Interpolation =
     if image.dtype == np.float32:
         return values
     largest = np.float32(np.iinfo(image.dtype).max)
-    # Half is added and the fraction cut off: rounding, several times faster than np.rint.
+    # Adding a half and truncating rounds, several times faster than np.rint.
     return (np.clip(values, 0.0, largest) + np.float32(0.5)).astype(image.dtype)
 
 
 def _resample_few(
     image: NDArray[Any], positions: F32, known: NDArray[np.bool_], interpolation: Interpolation
 ) -> NDArray[Any]:
-    """``resample`` of few ``known`` (h, w) positions."""
+    """``resample`` for few ``known`` (h, w) positions."""
     out = np.zeros((*known.shape, *image.shape[2:]), dtype=image.dtype)
     some = positions[known]
     if len(some):
@@ -183,7 +185,7 @@ def _cubic(image: F32, positions: F32, values: F32) -> None:
 def _pixel(
     flat: F32, width: int, channels: int, px: np.float32, py: np.float32, values: F32, y: int, x: int
 ) -> None:
-    # Unsigned offsets spare numba's test for negative indices.
+    # Unsigned offsets avoid numba's test for negative indices.
     i, j, step, line = np.uint64(px), np.uint64(py), np.uint64(channels), np.uint64(width * channels)
     wx, wy = keys_weights(px - np.float32(i)), keys_weights(py - np.float32(j))
     first = (j - np.uint64(1)) * line + (i - np.uint64(1)) * step
@@ -204,7 +206,7 @@ def _taps(flat: F32, at: np.uint64, step: np.uint64, w: Weights) -> np.float32:
 
 @compiled(error_model="numpy")
 def _border_pixel(image: F32, px: np.float32, py: np.float32, values: F32, y: int, x: int) -> None:
-    """One position whose window leaves the image: the border pixels are repeated outward."""
+    """Value at a position whose window extends beyond the image: the border pixels are repeated outward."""
     height, width, channels = image.shape
     i, j = int(np.floor(px)), int(np.floor(py))
     wx, wy = keys_weights(np.float32(px - i)), keys_weights(np.float32(py - j))
@@ -220,11 +222,11 @@ def _border_pixel(image: F32, px: np.float32, py: np.float32, values: F32, y: in
 T = TypeVar("T")
 R = TypeVar("R")
 _BYTES = 1e9
-"""Memory for frames that are processed at once: correcting four of full HD stays below 2 GB."""
+"""Memory for frames that are processed at once, bytes: correcting four frames of full HD takes less than 2 GB."""
 
 
 def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_per_pixel: float) -> list[R]:
-    """``work`` on each item, by threads: no more than there are cores, and at least one.
+    """Apply ``work`` to each item in at least one and at most as many threads as there are cores.
 
     Args:
         pixels: of one frame.
@@ -236,19 +238,19 @@ def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_pe
 
 
 def ahead(items: Iterator[T], most: int) -> Iterator[T]:
-    """The items, in order, of which a thread makes up to ``most`` in advance."""
+    """Yield the items, in order; a thread prepares up to ``most`` in advance."""
     last, pool = object(), ThreadPoolExecutor(1)
     waiting = deque(pool.submit(next, items, last) for _ in range(most))
     try:
         while (item := waiting.popleft().result()) is not last:
             waiting.append(pool.submit(next, items, last))
             yield item  # pyrefly: ignore[invalid-yield]
-    finally:  # an interrupt does not wait for what runs
+    finally:  # an interrupt does not wait for running work
         pool.shutdown(wait=False, cancel_futures=True)
 
 
 def map_ahead(work: Callable[[T], R], items: Iterable[T], most: int, threads: int) -> Generator[R]:
-    """``work`` on each item, in order, by threads; up to ``most`` wait for those before them."""
+    """Apply ``work`` to each item, in order, in threads; up to ``most`` results wait for earlier ones."""
     waiting, pool = deque[Future[R]](), ThreadPoolExecutor(threads)
     try:
         for item in items:

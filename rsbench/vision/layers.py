@@ -1,25 +1,23 @@
-"""A scene at rest as a few planes: found from matches, given to pixels, and used to refine the camera's motion.
+"""A static scene as a few planes: fitted to matches, assigned to pixels, and used to refine the camera's motion.
 
-A plane is n (3,) with n . X = 1 for its points X in the world, the frame of the camera before it moves; 0 is the
-plane at infinity. In the camera of a line with pose R, t and centre c it is ``R n / (1 - n . c)``, whose product
-with a ray (u, v, 1) is the inverse depth there: so each pixel of a layer moves by the homography of its two lines.
+A plane is n (3,) with n . X = 1 for its points X in the world, which has the axes of the camera before it moves; 0
+is the plane at infinity. In the camera of a line with pose R, t and centre c it is ``R n / (1 - n . c)``. The
+product of this vector with a ray (u, v, 1) is the inverse depth there, so each pixel of a layer moves by the
+homography of its two lines. A pixel gets the layer at which the other frame is most similar to it, with a penalty
+on changes of the layer. If the other frame shows a nearer layer at the place of a pixel, the similarity there
+means nothing, and the layer gets the cost of an unseen pixel. Which pixels are hidden follows from the layers of
+both frames, so they are determined in rounds.
 
-A pixel shows the layer at which the other frame looks most like it, as smoothly as costs allow. Layers hide each
-other: where the other frame shows a nearer one in the place of a pixel, its likeness there means nothing, and the
-layer costs what an unseen pixel costs. Which pixels are hidden follows from the layers of both frames, so they
-are found in rounds.
-
-A match on a layer constrains the motion by more than its epipolar constraint: by how far along the epipolar curve
-its end is. How much that counts depends on how thick the layer is: the errors of a match are those of its pixels
-and, along the curve, the parallax of a depth that scatters about the plane by the layer's thickness. Both are
-estimated from the matches, so that exact planes give the motion all that matches can, and a scene without planes
-does not bias it. Beside the given matches, pixels of a grid are followed through frames that the layers have
-aligned: the differences that the layers leave count as lengths. As differences of colour they would count pixels
-whose layer is a little off as errors of the motion, whatever their direction.
+A match on a layer constrains the motion by more than its epipolar constraint: also by the position of its end
+along the epipolar curve. The weight of that constraint depends on the thickness of the layer: the errors of a
+match are those of its pixels and, along the curve, the parallax of a depth that scatters about the plane by the
+layer's thickness. Both are estimated from the matches, so that exact planes give the motion all information of the
+matches, and a scene without planes does not bias it. In addition to the given matches, pixels of a grid are
+tracked between frames that were aligned by the layers, and the remaining displacements are used. Differences of
+colour would instead count pixels with a slightly wrong layer as errors of the motion in any direction.
 
 After Vasu, Mohan M. R., Rajagopalan, "Occlusion-aware rolling shutter rectification of 3D scenes", CVPR 2018, of
-which the abstract alone was read: the equations are ours. Smoothness is semi-global aggregation in place of graph
-cuts.
+which we read only the abstract: the equations are ours. Semi-global aggregation replaces graph cuts.
 """
 
 from __future__ import annotations
@@ -60,20 +58,20 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class LabelOptions:
-    """How pixels are given to layers."""
+    """Options of the assignment of pixels to layers."""
 
     window: int = 5
     """Side, px, of the window in which frames are compared."""
     full_levels: float = 30.0
-    """Difference of grey levels, of 256, from which pixels count as entirely unlike."""
+    """Difference of grey levels at which, and above which, two pixels count as completely different."""
     p1: int = 24
-    """Cost of a step to the next layer; the worst likeness costs 255."""
+    """Cost of a step to the next layer; the largest cost of a pixel is 255."""
     p2: int = 96
     """Cost of a step to any other layer."""
     unseen: float = 0.2
-    """Cost of a pixel that the other frame does not see, from 0 to 1, the worst likeness."""
+    """Cost of a pixel that the other frame does not see, from 0 to 1 (completely different)."""
     rounds: int = 2
-    """Rounds of finding hidden pixels from the layers of both frames."""
+    """Number of rounds in which hidden pixels are determined from the layers of both frames."""
 
     def __post_init__(self) -> None:
         if self.window % 2 == 0:
@@ -87,14 +85,15 @@ class MovingCamera(NamedTuple):
     """One camera of a rig and its motion."""
 
     rig: StereoRig
-    """Its body is where the camera is."""
+    """A rig whose body is at the camera."""
     shutter: RollingShutter
     side: Side
     motion: Motion
 
     @property
     def parallax_px(self) -> float:
-        """px that a point of inverse depth 1, in the unit of the motion, moves in a frame period, about."""
+        """Approximate displacement, px, of a point of inverse depth 1, in the unit of the motion, in a frame
+        period."""
         return self.rig.sensor(self.side).fx * float(np.linalg.norm(self.motion.d))
 
     def row_poses(self, frame: int) -> Pose:
@@ -110,7 +109,8 @@ class MovingCamera(NamedTuple):
 
 
 def planes_seen(planes: FloatArray, pose: Pose) -> FloatArray:
-    """Planes (n, 3) of the world in cameras of poses (..., 3, 3), (..., 3): (..., n, 3); NaN where passed."""
+    """Planes (n, 3) of the world in cameras of poses (..., 3, 3), (..., 3): (..., n, 3); NaN if the camera has
+    passed the plane."""
     turned = planes @ np.swapaxes(pose.R, -1, -2)
     # c = -R^T t, so 1 - n . c = 1 + (R n) . t
     ahead = 1.0 + np.einsum("...nk,...k->...n", turned, pose.t)
@@ -118,22 +118,22 @@ def planes_seen(planes: FloatArray, pose: Pose) -> FloatArray:
 
 
 class Labelled(NamedTuple):
-    """Which layer each pixel shows."""
+    """The layer of each pixel."""
 
     labels: tuple[Labels, Labels]
     """(H, W) number of the plane, of frames 0 and 1."""
     seen: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     """(H, W) whether the other frame sees the pixel too."""
     places: F32
-    """(H, W, 2) px in frame 1 that show the pixels of frame 0; NaN where it does not see them."""
+    """(H, W, 2) places in frame 1 of the pixels of frame 0, px; NaN where it does not see them."""
     cost: float
-    """Mean unlikeness of all pixels, 0 to 1, without the smoothness."""
+    """Mean dissimilarity of all pixels, 0 to 1, without the penalty on changes of the layer."""
 
 
 def label_pixels(
     greys: tuple[F32, F32], camera: MovingCamera, planes: FloatArray, options: LabelOptions, step_px: float
 ) -> Labelled:
-    """Layers of the pixels of two grey frames (H, W) among ``planes`` (n, 3), ordered from far to near.
+    """Assign ``planes`` (n, 3), ordered from far to near, to the pixels of two grey frames (H, W).
 
     ``step_px`` is the parallax, px, by which a layer must be nearer to hide another one.
     """
@@ -151,10 +151,10 @@ def label_pixels(
 
 
 def _behind(labels: Labels, seen: NDArray[np.bool_], across: NDArray[np.bool_]) -> Labels:
-    """Layers (H, W) where unseen pixels are of the farther one of the seen layers on their two sides.
+    """Layers (H, W) after unseen pixels got the farther layer of the two seen pixels beside them.
 
-    What hides a pixel lies along its parallax: sides are in its row where that is ``across`` (H, W), else in its
-    column, or in the other where there are none.
+    The object that hides a pixel lies along its parallax: the two pixels are in its row where ``across`` (H, W) is
+    true, otherwise in its column, or in the other direction if there are none.
     """
     known = np.where(seen, labels, np.nan).astype(np.float32)
     in_row = np.fmin(*known_beside(known))
@@ -165,7 +165,7 @@ def _behind(labels: Labels, seen: NDArray[np.bool_], across: NDArray[np.bool_]) 
 
 
 class _Pair:
-    """Unlikeness of two frames for each layer, and where its pixels land."""
+    """Dissimilarity of two frames for each layer, and the places of its pixels."""
 
     def __init__(
         self, greys: tuple[F32, F32], camera: MovingCamera, planes: FloatArray, options: LabelOptions, step: float
@@ -180,9 +180,10 @@ class _Pair:
         ]
         self.costs = [np.zeros_like(rho) for rho in self._rhos]
         self._pixels = [np.zeros(rho.shape, dtype=np.int32) for rho in self._rhos]
-        """(n, H, W) the other frame's pixel, counted along its rows, at which a layer lands; any if at none."""
+        """(n, H, W) index of the other frame's pixel, counted along its rows, at the place of a layer; arbitrary
+        if there is none."""
         self._there = [np.zeros_like(rho) for rho in self._rhos]
-        """(n, H, W) its inverse depth there."""
+        """(n, H, W) inverse depth of the layer there."""
         for frame in FRAMES:
             comparer = Comparer(greys[frame], options.window)
             for k, rho in enumerate(self._rhos[frame]):
@@ -195,25 +196,25 @@ class _Pair:
         return reproject_pixels(self._maps[frame], rho, lines)
 
     def _unlike(self, comparer: Comparer, greys: tuple[F32, F32], frame: int, places: F32) -> F32:
-        """0 to 1 (H, W), NaN outside: half by the windows around pixels, which tell them apart, and half by the
-        pixels alone, which tell on which side of a border they are."""
+        """Dissimilarity (H, W), 0 to 1, NaN outside the frame: half from windows around the pixels, which
+        distinguish layers, and half from single pixels, which show the side of a border."""
         seen = resample(greys[1 - frame], places)
         levels = np.abs(seen - greys[frame]) / np.float32(self._options.full_levels)
         unlike = np.float32(0.5) * comparer.compared(seen) + np.float32(0.25) * np.minimum(levels, np.float32(1.0))
         return np.where(np.isnan(places[..., 0]), np.float32(np.nan), unlike)
 
     def across(self, frame: int) -> NDArray[np.bool_]:
-        """(H, W) where parallax moves a pixel rather along its row than along its column."""
+        """(H, W) whether parallax moves a pixel more along its row than along its column."""
         near, far = (self._landed(frame, self._rhos[frame][k])[0] for k in (-1, 0))
         direction = np.abs(near - far)
         return ~(direction[..., 1] > direction[..., 0])
 
     def places(self, labels: Labels) -> F32:
-        """(H, W, 2) px in frame 1 of the pixels of frame 0 on their layers (H, W)."""
+        """(H, W, 2) places in frame 1, px, of the pixels of frame 0 on their layers (H, W)."""
         return self._landed(0, np.take_along_axis(self._rhos[0], labels[None], axis=0)[0])[0]
 
     def smoothed(self, costs: list[F32]) -> tuple[Labels, Labels]:
-        """Layers of least cost (n, H, W) and smoothness, of both frames."""
+        """Layers with the least sum of the costs (n, H, W) and of the penalty on changes, for both frames."""
         first, second = (self._winners(cost) for cost in costs)
         return first, second
 
@@ -234,7 +235,7 @@ class _Pair:
 
 
 def _numbered(places: F32) -> NDArray[np.int32]:
-    """The pixel (H, W), counted along the rows, that is nearest to each place (H, W, 2); 0 for NaN."""
+    """Index (H, W), counted along the rows, of the pixel nearest to each place (H, W, 2); 0 for NaN."""
     height, width = places.shape[:2]
     known = np.where(np.isnan(places), np.float32(0.0), places)
     x, y = (np.clip(np.rint(known[..., k]).astype(np.int32), 0, most - 1) for k, most in ((0, width), (1, height)))
@@ -242,18 +243,19 @@ def _numbered(places: F32) -> NDArray[np.int32]:
 
 
 FEWEST = 5
-"""Matches of a layer."""
+"""Fewest matches of a layer."""
 _ROUNDS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneOptions:
-    """How many layers there are."""
+    """Options of the number of layers."""
 
     most: int = 24
-    """Largest number of layers, beside that at infinity."""
+    """Largest number of layers, in addition to that at infinity."""
     thickness_px: float = 0.25
-    """Layers are split until their matches scatter by no more parallax over a frame period (root mean square)."""
+    """Layers are split until the parallax of their matches over a frame period scatters by no more than this, px
+    (root mean square)."""
 
     def __post_init__(self) -> None:
         check_ranges(self, {"most": (1, 64), "thickness_px": (1e-3, 1e3)})
@@ -274,7 +276,8 @@ def fronto_parallel(matches: FloatArray, camera: MovingCamera, options: PlaneOpt
 
 
 def _inverse_depths(matches: FloatArray, camera: MovingCamera) -> FloatArray:
-    """(m,) in the camera before it moves, of matches (m, 4); 0 where their rays do not meet before it."""
+    """(m,) inverse depths in the camera before it moves, of matches (m, 4); 0 if their rays do not meet in front
+    of it."""
     rig, shutter, side, motion = camera
     pixels = matches[:, :2]
     depth, _ = flow_depth(pixels, matches[:, 2:] - pixels, rig, shutter, motion, side, 0)
@@ -286,10 +289,10 @@ def _inverse_depths(matches: FloatArray, camera: MovingCamera) -> FloatArray:
 
 
 def grouped(values: FloatArray, options: PlaneOptions) -> FloatArray:
-    """Centres, ascending, of groups of values (n,), px: the widest group is split until all are thin enough.
+    """Centres, ascending, of groups of values (n,), px: the widest group is split until all are narrow enough.
 
-    Medians in place of means keep strays out. Groups of a few strays, and what is no thicker than a layer at
-    infinity would be, are left out.
+    Medians instead of means are used to tolerate outliers. Groups of a few outliers, and groups that a layer at
+    infinity includes within its width, are left out.
     """
     centres = np.array([np.median(values)])
     while len(centres) < options.most:
@@ -315,7 +318,7 @@ def _offsets(values: FloatArray, centres: FloatArray) -> list[FloatArray]:
 
 
 def _settled(values: FloatArray, centres: FloatArray) -> FloatArray:
-    """Centres that are the medians of what is nearest to them (Lloyd's iteration)."""
+    """Centres that are the medians of the values nearest to them (Lloyd's iteration)."""
     for _ in range(_ROUNDS):
         offsets = _offsets(values, centres)
         moved = centres + [float(np.median(own)) if own.size else 0.0 for own in offsets]
@@ -326,11 +329,12 @@ def _settled(values: FloatArray, centres: FloatArray) -> FloatArray:
 
 
 _GRID = 4
-"""px between two pixels that are followed."""
+"""Distance between two tracked pixels, px."""
 _TOGETHER = 9.0
-"""Followed pixels that err alike: flow is that of patches of 8 px, and smooth beyond them."""
+"""Number of tracked pixels with equal errors: flow is estimated for patches of 8 px, and is smooth over larger
+distances."""
 _AROUND = np.ones((7, 7), np.uint8)
-"""px around one that must show its layer."""
+"""Radius, px, around a tracked pixel that must show its layer."""
 _LEAST_NOISE_PX = 0.02
 _MAD = 1.4826
 """Standard deviations in a median absolute deviation of normal errors."""
@@ -339,18 +343,18 @@ _STEPS = 30
 
 
 class Followed(NamedTuple):
-    """Matches of one accuracy, on layers."""
+    """Matches on layers, all with the same accuracy."""
 
     matches: FloatArray
     """(n, 4) x0, y0, x1, y1 px."""
     layer: NDArray[np.int64]
     """(n,) number of the plane."""
     together: float = 1.0
-    """How many of them err alike: so many count as one."""
+    """Number of them with equal errors, which together count as one."""
 
 
 def on_layers(matches: FloatArray, labelled: Labelled) -> Followed:
-    """The matches, of (n, 4), whose pixel in frame 0 lies within a layer that frame 1 sees."""
+    """Those of the matches (n, 4) whose pixel in frame 0 lies within a layer that frame 1 sees."""
     height, width = labelled.labels[0].shape
     x, y = np.clip(np.rint(matches[:, :2]).astype(np.int64), 0, (width - 1, height - 1)).T
     inner = _inner(labelled)[y, x]
@@ -358,9 +362,10 @@ def on_layers(matches: FloatArray, labelled: Labelled) -> Followed:
 
 
 def followed(greys: tuple[F32, F32], labelled: Labelled) -> Followed:
-    """Matches of pixels of frame 0 on a grid: where the layer takes each, and from there what flow is left.
+    """Matches of a grid of pixels of frame 0: the place by the layer of each, plus the remaining flow.
 
-    Grey frames (H, W) are compared once the layers have aligned them, so the flow is short and crosses no edge.
+    Grey frames (H, W) are compared after they were aligned by the layers, so the flow is short and crosses no
+    edge.
     """
     places, labels, seen = labelled.places, labelled.labels[0], labelled.seen[0]
     aligned = np.where(seen, resample(greys[1], places), greys[0])

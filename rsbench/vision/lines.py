@@ -27,7 +27,8 @@ from rsbench.vision.features import ROW_TOLERANCE_PX, Indices, MatchOptions, clo
 from rsbench.vision.images import grey_u8
 
 _BLUR_PX = 0.75
-"""As LSD blurs at its own scale: stairs of a slanted edge are no segments."""
+"""Standard deviation of a blur, as LSD applies at its default scale: otherwise the stairs of a slanted edge become
+segments."""
 _RANGES = {
     "max_lines": (1, 2000),
     "min_length": (4.0, 1e6),
@@ -44,28 +45,29 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class LineOptions:
-    """What counts as a line and what as a match; distances between descriptors are SIFT's, 0 to about 720."""
+    """Options of lines and matches; distances between descriptors are SIFT's, 0 to about 720."""
 
     max_lines: int = 500
-    """Longest segments kept per image."""
+    """Number of segments kept per image, the longest ones."""
     min_length: float = 25.0
-    """Length of the shortest segment, px."""
+    """Least length of a segment, px."""
     spacing: float = 10.0
     """Distance between the descriptors along a segment, px."""
     patch: float = 6.0
-    """Size of a descriptor's keypoint, px: it sees about three times as far to either side."""
+    """Size of a descriptor's keypoint, px: the descriptor covers about three times as much on either side."""
     ratio: float = 0.9
     """Largest ratio of the best to the second-best distance."""
     max_distance: float = 300.0
-    """Largest distance of a match: the mean over a segment's descriptors, each to the nearest of the other."""
+    """Largest distance of a match: the mean, over a segment's descriptors, of the distance to the nearest one of
+    the other segment."""
     max_turn_deg: float = 20.0
     """Largest angle between the two segments of a match."""
     search: float = 0.2
-    """The middles of a match over time are at most this share of the image's width apart."""
+    """Largest distance of the midpoints of a match over time, as a share of the image's width."""
     min_overlap: float = 0.5
-    """Share of the rows of the shorter segment that a left-right match has in common."""
+    """Least share of the rows of the shorter segment that both segments of a left-right match cover."""
     min_slope_deg: float = 10.0
-    """Segments nearer to the direction of the rows have no depth and are left out."""
+    """Least angle to the rows: segments with a smaller one have no depth and are left out."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -83,21 +85,19 @@ class SiftLineMatcher(MatchOptions, FeatureMatcher):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segments:
-    """Segments of one image, the longest first."""
+    """Segments of one image, sorted from the longest."""
 
     ends: FloatArray
     """(n, 4) xa, ya, xb, yb, px."""
     descriptors: NDArray[np.float32]
-    """(m, 128) of points along them."""
+    """(m, 128) descriptors of points along them."""
     first: Indices
-    """(n,) where each segment's begin."""
+    """(n,) index of the first descriptor of each segment."""
 
 
 def detect_lines(image: NDArray[Any], options: LineOptions | None = None) -> FloatArray:
-    """Ends (n, 4) xa, ya, xb, yb, px, of the segments of an image (H, W[, 3]), uint8 or uint16; longest first.
-
-    Raises ValueError on images of other shapes and types.
-    """
+    """Ends (n, 4) xa, ya, xb, yb, px, of the segments of an image (H, W[, 3]), uint8 or uint16, sorted from the
+    longest. Raises ValueError for images of other shapes and types."""
     options = options or LineOptions()
     grey = cv2.GaussianBlur(grey_u8(image), (0, 0), _BLUR_PX)
     found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, scale=1.0).detect(grey)[0]
@@ -110,14 +110,14 @@ def detect_lines(image: NDArray[Any], options: LineOptions | None = None) -> Flo
 
 
 def describe_lines(image: NDArray[Any], ends: FloatArray, options: LineOptions | None = None) -> Segments:
-    """SIFT descriptors, turned as the segment is, of points along each of the segments (n, 4) of an image."""
+    """SIFT descriptors, oriented along the segment, of points along each of the segments (n, 4) of an image."""
     options = options or LineOptions()
     points, first = list[cv2.KeyPoint](), list[int]()
     for xa, ya, xb, yb in ends:
         length, angle = np.hypot(xb - xa, yb - ya), np.degrees(np.arctan2(yb - ya, xb - xa)) % 360.0
         first.append(len(points))
         for t in (np.arange(max(1, round(length / options.spacing))) + 0.5) * options.spacing / length:
-            # A point that SIFT gives back in the same order and number: it drops none that it is given.
+            # SIFT returns the given points in the same order, without dropping any.
             points.append(cv2.KeyPoint(xa + t * (xb - xa), ya + t * (yb - ya), options.patch, angle))
     descriptors = np.zeros((0, 128), dtype=np.float32)
     if points:
@@ -128,8 +128,8 @@ def describe_lines(image: NDArray[Any], ends: FloatArray, options: LineOptions |
 
 
 def distances(a: Segments, b: Segments) -> FloatArray:
-    """Distances (n, m): the mean over a segment's descriptors of the nearest of the other segment; the larger of
-    both means."""
+    """Distances (n, m) of segments: for each of the two, the mean over its descriptors of the distance to the
+    nearest of the other; the larger of both means."""
     if not (len(a.ends) and len(b.ends)):
         return np.zeros((len(a.ends), len(b.ends)))
     squares = np.sum(a.descriptors**2, axis=1)[:, None] + np.sum(b.descriptors**2, axis=1)
@@ -143,7 +143,7 @@ def distances(a: Segments, b: Segments) -> FloatArray:
 
 
 def match_segments(a: Segments, b: Segments, allowed: BoolArray, options: LineOptions | None = None) -> Indices:
-    """Mutual nearest segments (k, 2) among the ``allowed`` (n, m), each clearly nearer than its second."""
+    """Mutual nearest segments (k, 2) among the ``allowed`` (n, m), each clearly nearer than its second-nearest."""
     options = options or LineOptions()
     if not allowed.size:
         return np.zeros((0, 2), dtype=np.int64)
@@ -202,14 +202,14 @@ def beside(a: FloatArray, b: FloatArray, options: LineOptions) -> BoolArray:
 
 
 def _column(ends: FloatArray, row: FloatArray) -> FloatArray:
-    """x at which lines (..., 4) cross rows (...)."""
+    """x where lines (..., 4) cross rows (...)."""
     return np.asarray(
         ends[..., 0] + (row - ends[..., 1]) * (ends[..., 2] - ends[..., 0]) / (ends[..., 3] - ends[..., 1])
     )
 
 
 def _alike(a: FloatArray, b: FloatArray, options: LineOptions) -> BoolArray:
-    """Mask (n, m) of the segments of like direction, with the same side the brighter one."""
+    """Mask (n, m) of the segments with similar directions and the same brighter side."""
     direction = [(ends[:, 2] - ends[:, 0]) + 1j * (ends[:, 3] - ends[:, 1]) for ends in (a, b)]
     turn = np.angle(direction[1] / direction[0][:, None])
     return np.asarray(np.abs(turn) <= np.radians(options.max_turn_deg))

@@ -1,17 +1,17 @@
 """Depth from a known motion by a plane sweep in which each pixel has the pose of its own line.
 
-For every inverse depth of a grid the other views are resampled to what each pixel would show of them, were the
-surface there; that at which they look most alike wins. Over two frames of one camera this is depth from time, from
-the other camera depth from stereo, and from all views both. The planes face the camera of the pixel's line.
+For every inverse depth of a grid the other views are resampled as if the surface of each pixel were there; the
+inverse depth with the most similar views is used. Two frames of one camera give depth from time, the two cameras
+depth from stereo, and all views combine both. The planes face the camera of the pixel's line.
 
-Saurer, Koeser, Bouguet, Pollefeys, "Rolling shutter stereo", ICCV 2013. Ours are the aggregation and the last
-rounds, in which the planes follow the surface that was found.
-Views that a pixel may be hidden from: Kang, Szeliski, Chai, "Handling occlusions in dense multi-view stereo",
-CVPR 2001.
+Saurer, Koeser, Bouguet, Pollefeys, "Rolling shutter stereo", ICCV 2013. The aggregation and the last rounds, in
+which the planes follow the surface that was found, are ours. Views in which a pixel may be hidden: Kang, Szeliski,
+Chai, "Handling occlusions in dense multi-view stereo", CVPR 2001.
+
 Aggregation (``aggregated``): Hirschmueller, "Stereo processing by semi-global matching and mutual information",
-PAMI 2008: along each direction
-``L(p, k) = C(p, k) + min(L(q, k), L(q, k +- 1) + p1, min L(q) + p2) - min L(q)``, with q the pixel before p; the
-sum over directions is least at the hypothesis of a pixel. OpenCV's own takes images, not costs.
+PAMI 2008: along each direction ``L(p, k) = C(p, k) + min(L(q, k), L(q, k +- 1) + p1, min L(q) + p2) - min L(q)``,
+with q the pixel before p; the sum over directions is least at the hypothesis of a pixel. OpenCV's implementation
+takes images, not costs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from rsbench.vision.reprojection import Reprojection, parallax_gain, reproject_p
 from rsbench.vision.stereo_matcher import F32, Cameras, MotionMatcher
 
 _NOISE = 4.0
-"""Variance of grey levels, about that of noise and rounding: windows with less are alike by chance."""
+"""Variance of grey levels, about that of noise and rounding: windows with less are similar by chance."""
 
 
 class Comparer:
@@ -53,13 +53,13 @@ class Comparer:
         return np.asarray(cv2.boxFilter(values, -1, self._window, borderType=cv2.BORDER_REFLECT))
 
     def cost_of(self, other: F32, places: F32, *, cubic: bool) -> F32:
-        """0 (alike) to 1 (H, W) of the other image (H, W) at places (H, W, 2) px; NaN where those are NaN."""
+        """Cost (H, W), 0 (equal) to 1, of the other image (H, W) at places (H, W, 2), px; NaN where those are."""
         return np.where(
             np.isnan(places[..., 0]), np.float32(np.nan), self.compared(self._seen(other, places, cubic))
         )
 
     def compared(self, other: F32) -> F32:
-        """0 (alike) to 1 (H, W) of another image (H, W) that lies on the same pixels."""
+        """Cost (H, W), 0 (equal) to 1, of another image (H, W) on the same pixels."""
         seen = other - np.float32(128.0)
         mean = self._box(seen)
         variance = self._box(seen * seen) - mean * mean
@@ -82,9 +82,9 @@ _FAR = np.float32(1e9)
 
 
 def aggregated(costs: U8, p1: int, p2: int) -> U16:
-    """Sum (H, W, n) over the eight directions of the costs (H, W, n) of n hypotheses in order.
+    """Sum (H, W, n) over the eight directions for the costs (H, W, n) of n ordered hypotheses.
 
-    ``p1`` and ``p2``, each at most 4000, are what steps by one and by more hypotheses cost.
+    ``p1`` and ``p2``, each at most 4000, are the costs of steps by one and by more hypotheses.
     """
     total = np.zeros(costs.shape, dtype=np.uint16)
     for step in (1, -1):
@@ -94,7 +94,8 @@ def aggregated(costs: U8, p1: int, p2: int) -> U16:
 
 
 def winners(total: U16) -> F32:
-    """Hypothesis (H, W) of least cost, with the fraction of the parabola through it and its neighbours."""
+    """Hypothesis (H, W) of least cost, plus the fraction at the minimum of the parabola through it and its
+    neighbours."""
     best = np.zeros(total.shape[:2], dtype=np.float32)
     _winners(total, best)
     return best
@@ -130,7 +131,7 @@ def _pass(costs: U8, total: U16, p1: np.float32, p2: np.float32) -> None:
 def _extend(
     cost: U8, before: F32, least_before: np.float32, p1: np.float32, p2: np.float32, here: F32, into: U16
 ) -> np.float32:
-    """One pixel further: fill ``here``, add it to ``into``, and return its least value."""
+    """Proceed by one pixel: fill ``here``, add it to ``into``, and return its least value."""
     least, jump = _FAR, least_before + p2
     for k in range(len(cost)):
         reached = min(min(before[k + 1], jump), min(before[k], before[k + 2]) + p1)
@@ -173,12 +174,12 @@ _RANGES = {
     "refine_rounds": (0, 20),
 }
 _COARSE, _RANGE_QUANTILE, _RANGE_MARGIN = 4, 0.999, 1.1
-"""The range is looked for at a quarter of the size, as ``stereo_depth`` does."""
+"""The range is searched at a quarter of the size, as in ``stereo_depth``."""
 _FEWEST = 8
 _FOLLOW_WINDOW = 7
-"""px, of the last rounds: where the plane follows the surface, a larger window is the better one."""
+"""Side of the window in the last rounds, px: if the plane follows the surface, a larger window is better."""
 _ROUND = (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""Steps of a last round; they are a quarter of a plane's, and half of that in each further round."""
+"""Number of steps of a last round; each is a quarter of a plane's, and half of that in each further round."""
 
 
 @final
@@ -189,25 +190,25 @@ class SweepMatcher(MotionMatcher):
     sources: Sources = "all"
     """``time``: the other frame of the same camera; ``stereo``: the other camera; ``all``: the three others."""
     rolling: bool = True
-    """False: all lines of a frame are believed to have the pose of the first."""
+    """False: all lines of a frame are assumed to have the pose of the first."""
     planes: int = 128
-    """At most so many; fewer where ``step_px`` needs fewer."""
+    """Largest number of planes; there are fewer if ``step_px`` needs fewer."""
     step_px: float = 0.5
     """Parallax between two planes, in the view in which it is largest."""
     window: int = 3
     """Side, px, of the window in which views are compared."""
     p1: int = 24
-    """Cost of a step to the next plane; the worst likeness costs 255."""
+    """Cost of a step to the next plane; the largest cost of a pixel is 255."""
     p2: int = 200
     """Cost of larger steps."""
     nearest_depth: float | None = None
-    """Metres; None finds the range in the images, by a sweep at a quarter of the size."""
+    """Least depth, metres; None: the range is estimated from the images, by a sweep at a quarter of the size."""
     least_parallax_px: float = 0.5
-    """Depth of less parallax is unknown: hardly distinguishable from infinity."""
+    """Least parallax, px: depth with less is unknown, as it is hardly distinguishable from infinity."""
     consistency_px: float = 1.0
-    """Largest difference of parallax to the depth of one other view, where that sees the pixel."""
+    """Largest difference, px, from the parallax by the depth of one other view that sees the pixel."""
     refine_rounds: int = 2
-    """Rounds in which depth is refined on the images, below the step of the planes; 0: none."""
+    """Number of rounds in which depth is refined below the step of the planes; 0: none."""
 
     def __post_init__(self) -> None:
         if self.sources not in get_args(Sources):
@@ -248,8 +249,8 @@ def sweep_depths(
 ) -> dict[View, F32]:
     """Depth (H, W), metres, of the pixels of these views, in each line's own camera; NaN where it is unknown.
 
-    ``images`` (H, W[, 3]) are uint8 or uint16. Unknown is what no other view sees or confirms, what has too little
-    parallax, and everything where the motion gives none.
+    ``images`` (H, W[, 3]) are uint8 or uint16. Depth is unknown where no other view sees or confirms it, where the
+    parallax is too small, and everywhere if the motion gives no depth.
     """
     options = options or SweepMatcher()
     scene = _Scene({view: grey_u8(images[view]) for view in VIEWS}, rig, shutter, motion, options)
@@ -263,7 +264,7 @@ def sweep_depths(
 
 
 def _range(scene: _Scene) -> float:
-    """Largest inverse depth, 1 / m, that is to be searched."""
+    """Largest inverse depth, 1 / m, to be searched."""
     found = scene.confirmed(scene.sweep_all(0.5 * max(scene.size) / scene.gain, 0, VIEWS), VIEWS)
     known = np.concatenate([rho[np.isfinite(rho)] for rho in found.values()])
     largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
@@ -300,11 +301,12 @@ class _Scene:
 
     @cached_property
     def gain(self) -> float:
-        """px that a point of inverse depth 1 / m moves at most between two views."""
+        """Largest displacement, px, of a point of inverse depth 1 / m between two views."""
         return max(parallax_gain(self.rig.camera, m, self.maps[b, a]) for (a, b), m in self.maps.items())
 
     def coarse(self) -> _Scene:
-        """The same at a quarter of the size; a line is then read 1.5 lines too early, which moves no range."""
+        """The same scene at a quarter of the size; a line is then read 1.5 lines too early, which does not change
+        ranges."""
         height, width = (max(n // _COARSE, _FEWEST) for n in self.size)
         camera = self.rig.camera.resized(width, height)
         small = {
@@ -315,11 +317,11 @@ class _Scene:
         return _Scene(small, replace(self.rig, camera=camera), shutter, self.motion, self.options)
 
     def confirming(self, views: Sequence[View]) -> list[View]:
-        """Some views, and all that may confirm what is found of them."""
+        """These views, and all views that may confirm their results."""
         return [view for view in VIEWS if view in views or set(views) & set(self._others(view))]
 
     def sweep_all(self, most: float, rounds: int, views: Sequence[View]) -> dict[View, F32]:
-        """Inverse depth (H, W), 1 / m, of some views, NaN where unknown, of 0 to ``most``."""
+        """Inverse depth (H, W), 1 / m, of some views, searched from 0 to ``most``; NaN where it is unknown."""
         with ThreadPoolExecutor(2) as pool:
             return dict(zip(views, pool.map(lambda view: self._sweep(view, most, rounds), views), strict=True))
 
@@ -350,9 +352,10 @@ class _Scene:
     def _cost(
         self, comparer: Comparer, view: View, rho: F32, lines: Sequence[NDArray[np.int32]], *, cubic: bool
     ) -> F32:
-        """Unlikeness (H, W), 0 to 1, of surfaces of inverse depth (H, W); NaN where no view sees them.
+        """Cost (H, W), 0 to 1, of surfaces of inverse depth (H, W); NaN where no view sees them.
 
-        The mean of all views that see a pixel but the one that is least like it, for which it may be hidden.
+        It is the mean over the views that see a pixel, without the least similar view, in which the pixel may be
+        hidden.
         """
         costs = []
         for other, start in zip(self._others(view), lines, strict=True):
@@ -367,7 +370,8 @@ class _Scene:
     def _follow(
         self, comparer: Comparer, view: View, rho: F32, step: float, lines: Sequence[NDArray[np.int32]]
     ) -> F32:
-        """A last round: inverse depths near those that were found, with the parabola's minimum."""
+        """One last round: inverse depths near the current ones are compared, and the minimum of the parabola is
+        used."""
         steps = np.array(_ROUND, dtype=np.float32) * np.float32(step)
         smooth = _smoothed(rho)
         costs = np.stack([self._cost(comparer, view, smooth + each, lines, cubic=True) for each in steps])
@@ -381,19 +385,19 @@ class _Scene:
         return np.where(np.isfinite(rho) & np.isfinite(moved), np.maximum(moved, 0.0), rho).astype(np.float32)
 
     def _parallax(self, view: View, rho: F32, lines: Sequence[NDArray[np.int32]]) -> F32:
-        """px (H, W) that the pixel's own inverse depth moves it, in the view where it does so most."""
+        """Parallax (H, W), px, by the pixel's own inverse depth, in the view where it is largest."""
         found = np.zeros(self.size, np.float32)
         for other, start in zip(self._others(view), lines, strict=True):
             maps = self.maps[view, other]
             here, far = (reproject_pixels(maps, at, start)[0] for at in (rho, np.zeros_like(rho)))
-            # What is infinitely far may lie beside the image: then there is parallax enough.
+            # A point at infinity may lie outside the image: then the parallax is large enough.
             moved = np.linalg.norm(here - far, axis=-1)
             moved = np.where(np.isfinite(here[..., 0]), np.nan_to_num(moved, nan=np.inf), 0.0)
             found = np.maximum(found, moved).astype(np.float32)
         return found
 
     def confirmed(self, rhos: Mapping[View, F32], views: Sequence[View]) -> dict[View, F32]:
-        """The inverse depths of some views that one other at least confirms where it sees the point."""
+        """The inverse depths of some views that at least one other view that sees the point confirms."""
         found = {}
         for view in views:
             rho = rhos[view]
@@ -410,7 +414,7 @@ class _Scene:
 
 
 def _smoothed(rho: F32) -> F32:
-    """Inverse depth without the steps of its planes; a surface of a few pixels keeps its own."""
+    """Inverse depth smoothed over the steps of its planes; surfaces of a few pixels keep their value."""
     known = np.isfinite(rho)
     filled = np.where(known, rho, np.float32(0.0))
     return np.where(known, cv2.medianBlur(filled, 5), np.float32(np.nan))
@@ -418,7 +422,8 @@ def _smoothed(rho: F32) -> F32:
 
 @compiled(error_model="numpy")
 def _store(cost: F32, volume: NDArray[np.uint8], k: int) -> None:
-    """Put a cost (H, W), 0 to 1, into plane k of a volume (H, W, n) as 0 to 255, rounded; NaN costs most."""
+    """Store a cost (H, W), 0 to 1, in plane k of a volume (H, W, n) as 0 to 255, rounded; NaN gets the largest
+    cost."""
     height, width = cost.shape
     for y in range(height):
         for x in range(width):
@@ -428,7 +433,7 @@ def _store(cost: F32, volume: NDArray[np.uint8], k: int) -> None:
 
 @compiled(error_model="numpy")
 def _all_but_the_worst(costs: F32, found: F32) -> None:
-    """Mean (H, W) of the costs (n, H, W) that are known, without the largest where there are two or more."""
+    """Mean (H, W) of the known costs (n, H, W), without the largest if there are two or more."""
     n, height, width = costs.shape
     for y in range(height):
         for x in range(width):

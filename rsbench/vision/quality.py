@@ -31,12 +31,12 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 class Window(NamedTuple):
-    """Around every pixel, of SSIM."""
+    """The window of SSIM around every pixel."""
 
     mean: Callable[[FloatArray], FloatArray]
-    """Averages an image (H, W[, C]) over the window of every pixel."""
+    """Function that averages an image (H, W[, C]) over the window of every pixel."""
     factor: float = 1.0
-    """Factor of variances and covariance."""
+    """Factor of the variances and the covariance."""
 
 
 class Moments(NamedTuple):
@@ -47,7 +47,7 @@ class Moments(NamedTuple):
 
 
 class Picture:
-    """An image (H, W[, C]), and what comparisons with others need of it: each is found once."""
+    """An image (H, W[, C]) with the quantities that comparisons need, each computed once."""
 
     def __init__(self, image: NDArray[Any]) -> None:
         self.image = image
@@ -74,10 +74,10 @@ def picture_of(image: NDArray[Any] | Picture) -> Picture:
 def psnr(
     estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, mask: NDArray[np.bool_] | None = None
 ) -> float:
-    """Peak signal-to-noise ratio in dB of images (H, W[, C]); inf when equal, NaN when the mask is empty.
+    """Peak signal-to-noise ratio in dB of images (H, W[, C]); inf if they are equal, NaN if the mask is empty.
 
-    Images are uint8, uint16 or floating point in [0, 1]; ``mask`` (H, W) tells which pixels count, all by default.
-    Raises ValueError on shapes or types that do not fit.
+    Images are uint8, uint16 or floating point in [0, 1]; ``mask`` (H, W) selects the pixels that count, by default
+    all. Raises ValueError for unsuitable shapes or types.
     """
     return psnr_within(estimate, truth, (mask,))[0]
 
@@ -104,7 +104,7 @@ def ssim(
 ) -> float:
     """Structural similarity of images (H, W[, C]) over the windows that ``mask`` covers entirely.
 
-    NaN when no window is covered. Arguments and errors as for ``psnr``.
+    NaN if no window is covered. Arguments and errors as for ``psnr``.
     """
     return ssim_within(estimate, truth, (mask,))[0]
 
@@ -112,7 +112,7 @@ def ssim(
 def ssim_within(
     estimate: NDArray[Any] | Picture, truth: NDArray[Any] | Picture, masks: Sequence[NDArray[np.bool_] | None]
 ) -> list[float]:
-    """``ssim`` for each of several masks, at the cost of one."""
+    """``ssim`` for each of several masks, in the time of one."""
     a, b = _pair(estimate, truth, masks)
     chosen = [window_mask(b.image.shape[:2], mask) for mask in masks]
     if not any(np.any(windows) for windows in chosen):
@@ -122,13 +122,13 @@ def ssim_within(
 
 
 class LastSsim:
-    """``ssim`` of one pair of images within one mask after the other, at the cost of one."""
+    """``ssim`` of one pair of images within several masks, one after the other, in the time of one."""
 
     def __init__(self) -> None:
         self._last: tuple[NDArray[Any], NDArray[Any], FloatArray] | None = None
 
     def within(self, estimate: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_]) -> float:
-        """As ``ssim``; images of the last call are known again as the same objects, which nobody may change."""
+        """``ssim`` within a mask; the last images are recognised as the same objects and must not be modified."""
         a, b = _pair(estimate, truth, (mask,))
         windows = window_mask(truth.shape[:2], mask)
         if not np.any(windows):
@@ -147,7 +147,7 @@ def window_mask(size: tuple[int, ...], mask: NDArray[np.bool_] | None) -> NDArra
 
 
 def ssim_map(a: Picture, b: Picture, window: Window, constants: float = 1.0) -> FloatArray:
-    """Local SSIM (H, W[, C]) of images; ``constants`` scales the two that keep its quotients from 0 / 0."""
+    """Local SSIM (H, W[, C]) of images; ``constants`` scales the two constants that prevent 0 / 0."""
     c1, c2 = constants * _C1, constants * _C2
     first, second = a.moments(window), b.moments(window)
     product = first.mean * second.mean
@@ -200,9 +200,10 @@ def ssim_deepunroll(estimate: Image, truth: Image) -> float:
 
 
 def psnr_deepunroll(estimate: Image, truth: Image, weights: FloatArray | None = None) -> float:
-    """PSNR in dB of images (H, W[, C]) as DeepUnrollNet has it: each pixel with its weight (H, W), 100 if equal.
+    """PSNR in dB of images (H, W[, C]) as computed by DeepUnrollNet: pixels have weights (H, W), and equal images
+    get 100. NaN if no pixel has weight.
 
-    NaN where no pixel has weight. Its masks are images, whose values are the weights.
+    Its masks are images, whose values are the weights.
     """
     difference = picture_of(estimate).unit - picture_of(truth).unit
     squares = (difference * difference).reshape(*difference.shape[:2], -1).mean(axis=-1)
@@ -224,7 +225,7 @@ def ssim_uniform(estimate: Image, truth: Image) -> float:
 def _off_centre(image: FloatArray) -> FloatArray:
     window = np.exp(-((np.arange(_OFF_CENTRE_SIZE) - _OFF_CENTRE_SIZE / 2) ** 2) / (2 * _OFF_CENTRE_SIGMA**2))
     window /= window.sum()
-    # Not mirrored, as a network's convolution.
+    # Not mirrored, like a network's convolution.
     filtered = cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(filtered).reshape(image.shape)
 
@@ -238,10 +239,11 @@ _SAMPLES = Window(_evenly, _UNIFORM**2 / (_UNIFORM**2 - 1))
 
 
 def flip(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> FloatArray | None:
-    """FLIP error (H, W) in [0, 1] of RGB images (H, W, 3): what one sees who switches between both.
+    """FLIP error (H, W) in [0, 1] of RGB images (H, W, 3): the difference that a viewer perceives when switching
+    between both images.
 
-    At 67 pixels per degree, the metric's default; None where its package has no wheel. Andersson et al., FLIP: A
-    difference evaluator for alternating images, HPG 2020, by the authors' implementation.
+    At 67 pixels per degree, the metric's default; None if its package has no wheel for this system. Andersson et
+    al., FLIP: A difference evaluator for alternating images, HPG 2020, in the authors' implementation.
     """
     try:
         from flip_evaluator import evaluate

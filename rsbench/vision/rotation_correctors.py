@@ -1,4 +1,5 @@
-"""Correctors of the rotation alone, from a gyroscope or from lines in one image: each row turned, no depth."""
+"""Correctors of the rotation only, from a gyroscope or from lines in one image: each row is rotated, without
+depth."""
 
 from __future__ import annotations
 
@@ -27,13 +28,14 @@ from rsbench.vision.straightness import (
 )
 
 _SHORTEST = 0.08
-"""Length of a curve, in heights of the image."""
+"""Least length of a curve, in heights of the image."""
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
 class GyroCorrector(Corrector):
-    """Everything at infinity, turned as a gyroscope says; what it has wrong (bias, noise, delay) stays wrong."""
+    """Rotate everything, as if at infinity, by the rates of a gyroscope; its errors (bias, noise, delay)
+    remain."""
 
     warp: WarpOptions = field(default_factory=WarpOptions)
     """How pixels are taken from the source image."""
@@ -58,7 +60,8 @@ class GyroCorrector(Corrector):
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRotationCorrector(Corrector):
-    """Everything at infinity, turned by a rotation estimated from the frame's own curves; no second image."""
+    """Rotate everything, as if at infinity, by a rotation estimated from curves in this frame, without a second
+    image."""
 
     seed: int = 0
     """Seed of the random samples."""
@@ -100,7 +103,7 @@ class ImageRotationCorrector(Corrector):
 @final
 @dataclass(frozen=True, kw_only=True)
 class LinesCorrector(ImageRotationCorrector):
-    """Turned such that curves become straight lines."""
+    """Rotate such that curves become straight lines."""
 
     lines: LineOptions = field(default_factory=LineOptions)
     """Search for the rotation from curves."""
@@ -120,7 +123,7 @@ class LinesCorrector(ImageRotationCorrector):
 @final
 @dataclass(frozen=True, kw_only=True)
 class ManhattanCorrector(ImageRotationCorrector):
-    """Turned such that lines run along three orthogonal directions."""
+    """Rotate such that lines run along three orthogonal directions."""
 
     manhattan: ManhattanOptions = field(default_factory=ManhattanOptions)
     """Search for rotation and directions from curves."""

@@ -240,6 +240,7 @@ def test_what_matches_cannot_tell_is_said_and_the_likeliest_model_used() -> None
     assert str(choice).startswith(f"cannot tell, so {choice.used} is used (")
     requested = choose_model(capture, "twist")
     assert requested is not None and requested.used == "twist" and requested.rival != "twist"
+    assert str(requested).startswith("twist, as requested (")
     motion = motion_at(capture.peaks["twist"])
     assert motion.name == "twist" and np.linalg.norm(motion.d - truth.d) < 0.05
 

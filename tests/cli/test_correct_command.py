@@ -75,7 +75,7 @@ def test_a_rendered_sequence_is_footage_that_knows_its_rig(tmp_path: Path, castl
     )
     assert [frame["number"] for frame in record["frames"]] == [0, 1] and not record["readout_ratio_estimated"]
     assert record["readout_ratio"] == castle.shutter.readout_ratio and record["baseline"] == castle.rig.baseline
-    others = {("--rig", rig): "knows its frames and rig", ("--left", castle.folder): "leave the others out"}
+    others = {("--rig", rig): "its own frames and rig", ("--left", castle.folder): "leave the others out"}
     for more, words in others.items():
         assert_refused(correct(castle.folder, *more, "--out", tmp_path / "other"), words)
     words = "is a dataset; give one of its sequences: castle, room-twist"
@@ -270,6 +270,8 @@ def test_a_gyroscope_that_contradicts_the_frames_is_told_and_left_out(
     given = ("--gyro", log, "--fps", 20, "--motion-model", "linear")
     assert_refused(correct(*footage, tmp_path / "no", *given), "--gyro", "four frames and more")
     assert_refused(correct(*footage, tmp_path / "no", *given[:4], "--gyro-offset", 90), "--gyro-offset")
+    given = ("--row-poses", "--motion-model", "linear")
+    assert_refused(correct(*footage, tmp_path / "no", *given), "--row-poses", "four frames and more")
 
 
 def test_bad_calls_are_refused_and_leave_nothing(tmp_path: Path, frames: list[Path], rig: Path) -> None:

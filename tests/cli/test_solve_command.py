@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import assert_refused, run_apart, run_here
+from documents import ROOT, blocks
 
 import rsbench
 from rsbench.components.motion_models import TwistMotion
@@ -173,6 +174,15 @@ def test_an_interrupt_keeps_earlier_answers_and_ends_the_solvers_process(tmp_pat
         assert process.stdout.read() == ""
         assert "interrupted; nothing is kept" in process.stderr.read()
         assert process.wait(60) == 130
+
+
+def test_the_page_shows_what_the_example_prints() -> None:
+    (shown,) = blocks(ROOT / "docs/how-to/solve.md", "text")
+    number = re.compile(r"-?\d+\.\d+")
+    printed = run_here("solve", EXAMPLE).stdout
+    assert number.sub("#", shown) == number.sub("#", printed)
+    found = [[float(each) for each in number.findall(text)] for text in (shown, printed)]
+    assert found[0] == pytest.approx(found[1], rel=0.05, abs=0.002)
 
 
 def test_the_motion_model_is_chosen_and_printed() -> None:

@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_format_is_written_whole_and_again_the_same(made: Path, tmp_path: Path, name: str) -> None:
     result = run_here("export", made, "--to", name, "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == f"{tmp_path / 'out'}: {name}; README.txt says what it holds"
+    assert result.stdout.splitlines()[-1] == f"{tmp_path / 'out'}: {name}; README.txt describes it"
     first = bytes_below(tmp_path / "out")
     record = read_json(tmp_path / "out/export.json")
     assert record["to"] == name and list(record["sequences"]) == ["planes"]

@@ -435,7 +435,7 @@ def test_without_frames_it_fails_by_value() -> None:
         RobustOptions(),
         np.random.default_rng(0),
     )
-    assert "0 left matches with affine frames, a sample needs 7" in robust.estimate.reason
+    assert "too few left matches with affine frames: 0, a sample needs 7" in robust.estimate.reason
     assert robust.iterations == 0 and robust.inliers["left"].shape == (40,)
 
 

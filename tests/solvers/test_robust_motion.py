@@ -409,7 +409,10 @@ def test_too_few_linked_matches_is_a_failure_in_words() -> None:
     s = simulated(pairs=60, tracks=2)
     result = run_loop(LinkedSolver(), pairwise(s.correspondences))
     assert not result.estimate.success
-    assert "2 matches over time with left-right matches at both ends, a sample needs 3" in result.estimate.reason
+    assert (
+        "too few matches over time with left-right matches at both ends: 2, a sample needs 3"
+        in result.estimate.reason
+    )
 
 
 def test_left_right_matches_a_hair_off_hold_the_scale() -> None:

@@ -21,7 +21,7 @@ from rsbench.vision.features import (
     MatchOptions,
     Recent,
     SiftMatcher,
-    aligned,
+    align,
     best_two,
     close_loops,
     content_key,
@@ -286,7 +286,7 @@ def test_patches_follow_affine_maps(shear: list[float], shift: list[float], gain
     t = np.array(shift) + 48.0 - A @ [48.0, 48.0]
     truth = _PLACES @ A.T + t
     rough = np.rint(truth * 2.0) / 2.0
-    found, done = aligned(smoothed(_image(np.eye(2), np.zeros(2))), smoothed(_image(A, t, gain)), _PLACES, rough)
+    found, done, _ = align(smoothed(_image(np.eye(2), np.zeros(2))), smoothed(_image(A, t, gain)), _PLACES, rough)
     assert np.mean(done) > 0.9
     assert np.median(np.abs(found - truth)[done]) < 0.015
     assert np.max(np.abs(found - truth)[done]) < 0.12
@@ -297,7 +297,7 @@ def test_noise_decides_how_well() -> None:
     the gradients, of which the smoothing and the weights keep a half: some 0.02 px here."""
     shift = np.array([0.3, -0.2])
     a, b = (smoothed(_image(np.eye(2), t, noise=1.5, seed=n)) for n, t in enumerate((np.zeros(2), shift)))
-    found, done = aligned(a, b, _PLACES, _PLACES)
+    found, done, _ = align(a, b, _PLACES, _PLACES)
     dx, dy = (_levels(_PLACES + step) - _levels(_PLACES - step) for step in ([0.5, 0.0], [0.0, 0.5]))
     bound = 1.5 * np.sqrt(2.0) / np.sqrt(0.5 * 100.0 * np.mean(np.concatenate([dx, dy]) ** 2))
     assert np.all(done)
@@ -311,7 +311,7 @@ def test_what_cannot_be_aligned_stays(levels: float | None) -> None:
     other = np.random.default_rng(1).integers(0, 255, (_SIZE, _SIZE)).astype(np.uint8)
     b = smoothed(other if levels is None else np.full((_SIZE, _SIZE), levels, dtype=np.uint8))
     places = np.array([[48.0, 48.0], [3.0, 48.0], [48.0, 94.0]])
-    found, done = aligned(a, b, places, places)
+    found, done, _ = align(a, b, places, places)
     assert not np.any(done)
     np.testing.assert_array_equal(found, places)
 

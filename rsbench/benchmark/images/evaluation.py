@@ -1,4 +1,4 @@
-"""Evaluation of a dataset: predictions, then scores, then the record of how they came about."""
+"""Evaluation of a dataset: predictions, then scores, then their provenance."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ def _serve_metric(place: str) -> Callable[..., object]:
 
 
 class Job(NamedTuple):
-    """What one call of a child process does for a sequence: one more motion, or all predictions, or the scores."""
+    """The work of one call of a child process for a sequence: one further motion, all predictions, or the
+    scores."""
 
     sequence: str
     solver: str = ""
@@ -95,7 +96,7 @@ def isolated(plan: Plan, isolation: Isolation) -> Plan:
 
 
 def repeats_of(plan: Plan) -> list[Job]:
-    """The motions that are planned beside the first one of each solver; what takes long is begun early."""
+    """The motions that are planned in addition to the first one of each solver; long ones are started early."""
     return [
         Job(sequence, solver.name, seed)
         for solver in sorted(plan.solvers, key=lambda entry: entry.name, reverse=True)
@@ -117,7 +118,7 @@ def _shared_words(value: Any) -> Any:
 def _serve(
     dataset: Path, out: Path, options: EvaluationOptions
 ) -> Callable[[Job], tuple[dict[str, Any] | None, list[str]]]:
-    """Function that does the jobs in a child: the fields of ``Scores``, and the hashes that are new."""
+    """Function that runs jobs in a child process; returns the fields of ``Scores``, and new hashes."""
     use_one_thread()
     evaluation = open_evaluation(dataset, out, options)
     sequences = {each.name: each for each in evaluation.sequences}
@@ -152,7 +153,7 @@ class Evaluation:
 
     @property
     def steps(self) -> int:
-        """How often ``run`` reports progress."""
+        """Number of progress reports of ``run``."""
         own = len(self.plan.sequence_names) * prediction_steps(self.plan)
         return own + len(repeats_of(self.plan)) + len(self.sequences)
 
@@ -184,7 +185,7 @@ class Evaluation:
         return [name for scores in found for name in scores.stale]
 
     def _here(self, hashes: FileHashes, step: Step) -> dict[str, Scores]:
-        """Scores by the name of the sequence, all by this process but for the repeats."""
+        """Scores by the name of the sequence, all by this process except the repeats."""
         scored = {}
         with SolverRunner() as runner, Isolation() as isolation:
             plan = isolated(self.plan, isolation)
@@ -199,14 +200,14 @@ class Evaluation:
         return scored
 
     def _apart(self, hashes: FileHashes, step: Step, workers: Workers) -> dict[str, Scores]:
-        """The same by ``workers``."""
+        """Scores by the name of the sequence, by ``workers``."""
         due = self.plan.sequence_names
-        if repeats_of(self.plan):  # which need the matches, and are scored with the others
+        if repeats_of(self.plan):  # repeats need the matches, and are scored with the others
             self._done([Job(name, predict=True) for name in sorted(due)], hashes, step, workers)
             self._repeat(hashes, step, workers)
             due = frozenset[str]()
         jobs = [Job(each.name, predict=each.name in due, score=True) for each in self.sequences]
-        jobs.sort(key=lambda job: not job.predict)  # what takes long is begun early
+        jobs.sort(key=lambda job: not job.predict)  # long jobs start early
         return self._done(jobs, hashes, step, workers)
 
     def _repeat(self, hashes: FileHashes, step: Step, workers: Workers) -> None:
@@ -247,7 +248,7 @@ class Evaluation:
         return scored
 
     def scored(self, places: Places, plan: Plan) -> Scores:
-        """Scores of what is stored and current of a sequence."""
+        """Scores of the stored current predictions of a sequence."""
         scorer = Scorer(places, plan, kept_scores(self.out, places.sequence.name), self.options.rehash)
         scorer.score()
         return Scores(scorer.rows, scorer.stale)
@@ -287,7 +288,7 @@ def open_evaluation(dataset: Path, out: Path, options: EvaluationOptions) -> Eva
 
 
 def described_columns(plan: Plan) -> dict[str, list[dict[str, object]]]:
-    """What the metrics' columns of each table are, ready for JSON; an infinite worst value as a text."""
+    """Descriptions of the metrics' columns of each table, ready for JSON; an infinite worst value is a text."""
     return {
         table: [
             {

@@ -1,4 +1,4 @@
-"""What an evaluation runs, and the identity of every prediction: the artefacts, current or to be made."""
+"""The work of an evaluation, and the identity of every prediction (artefact), current or to be made."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Component = TypeVar("Component")
 HashOf = Callable[[Path], str]
 STANDARD_METRICS = ("pose", "depth", "psnr", "ssim")
 TRUE = "true"
-"""Stands for a solver or a matcher where an oracle is given the truth instead; no entry may have this name."""
+"""Name in place of a solver or matcher if an oracle gets the truth instead; no entry may have this name."""
 NONE = "none"
-"""Stands for a component that nothing was taken from; no entry may have this name."""
+"""Name in place of a component that is not used; no entry may have this name."""
 SCORED = ("rs", "rs_depth", "gs")
-"""Folders of a sequence whose files scores and pictures come from."""
+"""Folders of a sequence whose files are used for scores and pictures."""
 _SEEDS = "seeds"
-"""Folder of the motions by all samples of the robust loop but the first."""
+"""Folder of the motions with further seeds of the robust loop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,11 +52,12 @@ class EvaluationOptions:
     metrics: tuple[str, ...] = ()
     """Metrics that are computed in addition to ``STANDARD_METRICS``."""
     only: tuple[str, ...] = ()
-    """Names of solvers and sequences to which predicting is limited; all when empty."""
+    """Names of solvers and sequences to which predictions are limited; empty: all."""
     force: bool = False
-    """Whether predictions that are current are made again."""
+    """Whether current predictions are made again."""
     seeds: int = 1
-    """How often each solver's robust loop is run, with other samples; the correction uses the first motion."""
+    """Number of runs of each solver's robust loop, with different samples; the correction uses the first
+    motion."""
     seed: int = 0
     rehash: bool = False
     """Whether all files of the dataset are hashed again, even those with unchanged size and times, and all scores
@@ -140,7 +141,7 @@ def _check_metres(chain: CorrectionOptions, solvers: tuple[SolverEntry, ...]) ->
 def _chosen(
     only: tuple[str, ...], sequences: Mapping[str, str], solvers: list[str]
 ) -> tuple[frozenset[str], frozenset[str]]:
-    """Names of the sequences and of the solvers to work on; a sequence of many frames stands for its pairs."""
+    """Names of the selected sequences and solvers; a sequence of many frames selects all its pairs."""
     known = [*dict.fromkeys([*sequences.values(), *sequences]), *solvers]
     for name in only:
         if name not in known:
@@ -168,7 +169,7 @@ _PARTS: dict[str, tuple[Kind[Any, Any], Callable[[str], Any]]] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recipe:
-    """The components of a correction, and which of its inputs are the true ones."""
+    """The components of a correction, and the inputs that are replaced by the true ones."""
 
     chain: CorrectionOptions
     true_motion: bool = False
@@ -236,7 +237,7 @@ class Places:
         return self._artefact("matches", data=self.data, features=self.chain.features.key)
 
     def motion(self, solver: SolverEntry, seed: int = 0) -> Artefact:
-        """Motion by the samples number ``seed`` of the robust loop."""
+        """Motion with the seed ``seed`` of the robust loop."""
         return self._artefact(
             f"motion/{solver.name}" if seed == 0 else f"{_SEEDS}/{seed}/{solver.name}",
             matches=self.matches().identity,
@@ -247,7 +248,7 @@ class Places:
         )
 
     def depth(self, matcher: MatcherEntry) -> Artefact:
-        """Depth, by the motion of the solver of ``chain`` where the matcher needs one."""
+        """Depth, with the motion by the solver of ``chain`` if the matcher needs one."""
         motion = {"motion": self.motion(self.chain.solver).identity} if needs_motion(matcher) else {}
         return self._artefact(f"depth/{matcher.name}", data=self.data, matcher=matcher.key, **motion)
 
@@ -321,7 +322,7 @@ def _named(load: Callable[[str], Component], source: str) -> Component:
 
 
 def _again(load: Callable[[Any], Component], source: Any) -> Component | None:
-    """The component that made a record, in its present version; None when it no longer exists."""
+    """The component that made a record, in its present version; None if it no longer exists."""
     try:
         return load(source)
     except (RsbenchError, KeyError, TypeError):

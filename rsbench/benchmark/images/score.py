@@ -36,7 +36,7 @@ from rsbench.vision.stereo_depth import seen_by_other
 
 Row = dict[str, Any]
 _PACKAGES = ("flip-evaluator", "matplotlib", "OpenEXR")
-"""Packages that scores and pictures come from, beside those that predictions come from."""
+"""Packages that affect scores and pictures, in addition to those that affect predictions."""
 
 
 def kept_scores(out: Path, sequence: str) -> Path:
@@ -46,7 +46,8 @@ def kept_scores(out: Path, sequence: str) -> Path:
 
 @cache
 def scoring_version() -> dict[str, str]:
-    """What decides a score beside its inputs: all of our source, and the packages below it."""
+    """Everything that determines a score apart from its inputs: our whole source, and the packages that it
+    uses."""
     package = Path(str(resources.files("rsbench")))
     return {
         **numeric_version(),
@@ -73,7 +74,7 @@ KEYS = {
 AFTER = {"pose": ("inliers", "matches", "iterations", "reason")}
 """Columns after those of the metrics."""
 _SEES = "single-view"
-"""Corrector that says which places a frame saw."""
+"""Corrector from which the pixels that a frame saw are determined."""
 
 
 class Scorer:
@@ -91,12 +92,12 @@ class Scorer:
         self._kept, self._rehash = kept, rehash
         self.rows: dict[str, list[Row]] = {table: [] for table in TABLES}
         self.stale: list[str] = []
-        """Predictions on disk that are not current, and not scored."""
+        """Predictions on disk that are not current, and are not scored."""
         self._failing: list[Row] = []
-        """What the part that is being scored adds to the failures."""
+        """Rows that the current part adds to the table of failures."""
 
     def score(self) -> None:
-        """Fill ``rows`` from what is stored and current."""
+        """Fill ``rows`` from the stored current predictions."""
         self._score_matches()
         self._score_poses()
         self._score_depth()
@@ -110,7 +111,7 @@ class Scorer:
     def _add_part(
         self, table: str, name: str, files: list[Path], case: type[Case], rows: Callable[[], Iterable[Row]]
     ) -> None:
-        """Add the rows of the prediction in ``files``, kept ones where nothing has changed that they came from."""
+        """Add the rows of the prediction in ``files``: stored ones if none of their inputs has changed."""
         key = identity_of(
             code=scoring_version(),
             sequence=self.sequence.name,
@@ -288,12 +289,13 @@ class Scorer:
 def visible_pixels(
     sequence: Sequence, pairs: Pairs, views: tuple[View, ...], target_row: float = 0.0
 ) -> dict[View, NDArray[np.bool_]]:
-    """Pixels (H, W) of corrected frames whose place the rolling-shutter frame saw, by true depth and motion.
+    """Pixels (H, W) of corrected frames whose scene points the rolling-shutter frame saw, by true depth and
+    motion.
 
     Args:
         pairs: the frames with their true depth.
-        views: the frames that are wanted.
-        target_row: at whose time.
+        views: the requested frames.
+        target_row: the row to whose time they are corrected.
     """
     images = {(side, frame): pairs[frame].images[side] for side, frame in VIEWS}
     given = Given(motion=sequence.motion, pairs=pairs)

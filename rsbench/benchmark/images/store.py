@@ -73,7 +73,7 @@ class _Correction(_Record):
     matcher: str
     entries: dict[str, str]
     failures: dict[str, str] = field(default_factory=dict)
-    """Why the corrector failed on views such as ``left_0``."""
+    """Reasons why the corrector failed on views such as ``left_0``."""
 
 
 _KINDS: dict[str, type[_Record]] = {
@@ -86,7 +86,7 @@ _KINDS: dict[str, type[_Record]] = {
 
 
 def is_whole(name: str, record: Mapping[str, Any]) -> bool:
-    """Whether a record has what the one of an artefact such as ``motion/gs-8pt`` must have, and nothing else."""
+    """Whether a record has exactly the content that one of an artefact such as ``motion/gs-8pt`` must have."""
     try:
         parse_card(_KINDS[name.partition("/")[0]], record, name)
     except RsbenchError:
@@ -95,41 +95,41 @@ def is_whole(name: str, record: Mapping[str, Any]) -> bool:
 
 
 SECONDS = "seconds.json"
-"""Times of a sequence's artefacts: no two runs agree on them, so no other file holds any."""
+"""Run times of a sequence's artefacts; they differ between runs, so no other file contains any."""
 
 
 def identity_of(**parts: object) -> str:
-    """Hash of what decides an artefact; the values must be JSON-ready."""
+    """Hash of everything that determines an artefact; the values must be JSON-ready."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Artefact:
-    """A prediction on disk, or the place for it."""
+    """A prediction on disk, or the place of a future one."""
 
     folder: Path
     """Folder of the sequence."""
     name: str
-    """Such as ``motion/gs-8pt``."""
+    """Name, such as ``motion/gs-8pt``."""
     identity: str
 
     @property
     def stem(self) -> Path:
-        """Path of its files, but for their ends."""
+        """Path of its files without their suffixes."""
         return self.folder / self.name
 
     def file(self, end: str) -> Path:
-        """One of its files, such as the one that ends in ``-inliers.npz``."""
+        """Path of one of its files, by its ending such as ``-inliers.npz``."""
         return self.stem.with_name(self.stem.name + end)
 
     def record(self) -> dict[str, Any] | None:
-        """What was stored, when it is current; None otherwise."""
+        """The stored record if it is current, otherwise None."""
         record = read_record(self.file(".json"))
         current = record is not None and record.get("identity") == self.identity and is_whole(self.name, record)
         return record if current else None
 
     def forget(self) -> None:
-        """Make it stale: the next run makes it again."""
+        """Mark it as outdated, so that the next run makes it again."""
         self.file(".json").unlink(missing_ok=True)
 
     def start(self) -> None:
@@ -152,7 +152,8 @@ def keep(path: Path, identity: str, content: object) -> None:
 
 
 def kept(path: Path, identity: str) -> Any:
-    """What ``keep`` stored under this identity; None where there is no file, another identity, or damage."""
+    """The content that ``keep`` stored with this identity; None if there is no file, another identity, or
+    damage."""
     record = read_record(path) or {}
     content = record.get("content")
     current = record.get("identity") == identity and record.get("sha256") == _digest(content)
@@ -192,7 +193,7 @@ def _digest(content: object) -> str:
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
-    """A stored record of whatever identity; None when there is none that can be read."""
+    """A stored record of any identity; None if none can be read."""
     try:
         return read_json(path)
     except RsbenchError:
@@ -208,6 +209,6 @@ def records_below(folder: Path, kind: str) -> Iterator[tuple[str, dict[str, Any]
 
 
 def read_seconds(folder: Path) -> dict[str, float]:
-    """Seconds by the name of the artefact; what is no number is left out."""
+    """Seconds by the name of the artefact; values that are not numbers are left out."""
     found = read_record(folder / SECONDS) or {}
     return {name: float(value) for name, value in found.items() if isinstance(value, int | float)}

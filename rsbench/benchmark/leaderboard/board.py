@@ -63,11 +63,11 @@ class Recorded:
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
     doubt: str = ""
-    """Reason why it is in doubt, see ``doubt.doubt_about``; empty if it is not."""
+    """Reason for doubts about the entry, see ``doubt.doubt_about``; empty if there are none."""
     accepted: str = ""
-    """Reason why the keeper of the board accepted an entry in doubt."""
+    """Reason why the keeper of the board accepted an entry in spite of doubts."""
     made: dict[str, Any] = field(default_factory=dict)
-    """Its provenance: ``command``, version, machine."""
+    """Provenance: ``command``, version, machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ class Scored:
     files: dict[str, str]
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
     doubt: str
-    """Reason why it is not ranked; empty if it is ranked."""
+    """Reason why it is not ranked; empty if it is."""
     handed_in: bool
     """Whether the answers were submitted as a file; if not, this board ran the method."""
 
@@ -111,7 +111,7 @@ def move_entry(new: Path, folder: Path) -> None:
     """Rename a finished entry from its work folder to its place; the old one is moved into the work folder."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.is_symlink() or folder.exists():
-        os.replace(folder, new.with_name(f"{new.name}~"))  # no name of an entry
+        os.replace(folder, new.with_name(f"{new.name}~"))  # entries cannot have this name
     os.replace(new, folder)
 
 
@@ -121,10 +121,10 @@ def place(board: Path, protocol: str, split: str) -> Path:
 
 
 def open_board(board: Path) -> None:
-    """Make a board of an empty folder; an existing board is checked.
+    """Create a board in an empty folder, or check an existing board.
 
     Raises:
-        RsbenchError: the folder holds something else.
+        RsbenchError: the folder contains something else.
     """
     path = board / "board.json"
     if path.is_file():
@@ -164,7 +164,7 @@ def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
 
 
 def refuse_same_but_case(entries: Path, method: str) -> None:
-    """Raises RsbenchError if a name differs from an entry in case only: some file systems ignore case."""
+    """Raises RsbenchError if a name differs from that of an entry only in case: some file systems ignore case."""
     for folder in _folders(entries):
         if folder.name != method and folder.name.lower() == method.lower():
             raise RsbenchError(
@@ -179,7 +179,7 @@ def splits_of(board: Path) -> list[tuple[str, str]]:
     """Protocols and names of the splits of a board, in the order of tracks.
 
     Raises:
-        RsbenchError: it is no board.
+        RsbenchError: the folder is no board.
     """
     _check_board(board)
     found: list[tuple[str, str]] = []
@@ -192,7 +192,7 @@ def about_split(folder: Path) -> About:
     """Read the split.json of a folder of a board.
 
     Raises:
-        RsbenchError: it is not there, or damaged.
+        RsbenchError: the file is missing, or damaged.
     """
     path = folder / "split.json"
     if path.is_symlink() or not path.is_file():
@@ -218,7 +218,7 @@ def _folders(folder: Path) -> Iterator[Path]:
 
 
 def read_entry(folder: Path) -> Scored:
-    """An entry from its folder. Raises RsbenchError when it is damaged."""
+    """Read an entry from its folder. Raises RsbenchError if it is damaged."""
     record = _read_record(folder)
     return Scored(
         folder=folder,
@@ -242,7 +242,7 @@ def _read_record(folder: Path) -> Recorded:
     record = parse_card(Recorded, read_json(path), str(path), extra="ignore")
     named = (record.header.protocol, record.header.split, record.header.method)
     if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
-        raise RsbenchError(f"{path}: header: names {'/'.join(named)}, which is not where it lies")
+        raise RsbenchError(f"{path}: header: is of {'/'.join(named)}, but the entry is in another folder")
     record.header.check_uses(track_of_id(record.header.protocol), str(path))
     if hashlib.sha256(read_bytes(folder / FILES[0], SUBMISSION_BYTES)).hexdigest() != record.predictions_sha256:
         raise RsbenchError(
@@ -269,7 +269,7 @@ def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
 
 
 def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> None:
-    """Raises RsbenchError where the SHA-256 ``found`` of an entry's files are not the recorded ones."""
+    """Raises RsbenchError if the SHA-256 ``found`` of the files of an entry differ from the recorded ones."""
     for name, digest in files.items():
         if found[name] != digest:
             raise RsbenchError(
@@ -280,13 +280,14 @@ def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> N
 def rescore(
     board: Path, split: Split, workers: Workers = 1, step: Step = lambda word: None
 ) -> dict[str, list[str]]:
-    """Score the stored predictions of a split again; no method runs. ``workers`` and ``step``: see ``Track.mark``.
+    """Score the stored predictions of a split again, without running a method. ``workers`` and ``step``: see
+    ``Track.mark``.
 
     Returns:
-        For each entry whose scores were others, the columns that changed; all of them where there was no table.
+        For each entry with different scores, the columns that changed; all columns if there was no table.
 
     Raises:
-        RsbenchError: stored predictions are at fault, or not of the entry that they lie in.
+        RsbenchError: stored predictions are invalid, or belong to another entry.
     """
     changed: dict[str, list[str]] = {}
     _check_board(board)
@@ -310,10 +311,10 @@ def rescore(
 
 
 def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> str:
-    """Accept an entry in doubt, so that it is ranked; returns the reason of the doubt.
+    """Accept an entry in spite of doubts, so that it is ranked; returns the reason for the doubts.
 
     Raises:
-        RsbenchError: there is no such entry, or nothing speaks against it.
+        RsbenchError: there is no such entry, or there are no doubts about it.
     """
     folder = place(board, protocol, split) / "entries" / method
     if not folder.is_dir():
@@ -321,7 +322,7 @@ def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> 
     with work_folder(board):
         record = _read_record(folder)
         if not record.doubt:
-            raise RsbenchError(f"{folder}: nothing speaks against it; it has a rank")
+            raise RsbenchError(f"{folder}: there are no doubts about it; it has a rank")
         write_json(folder / FILES[2], {**read_json(folder / FILES[2]), "accepted": reason})
     return record.doubt
 
@@ -337,7 +338,7 @@ def _stored(folder: Path, split: Split) -> Submission:
     return submission
 
 
-# Submissions become entries of a board: read, copied aside, scored together, and renamed to their places.
+# New entries: submissions are read, copied to a work folder, scored together, and renamed to their places.
 
 
 class _Taken(NamedTuple):
@@ -365,7 +366,7 @@ def add(
     workers: Workers = 1,
     step: Step = lambda word: None,
 ) -> Scored:
-    """Score a file of predictions and keep both.
+    """Score a file of predictions, and store both on the board.
 
     Args:
         made: provenance for entry.json.
@@ -374,7 +375,7 @@ def add(
 
     Raises:
         RsbenchError: the file has a fault; an entry of that name has other predictions; the board cannot be
-            written, or another command is at work there.
+            written, or another command is using it.
     """
     (scored,) = add_all(
         board, [predictions], split, made, replace=lambda method: replace, workers=workers, step=step
@@ -392,10 +393,11 @@ def add_all(
     workers: Workers = 1,
     step: Step = lambda word: None,
 ) -> list[Scored]:
-    """``add`` for several files, which share what is found of the truth; ``replace`` decides by the method's name.
+    """``add`` for several files, which share intermediate results of the truth; ``replace`` decides by the name of
+    the method.
 
     Raises:
-        RsbenchError: as ``add``; where there are other files, after they are on the board.
+        RsbenchError: as ``add``; the valid files are added to the board first.
     """
     read, faults = _read_all(files, split)
     if not read and faults:
@@ -465,13 +467,14 @@ def _put(taken: _Taken, scores: pd.DataFrame, split: Split, made: dict[str, Any]
 
 
 def merge(other: Path, board: Path) -> list[str]:
-    """Copy the entries of another board that are not here yet; returns what was copied.
+    """Copy the entries of another board that this one lacks; returns their names.
 
-    Scores are copied as they are: ``rescore`` checks them against the truth. What the keeper of the other board
-    accepted is in doubt again: the keeper of this one decides.
+    Scores are copied unchanged: ``rescore`` checks them against the truth. Entries that the keeper of the other
+    board accepted are in doubt again, until the keeper of this one decides.
 
     Raises:
-        RsbenchError: an entry of one name has two predictions; one of the boards is none, or damaged.
+        RsbenchError: two entries of one name have different predictions; one of the folders is no board, or is
+            damaged.
     """
     theirs = [
         (scored, place(board, protocol, split) / "entries" / scored.header.method)
@@ -507,7 +510,7 @@ def _copy(scored: Scored, new: Path) -> None:
     check_files(scored.folder, scored.files, copy_files(scored.folder, scored.files, new))
 
 
-# Stored predictions: compressed, so that anybody can score them again without running a method
+# Stored predictions: compressed, so that they can be scored again without running a method
 
 SUFFIX = ".jsonl.xz"
 
@@ -530,14 +533,14 @@ def store(board: Path, protocol: str, split: str, out: Path) -> list[Path]:
 def restore(
     stored: Path, split: Split, board: Path, part: Split | None = None, step: Step = lambda word: None
 ) -> list[Scored]:
-    """Entries of a board from what ``store`` wrote of this split, scored by the code of today.
+    """Add the predictions that ``store`` wrote for this split to a board, scored by the current code.
 
     Args:
-        part: the same split with fewer problems: the entries are then of these alone.
-        step: called with the name of each file.
+        part: the same split with fewer problems: only these are then scored.
+        step: called with the name of each method.
 
     Raises:
-        RsbenchError: there is nothing, or a file is damaged or of another split.
+        RsbenchError: there are no files, or a file is damaged or of another split.
     """
     files = sorted(stored.glob(f"*{SUFFIX}"))
     if not files:
@@ -556,7 +559,7 @@ def restore(
 
 
 def _only(data: bytes, split: Split, part: Split, where: str) -> bytes:
-    """Predictions of a split, of those problems alone that a part of it has."""
+    """Predictions of a split, restricted to the problems of a part of it."""
     header, *answers = (parse_json(line, where) for line in data.decode().splitlines())
     if header.get("split") == split.name:
         header["split"] = part.name

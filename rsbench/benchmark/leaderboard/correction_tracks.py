@@ -1,7 +1,7 @@
-"""Tracks of corrected frames: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
+"""Tracks of corrected frames; docs/reference/protocols.md has the formulas, which ``rsbench.vision`` implements.
 
-Pixels that a method did not draw are black, so that leaving out difficult pixels does not pay. Entries that the
-board makes itself close narrow holes, as the command does.
+Pixels that a method did not draw are black, so that leaving out difficult pixels does not raise a score. Entries
+that the board makes itself close narrow holes, as the command does.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _WORST_FRAME: Numbers = {
     "ssim_uniform": 0.0,
 }
 _SMALLER = 0.25
-"""A likely mistake is reported if undoing it reduces the squared error below this share."""
+"""A likely mistake is reported if undoing it reduces the squared error to less than this share."""
 _FRAMES = (
     Score("ssim", "SSIM", "of the common pixels, at least 0", "share", "higher"),
     Score("ssim_covered", "SSIM covered", "of what it drew itself", "share", "higher"),
@@ -135,14 +135,14 @@ class CorrectionTrack(PictureTrack):
     """Rolling-shutter frames as a global shutter would have taken them."""
 
     rows: tuple[str, ...] = ("first", "middle")
-    """Rows whose times frames may show, where the dataset has the truth."""
+    """Rows whose times are requested, if the dataset has the truth for them."""
     flips: bool = True
     """Whether FLIP is among the scores."""
     at_rows = True
     part_score, part_title = "rms", "RMS error of the common pixels, of 255"
 
     def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
-        """At the first row, and at others where the dataset has that truth."""
+        """The pictures of the first row, and of the other rows for which the dataset has the truth."""
         side, frame = VIEW
         lines = sequence.shutter.lines(side)
         numbers = {"first": 0, "middle": lines // 2, "last": lines - 1}
@@ -173,7 +173,7 @@ class CorrectionTrack(PictureTrack):
         return found
 
     def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
-        """Means over the requested frames, of dB too; FLIP takes most of the time."""
+        """Means over the requested frames, also of dB; FLIP takes most of the time."""
         scores, images = list[Numbers](), list[NDArray[np.uint8] | None]()
         for number, one in enumerate(true):
             image, mask = (None, None) if drawn is None else drawn[number]
@@ -212,10 +212,10 @@ class CorrectionTrack(PictureTrack):
         return {"seconds": round(seconds, 4)}
 
     def corrected(self, work: SharedWork, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
-        """The frame at the time of each requested row, and the seconds that this takes alone.
+        """The frame at the time of each requested row, and the seconds for this correction alone.
 
         Raises:
-            RsbenchError: it cannot be corrected.
+            RsbenchError: the frame cannot be corrected.
         """
         needs = chain.corrector.component.spec.needs
         rig, shutter = work.problem.rig, work.problem.shutter
@@ -265,7 +265,7 @@ class TrueFrame:
     common: NDArray[np.bool_]
     """(H, W) see ``TruePictures.common``."""
     parts: Parts
-    """Parts of the common pixels."""
+    """Named parts of the common pixels."""
 
 
 def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, flips: bool) -> Numbers:
@@ -279,7 +279,7 @@ def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, 
     found["epe_px"] = float(np.mean(off)) if off.size else math.inf
     found["ssim_deepunroll"] = ssim_deepunroll(drawing, truth)
     found["ssim_uniform"] = ssim_uniform(drawing, truth)
-    # Where no pixel counts there is no value; where SSIM is below 0, nothing of the picture is left.
+    # Without counted pixels there is no value; a negative SSIM counts as 0.
     found = {key: _WORST_FRAME[key] if math.isnan(value) else value for key, value in found.items()}
     found |= {key: max(value, 0.0) for key, value in found.items() if key.startswith("ssim")}
     return {**found, **(_flips(image, truth.image, masks) if flips else {})}
@@ -322,22 +322,22 @@ def _mistakes(
 
 
 def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
-    """Mean squared difference of the pixels that are not black, without the border, which shifts fill in."""
+    """Mean squared difference of the pixels that are not black, without the border, which shifts fill."""
     counted = np.any(image > 0, axis=-1)
     counted[[0, -1]] = counted[:, [0, -1]] = False
     difference = image[counted].astype(np.float32) - truth[counted]
     return float(np.mean(difference * difference)) if difference.size else np.inf
 
 
-# By where things are in corrected frames
+# Scores by the position of the content in corrected frames
 #
-# A frame's noise, blur and vignetting have nothing to do with the shutter, yet they are most of what SSIM counts
-# on a real sensor. So windows of the frame and of the truth, blurred alike, are shifted against each other to
-# where they correlate most, and the length of that shift counts. Dense flow would not do: on a noisy frame it errs
-# by as much as a corrected frame is off; nor would phase correlation, which undoes the blur.
+# Noise, blur and vignetting do not depend on the shutter, but determine most of the SSIM of a real sensor.
+# Therefore equally blurred windows of frame and truth are shifted against each other to the maximum of their
+# correlation, and the length of the shift is scored. Dense flow is not accurate enough: on noisy frames its errors
+# are as large as those of a corrected frame. Phase correlation would undo the blur.
 
 LIMIT_PX = 2.0
-"""Displacement from which on a window scores 0."""
+"""Displacement at which, and above which, the score of a window is 0."""
 WINDOW_PX, _STEP_PX, _REACH_PX = 64, 32, 4
 """Side of a window, distance between windows, and radius of the search, px."""
 _BLUR_PX = 3.0
@@ -345,15 +345,15 @@ _BLUR_PX = 3.0
 _LOOK_PX = 2.0
 """Standard deviation of the blur before pictures are compared; it reduces white noise to a seventh."""
 _LOOK_CONSTANTS = 0.1
-"""Factor of SSIM's constants, because the blur reduces contrast."""
+"""Factor of the constants of SSIM, because the blur reduces the contrast."""
 _TEXTURE = 5.0
-"""Smallest local standard deviation of the true image, grey levels, of the pixels that count."""
+"""Smallest local standard deviation of the true image, grey levels, at pixels that count."""
 _LEAST = 0.25
-"""Smallest share of pixels that count in a window."""
+"""Smallest share of counted pixels in a window."""
 
 
 class PlacedTrack(CorrectionTrack):
-    """Frames as a global shutter would have taken them, ranked by geometry."""
+    """Frames that a global shutter would have taken, ranked by geometry."""
 
     def chain(self, card: str) -> CardChain:
         return super().chain(card).choosing()
@@ -364,13 +364,13 @@ class PlacedTrack(CorrectionTrack):
 
 
 class SensorTrack(PlacedTrack):
-    """Frames as a global shutter of the same sensor would have taken them."""
+    """Frames that the same sensor would have taken with a global shutter."""
 
     def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
-        """The truth is what the same sensor expects under a global shutter, without noise.
+        """The truth is the image of the same sensor with a global shutter and without noise.
 
         Raises:
-            RsbenchError: the dataset has a sensor and no such images.
+            RsbenchError: the dataset has a sensor, but no such images.
         """
         requested = super().requested(sequence)
         if sequence.sensor is None:
@@ -393,10 +393,11 @@ class SensorTrack(PlacedTrack):
 
 
 def seen_alike(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
-    """The mean over frames of the SSIM to their truth, both blurred, over their common pixels; at least 0.
+    """Mean over frames of the SSIM to the truth, both blurred, over the common pixels; at least 0. Pixels that
+    were not drawn count 0.
 
-    What is not drawn counts 0. The blur leaves a sensor's noise without weight, so that a filter gains nothing;
-    contrast, colour, strong noise and holes that were filled with anything keep theirs.
+    The blur removes most of the sensor's noise, so that smoothing does not raise the score; contrast, colour,
+    strong noise and filled holes still affect it.
     """
     return float(np.mean([_alike(*frame, true) for true, frame in zip(truths, frames, strict=True)]))
 
@@ -413,8 +414,8 @@ def _alike(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) 
 
 
 def placed(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
-    """The mean over frames of the share of their textured common pixels that are drawn, each by its window's
-    distance from its place: 1 at 0, 0 from ``LIMIT_PX`` on; 1 where no window has enough texture."""
+    """Mean over frames of the share of textured common pixels that are drawn, each weighted by the displacement of
+    its window: 1 at 0, 0 from ``LIMIT_PX`` on. It is 1 if no window has enough texture."""
     return float(np.mean([_placed(*frame, true) for true, frame in zip(truths, frames, strict=True)]))
 
 
@@ -437,7 +438,7 @@ def _placed(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame)
 
 
 def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float:
-    """Distance, px, of the best place of a window from the middle of its surroundings; infinite at the rim."""
+    """Distance, px, of the best position of a window from the centre of the search; infinite at its border."""
     found = cv2.matchTemplate(around, window, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(np.argmax(found)), found.shape)
     if not (0 < y < 2 * _REACH_PX and 0 < x < 2 * _REACH_PX):
@@ -448,7 +449,7 @@ def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float
 
 
 def _top(three: NDArray[np.float32]) -> float:
-    """Position of the maximum of the parabola through three neighbours, relative to the middle one."""
+    """Position of the maximum of the parabola through three neighbouring values, relative to the middle one."""
     before, middle, after = map(float, three)
     bend = before - 2.0 * middle + after
     return 0.5 * (before - after) / bend if bend < 0.0 else 0.0
@@ -459,18 +460,18 @@ def _blurred(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float32)
 
 
-# Of one camera
+# Tracks of one camera
 #
-# What a corrector needs is found from the two frames of that camera alone, by dense flow: matches, and a motion
-# whose translation has no length. Correctors that need the depth of a rig run in the chain of ``correction``, and
-# their entries say that they use the other camera: what it is worth.
+# The inputs of a corrector are estimated from the two frames of this camera, by dense flow: matches, and a motion
+# whose translation has no scale. Correctors that need the depth of a rig run in the chain of ``correction``; their
+# entries state that they use the other camera, which shows its benefit.
 
 _SIDE = VIEW[0]
 _LAST = {"key": "psnr_last", "title": "PSNR last", "hint": "of the last row's time, common pixels"}
 
 
 class OneCameraTrack(CorrectionTrack):
-    """Frames of one camera as a global shutter would have taken them."""
+    """Frames of one camera that a global shutter would have taken."""
 
     def chain(self, card: str) -> CardChain:
         made = super().chain(card)
@@ -499,7 +500,7 @@ class OneCameraTrack(CorrectionTrack):
 
 
 def _needs_rig(spec: CorrectorSpec) -> bool:
-    """Whether a corrector needs both cameras: for depth, or for frames of the other one."""
+    """Whether a corrector needs both cameras, for depth or for frames of the other camera."""
     return "depth" in spec.needs or ("stereo" in spec.sees and not spec.needs & {"motion", "matches"})
 
 
@@ -507,7 +508,7 @@ def _from_left(work: SharedWork, chain: CorrectionOptions) -> Given:
     """Matches of the left camera over time, and its motion, whose translation has length 1.
 
     Raises:
-        RsbenchError: its frames show none.
+        RsbenchError: its frames determine no motion.
     """
     start = time.perf_counter()
     frames = [work.images[_SIDE, frame] for frame in FRAMES]
@@ -576,7 +577,7 @@ OF_SENSORS: dict[str, Any] = _RIG | {
     "error_title": "1 - placed x picture",
     "beside": ("placed", "picture", "failure"),
 }
-"""Fields of a track of frames as a global shutter of the same sensor shows them."""
+"""Fields of a track of frames that the same sensor would have taken with a global shutter."""
 TRACKS: tuple[Track, ...] = (
     SensorTrack(
         **OF_SENSORS,

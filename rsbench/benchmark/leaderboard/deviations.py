@@ -47,7 +47,7 @@ Triple = tuple[float, float, float]
 def stated(error: FloatArray, covariance: FloatArray) -> tuple[float, float]:
     """NEES and the logarithm of the Gaussian density of an error (n,) under a stated covariance (n, n).
 
-    inf and -inf where the covariance is not positive definite.
+    inf and -inf if the covariance is not positive definite.
     """
     values, vectors = np.linalg.eigh(covariance)
     if not values[0] > 0.0:
@@ -67,7 +67,7 @@ def vague_log_densities(motions: Sequence[Motion]) -> FloatArray:
 
 
 def log_score(log_density: float, vague: float) -> float:
-    """The log score by the logarithms of both densities at the truth; 0 where no density is stated (NaN)."""
+    """The log score from the logarithms of both densities at the truth; 0 if no density is stated (NaN)."""
     if math.isnan(log_density):
         return 0.0
     return float(np.logaddexp(math.log1p(-VAGUE) + log_density - vague, math.log(VAGUE)))
@@ -83,7 +83,7 @@ class Calibration:
     stated: int
     """Number of answers with a covariance."""
     spread: Triple
-    """Median of NEES over that of a right covariance: 1 where it is right, 4 where errors are twice as large."""
+    """Median of NEES divided by that of a right covariance: 1 if it is right, 4 if errors are twice as large."""
     covers: tuple[Triple, ...]
     """For each of ``LEVELS``, the share of problems whose true value lies within the ellipsoid of that level."""
     mean: float

@@ -1,11 +1,11 @@
 """Entries that are more accurate than their data allow are in doubt: they are not ranked until the board's keeper
 accepts them.
 
-Two things put an entry in doubt: an error that is zero but for rounding in a tenth of the problems, and errors
+An entry is in doubt for two reasons: an error that is zero up to rounding in a tenth of the problems, or errors
 below the Cramer-Rao bound of the data that the method states to use. The error of an unbiased method is below the
-median at the bound in at most half of the problems. Each error of a track is tested separately. Where no bound is
-known, as for rendered frames, a submission of the true values with a small error is not detected; the keeper has
-to run the method to be sure.
+median at the bound in at most half of the problems. Each error of a track is tested separately. If no bound is
+known, as for rendered frames, a submission of the true values with a small error is not detected; to be sure, the
+keeper must run the method.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from rsbench.core.errors import RsbenchError
 COVERAGE = 0.999
 """Coverage of the interval that must exclude one half: 1 of 2000 unbiased methods at the bound is put in doubt."""
 _EXACT_SHARE = 0.1
-"""Largest share of problems in which an error may be zero but for rounding."""
+"""Largest share of problems in which an error may be zero up to rounding."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
 _BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
-"""Names of former entries, beside those of cards."""
+"""Names of former entries, in addition to those of cards."""
 
 
 def outline(name: str) -> str:
-    """A name without differences that are easily overlooked: case, separators, 0 and o, 1, i and l."""
+    """A name reduced to its appearance: without case and separators, and with 0 = o and 1 = i = l."""
     return re.sub("[._-]+", "-", name.lower()).strip("-").translate(str.maketrans("01i", "oll"))
 
 

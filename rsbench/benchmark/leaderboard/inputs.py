@@ -1,6 +1,6 @@
 """Inputs for any language: CSV, npz and JSON of the same problems, and the truth of a public split.
 
-What is written is all that a method may know; docs/how-to/submit.md describes the files.
+The files contain everything that a method may use; docs/how-to/submit.md describes them.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from rsbench.storage.work_folder import HIDDEN, named
 RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "readout_ratio")
 """Columns of problems.csv after the name."""
 OF_ANY_RIG = ("baseline", "readout_ratio")
-"""Those of rigs whose cameras differ or are turned, which problems.jsonl describes."""
+"""Columns for rigs whose cameras differ or are rotated, which problems.jsonl describes."""
 
 
 def check_place(split: Split, out: Path) -> None:
-    """Raises RsbenchError when a folder holds anything but inputs of this split, or a truth that is secret now."""
+    """Raises RsbenchError if a folder contains anything but inputs of this split, or a truth that is secret."""
     others = [path.name for path in out.iterdir() if path.name != HIDDEN] if out.is_dir() else []
     record = (read_record(out / "split.json") or {}) if others else split_record(split)
     reveals = not split.public and "truth.jsonl" in others
@@ -47,7 +47,7 @@ def check_place(split: Split, out: Path) -> None:
 
 
 def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
-    """Write the problems of a split into a folder, and its truth where that is public.
+    """Write the problems of a split into a folder, and its truth if that is public.
 
     Raises:
         RsbenchError: a file cannot be written.
@@ -75,7 +75,8 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
 
 
 def write_matches(problems: Sequence[Problem], out: Path) -> None:
-    """Write ``left.csv`` and the like, with the name of its problem in each row; a set without matches has none.
+    """Write ``left.csv`` and similar files, with the name of its problem in each row; a set without matches gets
+    no file.
 
     Raises:
         RsbenchError: a file cannot be written.
@@ -88,7 +89,7 @@ def write_matches(problems: Sequence[Problem], out: Path) -> None:
 
 
 def split_record(split: Split) -> dict[str, Any]:
-    """What is published of a split before anything is scored."""
+    """The information on a split that is published before anything is scored."""
     return {
         "protocol": split.track.id,
         "split": split.name,
@@ -122,7 +123,8 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 
 
 def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """``names`` (n,), ``rig`` (n, k columns); sets (m, 4 or 8), ``<set>_problem`` (m,): the problem of a row."""
+    """Arrays: ``names`` (n,), ``rig`` (n, k columns); sets (m, 4 or 8), ``<set>_problem`` (m,): index of the
+    problem of each row."""
     arrays: dict[str, NDArray[Any]] = {
         "names": np.array([problem.name for problem in problems]),
         "rig": np.array([_rig(problem, columns) for problem in problems]),
@@ -156,7 +158,7 @@ def write_frames(split: Split, out: Path) -> None:
 
 
 def read_frames(inputs: Path, problem: Problem) -> Images:
-    """The frames of a problem, as ``write_frames`` wrote them.
+    """Read the frames of a problem that ``write_frames`` wrote.
 
     Raises:
         RsbenchError: one is missing, or is no image of its camera's size.
@@ -167,12 +169,12 @@ def read_frames(inputs: Path, problem: Problem) -> Images:
 
 
 def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, folder: Path) -> None:
-    """Export a split into a folder without its truth, unless the folder holds the split already.
+    """Export a split into a folder without its truth, unless the folder has the split already.
 
     Args:
-        split: which problems.
-        data, seed_file: as of ``Track.split``.
-        folder: made if missing.
+        split: the problems.
+        data, seed_file: as in ``Track.split``.
+        folder: created if missing.
 
     Raises:
         RsbenchError: as ``write_frames`` and ``write_inputs``.
@@ -186,10 +188,10 @@ def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, fold
 
 
 def read_inputs(inputs: Path, track: Track) -> list[Problem]:
-    """The exported problems; where the readout ratio is not given, it is 0.
+    """Read the exported problems; if the readout ratio is not given, it is 0.
 
     Raises:
-        RsbenchError: they are not there, or damaged.
+        RsbenchError: they are missing, or damaged.
     """
     path = inputs / "problems.jsonl"
     unknown: dict[str, float] = {} if track.gives_readout else {"readout_ratio": 0.0}

@@ -1,9 +1,9 @@
 """Tracks of motions: from simulated matches, from given matches of frames, and from frames alone.
 
-Where methods find matches themselves, they may submit these too, as ``matches/left.csv`` and the like beside the
-file of answers, with the columns of the given matches that ``export pose`` writes. The true place of a match is
-where the other frame sees the surface at its first end, by the true depth, which between pixels is that of one
-plane, and the true motion, each end at its own row's time.
+If methods find matches themselves, they may submit these too: ``matches/left.csv`` and similar files beside the
+file of answers, with the columns of the given matches that ``export pose`` writes. The true second end of a match
+is the place where the other frame sees the surface point of its first end. It is computed from the true depth,
+interpolated between pixels by a plane, and from the true motion, with each end at the time of its own row.
 """
 
 from __future__ import annotations
@@ -83,17 +83,17 @@ from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import between_pixels
 
 CHOOSES = "rs-stereo-auto"
-"""Entry of the recommended solver under the motion model that the matches prefer: what ``rsbench solve`` does."""
+"""Name of the entry that chooses the motion model by the matches, as ``rsbench solve`` does."""
 AUC_DEG = (1, 5, 10)
 """Thresholds of the areas under the curve of max(e_R, e_T)."""
 FLIP_DEG = 90.0
-"""A direction that is wrong by more is the opposite one."""
+"""A larger error of the direction counts as a flipped sign."""
 SUCCESS_DEG = (1.0, 5.0)
-"""A success errs by less in rotation and direction, as in the sweeps of simulated points."""
+"""Largest errors of rotation and direction of a success, as in the sweeps of simulated points."""
 BOUND = "cramer-rao"
 """Name of the entry whose errors are drawn from the bound."""
 OPEN_DEG = 10.0
-"""Where the median error of the direction at the bound is larger, the rotation alone counts."""
+"""If the median error of the direction at the bound is larger, only the rotation counts."""
 MATCHES = "matches"
 """Folder of a method's own matches, beside the file of answers."""
 _EXTRAS: tuple[Extra, ...] = ("covariance",)
@@ -107,19 +107,19 @@ _ANSWER_KEYS = (
     *("name", "success", "reason", "w", "d", "metric", "reference_point", "direction_known", "covariance"),
     "seconds",
 )
-"""What is kept of an answer of ``solve_problem``."""
+"""Keys of an answer of ``solve_problem`` that are stored."""
 _TIMES = 33
 """Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
 _DECADES = 2.0
 _AREAS_DEG = (0.1, 1.0)
-"""Limits of e_R and of e_T in pose-2: a rotation is known ten times as well."""
+"""Limits of e_R and of e_T in pose-2: rotations are ten times as accurate."""
 _DRAWS = 4000
-"""Errors drawn at a bound: their median is known to 3 %."""
+"""Number of errors that are drawn at a bound: their median is then accurate to 3 %."""
 _RIGHT_PX = 1.0
-"""A right match ends so near to the truth."""
+"""Largest distance of the second end of a right match from the truth."""
 _MATCH_FILES = tuple(f"{key}.csv" for key in COLUMNS)
 _LARGEST_PX = 1e6
-"""No image is so large."""
+"""Limit of coordinates, px: larger than any image."""
 _MOTION = (
     *(
         Score(
@@ -157,15 +157,15 @@ class SolverTrack(Track):
     """A track whose cards are solvers, and whose answers are lines of numbers."""
 
     choosing: bool = False
-    """Whether the entry ``CHOOSES`` exists, and headers name every motion model."""
+    """Whether there is an entry ``CHOOSES``, and headers state the motion model of every entry."""
     more_columns: Callable[[list[Row], Submission, Split], None] | None = None
-    """Adds columns to the rows of a submission."""
+    """Function that adds columns to the rows of a submission."""
     also_uses: ClassVar[tuple[str, ...]] = ()
-    """What every entry uses beside what its solver does."""
+    """Inputs that every entry uses in addition to those of its solver."""
 
     @abstractmethod
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        """What a solver answers to a problem, as a line of a submission."""
+        """The answer of a solver to a problem, as a line of a submission."""
 
     @abstractmethod
     def row(self, truth: Truth, answer: Answer | None) -> Row:
@@ -230,13 +230,13 @@ class SolverTrack(Track):
 
 
 def uses_of(entry: SolverEntry, readout: bool = True) -> tuple[str, ...]:
-    """What a solver uses, as it declares, on a track that gives the ``readout`` ratio or not."""
+    """The inputs that a solver declares, on a track that does or does not give the ``readout`` ratio."""
     rolling = entry.solver.spec.shutter == "rolling" and readout
     return _USES[enter(entry).information] + (("readout",) if rolling else ())
 
 
 def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
-    """Samples are drawn by the names of problem and solver: they do not depend on the order or on the workers."""
+    """Seed from the names of problem and solver, so that answers do not depend on order or workers."""
     text = f"leaderboard {problem.name} {entry.name}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
@@ -264,7 +264,7 @@ class _Motion(Answer):
         super().__post_init__()
         for name in ("w", "d"):
             if self.success and getattr(self, name) is None:
-                raise ValueError(f"{name}: a success needs three numbers; a failure says success = false")
+                raise ValueError(f"{name}: a success needs three numbers; for a failure give success = false")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -319,7 +319,7 @@ class MotionTrack(SolverTrack):
 
 
 def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:
-    """The slip that explains most of the motions, and how many; None when no slip does."""
+    """The mistake that explains most of the motions, and their number; None if no mistake does."""
     found: Counter[str] = Counter()
     for answer in answers:
         truth = split.by_name[answer.name]
@@ -383,7 +383,7 @@ def _true_d(truth: Truth, point: str) -> FloatArray:
 
 
 def _row_angle(w: FloatArray, truth: Truth) -> float:
-    """The largest angle between true poses of a row and those of an even turn by ``w``, degrees."""
+    """Largest angle between the true pose of a row and a uniform rotation by ``w``, degrees."""
     times = np.linspace(0.0, 1.0 + truth.shutter.readout_ratio, _TIMES)
     estimated = so3.exp(times[:, None] * w)
     true = truth.motion.body_from_world(times).R
@@ -395,10 +395,10 @@ def _row_angle(w: FloatArray, truth: Truth) -> float:
 
 @lru_cache(maxsize=8)
 def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str, FloatArray]:
-    """As of ``Track.medians_at_bound``, of Gaussian errors in the first problems; a bound takes a solver's time.
+    """``Track.medians_at_bound`` for Gaussian errors in the first problems; a bound takes as long as a solver.
 
-    A method that names less data is compared with the bound of less; the readout ratio counts as known. The
-    direction is that of the body, and of a method of the left camera alone that of this camera.
+    A method that uses fewer inputs is compared with the bound for these; the readout ratio counts as known. The
+    direction is that of the body, or, if only the left camera is used, that of this camera.
     """
     bounds = list[Bound]()
     views: Views = "four-view" if seen == "links" else "pairs"
@@ -418,9 +418,10 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
 
 
 def smooth(motion: Motion) -> Motion:
-    """For a bound: of a spline with vibrations, the twist around which it vibrates, whose bound is within 5 %.
+    """Smooth motion for a bound: of a spline with vibrations, the twist around which it vibrates; the bound
+    differs by less than 5 %.
 
-    A derivative of a spline by its end takes a hundred times as long; that of a path through given poses has none.
+    The derivative of a spline by its end takes a hundred times as long, and a path through given poses has none.
     """
     return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion | TrajectoryMotion) else motion
 
@@ -433,10 +434,10 @@ def _median(axes: FloatArray, draws: FloatArray) -> float:
 
 
 def bound_text(split: Split, folder: Path) -> str:
-    """Motions that err as little as the data allow, as a submission.
+    """A submission of motions with errors as small as the data allow.
 
-    Errors are drawn from the Cramer-Rao bound of the matches without the outliers: what an unbiased method that
-    knows them, and uses all their links, could at best do.
+    The errors are drawn from the Cramer-Rao bound of the matches without the outliers: the best possible result of
+    an unbiased method that knows the outliers and uses all links.
     """
     words = "The true motion with errors drawn from the Cramer-Rao bound of all that is no outlier"
     return submission_text(method_header(split, BOUND, [ORACLE], words), _at_the_bound(split))
@@ -461,7 +462,7 @@ def _at_the_bound(split: Split) -> Iterator[dict[str, Any]]:
         }
 
 
-# Columns of the second protocols
+# Columns of protocols 2
 
 
 def nearness(over: FloatArray) -> FloatArray:
@@ -484,7 +485,7 @@ def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) ->
 
 
 def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """pose-2: areas under the curves of the rotation and of the direction, apart."""
+    """pose-2: areas under the curves of rotation and direction, separately."""
     for row, truth in zip(rows, split.truths, strict=True):
         R = max(0.0, 1.0 - row["e_R_deg"] / _AREAS_DEG[0])
         T = R if math.isnan(row["e_T_deg"]) else max(0.0, 1.0 - row["e_T_deg"] / _AREAS_DEG[1])
@@ -492,7 +493,7 @@ def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> N
 
 
 def _add_match_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """pose-own: how many own matches there are, and how many are right."""
+    """pose-own: number of own matches, and share of right ones."""
     own = read_own_matches(submission.folder, split.by_name)
     for row, truth in zip(rows, split.truths, strict=True):
         row |= match_scores(truth.rendered, None if own is None else own[truth.name])
@@ -508,14 +509,14 @@ class OwnMatchesTrack(MotionTrack):
     also_uses = ("images",)
 
     def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
-        """Solvers get the matches of ``sift-refined``, or those of ``features``."""
+        """Add the matches of ``sift-refined``, or of the matcher ``features``, to the inputs of solvers."""
         options = CorrectionOptions(features=load_features(features)) if features else CorrectionOptions()
         found = list[Problem]()
         for problem in read_inputs(inputs, self):
             images, scanning = read_frames(inputs, problem), problem.shutter.scanning
             try:
                 matches = find_matches_of_rig(images, problem.rig, scanning, options)
-            except RsbenchError:  # frames without texture: every solver fails such a problem, and says why
+            except RsbenchError:  # frames without texture: every solver fails, with this reason
                 matches = problem.correspondences
             found.append(replace(problem, correspondences=matches))
             step(problem.name)
@@ -543,7 +544,7 @@ def match_files(beside: Path) -> list[str]:
     """Names of the files of matches beside a file of answers.
 
     Raises:
-        RsbenchError: something else lies in the folder ``matches``, or a link.
+        RsbenchError: the folder ``matches`` contains something else, or is a link.
     """
     folder = beside / MATCHES
     if not os.path.lexists(folder):
@@ -559,11 +560,11 @@ def match_files(beside: Path) -> list[str]:
 
 
 def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, Correspondences] | None:
-    """Matches by the name of the problem; None where there is no folder of them.
+    """Own matches, by the name of the problem; None if there is no folder of matches.
 
     Raises:
-        RsbenchError: see ``match_files``; a file is no such table, names no problem, or has more matches of one
-            than its images have pixels.
+        RsbenchError: see ``match_files``; a file is no such table, names an unknown problem, or has more matches
+            of a problem than its images have pixels.
     """
     names = match_files(beside)
     tables = {name.removesuffix(".csv"): _table(beside / MATCHES / name, problems) for name in names}
@@ -598,9 +599,9 @@ def _table(path: Path, problems: Mapping[str, Truth]) -> pd.DataFrame:
 
 
 def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[str, float]:
-    """Of the matches of one problem, each counted once: their number, and the share that is right.
+    """Number of matches of one problem, each counted once, and the share of right ones.
 
-    NaN where the method hands in none at all; of a problem without matches nothing is right.
+    NaN if the method submits no matches at all; a problem without matches has no right ones.
     """
     if matches is None:
         return {"matches": math.nan, "matches_1px": math.nan}
@@ -614,9 +615,9 @@ def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[st
 
 
 def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray) -> FloatArray:
-    """Distances (n,), px, of the second ends of matches (n, 4) from their true places; infinite without one.
+    """Distances (n,), px, of the second ends of matches (n, 4) from their true places; infinite if there is none.
 
-    What has no surface is infinitely far.
+    A pixel that shows no surface is at infinity.
     """
     source, target = views
     disparity = np.nan_to_num(sequence.rig.disparity(sequence.depth("rs", *source))).astype(np.float32)
@@ -628,7 +629,7 @@ def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray)
     return np.where(np.isfinite(error) & np.isfinite(there), error, np.inf)
 
 
-# The track of motions from frames alone: a method finds its own matches, and may hand them in.
+# The track of motions from frames alone: a method finds its own matches, and may submit them.
 
 
 _SHOWN_TOO = tuple(
@@ -636,7 +637,7 @@ _SHOWN_TOO = tuple(
     for score in _MOTION
     if score.key in ("within", "flip", "failure", "e_R_deg", "e_T_deg", "e_s", "seconds")
 )
-"""Scores of the first protocols that the second ones show too."""
+"""Scores of protocols 1 that protocols 2 show too."""
 _SHARED: dict[str, Any] = {
     "error": "error_deg",
     "error_title": "max(e_R, e_T) in degrees",

@@ -1,10 +1,11 @@
 """Tracks whose answers are pictures: depth maps or corrected frames beside the file of answers.
 
-A job of running cards is one problem, for all cards whose answer is not current: matchers share the motion,
-correctors the motion and the depth. The seconds of an entry are those that it would have taken alone. Pictures are
-scored problem by problem too, because what is found of the truth serves all entries, each problem in one process
-of one thread. A score does not depend on the process or on other entries: none draws at random, or adds in an
-order of its own.
+A job of running cards is one problem for all cards without a current answer: matchers share the motion, correctors
+share motion and depth. The seconds of an entry are those that it would take without the others.
+
+Pictures are also scored problem by problem, in one process of one thread each, because all entries share
+intermediate results of the truth. A score depends neither on the process nor on other entries: nothing is random,
+and the order of sums is fixed.
 """
 
 from __future__ import annotations
@@ -56,44 +57,44 @@ from rsbench.storage.untrusted_files import read_bytes
 from rsbench.storage.work_folder import remove
 
 Draw = Callable[[TruePictures, Path], None]
-"""Writes the pictures of one problem into a folder."""
+"""Function that writes the pictures of one problem into a folder."""
 
 
 class CardChain(NamedTuple):
-    """The chain that a card runs in: a matcher, or a corrector with the default solver and matcher."""
+    """The chain in which a card runs: a matcher, or a corrector with the default solver and matcher."""
 
     options: CorrectionOptions
     entry: Entry[Any, Any]
-    """The component that the card names."""
+    """Name of the component of the card."""
     key: object
-    """What decides an answer."""
+    """Everything that determines an answer."""
     uses: tuple[str, ...]
     """Names of ``KNOWLEDGE``."""
     reference: str = ""
     """Where the method is published."""
 
     def choosing(self) -> CardChain:
-        """The same chain with the motion model that the matches prefer, as ``rsbench correct`` has it."""
+        """The same chain with the motion model chosen by the matches, as in ``rsbench correct``."""
         options = replace(self.options, motion_model=AUTO)
         return self._replace(options=options, key=options.key)
 
 
 class SharedWork:
-    """A problem whose pictures are made, and what several entries share."""
+    """A problem whose pictures are made, and the results that several entries share."""
 
     def __init__(self, problem: Problem, images: Images, requested: tuple[RequestedPicture, ...]) -> None:
         self.problem, self.images, self.requested = problem, images, requested
         self.known = Given()
-        """What was found of the rig's frames."""
+        """Estimates from the frames of the rig."""
         self.left: Given | None = None
-        """What the frames of the left camera alone determine; None: not estimated yet."""
+        """Estimates from the frames of the left camera only; None: not estimated yet."""
         self.spent: dict[str, float] = {}
         """Seconds by step."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureAnswer(Answer):
-    """An answer whose pictures lie beside the file."""
+    """An answer with pictures beside the file."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,27 +108,27 @@ class PictureTrack(Track):
     answers = PictureAnswer
     pictures = True
     part_score: ClassVar[str]
-    """Beginning of the columns of scores of parts of the pixels, see ``pictures.PARTINGS``."""
+    """Prefix of the columns of scores of parts of the pixels, see ``pictures.PARTINGS``."""
     part_title: ClassVar[str]
     """Their name in figures."""
 
-    # Of each kind of picture
+    # Methods of each kind of picture
 
     @abstractmethod
     def read(self, submission: Submission, pictures: TruePictures) -> Any:
-        """The pictures of an answer. Raises RsbenchError when one cannot be read."""
+        """Read the pictures of an answer. Raises RsbenchError if one cannot be read."""
 
     @abstractmethod
     def hints(self, drawn: Any, pictures: TruePictures, public: bool) -> Iterable[str]:
-        """Likely mistakes in what ``read`` returned; the truth is compared where it is public."""
+        """Likely mistakes in the result of ``read``; it is compared with the truth if that is public."""
 
     @abstractmethod
     def truth_of(self, pictures: TruePictures) -> Any:
-        """What ``scores_of`` needs of the truth of a problem."""
+        """The part of the truth of a problem that ``scores_of`` needs."""
 
     @abstractmethod
     def scores_of(self, true: Any, drawn: Any | None) -> Numbers:
-        """Scores of what ``read`` returned, by what ``truth_of`` returned; None: a failure."""
+        """Scores of the result of ``read`` (None: a failure) by that of ``truth_of``."""
 
     @abstractmethod
     def draw(self, pictures: TruePictures, place: Path) -> None:
@@ -135,11 +136,11 @@ class PictureTrack(Track):
 
     @abstractmethod
     def chain(self, card: str) -> CardChain:
-        """What a card runs in. Raises RsbenchError: no such card."""
+        """The chain of a card. Raises RsbenchError: no such card."""
 
     @abstractmethod
     def make(self, work: SharedWork, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
-        """Write the pictures of a chain into a new folder; the answer without its name."""
+        """Write the pictures of a chain into a new folder; returns the answer without its name."""
 
     # Predictions
 
@@ -164,7 +165,7 @@ class PictureTrack(Track):
                     yield f"{PICTURES}/{truth.name}/{found.name}"
 
     def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
-        """Each picture is read once; a secret truth is not looked at."""
+        """Check each picture, reading it once; a secret truth is not used."""
         answered = [answer.name for answer in submission.answers.values() if answer.success]
         folder = submission.folder / PICTURES
         faults, found = list(islice(_strange_files(folder, split, answered), most)), Counter[str]()
@@ -194,7 +195,7 @@ class PictureTrack(Track):
     def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
         problems = {problem.name: problem for problem in read_inputs(inputs, self)}
         isolation = Isolation(time_limit_s=limits.seconds, memory_mb=limits.memory_mb)
-        chains = dict[str, CorrectionOptions]()  # as long as this process
+        chains = dict[str, CorrectionOptions]()  # lives as long as this process
 
         def solve(job: Job) -> Iterator[list[dict[str, Any]]]:
             (name,) = job.problems
@@ -242,7 +243,7 @@ def _serve_rows(submissions: Sequence[Submission], split: Split) -> Callable[[st
 
 
 def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> list[Row | str]:
-    """For each submission the scores of its pictures, which are read here, or what is wrong with them.
+    """Scores of the pictures of each submission, which are read here, or the fault in them.
 
     Raises:
         RsbenchError: the truth has changed since the split was read.
@@ -264,7 +265,7 @@ def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> 
 
 
 def _strange_files(folder: Path, split: Split, answered: Collection[str]) -> Iterator[str]:
-    """A line for each thing below ``pictures`` that is no picture of an answer."""
+    """A line for each file below ``pictures`` that is no picture of an answer."""
     if folder.is_symlink() or not folder.is_dir():
         return
     for place in sorted(folder.iterdir()):

@@ -61,7 +61,7 @@ class TruePictures:
     """SHA-256 by path below the sequence's folder, for the inputs of methods and the ground truth."""
 
     def check(self) -> None:
-        """Raises RsbenchError when a file is not the one of the split."""
+        """Raises RsbenchError if a file is not the one of the split."""
         for name, digest in self.files.items():
             path = inside(self.sequence.folder, name)
             if not path.is_file() or sha256(path) != digest:
@@ -116,14 +116,14 @@ _COLOURS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 """Colour types of a PNG header."""
 _BYTES_OF_PIXEL = 16
 _BYTES = 1 << 16
-"""Largest size of a file: these bytes, and ``_BYTES_OF_PIXEL`` for each pixel."""
+"""Largest size of a file: this many bytes, plus ``_BYTES_OF_PIXEL`` for each pixel."""
 
 
 def find_picture(folder: Path, problem: str, picture: RequestedPicture) -> Path:
     """The file of a picture below ``pictures``.
 
     Raises:
-        RsbenchError: there is none, two of different kinds, or something that is no file of its own.
+        RsbenchError: there is none, there are two of different formats, or it is a link or no file.
     """
     paths = [folder / problem / f"{picture.stem}{suffix}" for suffix in picture.suffixes]
     found = [path for path in paths if os.path.lexists(path)]
@@ -136,12 +136,12 @@ def find_picture(folder: Path, problem: str, picture: RequestedPicture) -> Path:
 
 
 def copy_files(folder: Path, names: Iterable[str], target: Path) -> dict[str, str]:
-    """Copy what lies beside a file of answers; returns the SHA-256 of each, by its name.
+    """Copy the files beside a file of answers; returns the SHA-256 of each, by its name.
 
     Args:
-        folder: where they are.
+        folder: their folder.
         names: such as ``pictures/castle/left_1.exr``.
-        target: a folder, made if missing.
+        target: a folder, created if missing.
 
     Raises:
         RsbenchError: a name leads elsewhere, a file is missing, a link or too large, or cannot be written.
@@ -164,7 +164,7 @@ def file_bytes(folder: Path, name: str) -> bytes:
 
 
 def check_own(folder: Path, name: str) -> None:
-    """Raises RsbenchError unless a file, and each folder that leads to it, exists and is no link."""
+    """Raises RsbenchError unless a file and all folders that lead to it exist and are no links."""
     path = folder
     *folders, file = name.split("/")
     for part, kind, is_kind in (
@@ -177,15 +177,15 @@ def check_own(folder: Path, name: str) -> None:
 
 
 def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | None) -> NDArray[np.float32]:
-    """Depth (H, W), m, 0 unknown, of an answer: an EXR file or a PNG of 16 bits.
+    """Depth (H, W), m, 0 where unknown, of an answer: an EXR file or a PNG of 16 bits.
 
     Args:
         folder: ``pictures`` beside the file of answers.
         pictures: of the problem.
-        png_unit_m: metres of one step of a PNG.
+        png_unit_m: depth in metres of one grey level of a PNG.
 
     Raises:
-        RsbenchError: as ``find_picture``; the file is of another kind, or has values that are no depth.
+        RsbenchError: as ``find_picture``; the file has another format, or values that are no depth.
     """
     (picture,) = pictures.requested
     path, size = find_picture(folder, pictures.sequence.name, picture), pictures.size
@@ -210,10 +210,11 @@ def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | 
 def read_answer_frame(
     folder: Path, pictures: TruePictures, picture: RequestedPicture
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A frame (H, W, 3) RGB of an answer, black where nothing was drawn, and where alpha is above 0 (H, W).
+    """A frame (H, W, 3) RGB of an answer, black where nothing was drawn, and the mask (H, W) where alpha is above
+    0.
 
     Raises:
-        RsbenchError: as ``find_picture``; the file is no PNG of 8 bits in colour of the camera's size.
+        RsbenchError: as ``find_picture``; the file is no colour PNG of 8 bits of the camera's size.
     """
     pixels = _read_png(find_picture(folder, pictures.sequence.name, picture), pictures.size, 8, ("RGB", "RGBA"))
     if pixels.shape[2] == 3:
@@ -223,7 +224,7 @@ def read_answer_frame(
 
 
 def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:
-    """A file that ``read_answer_frame`` reads: without alpha where all was drawn."""
+    """Content of a file that ``read_answer_frame`` reads, without alpha if all pixels were drawn."""
     alpha = [] if np.all(drawn) else [np.where(drawn, np.uint8(255), np.uint8(0))]
     ok, data = cv2.imencode(".png", np.dstack([image[..., ::-1], *alpha]))
     if not ok:
@@ -232,7 +233,7 @@ def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:
 
 
 def _check_bytes(path: Path, size: tuple[int, int]) -> bytes:
-    """The content of a file that is no larger than a picture of this size can be."""
+    """The content of a file, if it is no larger than a picture of this size can be."""
     return read_bytes(path, _BYTES + _BYTES_OF_PIXEL * size[0] * size[1])
 
 
@@ -253,7 +254,7 @@ def _read_png(path: Path, size: tuple[int, int], bits: int, colours: tuple[str, 
             if image.size != size:  # a second header
                 raise ValueError(f"its headers differ: {image.size[0]} x {image.size[1]} pixels")
             pixels = np.asarray(image)
-    except Exception as error:  # Pillow raises what a damaged file makes it stumble over
+    except Exception as error:  # Pillow raises various exceptions for damaged files
         raise RsbenchError(f"{path}: is a damaged PNG file: {' '.join(str(error).split())[:100]}") from error
     if pixels.shape[:2] != (height, width) or pixels.ndim != (2 if colours == ("grey",) else 3):
         raise RsbenchError(f"{path}: is {is_now}, and holds something else")
@@ -308,7 +309,7 @@ def texture(image: NDArray[np.uint8]) -> FloatArray:
 
 
 Parts = dict[str, BoolArray]
-"""Pixels (H, W) of each part, by column."""
+"""Masks (H, W) of the parts, by column."""
 
 
 def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolArray) -> Parts:
@@ -340,7 +341,7 @@ def rms_by_part(
 
 
 def shares(parts: Parts, wrong: BoolArray) -> dict[str, float]:
-    """Share of ``wrong`` (H, W) of each part, by column; NaN for one without pixels."""
+    """Share of ``wrong`` (H, W) pixels in each part, by column; NaN for a part without pixels."""
     return {name: float(np.mean(wrong[part])) if np.any(part) else math.nan for name, part in parts.items()}
 
 

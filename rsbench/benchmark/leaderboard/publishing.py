@@ -1,7 +1,7 @@
-"""Secret test splits of rendered frames: inputs for everybody, a commitment, and the truth from the secret text.
+"""Secret test splits of rendered frames: public inputs, a commitment, and the truth from the secret text.
 
-Announced are a hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset. So
-whoever gets the text afterwards can see that it is the announced one, that it makes the same motions, and, by
+A hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset are announced.
+Whoever gets the text afterwards can verify that it is the announced one, that it gives the same motions, and, by
 rendering again, the same frames and depth.
 """
 
@@ -35,7 +35,7 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Announcement:
-    """What is published of a secret split before anybody submits."""
+    """The information on a secret split that is published before anybody submits."""
 
     format: int
     card: str
@@ -49,22 +49,22 @@ class Announcement:
     truth: str
     """Hash of the names and hashes of all files of the keeper's dataset."""
     made_by: dict[str, str]
-    """Versions that rendered it: others may round otherwise."""
+    """Versions that rendered it: other versions may round differently."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the public files."""
 
 
 def secret_of(track: Track, text: Secret) -> Secret:
-    """What a split is drawn from. A track of the readout ratio has a split of its own,
-    because the inputs of other tracks reveal the ratio."""
+    """Text from which a split is drawn. A track of the readout ratio has its own split, because the inputs of
+    other tracks reveal the ratio."""
     return text if track.gives_readout else Secret(text.digest("track", track.name).hex())
 
 
 def drawn_split(track: Track, card: str, text: Secret) -> Split:
-    """The split that ``publish`` makes, from the text alone; nothing is rendered.
+    """The split that ``publish`` makes, from the text only, without rendering.
 
     Raises:
-        RsbenchError: as ``secret_card``; or the truth of the track has to be rendered.
+        RsbenchError: as ``secret_card``; or the truth of the track must be rendered.
     """
     if track.pictures or track.inputs.whole:
         raise RsbenchError(f"track {track.name!r}: its truth is rendered; name the keeper's folder with --keep")
@@ -74,7 +74,7 @@ def drawn_split(track: Track, card: str, text: Secret) -> Split:
 
 
 def _sequences(card: DatasetCard) -> list[Sequence]:
-    """The sequences of a card as they would be read after rendering."""
+    """The sequences of a card, as read after rendering."""
     names = {each.scene for each in card.sequence}
     scenes = {name: read_scene_card(card_path("scenes", name))[0].name for name in names}
     manifests = [card.manifest_of(each) | {"scene": {"name": scenes[each.scene]}} for each in card.sequence]
@@ -91,22 +91,23 @@ def publish(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Announcement:
-    """Render a secret split into the keeper's folder, and write its inputs and the announcement into another.
+    """Render a secret split into the keeper's folder, and write its inputs and the announcement into another one.
 
-    Where ``out`` holds an announcement already, what is made must be what was announced, to the last byte: that is
-    the proof.
+    If ``out`` already has an announcement, the result must equal the announced one to the last byte: that is the
+    proof.
 
     Args:
-        track: of frames.
+        track: a track of frames.
         card: name or path of a dataset card.
         text: the secret.
-        keep: gets the scene cards and the dataset, which ``verify`` checks; an interrupted run resumes there.
-        out: gets what everybody may see.
+        keep: folder for the scene cards and the dataset, which ``verify`` checks; an interrupted run resumes
+            there.
+        out: folder for the public files.
         workers: processes.
-        progress: as of ``generate_dataset``.
+        progress: as for ``generate_dataset``.
 
     Raises:
-        RsbenchError: a card that hides nothing; a folder with something else; another split was announced.
+        RsbenchError: the card hides nothing; a folder contains something else; another split was announced.
     """
     secret, data = secret_of(track, text), keep / DATA
     drawn = secret_card(card, secret, keep / SCENES)
@@ -132,7 +133,7 @@ def publish(
 
 
 def _announcement(split: Split, card: str, text: Secret, data: Path) -> Announcement:
-    """All but the public files."""
+    """The announcement without the public files."""
     first, path = read_dataset_manifest(data).sequences[0], card_path("datasets", card)
     return Announcement(
         format=FORMAT,
@@ -148,16 +149,16 @@ def _announcement(split: Split, card: str, text: Secret, data: Path) -> Announce
 
 
 def truth_hash(data: Path) -> str:
-    """SHA-256 of the names and hashes of all files of a dataset, which do not depend on where it lies."""
+    """SHA-256 of the names and hashes of all files of a dataset, independent of its folder."""
     listed = {name: file.sha256 for name, file in read_dataset_manifest(data).files.items()}
     return hashlib.sha256(json.dumps(listed, sort_keys=True).encode()).hexdigest()
 
 
 def read_announcement(folder: Path) -> Announcement:
-    """The announcement in a public folder.
+    """Read the announcement in a public folder.
 
     Raises:
-        RsbenchError: it is not there, or damaged.
+        RsbenchError: it is missing, or damaged.
     """
     path = folder / ANNOUNCEMENT
     if not path.is_file():
@@ -171,10 +172,10 @@ def read_announcement(folder: Path) -> Announcement:
 
 
 def announced_split(announced: Announcement, track: Track, card: str, text: Secret, keep: Path | None) -> Split:
-    """The truth of an announced split: drawn again, or that of the keeper's folder.
+    """The truth of an announced split, drawn again or from the keeper's folder.
 
     Raises:
-        RsbenchError: the text, the split or the keeper's files are not the announced ones.
+        RsbenchError: the text, the split or the keeper's files differ from the announced ones.
     """
     if text.commitment != announced.commitment:
         raise RsbenchError("--seed-file: its text is not the announced one; take the file that publish was given")
@@ -187,10 +188,10 @@ def announced_split(announced: Announcement, track: Track, card: str, text: Secr
 
 
 def _check_same(announced: Announcement, found: Announcement, *names: str) -> None:
-    """Raises RsbenchError where what was found is not what was announced."""
+    """Raises RsbenchError if a value differs from the announced one."""
     for name in names:
         if getattr(announced, name) != getattr(found, name):
             raise RsbenchError(
-                f"{ANNOUNCEMENT}: {name}: what is here is not what was announced: another text, card or dataset, "
+                f"{ANNOUNCEMENT}: {name}: differs from the announced one: another text, card or dataset, "
                 f"or other versions than {announced.made_by}"
             )

@@ -43,11 +43,11 @@ AUC_READOUT = {"auc_r10": 0.1, "auc_r02": 0.02}
 """Thresholds of the areas under the curve of the error, by the name of the column."""
 CONSTANT = "constant"
 RIGHT = 0.1
-"""Error of a readout ratio that counts as right."""
+"""Largest error of a readout ratio that counts as right."""
 _MAX_SIGMA = 0.2
-"""Largest standard deviation of a ratio that rsbench's entries answer with."""
+"""Largest standard deviation of a ratio with which rsbench's entries answer."""
 _WORST = 1.0
-"""Error of a failure: between the two ends of what a ratio can be."""
+"""Error of a failure: the largest possible error of a ratio."""
 _READOUT = (
     *(
         Score(
@@ -72,7 +72,7 @@ class _Readout(Answer):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.success and self.readout_ratio is None:
-            raise ValueError("readout_ratio: a success needs it; a failure says success = false")
+            raise ValueError("readout_ratio: a success needs it; for a failure give success = false")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +98,8 @@ class ReadoutTrack(SolverTrack):
         super().check_entry(entry)
 
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        """The readout ratio that explains the matches best; the solver is rsbench's own, without a ``runner``."""
+        """The readout ratio that explains the matches best; the solver is one of rsbench's, so no ``runner`` is
+        needed."""
         solver = entry.solver
         assert isinstance(solver, RefinedSolver)
         matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
@@ -155,17 +156,17 @@ def crps(error: float, sigma: float) -> float:
 
 
 def spread_of(ratios: Sequence[float]) -> float:
-    """The mean CRPS of the distribution of all ``ratios`` for each of them: half of their mean distance.
+    """Mean CRPS of the distribution of all ``ratios`` over these ratios: half of their mean distance.
 
-    No distribution that is stated for all of them alike has a lower mean. A single ratio has no spread: its value
-    is that of ratios even from 0 to 1.
+    No single distribution that is stated for all of them has a lower mean. If all ratios are equal, the value is
+    that of ratios uniform in 0 to 1.
     """
     known = np.array(ratios)
     return 0.5 * float(np.mean(np.abs(known[:, None] - known))) or 1.0 / 6.0
 
 
 def best_constant(ratios: Sequence[float]) -> float:
-    """The guess with the largest AUC@0.1 when stated for all: a sum of tents is largest at the top of one."""
+    """The constant guess with the largest AUC@0.1: a sum of tents has its maximum at the top of one of them."""
     known = np.array(ratios)
     tents = np.clip(1.0 - np.abs(known[:, None] - known) / AUC_READOUT["auc_r10"], 0.0, None)
     return float(known[np.argmax(np.sum(tents, axis=1))])

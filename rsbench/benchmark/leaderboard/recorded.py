@@ -32,7 +32,7 @@ OF_A_RECORDING = 60
 _SCOPE = ("leaderboard", "points-recorded")
 _PERIOD_S = 1.0 / 30.0
 _LASTS = 2.0
-"""Frame periods from the first row of frame 0 to the last possible time of a row of frame 1."""
+"""Length of a window, frame periods: from the first row of frame 0 to the latest possible row of frame 1."""
 _READOUT = (0.5, 1.0)
 
 
@@ -87,7 +87,7 @@ def _order(folder: Path, seed: int) -> NDArray[Any]:
 
 
 def _window(folder: Path, seed: int, number: int) -> tuple[str, int]:
-    """Name of the recording of a problem, and which of its equal parts holds the window."""
+    """Name of the recording of a problem, and index of the part of it that contains the window."""
     names = recordings_in(folder)
     part, which = divmod(int(_order(folder, seed)[number]), len(names))
     return names[which], part
@@ -114,7 +114,7 @@ def _motion(folder: Path, seed: int, number: int) -> Motion:
 
 @lru_cache(maxsize=512)
 def _setting(folder: Path, seed: int, number: int) -> Setting:
-    """The sizes of w and d are those of the window; its motion is not made by the setting."""
+    """Setting of a problem with the sizes of w and d of the window; the motion itself is not made from it."""
     kind = DEVICES[_window(folder, seed, number)[0].partition("-")[0]]
     motion, rng = _motion(folder, seed, number), generator(seed, *_SCOPE, "setting", number)
     return Setting(

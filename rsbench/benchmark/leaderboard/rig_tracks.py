@@ -1,9 +1,9 @@
-"""Tracks of rigs as they are: any two cameras, with the true calibration and with a loose one.
+"""Tracks of real rigs: any two cameras, with the true calibration and with a loose one.
 
-Each sequence is two problems of the same frames. In one the given calibration is the true one. In the other the
-right camera is turned, and focal lengths and principal points of both cameras are off, each by a fixed size in a
-direction that the name draws. The truth is the motion of the left camera, in its own axes, which no calibration
-moves.
+Each sequence gives two problems with the same frames. In one the given calibration is the true one. In the other
+the right camera is rotated, and focal lengths and principal points of both cameras have errors, each of a fixed
+size in a direction that is drawn by the name. The truth is the motion of the left camera in its own axes, which do
+not depend on the calibration.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_pairs
 
 LOOSE = "-loose"
-"""End of the name of a problem whose given calibration is not the true one."""
+"""Suffix of the name of a problem whose given calibration is not the true one."""
 TURN_DEG = 0.2
-"""Angle by which the right camera of a loose calibration is turned, about a drawn axis; its place stays."""
+"""Angle by which a loose calibration rotates the right camera about a drawn axis; its position is right."""
 FOCAL = 0.005
-"""Share by which the focal length of each camera is too long or too short."""
+"""Relative error of the focal length of each camera."""
 CENTRE_PX = 0.5
 """Distance of the principal point of each camera from the true one, in a drawn direction."""
 
 
 def loose_rig(rig: StereoRig, rng: np.random.Generator) -> StereoRig:
-    """A rig as a loose calibration has it; the centres of both cameras in the left one's axes are right."""
+    """The rig of a loose calibration; the positions of both cameras in the left one's axes are right."""
     left, right = (_loose_camera(rig.sensor(side), rng) for side in SIDES)
     R, t = rig.right_from_left
     axis = rng.standard_normal(3)
@@ -55,7 +55,7 @@ def _loose_camera(camera: PinholeCamera, rng: np.random.Generator) -> PinholeCam
 
 @dataclass(frozen=True)
 class RigFrames(Frames):
-    """Each two frames of the sequences of a dataset, with the true calibration and with a loose one."""
+    """Pairs of frames of the sequences of a dataset, with the true calibration and with a loose one."""
 
     any_rig: bool = True
 
@@ -69,7 +69,7 @@ class RigFrames(Frames):
         return [each for both in zip(pairs, loose, strict=True) for each in both]
 
     def pairs(self, track: Track, folder: Path) -> list[Rendered]:
-        """Pairs of frames; where pictures of the left camera are scored, only rigs whose left camera rolls."""
+        """Pairs of frames; if pictures of the left camera are scored, only of rigs with a rolling left camera."""
         found = read_pairs(folder)
         return [each for each in found if each.shutter.ratio_of("left") > 0.0] if track.pictures else found
 
@@ -94,16 +94,16 @@ def _both(truth: Truth) -> tuple[Truth, Truth]:
 def left_camera_motion(
     w: FloatArray, d: FloatArray, point: str, given: StereoRig, wanted: StereoRig
 ) -> tuple[FloatArray, FloatArray]:
-    """The motion of the left camera in the body's axes of ``wanted``, from one in those of ``given``.
+    """Convert a motion of the left camera from the body's axes of one rig to those of ``wanted``.
 
-    Both rigs have one left camera, whose own axes no calibration moves.
+    Both rigs have the same left camera, whose own axes do not depend on the calibration.
 
     Args:
         w: rotation vector (3,) of one frame period.
         d: translation (3,) of ``point``.
         point: ``body`` or ``left``.
         given: the rig in whose axes w and d are.
-        wanted: the other one.
+        wanted: the other rig.
     """
     turn = wanted.own("left").R.T @ given.own("left").R
     left = d if point == "left" else translation_of_offset(w, d, given.offset("left"))
@@ -112,7 +112,7 @@ def left_camera_motion(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigMotionTrack(MotionTrack):
-    """The motion of a rig of any two cameras: scored as that of its left camera, in that camera's axes."""
+    """The motion of a rig of any two cameras, scored as that of its left camera in that camera's axes."""
 
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:
         w, d = left_camera_motion(truth.motion.w, truth.motion.d, "body", truth.rig, truth.given_rig or truth.rig)

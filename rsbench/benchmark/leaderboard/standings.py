@@ -1,11 +1,11 @@
 """Ranks of methods: confidence intervals of mean scores over scenes, ties, and ranks with intervals.
 
-Scores of one scene are not independent, so scenes count, each alike: the score of an entry is the mean over scenes
-of its mean over the problems there, and its interval is Student's, of the scenes' means. For simulated problems
-each is a scene of its own. Two entries are compared by their differences on the same scenes, all pairs corrected
-by Holm's method (Scandinavian Journal of Statistics 1979); an entry's rank lies, with the same confidence for all
-entries at once, between the number of those that are better and of those that are worse (Mogstad, Romano, Shaikh,
-Wilhelm, Review of Economic Studies 2024).
+Scores within a scene are not independent. The score of an entry is therefore the mean over scenes of its mean over
+the problems of a scene, and its interval is Student's, from the means of the scenes. Each simulated problem is a
+scene of its own. Two entries are compared by their differences on the same scenes; Holm's method (Scandinavian
+Journal of Statistics 1979) corrects for all pairs. The rank of an entry lies, with the same confidence for all
+entries at once, between the number of better entries and that of worse ones (Mogstad, Romano, Shaikh, Wilhelm,
+Review of Economic Studies 2024).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ROUNDING = 1e-12
 
 
 class Rank(NamedTuple):
-    """A place, counted from 1, and the range of places that the data do not exclude."""
+    """Rank, counted from 1, and the range of ranks that the data do not exclude."""
 
     place: int
     low: int
@@ -40,7 +40,7 @@ class Rank(NamedTuple):
 
 
 class Place(NamedTuple):
-    """An entry's rank among the entries that use no more than it does; none where it is not ranked."""
+    """Rank of an entry among those that use no more inputs; None if it is not ranked."""
 
     rank: Rank | None = None
     peers: int = 0
@@ -50,7 +50,7 @@ class Place(NamedTuple):
 
 
 def better(means: FloatArray) -> NDArray[np.bool_]:
-    """Whether entry i is better than entry j (n, n): of means (n, k) of entries and scenes, higher is better.
+    """(n, n) whether entry i is better than entry j, from means (n, k) of entries in scenes; higher is better.
 
     All comparisons hold at once with ``statistics.COVERAGE``.
     """
@@ -74,7 +74,7 @@ def _chances(differences: FloatArray) -> FloatArray:
 
 
 def _holm(chances: FloatArray) -> NDArray[np.bool_]:
-    """Which hypotheses are rejected at a family-wise error of 1 - COVERAGE, by p value (n,)."""
+    """(n,) whether a hypothesis with the p value (n,) is rejected at a family-wise error of 1 - COVERAGE."""
     order = np.argsort(chances, kind="stable")
     limits = (1.0 - COVERAGE) / (len(chances) - np.arange(len(chances)))
     fails = np.flatnonzero(chances[order] > limits)
@@ -84,12 +84,12 @@ def _holm(chances: FloatArray) -> NDArray[np.bool_]:
 
 
 def ranks(scores: FloatArray, beats: NDArray[np.bool_], uses: Sequence[frozenset[str]]) -> list[Rank]:
-    """The rank of each entry among those that use no more than it does.
+    """Rank of each entry among those that use no more inputs.
 
     Args:
         scores: (n,) mean scores, higher is better.
-        beats: of ``better``.
-        uses: what each entry uses.
+        beats: result of ``better``.
+        uses: the inputs of each entry.
     """
     found = []
     for i in range(len(scores)):
@@ -111,11 +111,11 @@ def ties(beats: NDArray[np.bool_], i: int) -> list[Any]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Standing:
-    """An entry's line."""
+    """A row of a table: an entry with its rank and scores."""
 
     scored: Scored
     rank: Rank | None
-    """Rank among the entries that use no more; None for oracles and entries in doubt."""
+    """Rank among the entries that use no more inputs; None for oracles and entries in doubt."""
     peers: int
     """Number of these entries, itself included."""
     ties: tuple[str, ...]
@@ -127,13 +127,14 @@ class Standing:
     calibration: Calibration | None
     """Calibration of the covariances that it states."""
     log_rank: Rank | None
-    """Rank by the log score among the entries that have one and use no more; None without one."""
+    """Rank by the log score among the entries that have one and use no more inputs; None if it has no log
+    score."""
     log_peers: int
     """Number of these entries."""
     parts: dict[str, tuple[float, float, float]]
-    """The primary score in each part into which its track divides the problems, by name."""
+    """The primary score in each part of the problems, by the name of the part."""
     worst: dict[str, tuple[str, float]]
-    """The problem of each part with the largest error, and that error; "all" where there are no parts."""
+    """The problem with the largest error in each part, and that error; the key is "all" if there are no parts."""
 
     @property
     def track(self) -> Track:
@@ -149,7 +150,7 @@ class Standing:
 
     @property
     def stated_words(self) -> dict[str, str]:
-        """How often its ellipsoids of 95 % hold the truth, its log score, and its rank by that, by column."""
+        """Text by column: coverage of its 95 % ellipsoids, its log score, and its rank by that."""
         found = self.calibration
         words = {"in 95 %": format_interval(*found.covers[-1]) if found else "-"}
         if "log_score" in self.scored.scores:
@@ -159,7 +160,7 @@ class Standing:
 
     @property
     def assumes(self) -> str:
-        """The motion model that the method names; nothing of an oracle."""
+        """The motion model that the method states; empty for an oracle."""
         return "" if ORACLE in self.scored.header.uses else self.scored.header.motion_model
 
     @property
@@ -169,7 +170,7 @@ class Standing:
 
     @property
     def uses(self) -> str:
-        """What it uses, in the order of ``KNOWLEDGE``."""
+        """Its inputs, in the order of ``KNOWLEDGE``."""
         return " + ".join(name for name in KNOWLEDGE if name in self.scored.header.uses)
 
 
@@ -178,11 +179,11 @@ def _rank_words(rank: Rank, peers: int) -> str:
 
 
 def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None) -> list[Standing]:
-    """Lines of a table: those that use least first, of equal ones the better first, oracles last.
+    """Rows of a table, sorted by the inputs (fewest first) and then by the score; oracles are last.
 
     Args:
         entries: of one split.
-        at_most: leave out entries that use something else.
+        at_most: leave out entries that use other inputs.
 
     Raises:
         RsbenchError: the entries are not scored on the same problems.
@@ -197,7 +198,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
                 f"{each.folder}: is scored on other problems than {kept[0].folder.name}; rescore the board"
             )
     ranked = [each for each in kept if ORACLE not in each.header.uses and not each.doubt]
-    # Those that state a covariance somewhere have a log score.
+    # Entries that state any covariance have a log score.
     stating = [each for each in ranked if "log_score" in each.scores and each.scores["nees"].notna().any()]
     scenes, primary = list(problems["scene"]), track_of_id(kept[0].header.protocol).primary
     places = _ranked(ranked, primary.key, primary.sign, scenes)
@@ -207,7 +208,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
 
 
 def _ranked(entries: Sequence[Scored], column: str, sign: float, scenes: Sequence[str]) -> dict[Scored, Place]:
-    """Places of entries by a column."""
+    """Ranks of entries by a column."""
     if not entries:
         return {}
     uses = [frozenset(each.header.uses) for each in entries]
@@ -274,7 +275,7 @@ def _median(values: FloatArray) -> float:
 
 
 def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
-    """The numbers of a table, as its CSV file holds them; of a secret split without the ``worst`` problems."""
+    """The numbers of a table, as in its CSV file; for a secret split without the ``worst`` problems."""
     rows = []
     for line in lines:
         header = line.scored.header

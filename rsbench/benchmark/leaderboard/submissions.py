@@ -28,7 +28,7 @@ _OF_SOLVE = (
     *("solver", "d_unit", "d_body", "motion_model", "shutter", "assumes", "inliers", "matches", "stereo_alone"),
     *("threshold_px", "iterations", "noise_px", "inlier_indices", "model_choice"),
 )
-"""Further keys of an answer of ``rsbench solve --json``, which are ignored where the track does not read them."""
+"""Further keys of an answer of ``rsbench solve --json``, which are ignored if the track does not use them."""
 _NAMED = 3
 
 
@@ -41,11 +41,11 @@ class Findings:
     faults: tuple[str, ...]
     """One line each, with file, line, field, value and remedy."""
     notes: tuple[str, ...]
-    """Likely mistakes: the file is scored as it is."""
+    """Likely mistakes; they do not prevent scoring."""
 
 
 def read_submission(path: Path, split: Split) -> Submission:
-    """A file of predictions.
+    """Read a file of predictions.
 
     Raises:
         RsbenchError: the file has faults; the message has the first one and their number.
@@ -96,7 +96,7 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
 
 
 def failure_reasons(path: Path) -> str:
-    """How many answers of a file are failures and why, the most frequent reasons first; empty where none is."""
+    """Number of failures in a file, and their reasons, the most frequent first; empty if there are none."""
     answers = [parse_json(text, f"{path}:{number}") for number, text in _lines(path)][1:]
     reasons = Counter(str(each.get("reason", "")) for each in answers if each.get("success") is False)
     if not reasons:
@@ -191,12 +191,12 @@ def _few(names: list[str], total: int) -> str:
 
 
 def submission_text(header: Mapping[str, Any], answers: Iterable[Mapping[str, Any]]) -> str:
-    """JSON lines that ``check_submission`` reads."""
+    """JSON lines in the format of ``check_submission``."""
     return "".join(json.dumps(line, allow_nan=False) + "\n" for line in (header, *answers))
 
 
 def method_header(split: Split, method: str, uses: Sequence[str], description: str) -> dict[str, Any]:
-    """The first line of predictions that rsbench makes."""
+    """The header of predictions by rsbench."""
     return {
         "protocol": split.track.id,
         "split": split.name,

@@ -110,21 +110,21 @@ class Limits(NamedTuple):
     memory_mb: float | None = None
 
 
-# What a file of predictions holds
+# Contents of a file of predictions
 
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """The first line: which split it is about, what the method is and what it uses."""
+    """The first line of a file of predictions: the split, the method and its inputs."""
 
     protocol: str
     """Identifier of the track's protocol, as ``rsbench leaderboard template`` prints it."""
     split: str
-    """Name of the split that was solved."""
+    """Name of the split that the predictions are for."""
     method: str
     """Name of the method on the board: letters, digits, dots, dashes and underscores."""
     uses: tuple[str, ...]
-    """What the method takes of what its protocol allows."""
+    """Inputs that the method uses, of those that the protocol gives."""
     version: str = ""
     """Version of the method."""
     description: str = ""
@@ -138,14 +138,14 @@ class Header:
     licence: str = ""
     """Licence of the code."""
     hardware: str = ""
-    """Machine on which the seconds were measured."""
+    """Machine on which the run times were measured."""
     tuned_on: str = ""
-    """Data by which its parameters were chosen."""
+    """Data with which its parameters were chosen."""
     motion_model: Literal["linear", "twist", "inertial", "accelerated", "spline", "none", "chosen"] = "linear"
-    """Motion model that the method assumes between the rows: ``none`` of a global shutter, ``chosen`` where the
-    matches of a problem decide."""
+    """Motion model that the method assumes between the rows: ``none`` for a global shutter, ``chosen`` if it is
+    selected by the matches of each problem."""
     png_unit_m: float | None = None
-    """Metres of one step of depth maps that are PNG files, above 0 and at most 1."""
+    """Depth, metres, of one grey level of depth maps that are PNG files, above 0 and at most 1."""
 
     def __post_init__(self) -> None:
         try:
@@ -186,11 +186,11 @@ class Answer:
     reference_point: Literal["body", "left"] = "body"
     """Point whose translation ``d`` is: the middle of the baseline or the left camera."""
     direction_known: bool = True
-    """Whether the direction of ``d`` means anything."""
+    """Whether the direction of ``d`` is determined."""
     readout_ratio: float | None = None
-    """Estimated readout ratio, 0 to 1, on tracks of the readout ratio, which ask for no motion."""
+    """Estimated readout ratio, 0 to 1, on tracks of the readout ratio, which request no motion."""
     readout_sigma: float | None = None
-    """Standard deviation of ``readout_ratio``, where it is stated."""
+    """Standard deviation of ``readout_ratio``, if it is stated."""
     covariance: tuple[tuple[float, ...], ...] | None = None
     """6 x 6 covariance of ``w`` and ``d``, symmetric."""
     seconds: float | None = None
@@ -291,7 +291,7 @@ class Split:
     seed: int = PUBLIC_SEED
     """Seed of simulated problems."""
     draws: Any = None
-    """How simulated problems are drawn, a ``splits.Draws``; None of rendered frames."""
+    """Distribution of simulated problems, a ``splits.Draws``; None for rendered frames."""
 
     @cached_property
     def fingerprint(self) -> str:
@@ -330,7 +330,9 @@ def _identity(truth: Truth) -> dict[str, Any]:
         name=truth.name, correspondences=Correspondences(), rig=truth.rig, known_shutter=truth.shutter
     )
     motion = truth.motion
-    if isinstance(motion, LaterMotion):  # two frames of a longer sequence: its whole motion, and where they begin
+    if isinstance(
+        motion, LaterMotion
+    ):  # two frames of a longer sequence: its motion, and the time of the first one
         moved = {"later": motion_record(motion.motion), "start": motion.start}
     else:
         moved = motion_record(motion)
@@ -433,17 +435,17 @@ class Track(ABC):
     unknowns: int = 6
     """Degrees of freedom of the column ``nees``, where answers state deviations."""
     oracles: tuple[tuple[str, Callable[[Split, Path], str]], ...] = ()
-    """Entries that know the truth, beside the truth itself: name, and what draws their pictures into a folder, if
-    any, and returns their file of answers."""
+    """Entries that use the truth, in addition to the truth itself: for each, its name and a function that writes
+    its pictures into a folder, if there are any, and returns its file of answers."""
     smoke: tuple[str, ...] = ()
-    """Entries of a smoke run: rsbench's defaults, the strongest that cost little, and oracles."""
+    """Entries of a smoke run: rsbench's defaults, fast strong methods, and oracles."""
     smoke_metrics: tuple[str, ...] = ()
     """Columns of scores that a smoke run compares."""
     answers: ClassVar[type[Answer]] = Answer
-    """What a line of a file of predictions must hold."""
+    """Type of a line of a file of predictions."""
     pictures: ClassVar[bool] = False
-    """Whether an answer is pictures beside the file of answers. Cards that make them share intermediate results of
-    a problem, so that one job runs all of them."""
+    """Whether an answer consists of pictures in addition to the file of answers. Cards that make them share
+    intermediate results of a problem, so that one job runs all of them."""
     own_matches: ClassVar[bool] = False
     """Whether methods find matches themselves, and may submit them with motions."""
     at_rows: ClassVar[bool] = False
@@ -452,15 +454,16 @@ class Track(ABC):
     # Inputs
 
     def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
-        """The problems with their truth, of a dataset or a seed.
+        """The problems of a dataset or a seed, with their truth.
 
         Raises:
-            RsbenchError: an option that the track does not take, or misses; the dataset or the seed is at fault.
+            RsbenchError: an option that the track does not take is given, or a required one is missing; the
+                dataset or the seed is invalid.
         """
         return self.inputs.split(self, data, seed_file, secret)
 
     def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        """What a method gets of the first ``count``, without images."""
+        """The first ``count`` problems as a method gets them, without images."""
         return self.inputs.problems(self, data, seed_file, count)
 
     @property
@@ -481,11 +484,11 @@ class Track(ABC):
 
     @abstractmethod
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:
-        """The truth as an answer, without its name and its pictures."""
+        """The truth as an answer, without its name and pictures."""
 
     @abstractmethod
     def example(self, split: Split) -> Mapping[str, Any]:
-        """An answer to the first problem for a template, without its name and its pictures."""
+        """An example of an answer to the first problem for a template, without its name and pictures."""
 
     def draw_truth(self, split: Split, folder: Path) -> None:  # noqa: B027  most tracks have none
         """Write the pictures of the truth, if any."""
@@ -498,7 +501,7 @@ class Track(ABC):
         return ()
 
     def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
-        """Faults of answers and their files, ``most`` at most, and with ``hints`` likely mistakes."""
+        """Faults of answers and their files, at most ``most``, and with ``hints`` also likely mistakes."""
         return [], []
 
     def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
@@ -509,25 +512,26 @@ class Track(ABC):
 
     @abstractmethod
     def runnable(self, card: str) -> Runnable:
-        """What a card names. Raises RsbenchError: the card is wrong, or does not fit the track."""
+        """The component of a card. Raises RsbenchError: the card is invalid, or does not fit the track."""
 
     def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
-        """Runnables by their cards; errors as ``runnable``."""
+        """Runnables by their cards; errors as for ``runnable``."""
         return {card: self.runnable(card) for card in cards}
 
     def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
-        """The folder of the inputs that cards get: made in ``work`` where they need more than was exported."""
+        """Folder of the inputs of cards; a new one in ``work`` if they need more than was exported."""
         return inputs
 
     def copy_files(self, inputs: Path, folder: Path) -> None:  # noqa: B027
-        """Copy what a submission has beside its answers from those inputs, if anything."""
+        """Copy the files that a submission has in addition to its answers from these inputs, if there are any."""
 
     @abstractmethod
     def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
-        """Function that solves jobs on exported inputs, in the process of a job."""
+        """Function that solves jobs with exported inputs, in the process of a job."""
 
     def chunk(self, limits: Limits) -> int:
-        """Problems of one job. With limits one, so that a job that takes too much fails one problem."""
+        """Number of problems of a job: one if there are limits, so that a job that exceeds them fails only one
+        problem."""
         return 1
 
     # Scores
@@ -536,31 +540,33 @@ class Track(ABC):
     def mark(
         self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Kept | None
     ) -> list[pd.DataFrame | RsbenchError]:
-        """Scores of submissions, which share what is found of the truth; an error is that of one submission.
+        """Scores of submissions, which share intermediate results of the truth; an error belongs to one
+        submission.
 
         A table has one row for each problem, in the order of the split; docs/how-to/submit.md names the columns. A
-        problem without an answer is a failure, and a failure scores the worst value of everything.
+        problem without an answer is a failure, and a failure gets the worst value of every score.
 
         Args:
-            submissions: what was answered.
+            submissions: the answers.
             split: the truth.
             workers: processes that score pictures; the rest takes no time.
             step: called with the name of each problem whose pictures are scored.
-            kept: where an interrupted run keeps the scores of pictures, and finds them again; None: nowhere.
+            kept: folder and identity with which an interrupted run stores the scores of pictures, to find them
+                again; None: they are not stored.
 
         Raises:
             RsbenchError: the truth has changed since the split was read.
         """
 
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
-        """By column of scores.csv, the median (problems,) of errors at the Cramer-Rao bound of what a method uses.
+        """For columns of scores.csv, the median (problems,) of errors at the Cramer-Rao bound of the given inputs.
 
-        Infinite where its data determine nothing; no columns where no bound is known.
+        Infinite if the data determine nothing; no columns if no bound is known.
         """
         return {}
 
     def part_of(self, truth: Truth) -> Row:
-        """The column ``parting`` of a problem, if the track has one: a fact of it, or its motion model."""
+        """The column ``parting`` of a problem, if the track has one: a property of it, or its motion model."""
         return {self.parting: truth.facts.get(self.parting, truth.motion.name)} if self.parting else {}
 
     @property
@@ -573,7 +579,7 @@ class Track(ABC):
         return tuple(score.key for score in self.scores if score.kind in kinds)
 
     def check_uses(self, uses: Collection[str]) -> None:
-        """Raises ValueError when a method uses what does not exist, or what this protocol does not give."""
+        """Raises ValueError if an input is unknown, or is not given by this protocol."""
         for name in uses:
             if name not in KNOWLEDGE:
                 raise ValueError(f"uses: {name!r} is unknown{choices(name, KNOWLEDGE)}")
@@ -588,10 +594,10 @@ class Track(ABC):
 
 
 def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
-    """``Track.mark`` of one submission.
+    """``Track.mark`` for one submission.
 
     Raises:
-        RsbenchError: a picture is at fault, or the truth has changed since the split was read.
+        RsbenchError: a picture is invalid, or the truth has changed since the split was read.
     """
     (found,) = split.track.mark([submission], split, workers, lambda word: None, None)
     if isinstance(found, RsbenchError):
@@ -600,7 +606,7 @@ def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataF
 
 
 def score_row(truth: Truth, answer: Answer | None, success: bool, scores: Mapping[str, object]) -> Row:
-    """A row of scores.csv: which problem, the scores of its answer, and whether and how fast it was solved."""
+    """A row of scores.csv: the problem, the scores of its answer, success and run time."""
     seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
     row = {"problem": truth.name, "scene": truth.scene, "success": success, **scores}
     return {**row, "failure": float(not success), "seconds": seconds}

@@ -1,7 +1,7 @@
-"""The track of trajectories of whole sequences, from the matches of each two successive frames.
+"""The track of trajectories of whole sequences, from the matches of successive frames.
 
-An answer is poses at times of its own choice; a cubic spline goes through them. Rotations are scored at lines of
-all frames, drift at the starts of the frames, and what a viewer would see of it by true points.
+An answer consists of poses at times chosen by the method; a cubic spline interpolates them. Rotations are scored
+at lines of all frames, drift at the starts of the frames, and the visible effect by true points.
 """
 
 from __future__ import annotations
@@ -62,15 +62,16 @@ from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.problem import Problem
 
 _MOST_POSES = 500
-"""Most poses of an answer: a line of a file of answers has limited length."""
+"""Largest number of poses of an answer: a line of a file of answers has limited length."""
 APART = 1e-5
-"""Frame periods, at least, between two poses of an answer: rows are farther apart, and a spline through nearer
-ones may go anywhere."""
+"""Least time between two poses of an answer, frame periods: rows are farther apart, and a spline through closer
+poses may deviate arbitrarily."""
 _UNIT = 1e-3
 _REACH = 1e-6
-"""Frame periods by which the first and the last pose may miss the starts of the first and the last frame."""
+"""Largest distance, frame periods, of the first and the last pose from the starts of the first and the last
+frame."""
 _INVERTED = 10.0
-"""Poses are noted as inverted where inverting them reduces the error by at least this factor."""
+"""Poses are reported as inverted if inverting them reduces the error by at least this factor."""
 _FAILURE = {
     **{f"{name}_{part}_deg": 180.0 for name in ("rows", "way") for part in ("median", "95")},
     **dict.fromkeys(AUC_DEG, 0.0),
@@ -122,7 +123,7 @@ class TrajectoryAnswer(Answer):
     poses: Poses | None = None
     """Rows ``tau, tx, ty, tz, qx, qy, qz, qw``: frame periods, and the pose of the body in a fixed world."""
     metric: bool = False
-    """Whether positions are known, in metres."""
+    """Whether positions are in metres; if not, they are unknown."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,7 +131,7 @@ class TrajectoryAnswer(Answer):
         if not self.success:
             return
         if self.poses is None or len(self.poses) < 2:
-            raise ValueError("poses: a success needs two rows or more; a failure says success = false")
+            raise ValueError("poses: a success needs two rows or more; for a failure give success = false")
         rows = self.rows
         if np.any(np.abs(rows) > LARGEST):
             raise ValueError(f"poses: numbers must lie within {LARGEST:g} of 0")
@@ -148,7 +149,7 @@ class TrajectoryAnswer(Answer):
 
     @cached_property
     def motion(self) -> TrajectoryMotion:
-        """Through the poses, of a success. Raises ValueError where they lead nowhere."""
+        """The motion through the poses of a success. Raises ValueError if they define none."""
         rows = self.rows
         rows[:, 4:] /= np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
         poses = {"poses": rows}
@@ -173,7 +174,7 @@ class TrajectoryTrack(Track):
         return {"poses": still, "metric": False}
 
     def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
-        """Poses must cover the sequence, whose length the split knows."""
+        """Check that the poses cover the sequence, whose length only the split knows."""
         faults, answered = list[str](), list[tuple[TrajectoryAnswer, Truth]]()
         for answer in submission.answers.values():
             truth = split.by_name[answer.name]
@@ -236,7 +237,7 @@ class TrajectoryTrack(Track):
 
 
 def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
-    """Whether a trajectory is much nearer to the truth when each pose is inverted."""
+    """Whether a trajectory is much closer to the truth if each pose is inverted."""
     tau = np.arange(float(truth.rendered.frames))
     found, true = (each.body_from_world(tau).R for each in (answer.motion, truth.motion))
     as_is, turned = (np.max(so3.angle(R @ np.swapaxes(true, 1, 2))) for R in (found, np.swapaxes(found, 1, 2)))
@@ -258,7 +259,7 @@ def answer_of(estimate: Estimate, shutter: RollingShutter, frames: int) -> dict[
     """A trajectory as an answer: poses at lines of all frames of the left camera.
 
     Raises:
-        RsbenchError: it is not known throughout.
+        RsbenchError: a part of the trajectory is unknown.
     """
     lines = min(max(_MOST_POSES // frames, 2), LINES)
     rows = list[FloatArray]()

@@ -1,10 +1,14 @@
 """The Cramer-Rao bound of the motion from exact correspondences: the error of the best unbiased solver.
 
-Every point adds three unknowns, its position, which are eliminated from the derivatives of its implicit
-rolling-shutter projections: a row that moves is also read at another time. One camera tells millions of times less
-of the length of d than of the rest. An information matrix has that squared, beyond rounding; so all is done with
-its root B, F = B^T B: a point is eliminated by an orthogonal projection (Golub and Pereyra, SIAM J. Numer. Anal.
-1973), and sums are QR decompositions. Nothing here is shared with the solvers.
+Every point has three unknowns, its position, which are eliminated from the derivatives of its implicit
+rolling-shutter projections: a pixel that moves to another row is also read at another time.
+
+One camera determines the length of d millions of times less well than the other parameters. The square of that
+ratio in an information matrix would be below rounding. Therefore all computations use its root B, F = B^T B:
+points are eliminated by orthogonal projections (Golub and Pereyra, SIAM J. Numer. Anal. 1973), and sums are QR
+decompositions.
+
+This module shares no code with the solvers.
 """
 
 from __future__ import annotations
@@ -28,27 +32,30 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 Views = Literal["pairs", "three-view", "four-view"]
-"""Tracks as unlinked left and right pairs; without the right image of frame 1; as they are."""
+"""Use of the tracks: as unlinked left and right pairs; without the right image of frame 1; or complete."""
 _STEP = 1e-3
 _DIFFERENCES = (2 / 3, -1 / 12)
-"""Fourth-order central differences at 1 and 2 steps, radians and metres: they leave out and round at 1e-13."""
+"""Weights of fourth-order central differences at 1 and 2 times ``_STEP`` (radians and metres), whose truncation
+and rounding errors are 1e-13."""
 _SINGULAR = 1e-11
-"""Share of the largest singular value. Unknown directions have 1e-13; known ones were seen down to 1e-7."""
+"""Singular values below this share of the largest one count as 0. Undetermined directions have 1e-13; the least
+determined ones observed had 1e-7."""
 _OPEN = 3e-7
-"""Share of a point's largest singular value below which its position is unknown: along a ray without parallax."""
+"""Share of a point's largest singular value below which its position is undetermined: along a ray without
+parallax."""
 _FAR_M = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
-    """Root mean square errors that no unbiased solver undercuts; infinite where the data say nothing."""
+    """Least root mean square errors of an unbiased solver; infinite if the data determine nothing."""
 
     rotation_axes: FloatArray
-    """Deviations (3,) of the rotation along its principal axes, radians, largest first."""
+    """Standard deviations (3,) of the rotation along its principal axes, radians, largest first."""
     direction_axes: FloatArray
-    """Deviations (2,) of the direction of d, radians, largest first; meaningful while well below 1."""
+    """Standard deviations (2,) of the direction of d, radians, largest first; meaningful only well below 1."""
     scale: float
-    """Deviation of the length of d, relative to it."""
+    """Standard deviation of the length of d, relative to it."""
     root: FloatArray
     """(6, 6) B of the Fisher information B^T B of (w, d)."""
 
@@ -64,12 +71,12 @@ class Bound:
 
     @property
     def direction(self) -> float:
-        """Root mean square of e_T, radians; meaningful while well below 1."""
+        """Root mean square of e_T, radians; meaningful only well below 1."""
         return float(np.linalg.norm(self.direction_axes))
 
     @property
     def covariance(self) -> FloatArray | None:
-        """(6, 6) of (w, d); None where the data leave something open."""
+        """(6, 6) covariance of (w, d); None if the data do not determine all of it."""
         scale = _scale(self.root)
         _, values, rows = np.linalg.svd(self.root / scale)
         if not values[-1] > _SINGULAR * values[0]:
@@ -91,7 +98,7 @@ def motion_bound(
     Args:
         correspondences: left and right pairs, and tracks; no match may be in two sets.
         motion: the true motion; its model and the model's own parameters count as known.
-        views: what a solver sees of the tracks.
+        views: the part of the tracks that a solver gets.
     """
     roots = []
     tracks = correspondences.tracks
@@ -109,9 +116,11 @@ def motion_bound(
 def bound_of_one_camera(
     matches: FloatArray, rig: StereoRig, shutter: RollingShutter, motion: Motion, noise_px: float
 ) -> Bound:
-    """Bound on the left camera's own motion from its exact matches (n, 4), as a rig of one under the same law.
+    """Bound on the left camera's own motion from its exact matches (n, 4), as a rig of one camera under the same
+    motion model.
 
-    As one of a rig it would know its place in the body, which tells it a length, and its direction less well.
+    As a part of a rig, its known position in the body would add information on the length, and less on the
+    direction.
     """
     R, d = rig.own("left").R, translation_of_offset(motion.w, motion.d, rig.offset("left"))
     own = make_motion(motion.name, R @ motion.w, R @ d, motion.parameters)
@@ -120,7 +129,7 @@ def bound_of_one_camera(
 
 
 def joined(*roots: FloatArray) -> FloatArray:
-    """Root (6, 6) of the sum of what roots (n, 6) are the roots of: independent matches add their information."""
+    """Root (6, 6) of the sum of the matrices with the roots (n, 6): independent matches add their information."""
     return np.asarray(np.linalg.qr(np.concatenate([np.zeros((6, 6)), *roots]), mode="r"))
 
 
@@ -143,15 +152,15 @@ def bound_from_root(root: FloatArray, w: FloatArray, d: FloatArray) -> Bound:
 
 
 def _scale(root: FloatArray) -> FloatArray:
-    """Factors (6,) that give columns unit length, but for those that are zero up to rounding."""
+    """Factors (6,) that give columns unit length, except columns that are zero up to rounding."""
     lengths = np.linalg.norm(root, axis=0)
     most = float(np.max(lengths)) or 1.0
     return np.where(lengths > _SINGULAR * most, lengths, most)
 
 
 def _marginal_axes(root: FloatArray, target: FloatArray) -> FloatArray:
-    """Standard deviations (k,) of ``target @ (w, d)`` along its principal axes; infinite when it touches the null
-    space.
+    """Standard deviations (k,) of ``target @ (w, d)`` along its principal axes; infinite if it is not orthogonal
+    to the null space.
 
     Args:
         root: (6, 6) of the information.
@@ -161,7 +170,7 @@ def _marginal_axes(root: FloatArray, target: FloatArray) -> FloatArray:
     _, values, rows = np.linalg.svd(root / scale)
     weights = (target / scale) @ rows.T
     unknown = values <= _SINGULAR * max(float(values[0]), np.finfo(float).tiny)
-    # Rounding mixes a little of the weakest known directions into the null space.
+    # Rounding adds small parts of the least determined directions to the null space.
     if np.any(np.abs(weights[:, unknown]) > 1e-3 * np.linalg.norm(weights)):
         return np.full(len(target), np.inf)
     known = ~unknown
@@ -177,7 +186,7 @@ def _pair_root(
     pose, eye, axis = match_pose(rig, shutter, motion, side, matches), rig.eye(side), shutter.axis(side)
     x0, x1 = eye.unproject(matches[:, :2]), eye.unproject(matches[:, 2:])
     depth = ray_depths(pose, x0, x1)[:, 0]
-    # Without parallax the depth is open; any says the same about the motion.
+    # Without parallax the depth is undetermined, and any depth gives the same information on the motion.
     depth = np.where(np.isfinite(depth) & (depth > 0.0), np.minimum(depth, _FAR_M), _FAR_M)
     depth = depth * rig.own_depth(side, matches[:, :2])
     points = back_project(rig, shutter, motion, side, 0, matches[:, :2], depth)
@@ -204,7 +213,8 @@ def _track_root(
 
 
 def _triangulated(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> FloatArray:
-    """Points (n, 3) nearest to the four rays of exact tracks (n, 8), each from where its camera was."""
+    """Points (n, 3) nearest to the four rays of exact tracks (n, 8), each from the camera's position at its
+    time."""
     A, b = np.zeros((len(tracks), 3, 3)), np.zeros((len(tracks), 3))
     for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
         pixels = tracks[:, 2 * k : 2 * k + 2]
@@ -229,7 +239,7 @@ def root_information(
         seen: for each image that sees all the points, its side, frame and their lines (n,).
     """
     taus = [shutter.line_time(lines, frame, side) for side, frame, lines in seen]
-    # Of all images at once: on a few points the calls take longer than the arithmetic.
+    # All images at once: for few points the calls take longer than the arithmetic.
     everywhere = np.concatenate(taus), np.tile(points, (len(seen), 1))
     moved = np.split(np.stack([_derivative(motion, *everywhere, axis) for axis in np.eye(6)], axis=-1), len(seen))
     parts = [
@@ -239,9 +249,9 @@ def root_information(
     by_motion = np.concatenate([part[0] for part in parts], axis=1)
     by_point = np.concatenate([part[1] for part in parts], axis=1)
     axes, values, _ = np.linalg.svd(by_point, full_matrices=False)
-    # Directions in which a point is open are no loss.
+    # Undetermined directions of a point lose no information.
     axes = axes * (values > _OPEN * values[:, :1])[:, None]
-    # Twice: what the first leaves along the axes by rounding, the second takes away.
+    # Project twice: the second projection removes the rounding errors of the first.
     for _ in range(2):
         by_motion = by_motion - axes @ (np.swapaxes(axes, 1, 2) @ by_motion)
     return by_motion.reshape(-1, 6)
@@ -259,8 +269,8 @@ def _projection_jacobian(
     """Derivatives (n, 2, 6) and (n, 2, 3) of the implicit projection by (w, d) and by the point.
 
     Args:
-        tau: when each point is seen, (n,).
-        moved: derivatives (n, 3, 6) of the points in the body then, by (w, d).
+        tau: (n,) times at which the points are seen.
+        moved: (n, 3, 6) derivatives of the points in the body at these times, by (w, d).
     """
     R, t = rig.eye_from_world(motion, tau, side)
     rotated = (R @ points[:, :, None])[:, :, 0]

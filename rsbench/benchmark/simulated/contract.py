@@ -1,7 +1,7 @@
 """The contract of solvers, as named checks: for authors (``rsbench check-solver``) and for our own tests.
 
-Each check looks at exact, simulated data of a solver's own motion model and shutter. A solver need not be exact: a
-linearised one must come nearer to the truth as the motion becomes smaller.
+Each check uses exact simulated data that follow the motion model and shutter of the solver. A solver need not be
+exact: the error of a linearised one must decrease as the motion becomes smaller.
 """
 
 from __future__ import annotations
@@ -40,19 +40,20 @@ from rsbench.solvers.engine.base import (
 )
 
 _CLOSE = 0.2
-"""Largest error, as a share of the motion's angle and in radians of direction: no two misreadings are so near."""
+"""Largest error, as a share of the rotation angle and as an angle of the direction, radians, for which a mistake
+is recognised: no two mistakes are closer."""
 
 
 def misreading(
     w: FloatArray, d: FloatArray, true_w: FloatArray, true_d: FloatArray, rig: StereoRig, point: str
 ) -> str | None:
-    """The mistake that would turn the true motion into the given one; None when no usual one does.
+    """The common mistake that would give this motion instead of the true one; None if there is none.
 
     Args:
         w, d: (3,) the solver's motion.
-        true_w, true_d: (3,) the body's true motion.
-        rig: where the cameras are.
-        point: the point whose translation the solver says ``d`` is.
+        true_w, true_d: (3,) the true motion of the body.
+        rig: the cameras.
+        point: the reference point of the solver.
     """
     # Of the angle of rotation, and in radians.
     errors = {
@@ -69,7 +70,7 @@ def misreading(
 def _misreadings(
     w: FloatArray, d_body: FloatArray, rig: StereoRig, point: str
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """What each mistake makes of the true motion; the empty words are the truth itself."""
+    """The motion that each mistake gives; the empty text stands for the truth itself."""
     points = {"body": d_body} | {side: translation_of_offset(w, d_body, rig.offset(side)) for side in SIDES}
     d = points[point]
     found = {
@@ -98,21 +99,21 @@ def _misreadings(
 
 
 class BrokenContractError(Exception):
-    """What a solver did that it must not do, in one line."""
+    """A violation of the contract, in one line."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Answer:
-    """What one call of ``estimate`` gave and did."""
+    """The result and the side effects of one call of ``estimate``."""
 
     estimate: MotionEstimate
     changed: tuple[str, ...] = ()
-    """Sets of matches that it wrote into."""
+    """Sets of matches that it modified."""
     printed: str = ""
 
 
 class Subject:
-    """A solver whose answers are checked, to be closed.
+    """A solver whose answers are checked; close it after use.
 
     An entry of another package runs in a child process, so that it may hang, exit or crash.
     """
@@ -129,7 +130,7 @@ class Subject:
         self.changed: set[str] = set()
         self.printed = ""
         self.hung = False
-        """Whether a problem took longer than the limit."""
+        """Whether a problem exceeded the time limit."""
         self._time_limit_s = time_limit_s
         self._worker: IsolatedWorker | None = None
         if isolated:
@@ -139,10 +140,11 @@ class Subject:
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        """A valid answer.
+        """Return a valid answer.
 
         Raises:
-            BrokenContractError: it raised, took too long, ended its process, or the answer is not valid.
+            BrokenContractError: it raised an exception, took too long, ended its process, or the answer is
+                invalid.
         """
         if self._worker is None:
             try:
@@ -163,7 +165,7 @@ class Subject:
         return answer.estimate
 
     def _check(self, estimate: MotionEstimate) -> None:
-        """What ``checked_estimate`` leaves open."""
+        """Checks in addition to those of ``checked_estimate``."""
         if not estimate.success and not estimate.reason:
             raise BrokenContractError("returned a failure without a reason")
         if estimate.success and estimate.metric and not self.spec.metric:
@@ -180,7 +182,7 @@ class Subject:
 
 
 def _serve(place: str) -> Callable[..., object]:
-    """What answers in the child."""
+    """The function that solves problems in the child process."""
     try:
         solver = load_solver_entry(place).solver
     except BaseException as error:
@@ -191,12 +193,12 @@ def _serve(place: str) -> Callable[..., object]:
 def _looked_at(
     solver: Solver, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
 ) -> Answer:
-    """One answer, and what the call printed and changed.
+    """One answer, and the output and changes of the call.
 
     Raises:
-        EntryFailure: it raised, or its answer is no valid one.
+        EntryFailure: it raised an exception, or its answer is invalid.
     """
-    given = Correspondences(**vars(correspondences))  # arrays of its own, which refuse to be written
+    given = Correspondences(**vars(correspondences))  # copies that are read-only
     before = {field.name: getattr(given, field.name).tobytes() for field in fields(given)}
     printed = io.StringIO()
     try:
@@ -214,30 +216,30 @@ RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ROLLING = RollingShutter(height=900, readout_ratio=0.8)
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
-"""1.6 degrees and 0.3 m per frame: the paper's size of motion, along no axis."""
+"""Motion of 1.6 degrees and 0.3 m per frame, as large as the paper's, along no axis."""
 
 Verdict = Literal["passed", "warning", "failed", "skipped"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What one check found."""
+    """The result of one check."""
 
     check: str
     verdict: Verdict
     why: str = ""
-    """What was measured, or what is wrong."""
+    """The measurement, or the fault."""
 
 
 def check_solver(
     entry: SolverEntry, *, isolated: bool | None = None, time_limit_s: float | None = None
 ) -> list[Finding]:
-    """Hold a solver to the contract.
+    """Run all checks of the contract on a solver.
 
     Args:
         entry: the solver.
-        isolated: whether it runs in a child process; by default when it is not rsbench's own.
-        time_limit_s: for one problem; by default what its card says.
+        isolated: whether it runs in a child process; by default if it is not part of rsbench.
+        time_limit_s: for one problem; by default that of its card.
     """
     limit = entry.options.time_limit_s if time_limit_s is None else time_limit_s
     findings: list[Finding] = []
@@ -257,7 +259,8 @@ def check_solver(
 
 
 def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: float = 0.0) -> Simulation:
-    """60 + 60 matches and 60 tracks that satisfy what the solver assumes, under ``size`` times the motion."""
+    """Problem with 60 + 60 matches and 60 tracks that follow the assumptions of the solver, under ``size`` times
+    the motion."""
     shutter = ROLLING if subject.spec.shutter == "rolling" else GLOBAL
     try:
         motion = make_motion(subject.spec.motion_model, size * W, size * D, subject.spec.motion_parameters)
@@ -276,7 +279,7 @@ def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: fl
 
 
 def given(subject: Subject, simulation: Simulation) -> Correspondences:
-    """The matches of a simulation, with those between the cameras where the solver speaks of them."""
+    """The matches of a simulation, with left-right matches if the solver needs them."""
     c = simulation.correspondences
     if "stereo" not in {*subject.spec.needs, *subject.spec.minimum}:
         return c
@@ -290,7 +293,7 @@ def true_translation(subject: Subject, simulation: Simulation) -> FloatArray:
 
 
 def _solved(subject: Subject, simulation: Simulation, matches: Correspondences | None = None) -> MotionEstimate:
-    """A success, on data that the solver must be able to solve."""
+    """The answer, which must be a success, to data that the solver must be able to solve."""
     matches = given(subject, simulation) if matches is None else matches
     estimate = subject.estimate(matches, RIG, simulation.shutter)
     if not estimate.success:
@@ -302,21 +305,22 @@ def _solved(subject: Subject, simulation: Simulation, matches: Correspondences |
 
 
 def answers(subject: Subject) -> tuple[Verdict, str]:
-    """A ``MotionEstimate`` of finite numbers, on data that are easy."""
+    """The solver answers easy data with a ``MotionEstimate`` of finite numbers."""
     _solved(subject, own_problem(subject))
     return "passed", ""
 
 
 _SIZES, _SEEDS = (1.0, 0.5, 0.25), (5, 6, 7)
 _EXACT = 1e-6
-"""Share of the motion's angle, radians of direction, log of length: rounding, and the last step of a descent."""
+"""Largest errors of an exact solver (share of the angle, direction in radians, logarithm of length), due to
+rounding and the last step of a descent."""
 _LARGEST, _BIAS = 0.1, (0.02, 0.005, 0.02)
-"""What a linearised solver may be off at the paper's motion, and what remains however small the motion is. The
-latter tells a bias of the method from a wrong point of the rig, whose direction is 0.03 rad off."""
+"""Largest errors of a linearised solver at the paper's motion, and those that remain however small the motion is.
+The latter distinguish a bias of the method from a wrong reference point, whose direction errs by 0.03 rad."""
 
 
 def finds_the_truth(subject: Subject) -> tuple[Verdict, str]:
-    """The motion of exact data: exactly, or the better the smaller the motion is."""
+    """The solver finds the motion of exact data: exactly, or with an error that decreases with the motion."""
     errors = np.array([[_errors(subject, size, seed) for seed in _SEEDS] for size in _SIZES]).max(axis=1)
     names = ("rotation", "direction", "length")
     shown = [f"{name} {full:.0e}" for name, full in zip(names, errors[0], strict=True) if np.isfinite(full)]
@@ -363,10 +367,10 @@ def _vector(values: FloatArray) -> str:
 
 
 def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
-    """The same matches in another order have the same motion."""
+    """The same matches in another order give the same motion."""
 
     def shuffled(c: Correspondences) -> Correspondences:
-        # Of rows that belong together, the same order: of equally many from equal generators.
+        # Rows of different sets that belong together get the same order, by equal generators.
         orders = {name: np.random.default_rng(1).permutation(len(matches)) for name, matches in vars(c).items()}
         return Correspondences(**{name: matches[orders[name]] for name, matches in vars(c).items()})
 
@@ -374,7 +378,8 @@ def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
 
 
 def mirrors(subject: Subject) -> tuple[Verdict, str]:
-    """When x is mirrored, left and right change places, and d_x, w_y and w_z their sign."""
+    """Data with mirrored x give the mirrored motion: left and right are exchanged, and d_x, w_y and w_z change
+    sign."""
     alone = subject.spec.needs - BESIDE.keys() == {"left"}
     if not alone and (subject.spec.reference_point == "left" or "affine" in subject.spec.needs):
         return "skipped", "the mirror image of the left camera is the right one"
@@ -407,7 +412,7 @@ def mirrors(subject: Subject) -> tuple[Verdict, str]:
 
 
 _SAME_W, _SAME_D = 1e-6, 1e-5
-"""Radians, and share of the length: the last step of a descent that takes another path."""
+"""Largest differences, radians and share of the length, of two descents that take different paths."""
 
 
 def _agree(
@@ -417,7 +422,8 @@ def _agree(
     sign_d: FloatArray,
     words: str,
 ) -> tuple[Verdict, str]:
-    """Motions of changed matches: equal on exact data; with 0.3 px of noise, a difference is a warning."""
+    """Compare motions from changed matches: they must be equal on exact data; with 0.3 px of noise, a difference
+    is a warning."""
     severity: dict[float, Verdict] = {0.0: "failed", 0.3: "warning"}
     for noise_px, verdict in severity.items():
         simulation = own_problem(subject, noise_px=noise_px)
@@ -443,7 +449,8 @@ def is_deterministic(subject: Subject) -> tuple[Verdict, str]:
 
 
 def fails_by_value(subject: Subject) -> tuple[Verdict, str]:
-    """Data that determine no motion give a finite motion, or a failure with a reason; too few always fail."""
+    """Data that determine no motion give a finite motion or a failure with a reason; too few matches give a
+    failure."""
     failures = 0
     cases = degenerate_cases()
     for name, (c, shutter) in cases.items():
@@ -468,7 +475,7 @@ def _subset(c: Correspondences, *names: str) -> Correspondences:
 
 
 def leaves_its_input_alone(subject: Subject) -> tuple[Verdict, str]:
-    """No call so far wrote into the matches."""
+    """No call so far modified the matches."""
     if subject.changed:
         raise BrokenContractError(f"wrote into {', '.join(sorted(subject.changed))}")
     return "passed", ""
@@ -490,11 +497,11 @@ CHECKS: Mapping[str, Callable[[Subject], tuple[Verdict, str]]] = {
     "leaves its input alone": leaves_its_input_alone,
     "is quiet": is_quiet,
 }
-"""Checks in their order; if the first fails, the others are skipped."""
+"""Checks in order; if the first fails, the others are skipped."""
 
 
 def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
-    """Matches that determine no motion, or not all of it."""
+    """Matches that determine no motion, or only a part of it."""
     rng = np.random.default_rng(2)
     options = SimulationOptions(pairs=30, tracks=30, gyro_rate=GYRO_RATE, gravity=True, affine=True)
 

@@ -1,6 +1,7 @@
-"""Simulated correspondences: random points, seen exactly by a moving rolling-shutter rig, then noise and outliers.
+"""Simulated correspondences: exact images of random points in a moving rolling-shutter rig, then noise and
+outliers.
 
-Row times come from the true rows, solved for exactly; a solver only ever sees the noisy ones.
+Row times are those of the true rows, computed exactly; solvers only get the noisy ones.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ from rsbench.core.so3 import FloatArray
 SceneShape = Literal["box", "plane"]
 OutlierImages = Literal["frame 1", "all"]
 MOST_POINTS = 1_000_000
-"""Largest number in each set: ten seconds of one core, and a gigabyte."""
+"""Largest number of matches in each set, which take ten seconds of one core and a gigabyte."""
 GYRO_RATE = 20
-"""Samples of a gyroscope in a frame period, where a solver wants any: 600 Hz at 30 frames a second."""
+"""Samples of a gyroscope per frame period, if a solver uses them: 600 Hz at 30 frames/s."""
 
 _MOST_SLANT = np.deg2rad(60.0)
 """Largest angle between the normal of a patch and the ray on which frame 0 sees it."""
@@ -56,10 +57,10 @@ _DOWN = np.array([0.2, 0.9, -0.3]) / np.sqrt(0.94)
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions:
-    """What to simulate."""
+    """Options of a simulation."""
 
     pairs: int = 0
-    """Matches over time per camera, each camera with points of its own."""
+    """Matches over time per camera; each camera has its own points."""
     tracks: int = 0
     """Points seen in all four images."""
     lines: int = 0
@@ -68,25 +69,25 @@ class SimulationOptions:
     noise_px: float = 0.0
     """Standard deviation of the noise on every pixel coordinate."""
     outlier_ratio: float = 0.0
-    """Share of matches some of whose pixels are replaced by others."""
+    """Share of outliers: matches in which some pixels are replaced."""
     outlier_px: float = 80.0
-    """Outliers lie uniformly within this distance, per coordinate, of the truth."""
+    """Largest distance, per coordinate, of outliers from the truth, uniform."""
     outlier_images: OutlierImages = "frame 1"
     """Displaced pixels: those of frame 1, alike in both cameras, or those of every image, each by its own draw."""
     depth: tuple[float, float] = (2.0, 10.0)
     """Range of depths in frame 0, metres, uniform."""
     gyro_rate: int = 0
-    """Samples of a gyroscope in a frame period; 0: none."""
+    """Number of samples of a gyroscope per frame period; 0: none."""
     gyro_noise_deg: float = 0.0
-    """Standard deviation of a sample, degrees per frame period, on each axis."""
+    """Standard deviation of the noise of a sample, degrees per frame period, on each axis."""
     gyro_bias_deg: float = 0.0
-    """Length of what is added to all samples, in a random direction, degrees per frame period."""
+    """Length of the bias of all samples, in a random direction, degrees per frame period."""
     gyro_delay: float = 0.0
-    """Frame periods by which the samples say that they are later than they are."""
+    """Error of the samples' times, frame periods: above 0 they are stated too late."""
     gravity: bool = False
     """Whether the direction of gravity is given, at the start of either frame."""
     gravity_noise_deg: float = 0.0
-    """Standard deviation of each of its two angles, degrees."""
+    """Standard deviation of each of the two angles of the direction of gravity, degrees."""
     affine: bool = False
     """Whether the left matches have affine frames: of patches of all slants up to 60 degrees, or of the plane."""
     affine_noise: float = 0.0
@@ -121,7 +122,7 @@ class SimulationOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Simulation:
-    """Correspondences with the truth that made them."""
+    """Correspondences with their truth."""
 
     correspondences: Correspondences
     rig: StereoRig
@@ -138,12 +139,14 @@ def random_direction(rng: np.random.Generator) -> FloatArray:
 
 
 def unit(v: FloatArray) -> FloatArray:
-    """A vector (3,) made one long; BLAS, which ``np.linalg.norm`` asks, sums otherwise on other processors."""
+    """A vector (3,) scaled to length 1, without ``np.linalg.norm``, whose BLAS adds in another order on other
+    processors."""
     return v / np.sqrt(np.sum(v * v))
 
 
 def random_motion(rng: np.random.Generator, angle: float, distance: float, model: str = "linear") -> Motion:
-    """Motion that turns by ``angle`` (radians) and shifts by ``distance`` (metres) per frame period."""
+    """Random motion that rotates by ``angle`` (radians) and translates by ``distance`` (metres) per frame
+    period."""
     return make_motion(model, angle * random_direction(rng), distance * random_direction(rng))
 
 
@@ -232,13 +235,13 @@ def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Ge
 
 
 _SLIDE = 0.2
-"""Share of a line's length by which its ends differ between images, at most."""
+"""Largest difference of a line's ends between images, as a share of its length."""
 _SECANT_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class MovingRig:
-    """What the images of a simulation depend on, and what they show without noise."""
+    """Everything that determines the images of a simulation, and the images without noise."""
 
     rig: StereoRig
     shutter: RollingShutter

@@ -1,4 +1,5 @@
-"""Trials of one cell of a sweep: simulate, let every solver see what it needs, keep its answer and the truth."""
+"""Trials of one cell of a sweep: simulate, run every solver on the matches that it needs, and store its answers
+with the truth."""
 
 from __future__ import annotations
 
@@ -23,13 +24,14 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 
 Arrays = dict[str, NDArray[Any]]
 Information = Literal["left pairs", "left and right pairs", "linked pairs", "tracks"]
-"""What a solver is given: matches over time of one or both cameras, of points of their own; the same points in
-both cameras with their left-right matches; or tracks through all four images. The last two hold metric depth."""
+"""Matches that a solver gets: matches over time of one or both cameras, with separate points; matches over time of
+equal points in both cameras, with left-right matches; or tracks through all four images. The last two determine
+metric depth."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Entrant:
-    """A solver and the matches that it is given."""
+    """A solver and the kind of matches that it gets."""
 
     entry: SolverEntry
     information: Information
@@ -44,10 +46,10 @@ class Entrant:
 
 
 def enter(entry: SolverEntry) -> Entrant:
-    """A solver with the least information that it can use fully.
+    """A solver with the least information that it can use completely.
 
     Raises:
-        RsbenchError: another package's solver does not say how many matches it needs.
+        RsbenchError: another package's solver does not state how many matches it needs.
     """
     solver, needs = entry.solver, entry.solver.spec.needs
     probe = Correspondences(left=np.ones((50, 4)), right=np.ones((50, 4)), tracks=np.ones((50, 8)))
@@ -90,13 +92,13 @@ def run_trials(
 ) -> Arrays:
     """Trials ``first`` to ``first + count - 1`` of a setting.
 
-    A trial's scene, motion and noise depend on its number and the seed alone, so that all solvers, values and
-    sweeps share them as far as their settings allow. Whatever another package's solver does wrong is a failed
-    trial; an exception of a solver of rsbench's own is raised.
+    Scene, motion and noise of a trial depend only on its number and the seed, so that all solvers, values and
+    sweeps share them as far as their settings allow. Any error of another package's solver is a failed trial; an
+    exception of one of rsbench's solvers is raised.
 
     Returns:
         ``w``, ``d`` (trials, 3), the truth; ``w_est``, ``d_est`` (trials, solvers, 3), ``success``, ``metric``,
-        ``direction_known``, ``reason`` and ``seconds`` (trials, solvers).
+            ``direction_known``, ``reason`` and ``seconds`` (trials, solvers).
 
     Raises:
         RsbenchError: no such solver; the motion of the setting leaves too few points in view.
@@ -124,13 +126,13 @@ def run_trials(
 
 
 def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int) -> Arrays:
-    """Cramer-Rao bounds of trials for a noise of 1 px; outliers are left out.
+    """Cramer-Rao bounds of trials for a noise of 1 px, without outliers.
 
     Returns:
-        ``rotation`` (trials, solvers, 3), ``direction`` (trials, solvers, 2) and ``scale`` (trials, solvers): root
-        mean square errors that no unbiased solver undercuts, along the principal axes of the rotation and of the
-        direction of d (radians), and of the length of d, given what each solver is given; infinite where the
-        matches do not tell.
+        ``rotation`` (trials, solvers, 3), ``direction`` (trials, solvers, 2) and ``scale`` (trials, solvers):
+            least root mean square errors of an unbiased solver, along the principal axes of the rotation and of
+            the direction of d (radians), and of the length of d, for the matches that each solver gets; infinite
+            if these do not determine it.
     """
     entrants = [enter(load_solver_entry(name)) for name in solvers]
     rows = []
@@ -156,7 +158,7 @@ def _simulation(setting: Setting, entrants: list[Entrant], seed: int, trial: int
 
 
 def _bounds(simulation: Simulation, kinds: set[Information]) -> dict[Information, Bound]:
-    """Bounds at 1 px of what solvers are given."""
+    """Bounds at 1 px for the matches of each kind of information."""
     c, rig, motion = simulation.correspondences, simulation.rig, simulation.motion
     good = {name: getattr(c, name)[~simulation.outliers[name]] for name in ("left", "right", "tracks")}
 
@@ -183,7 +185,7 @@ def _timed(
     robust: bool,
     runner: SolverRunner,
 ) -> tuple[MotionEstimate, float]:
-    """An answer and its seconds: of the processor, since solvers have one thread and others shall not count."""
+    """An answer and its processor time, which does not include other processes, as solvers have one thread."""
     matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.given_shutter()
     sensed = {name: getattr(simulation.correspondences, name) for name in BESIDE if name in e.solver.spec.needs}
     matches = replace(matches, **sensed)
@@ -192,6 +194,6 @@ def _timed(
     rng = generator(seed, "simulate", "robust", e.name, trial)
     start = time.process_time()
     answer = runner.robust(e.entry, matches, rig, shutter, RobustOptions(), rng)
-    # Another process's time is not this one's: wall-clock time of the robust loop there.
+    # For a solver in another process: wall-clock time of the robust loop there.
     seconds = time.process_time() - start if e.entry.built_in else answer.seconds
     return answer.estimate, seconds

@@ -105,7 +105,7 @@ def by_law(images: pd.DataFrame) -> pd.DataFrame:
 
 
 def law_and_size(table: pd.DataFrame) -> pd.Series:
-    """Such as ``twist, moderate`` for each row of a table of sequences of the card ``laws``.
+    """Text such as ``twist, moderate`` for each row of a table of sequences of the card ``laws``.
 
     A sequence is named after its scene, law, size, sensor and seed: ``old-town-twist-moderate-ideal-1``.
     """

@@ -1,4 +1,4 @@
-"""What the paper's Figure 4 shows of one sequence: six pictures of the left camera's frame 0, and numbers."""
+"""Content of the paper's Figure 4 for one sequence: six pictures of the left camera's frame 0, and numbers."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ class Panels:
     """The global-shutter image at row 0's pose."""
     true_depth: NDArray[np.float32]
     depth_error: NDArray[np.float32]
-    """Absolute, of SGM against ``true_depth``; infinite where there is no surface, but a depth all the same."""
+    """Absolute error of SGM's depth; infinite where SGM has a depth but there is no surface."""
     numbers: dict[str, Any]
 
 
 def make_panels(sequence: Sequence) -> Panels:
-    """Match, solve, find depth and correct with the estimates; compare with the truth.
+    """Match, solve, estimate depth, correct, and compare with the truth.
 
-    Where no motion is found, the frame is shown as it was, and the numbers of the correction are the worst.
+    If no motion is found, the uncorrected frame is shown, with the worst scores for the correction.
     """
     bench = Bench(sequence, seed=0)
     frames = uncorrected(bench.images, (VIEW,))
@@ -74,7 +74,7 @@ def make_panels(sequence: Sequence) -> Panels:
 
 
 def literal_options(seed: int) -> CorrectionOptions:
-    """The components of ``LITERAL``, and none of the steps that the paper does not describe."""
+    """Options with the components of ``LITERAL``, without steps that the paper does not describe."""
     return CorrectionOptions(
         solver=load_solver_entry(LITERAL["solver"]),
         features=load_features(LITERAL["features"]),
@@ -87,11 +87,13 @@ def literal_options(seed: int) -> CorrectionOptions:
 
 
 def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tuple[list[dict[str, Any]], Panels]]:
-    """Per seed of RANSAC: scores of the four views corrected with ``literal_options``, and the panels of one.
+    """For each seed of RANSAC: scores of the four views corrected with ``literal_options``; and the panels for one
+    seed.
 
     A score is the PSNR, dB, on three sets of pixels: those ``drawn`` at an estimated depth, those ``visible`` in
-    the rolling-shutter frame by the true depth and motion, and ``all``; what is not drawn is black. That of the
-    uncorrected frame on the same pixels stands beside it. Where no motion is found, the scores are the worst.
+    the rolling-shutter frame by the true depth and motion, and ``all``; pixels that are not drawn are black. The
+    score of the uncorrected frame on the same pixels is listed too. If no motion is found, the scores are the
+    worst.
     """
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     rolling = {view: Picture(image) for view, image in images.items()}
@@ -171,7 +173,7 @@ def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused,
 
 
 def save_panels(folder: Path, panels: Panels) -> None:
-    """panels.npz and numbers.json in ``folder``."""
+    """Write panels.npz and numbers.json into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {name: value for name, value in vars(panels).items() if name != "numbers"}
     save_arrays(folder / "panels.npz", arrays)
@@ -179,7 +181,7 @@ def save_panels(folder: Path, panels: Panels) -> None:
 
 
 def load_panels(folder: Path) -> Panels:
-    """What ``save_panels`` wrote.
+    """Read the files of ``save_panels``.
 
     Raises:
         RsbenchError: numbers.json is missing or damaged.

@@ -21,15 +21,15 @@ PUBLISHED = ("rs-stereo-linear", "rs-stereo-linear-symmetric")
 
 @dataclass(frozen=True, kw_only=True)
 class ImageClaim:
-    """A claim, the stored table that it is judged by, and the rule."""
+    """A claim, the stored table by which it is judged, and the rule."""
 
     key: str
     text: str
     table: str
-    """Below the folder of results."""
+    """Path of the table below the folder of results."""
     rule: str
     check: Callable[[pd.DataFrame], dict[str, tuple[list[Check], str]]]
-    """Checks and figures in words, by who is judged."""
+    """Function that returns checks and figures as text, by the judged solver."""
 
 
 def motion_on_images(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
@@ -158,7 +158,7 @@ IMAGE_CLAIMS = (
 
 
 def judge_image_claims(results: Path) -> pd.DataFrame:
-    """One row per claim and who is judged: verdict and figures.
+    """One row per claim and judged solver: verdict and figures.
 
     Raises:
         RsbenchError: a table is missing or damaged.

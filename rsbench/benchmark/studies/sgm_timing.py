@@ -51,7 +51,8 @@ class Timing:
         return shutter.row_time(rows, frame) + self.delay
 
     def lag(self, shutter: RollingShutter, y: FloatArray, velocity_y: FloatArray) -> FloatArray:
-        """D (...): how much later than the left camera the right one sees a point of the left row y."""
+        """Lag (...): time from when the left camera sees a point of the left row y to when the right one sees
+        it."""
         if self.opposite:
             return (self.delay + shutter.h * (shutter.height - 1 - 2 * y)) / (1.0 + shutter.h * velocity_y)
         return self.delay / (1.0 - shutter.h * velocity_y)

@@ -148,7 +148,11 @@ class RobustProblem:
         if self._stereo:
             names["tracks"] = "matches over time with left-right matches at both ends"
         groups = zip(_GROUPS, self.num_data, self.sample_size, strict=True)
-        short = [f"{count} {names[name]}, a sample needs {size}" for name, count, size in groups if count < size]
+        short = [
+            f"too few {names[name]}: {count}, a sample needs {size}"
+            for name, count, size in groups
+            if count < size
+        ]
         return "; ".join(short)
 
     def failure(self, reason: str) -> str:

@@ -279,7 +279,7 @@ def test_another_text_is_not_the_announced_one(place: Path, card: str) -> None:
     announced, other = read_announcement(place / "out"), Secret(f"{TEXT}!")
     with pytest.raises(RsbenchError, match="--seed-file: its text is not the announced one"):
         announced_split(announced, TRACK, card, other, None)
-    with pytest.raises(RsbenchError, match="commitment: what is here is not what was announced"):
+    with pytest.raises(RsbenchError, match="commitment: differs from the announced one"):
         publish(TRACK, card, other, place / "other", place / "out")
 
 
@@ -287,13 +287,13 @@ def test_another_truth_is_not_the_announced_one(place: Path, card: str) -> None:
     announced = read_announcement(place / "out")
     shorter = Path(card).read_text().replace("rotation_deg = 2", "rotation_deg = 1.9")
     (place / "other.toml").write_text(shorter)
-    with pytest.raises(RsbenchError, match="fingerprint: what is here is not what was announced"):
+    with pytest.raises(RsbenchError, match="fingerprint: differs from the announced one"):
         announced_split(announced, TRACK, str(place / "other.toml"), SECRET, None)
     listing = place / "keep" / DATA / "dataset.json"
     content = json.loads(listing.read_text())
     content["files"]["s0/rs/left_0.png"]["sha256"] = 64 * "0"
     listing.write_text(json.dumps(content))
-    with pytest.raises(RsbenchError, match="truth: what is here is not what was announced"):
+    with pytest.raises(RsbenchError, match="truth: differs from the announced one"):
         announced_split(announced, TRACK, card, SECRET, place / "keep")
 
 

@@ -303,7 +303,7 @@ def test_a_method_at_its_bound_is_believed_and_one_below_it_is_not(tmp_path: Pat
     assert page.count('class="entry oracle handed-in doubt"') == 1 and page.count("handed in</span>") == 2
     assert accept(board, "points-1", SPLIT.name, "boasting", "seen by us") == scored.doubt
     assert all(line.rank is not None for line in lines_by_name(board).values())
-    with pytest.raises(RsbenchError, match="nothing speaks against it"):
+    with pytest.raises(RsbenchError, match="no doubts about it"):
         accept(board, "points-1", SPLIT.name, "honest", "why not")
 
 
