@@ -54,6 +54,8 @@ _AT_ONCE = 2
 """Number of pairs that are processed in parallel; parts of a pair's work use two cores by themselves."""
 _PENDING, _PENDING_BYTES = 14, 4e8
 """Number of pairs that wait for later ones, and the memory that their flow may take."""
+_ROUNDED_PX = 1 / 64
+"""Step to which the flow of large frames is rounded while it waits: a fraction of its error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +75,7 @@ class _Seen(NamedTuple):
     """Number of the first frame."""
     images: tuple[NDArray[Any], NDArray[Any]]
     flows: Flows | None
-    """None if the flow takes too much memory; it is then computed again."""
+    """See ``_kept``; None: it is computed again."""
     found: FoundOwnMotion | None
     reason: str
     """Why they cannot be corrected; empty if they can."""
@@ -230,8 +232,28 @@ def _analyse(
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
     matches = trajectory_matches(flows, options.seed, PIXELS) if gyro is None else np.zeros((0, 4))
-    small = _PENDING * sum(each.nbytes for each in (*flows.flow, *flows.returns)) <= _PENDING_BYTES
-    return _Seen(number, images, flows if small else None, found, reason, matches)
+    return _Seen(number, images, _kept(flows), found, reason, matches)
+
+
+def _kept(flows: Flows) -> Flows | None:
+    """The flow of a pair that waits: as it is, rounded to integers if it is large, or None if it is very large."""
+    size = _PENDING * sum(each.nbytes for each in (*flows.flow, *flows.returns))
+    if size <= _PENDING_BYTES:
+        return flows
+    if size > 2.0 * _PENDING_BYTES:
+        return None
+    first, second = (np.clip(np.rint(each / _ROUNDED_PX), -32767, 32767).astype(np.int16) for each in flows.flow)
+    there, back = (each.astype(np.float16) for each in flows.returns)
+    return Flows((first, second), (there, back), flows.scale)
+
+
+def _restored(flows: Flows) -> Flows:
+    """The flow for ``_kept``."""
+    if flows.flow[0].dtype == np.float32:
+        return flows
+    first, second = (each * np.float32(_ROUNDED_PX) for each in flows.flow)
+    there, back = (each.astype(np.float32) for each in flows.returns)
+    return Flows((first, second), (there, back), flows.scale)
 
 
 def _first_motion(
@@ -259,7 +281,8 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Cor
     if found is None:
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
-    flows, corrector = seen.flows or find_flows(images), options.corrector.component
+    flows = find_flows(images) if seen.flows is None else _restored(seen.flows)
+    corrector = options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
     if isinstance(found.own.motion, InertialMotion):  # the motion is not from a trajectory
         found = with_best_motion(found, flows, options.robust, options.seed)

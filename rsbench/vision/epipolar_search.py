@@ -434,9 +434,9 @@ _AGGREGATED = 6, 4, 90
 of a place outside the other frame, between the costs of right and of wrong places."""
 _MEDIAN = 5
 _FEWEST = 4
-_COARSE, _COARSE_REACH = 4, 0.2
-"""Factor by which the first search shrinks frames, with the options at half the size, and its largest parallax, as
-a share of the image's longer side."""
+_COARSE, _COARSE_SIDE, _COARSE_REACH = 4, 320, 0.2
+"""Least factor by which the first search shrinks frames, with the options at half the size; longest side after it,
+px; and its largest parallax, as a share of the image's longer side."""
 _TEXTURED, _TEXTURE_LEVELS = 5, 5.0
 """Side of a window, px, and least standard deviation of its grey levels; without texture, as in a smooth sky, any
 places look alike."""
@@ -530,13 +530,14 @@ def largest_seen(
     """Largest inverse depth of textured places that both frames show, with a margin; 0 if there are none.
     Arguments as in ``sweep_frames``.
 
-    It is searched at a quarter of the size and over the largest expected parallax: flow may have lost near
+    It is searched at a quarter of the size or less and over the largest expected parallax: flow may have lost near
     objects, whose depth would then not be searched.
     """
     poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
     maps = [reprojection_of(rig.sensor(side), poses[frame], poses[1 - frame]) for frame in FRAMES]
     gain = max(parallax_gain(rig.sensor(side), *maps), 1e-9)
-    coarse = replace(options, shrink=_COARSE * options.shrink // 2)
+    longest = max(greys[0].shape) // reduction(greys[0].shape)
+    coarse = replace(options, shrink=max(_COARSE * options.shrink // 2, math.ceil(longest / _COARSE_SIDE)))
     swept = sweep_frames(greys, rig, shutter, motion, side, _COARSE_REACH * max(greys[0].shape) / gain, coarse)
     height, width = swept[0].rho.shape
     known = []
