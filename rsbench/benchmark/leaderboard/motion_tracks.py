@@ -201,6 +201,7 @@ class SolverTrack(Track):
             "description": entry.description,
             "paper": spec.reference,
             "motion_model": "chosen" if entry.name == CHOOSES and self.choosing else model,
+            **{key: value for key in ("code", "tuned_on") if (value := getattr(entry.options, key))},
         }
         key = [entry.key, entry.options.deciding, asdict(RobustOptions())]
         return Runnable(entry.name, entry.built_in, key, header, spec.motion_model)
