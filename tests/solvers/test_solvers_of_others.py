@@ -29,12 +29,13 @@ def test_the_motion_is_found_among_wrong_matches(name: str) -> None:
     pytest.importorskip(PACKAGES[name])
     motion = TwistMotion(W, D)
     for ending, shutter in (("", GLOBAL), ("_scaled", SHUTTER)):
-        entry = load_solver_entry(f"{FOLDER / name}.py:{name}{ending}")
+        solver = f"{FOLDER / name}.py:{name}{ending}"
+        entry = load_solver_entry(solver)
         spec, options = entry.solver.spec, entry.options
         assert options.robust == "own" and options.code and options.tuned_on and not entry.built_in
         assert spec.shutter == ("global" if ending == "" else "rolling")
         data = rsbench.simulate(RIG, shutter, motion, noise_px=0.1, outlier_ratio=0.3)
-        found = rsbench.estimate_motion(data.correspondences, RIG, shutter, entry.path).estimate
+        found = rsbench.estimate_motion(data.correspondences, RIG, shutter, solver).estimate
         assert found.success, found.reason
         assert np.all(errors_deg(found, motion, spec.reference_point) < [0.1, 0.5])
         if spec.metric:

@@ -180,7 +180,9 @@ class SolverTrack(Track):
             return load_solver_entry(card)
         entry = load_solver_entry("rs-stereo-refined")
         words = "The recommended solver under the motion model that the matches of the problem prefer"
-        return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}")
+        tuned_on = f"spline added 26 November 2026, after points-2 was seen; {entry.options.tuned_on}"
+        options = replace(entry.options, tuned_on=tuned_on)
+        return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}", options=options)
 
     def check_entry(self, entry: SolverEntry) -> None:
         """Raises RsbenchError when a solver does not fit the track."""
