@@ -2,6 +2,7 @@
 
     nice python benchmarks/tune_solvers.py --out results/tuning                   # a quarter of an hour
     nice python benchmarks/tune_solvers.py --out results/tuning --solver rs-r6p    # those rows; others are kept
+    nice python benchmarks/tune_solvers.py --out out --solver examples/solvers/opencv_usac.py:opencv_usac
 
 Problems are drawn as those of the track `points`, of a seed of which nothing is published; gravity and gyroscopes,
 where a card asks for them, with the noise below. One option at a time differs from the card: the largest error of
@@ -79,7 +80,7 @@ def settings_of(solver: Solver, own_loop: bool) -> Iterator[Setting]:
     hints = get_type_hints(type(solver))
     for field in fields(solver):
         now, others = getattr(solver, field.name), tuple[Any, ...]()
-        if field.name == "threshold_px":
+        if field.name in ("threshold_px", "noise_px"):
             others = (0.5 * now, 2.0 * now)
         elif field.name == "lo_steps":
             others = (0,)
@@ -151,7 +152,7 @@ def rows_of(card: str, found: Sequence[tuple[Setting, FloatArray]]) -> list[dict
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--solver", action="append", choices=CARDS, help="only these rows")
+    parser.add_argument("--solver", action="append", help="only these rows; also FILE.py:NAME")
     options = parser.parse_args()
     assert SEED != PUBLIC_SEED, "tuned on what is published"
     options.out.mkdir(parents=True, exist_ok=True)

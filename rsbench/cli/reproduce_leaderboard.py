@@ -1,5 +1,5 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``, ``recorded``: what comes
-with rsbench, on tracks."""
+"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``, ``recorded``, ``held-out``:
+what comes with rsbench, on tracks."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import Any
 
 import pandas as pd
 
-from rsbench.benchmark.leaderboard.board import entries_of, splits_of, store
+from rsbench.benchmark.leaderboard.board import Scored, entries_of, restore, splits_of, store
 from rsbench.benchmark.leaderboard.motion_tracks import CHOOSES
 from rsbench.benchmark.leaderboard.smoke import own_solvers
+from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import track_of_id, track_of_name
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.trajectory_scores import METHODS
@@ -21,15 +22,22 @@ from rsbench.cli.console import echo
 from rsbench.cli.generate import generate
 from rsbench.cli.leaderboard import oracles, run, smoke
 from rsbench.cli.reproduce_correction import LAWS_FRAMES
+from rsbench.components.cards import shipped_folder
 from rsbench.components.plugins import Kind, offers
+from rsbench.core.errors import RsbenchError
+from rsbench.dataset.secret_split import read_secret
 from rsbench.report.board_page import build_site
+from rsbench.report.held_out_page import compared
+from rsbench.report.held_out_page import write_page as write_held_out
 from rsbench.report.recorded_page import by_recording, choices, write_page
+from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.storage.files import write_bytes, write_json, write_table
 from rsbench.storage.untrusted_files import read_json
 from rsbench.vision.corrector import CORRECTORS, load_corrector
 from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
 BOARD, LAWS, HANDHELD, FOOTAGE, RECORDED = "leaderboard", "laws", "handheld", "footage", "recorded"
+HELD_OUT = "held-out"
 """Folders of the boards below ``--data``."""
 OWN_RECORDINGS = "euroc"
 """Folder below ``--data`` of recordings that do not come with rsbench."""
@@ -41,6 +49,14 @@ SAME_METHOD = {
 }
 """Cards that are left out, each with the entry that stands for its method: versions that answer alike cost all
 others power, because the comparison of every pair is corrected for their number."""
+COMPARED = (
+    *("rs-stereo-auto", "rs-stereo-refined", "rs-stereo-refined-twist", "gs-stereo-tracks-scaled", "gs-poselib"),
+    *("gs-poselib-scaled", "gs-8pt", "gs-5pt-opencv", "rs-mono-refined", "gs-poselib-stereo", "rs-r6p"),
+    "rs-stereo-linear",
+)
+"""Entries of ours that are run on held-out splits."""
+_PUBLISHED = {"points-1": BOARD, "points-2": LAWS}
+"""Folders of results with what entries of ours answered on the public splits."""
 _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
 """Correctors of one camera, and that of a rig for what a second one is worth."""
 
@@ -113,6 +129,60 @@ def recorded(out: Path, data: Path, workers: int | None) -> None:
     write_table(folder / "recordings.csv", pd.concat(errors))
     write_table(folder / "choices.csv", pd.concat(chosen))
     echo(f"page: {write_page(folder)}")
+
+
+def held_out(out: Path, data: Path, workers: int | None) -> None:
+    """The announced secret splits of the tracks of points beside the public ones, with solvers of others.
+
+    Of public splits, the published answers of ours count as run; an entry that the board has is not run again.
+
+    Raises:
+        RsbenchError: the text or a split is not the announced one.
+    """
+    folder, board, count = out / HELD_OUT, data / f"{HELD_OUT}-board", workers or os.cpu_count() or 1
+    seed_file, about, tables = folder / "seed.txt", read_json(folder / "announced.json"), list[pd.DataFrame]()
+    foreign = {name.rpartition(":")[2]: name for name in solvers_of_others()}
+    for protocol, announced in about["splits"].items():
+        track, scored = track_of_id(protocol), list[list[Scored]]()
+        ours = {name: name for name in COMPARED if name != CHOOSES or protocol != "points-1"}
+        for given in (None, seed_file):
+            split = track.split(None, given)
+            if not split.public:
+                _check_announced(split, seed_file, about["commitment"], announced["fingerprint"])
+            there = board / protocol / split.name / "entries"
+            if split.public and protocol in _PUBLISHED and not there.is_dir():
+                restore(out / _PUBLISHED[protocol] / "predictions" / protocol, split, board)
+            entries = ours | foreign
+            if missing := [name for method, name in entries.items() if not (there / method).is_dir()]:
+                run(track.name, missing, str(board), seed_file=given, workers=count)
+            scored.append(
+                [each for each in entries_of(board, protocol, split.name) if each.header.method in entries]
+            )
+            if protocol == "points-2":
+                stored = folder / "predictions" / f"{protocol}--{split.name}"
+                store(board, protocol, split.name, stored, foreign if split.public else entries)
+        tables.append(compared(*scored))
+    publish(board, folder, f"rsbench reproduce {HELD_OUT}", tables_alone=True)
+    write_table(folder / "scores.csv", pd.concat(tables))
+    echo(f"page: {write_held_out(folder, about)}")
+
+
+def solvers_of_others() -> list[str]:
+    """The solvers in examples/solvers whose packages are installed, as ``FILE.py:NAME``."""
+    found = list[str]()
+    for file in sorted(shipped_folder("examples/solvers", "_docs/examples/solvers").glob("*.py")):
+        names = [f"{file}:{file.stem}{ending}" for ending in ("", "_scaled")]
+        try:
+            found += [name for name in names if load_solver_entry(name)]
+        except RsbenchError as error:
+            echo(f"left out: {error}", err=True)
+    return found
+
+
+def _check_announced(split: Split, seed_file: Path, commitment: str, fingerprint: str) -> None:
+    """Raises RsbenchError where a secret split or its text is not the announced one."""
+    if read_secret(seed_file).commitment != commitment or split.fingerprint != fingerprint:
+        raise RsbenchError(f"{seed_file}: draws {split.name}, which announced.json beside it does not announce")
 
 
 def _fill(

@@ -50,6 +50,8 @@ Component = TypeVar("Component")
 Options = TypeVar("Options")
 MARK = "rsbench_class"
 """Attribute of a function that is a component: the class that calls it."""
+CARD_OPTIONS = "card_options"
+"""Attribute of a class with its defaults for the further keys of a card, if it has any."""
 _PYTHON = re.compile(r"(.*\.py)(?::(.*))?", re.DOTALL)
 """A Python file, and the name of something in it."""
 
@@ -178,7 +180,7 @@ def _without_card(
         path=path,
         description=description,
         component=component,
-        options=kind.options(),
+        options=getattr(component, CARD_OPTIONS, kind.options()),
         key=component_key(component, {}),
     )
 
@@ -289,11 +291,14 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
     content = parse_card(
         CardContent, {("class_" if key == "class" else key): data[key] for key in _OWN if key in data}, str(path)
     )
-    options = parse_card(kind.options, {key: data[key] for key in data if key not in _OWN}, str(path))
     cls = _checked(
         kind, import_target(content.class_, path.parent, f"{path}: class = {content.class_!r}"), str(path)
     )
     component = make_component(kind, cls, content.parameters, str(path))
+    defaults = vars(getattr(component, CARD_OPTIONS, kind.options()))
+    options = parse_card(
+        kind.options, {**defaults, **{key: data[key] for key in data if key not in _OWN}}, str(path)
+    )
     return Entry(
         name=path.stem,
         path=path,

@@ -100,7 +100,7 @@ def test_everything_makes_each_folder_of_results_once(
     assert made[-1] == "image-claims" and len(set(made)) == len(made)
     lines = capsys.readouterr().out.splitlines()
     # Before each, how long it and the rest take, by how long the others took: at once, as if made before.
-    assert lines[0].startswith(f"[1 of {len(made)}] {made[0]}: about 3 minutes on two cores; with what follows 13")
+    assert lines[0].startswith(f"[1 of {len(made)}] {made[0]}: about 3 minutes on two cores; with what follows 14")
     assert lines[::2][:-1] == [each for each in lines if each.startswith("[")]
     assert lines[-3].endswith(
         "image-claims: about 1 minute on two cores; judges what the other targets have written: make them first"

@@ -185,6 +185,16 @@ def test_the_function_stays_one_and_is_a_solver_for_python() -> None:
         rsbench.estimate_motion(data.correspondences, RIG, ROLLING, print)
 
 
+def test_the_function_states_defaults_for_the_keys_of_its_card(folder: Path) -> None:
+    text = '@rsbench.solver(robust="own", code="OpenCV", tuned_on="seed 7")\ndef f(c, r, s): pass\n'
+    module = Path(written(folder, text))
+    options = load_solver_entry(module).options
+    assert (options.robust, options.code, options.tuned_on) == ("own", "OpenCV", "seed 7")
+    (folder / "mine-card.toml").write_text(f"class = '{module.stem}:f'\ncode = 'OpenCV 5'\n", "utf-8")
+    options = load_solver_entry("./mine-card.toml").options
+    assert (options.robust, options.code, options.tuned_on) == ("own", "OpenCV 5", "seed 7")
+
+
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
@@ -227,6 +237,7 @@ WRONG = {
     "@rsbench.solver\ndef f(c, rig, shutter, k): pass": ("defaults for all others",),
     "@rsbench.solver\ndef f(c, rig, shutter, spec=1): pass": ("rename the parameter 'spec'",),
     "@rsbench.solver(needs={'lefts'})\ndef f(c, rig, shutter): pass": ("'lefts' is no set of matches",),
+    "@rsbench.solver(robust='no')\ndef f(c, rig, shutter): pass": ("robust = 'no'", "ransac, own"),
     "@rsbench.solver(minimum=0)\ndef f(c, rig, shutter): pass": ("minimum", "above 0"),
     "f = rsbench.solver(len)": ("must decorate a function",),
     "@rsbench.solver\ndef f(c, r, s): pass\n@rsbench.solver\ndef g(c, r, s): pass": ("mine.py:f", "f, g"),

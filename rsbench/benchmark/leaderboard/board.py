@@ -18,7 +18,7 @@ import json
 import lzma
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -515,8 +515,10 @@ def _copy(scored: Scored, new: Path) -> None:
 SUFFIX = ".jsonl.xz"
 
 
-def store(board: Path, protocol: str, split: str, out: Path) -> list[Path]:
+def store(board: Path, protocol: str, split: str, out: Path, methods: Collection[str] | None = None) -> list[Path]:
     """Write the predictions of each entry of a split as ``<method>.jsonl.xz``; returns the files.
+
+    ``methods``: only of these entries.
 
     Raises:
         RsbenchError: an entry is damaged, or a file cannot be written.
@@ -524,6 +526,8 @@ def store(board: Path, protocol: str, split: str, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     files = list[Path]()
     for entry in entries_of(board, protocol, split):
+        if methods is not None and entry.header.method not in methods:
+            continue
         data = read_bytes(entry.folder / FILES[0], SUBMISSION_BYTES)
         files.append(out / f"{entry.header.method}{SUFFIX}")
         write_bytes(files[-1], lzma.compress(data, preset=9))

@@ -180,7 +180,9 @@ class SolverTrack(Track):
             return load_solver_entry(card)
         entry = load_solver_entry("rs-stereo-refined")
         words = "The recommended solver under the motion model that the matches of the problem prefer"
-        return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}")
+        tuned_on = f"spline added 26 November 2026, after points-2 was seen; {entry.options.tuned_on}"
+        options = replace(entry.options, tuned_on=tuned_on)
+        return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}", options=options)
 
     def check_entry(self, entry: SolverEntry) -> None:
         """Raises RsbenchError when a solver does not fit the track."""
@@ -201,6 +203,7 @@ class SolverTrack(Track):
             "description": entry.description,
             "paper": spec.reference,
             "motion_model": "chosen" if entry.name == CHOOSES and self.choosing else model,
+            **{key: value for key in ("code", "tuned_on") if (value := getattr(entry.options, key))},
         }
         key = [entry.key, entry.options.deciding, asdict(RobustOptions())]
         return Runnable(entry.name, entry.built_in, key, header, spec.motion_model)

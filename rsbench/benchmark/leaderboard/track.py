@@ -66,9 +66,18 @@ _ANNOUNCED = {
     "ee83b3153351ba62775f40dedeba0d2bfeb9c8c036fe6eefa6332c92b9e48b29": (
         "382c1320481b8b75aae3ba87190f80b7d671d73c323961e95e6bee131c507e77"
     ),
+    "c748fcf5effc5f5293eab32b091bd556929eb714be241a2195780639eef4adcf": (
+        "d432b58dd04f4353f6ce0631db5740e63c994e6966abcb9824830ae6f98dcdce"
+    ),
+    "ef8f2047bab3cc3881709c6582c1f96567efb3aee8147bbbb2ae50873ce7ff39": (
+        "9329dd1ab9a50dee717f6515e66785be690c95acbaa35d3c8856d4280ebc3272"
+    ),
+    "51ed76848fe56a6b53a86bc5749f9ac43490b4fa45135771edaacefb59155c66": (
+        "5fc20df13a159989134fd315cb2af1df41a27ea634296d38d795f268e7dc6878"
+    ),
 }
-"""Announced fingerprints of the public points and recordings, and of the motions of ``laws``. The key is the hash
-of the ground truth rounded to nine digits, which is the same on all processors."""
+"""Announced fingerprints of points and recordings, public and held-out, and of the motions of ``laws``. The key is
+the hash of the ground truth rounded to nine digits, which is the same on all processors."""
 Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Numbers = dict[str, float]

@@ -40,6 +40,7 @@ part of RANSAC's samples."""
 SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
 """Samples of other sensors."""
 Cameras = Literal["ideal", "lens", "any", "rig"]
+Robust = Literal["ransac", "own"]
 BESIDE: Mapping[MatchSet, str] = {"affine": "affine frames of left matches", **SENSORS}
 """Sets that are not matches."""
 
@@ -265,6 +266,7 @@ class _FunctionSolver(Solver):
     """Calls a function, see ``solver``."""
 
     function: ClassVar[Callable[..., Any]]
+    card_options: ClassVar[SolverOptions]
 
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
@@ -324,6 +326,9 @@ def solver(
     reference_point: Literal["body", "left"] = ...,
     cameras: Cameras = ...,
     reference: str = ...,
+    robust: Robust = ...,
+    code: str = ...,
+    tuned_on: str = ...,
 ) -> F: ...
 @overload
 def solver(
@@ -338,6 +343,9 @@ def solver(
     reference_point: Literal["body", "left"] = ...,
     cameras: Cameras = ...,
     reference: str = ...,
+    robust: Robust = ...,
+    code: str = ...,
+    tuned_on: str = ...,
 ) -> Callable[[F], F]: ...
 def solver(
     function: Any = None,
@@ -351,6 +359,9 @@ def solver(
     reference_point: Literal["body", "left"] = "body",
     cameras: Cameras = "ideal",
     reference: str = "",
+    robust: Robust = "ransac",
+    code: str = "",
+    tuned_on: str = "",
 ) -> Any:
     """Make a solver of a function ``(correspondences, rig, shutter)`` that returns w and d, or None.
 
@@ -370,6 +381,7 @@ def solver(
             is not for the samples of sensors, of which two are needed.
         metric: whether d is in metres.
         motion_model, shutter, reference_point, cameras, reference: see ``SolverSpec``.
+        robust, code, tuned_on: see ``SolverOptions``; a card may set them too.
 
     Raises:
         ValueError: no function of three arguments, or an option out of its range.
@@ -384,6 +396,8 @@ def solver(
     }
     sets: frozenset[Any] = frozenset([needs] if isinstance(needs, str) else needs)
     least = {each: 2 if each in SENSORS else minimum for each in sets} if isinstance(minimum, int) else minimum
+
+    card_options = SolverOptions(robust=robust, code=code, tuned_on=tuned_on)
 
     def mark(function: F) -> F:
         if not isinstance(function, FunctionType):
@@ -414,7 +428,7 @@ def solver(
             bases=(_FunctionSolver,),
             frozen=True,
             kw_only=True,
-            namespace={"__doc__": doc, "spec": spec},
+            namespace={"__doc__": doc, "spec": spec, "card_options": card_options},
         )
         cls.function = staticmethod(function)
         cls.__module__, cls.__qualname__ = function.__module__, f"{function.__qualname__}.{MARK}"
@@ -428,14 +442,20 @@ def solver(
 class SolverOptions:
     """Keys of a solver's card beside its parameters."""
 
-    robust: Literal["ransac", "own"] = "ransac"
+    robust: Robust = "ransac"
     """``own``: the solver rejects outliers itself and gets all matches; ``ransac``: rsbench's loop does."""
     use: str = ""
     """When to choose this solver, one line for readers; no code uses it."""
     time_limit_s: float = 60.0
     """Wall-clock time for one problem, after which a solver of another package has failed."""
+    code: str = ""
+    """Whose code finds the motion, if not rsbench's: package, version and licence, for boards."""
+    tuned_on: str = ""
+    """Data by which parameters of the method were chosen, and when, for boards; empty: not stated."""
 
     def __post_init__(self) -> None:
+        if self.robust not in get_args(Robust):
+            raise ValueError(f"robust = {shown(self.robust)}: must be one of {', '.join(get_args(Robust))}")
         if not self.time_limit_s > 0.0:
             raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
 

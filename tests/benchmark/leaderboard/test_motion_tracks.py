@@ -45,7 +45,7 @@ from rsbench.benchmark.leaderboard.splits import (
     truth_of,
 )
 from rsbench.benchmark.leaderboard.standings import standings, table
-from rsbench.benchmark.leaderboard.track import Split
+from rsbench.benchmark.leaderboard.track import ORACLE, Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_name
 from rsbench.benchmark.simulated.bound import motion_bound
 from rsbench.cli.reproduce_leaderboard import SAME_METHOD, entries_of_laws
@@ -311,6 +311,18 @@ def test_stored_predictions_give_the_committed_table(protocol: str, split: Split
     made = json.loads((LAWS_FOLDER / "provenance.json").read_text("utf-8"))["entries"]
     names = {name.rpartition("/")[2] for name in made if name.startswith(f"{protocol}/")}
     assert names == set(found["method"])
+
+
+@needs_results
+@pytest.mark.parametrize("folder", ["leaderboard/predictions/points-1", "laws/predictions/points-2"])
+def test_stored_entries_say_what_they_were_tuned_on(folder: str) -> None:
+    """As their cards do today; whoever chooses adds what concerns its choice."""
+    track = track_of_name(Path(folder).name)
+    for file in (ROOT / "results" / folder).glob(f"*{SUFFIX}"):
+        header = json.loads(lzma.decompress(file.read_bytes()).partition(b"\n")[0])
+        if header["uses"] != [ORACLE]:
+            assert header["tuned_on"] == track.runnable(header["method"]).header["tuned_on"] != ""
+            assert "2026" in header["tuned_on"] or header["tuned_on"] == "nothing"
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import assert_refused, run_here
+from documents import ROOT
 from leaderboards import jobs_here, leaderboard
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -28,7 +29,9 @@ from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.cli import reproduce_leaderboard
 from rsbench.cli.reproduce import Target, reproduce
+from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
+from rsbench.dataset.secret_split import Secret
 
 TRACK = TRACKS["points-recorded"]
 
@@ -133,6 +136,37 @@ def test_one_command_makes_the_boards_and_the_page(tmp_path: Path, monkeypatch: 
     )
     chosen = pd.read_csv(out / "recorded/choices.csv")
     assert len(chosen) == 8 and (chosen["departure_px"] > 0.0).all()
+
+
+def test_an_announced_split_is_run_beside_the_public_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two windows of each recording; another text, or another split, is not what was announced."""
+    monkeypatch.setattr(recorded, "OF_A_RECORDING", 2)
+    monkeypatch.setattr(reproduce_leaderboard, "COMPARED", ("gs-8pt",))
+    usac = f"{ROOT / 'examples/solvers/opencv_usac.py'}:opencv_usac"
+    monkeypatch.setattr(reproduce_leaderboard, "solvers_of_others", lambda: [usac])
+    monkeypatch.setattr(running, "finished_jobs", jobs_here)
+    forget()
+    folder = tmp_path / "results/held-out"
+    folder.mkdir(parents=True)
+    (folder / "seed.txt").write_text("a text that nobody could guess")
+    split = TRACK.split(None, folder / "seed.txt")
+    about = {"commitment": Secret("a text that nobody could guess").commitment}
+    about |= {"splits": {TRACK.id: {"split": split.name, "fingerprint": split.fingerprint}}}
+    (folder / "announced.json").write_text(json.dumps(about))
+    reproduce(Target.held_out, tmp_path / "results", tmp_path / "data", workers=1)
+    table = pd.read_csv(folder / "scores.csv").set_index("method")
+    assert set(table.index) == {"gs-8pt", "opencv_usac"}
+    assert table["code"]["gs-8pt"] == "rsbench" and table["code"]["opencv_usac"].startswith("OpenCV")
+    board = tmp_path / "data/held-out-board" / TRACK.id
+    for name, label in (("dev", TRACK.split(None).name), ("test", split.name)):
+        scores = pd.read_csv(board / label / "entries/gs-8pt/scores.csv")
+        assert table[f"{name}_score"]["gs-8pt"] == pytest.approx(
+            scores["near_bound"].mean(), abs=1e-6
+        )  # six digits
+    (folder / "seed.txt").write_text("another text that nobody could guess")
+    with pytest.raises(RsbenchError, match=r"seed\.txt: draws .* does not announce"):
+        reproduce(Target.held_out, tmp_path / "results", tmp_path / "data", workers=1)
+    forget()
 
 
 def forget() -> None:
