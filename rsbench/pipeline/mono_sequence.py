@@ -74,7 +74,7 @@ class _Seen(NamedTuple):
     number: int
     """Number of the first frame."""
     images: tuple[NDArray[Any], NDArray[Any]]
-    flows: Flows | None
+    flows: Flows | _RoundedFlows | None
     """See ``_kept``; None: it is computed again."""
     found: FoundOwnMotion | None
     reason: str
@@ -235,8 +235,22 @@ def _analyse(
     return _Seen(number, images, _kept(flows), found, reason, matches)
 
 
-def _kept(flows: Flows) -> Flows | None:
-    """The flow of a pair that waits: as it is, rounded to integers if it is large, or None if it is very large."""
+class _RoundedFlows(NamedTuple):
+    """``Flows`` in half the memory."""
+
+    flow: tuple[NDArray[np.int16], NDArray[np.int16]]
+    """In steps of ``_ROUNDED_PX``."""
+    returns: tuple[NDArray[np.float16], NDArray[np.float16]]
+    scale: float
+
+    def restored(self) -> Flows:
+        first, second = (each * np.float32(_ROUNDED_PX) for each in self.flow)
+        there, back = (each.astype(np.float32) for each in self.returns)
+        return Flows((first, second), (there, back), self.scale)
+
+
+def _kept(flows: Flows) -> Flows | _RoundedFlows | None:
+    """The flow of a pair that waits for others: as it is, rounded if it is large, or None if it is very large."""
     size = _PENDING * sum(each.nbytes for each in (*flows.flow, *flows.returns))
     if size <= _PENDING_BYTES:
         return flows
@@ -244,16 +258,7 @@ def _kept(flows: Flows) -> Flows | None:
         return None
     first, second = (np.clip(np.rint(each / _ROUNDED_PX), -32767, 32767).astype(np.int16) for each in flows.flow)
     there, back = (each.astype(np.float16) for each in flows.returns)
-    return Flows((first, second), (there, back), flows.scale)
-
-
-def _restored(flows: Flows) -> Flows:
-    """The flow for ``_kept``."""
-    if flows.flow[0].dtype == np.float32:
-        return flows
-    first, second = (each * np.float32(_ROUNDED_PX) for each in flows.flow)
-    there, back = (each.astype(np.float32) for each in flows.returns)
-    return Flows((first, second), (there, back), flows.scale)
+    return _RoundedFlows((first, second), (there, back), flows.scale)
 
 
 def _first_motion(
@@ -281,7 +286,8 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Cor
     if found is None:
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
-    flows = find_flows(images) if seen.flows is None else _restored(seen.flows)
+    flows = find_flows(images) if seen.flows is None else seen.flows
+    flows = flows.restored() if isinstance(flows, _RoundedFlows) else flows
     corrector = options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
     if isinstance(found.own.motion, InertialMotion):  # the motion is not from a trajectory

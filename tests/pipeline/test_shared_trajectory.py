@@ -15,9 +15,9 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_correction
 from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, with_shared_trajectory
-from rsbench.pipeline.mono_sequence import correct_frames
+from rsbench.pipeline.mono_sequence import _kept, _RoundedFlows, correct_frames
 from rsbench.pipeline.sequence_capture import CorrectedMoment
-from rsbench.vision.mono_fusion import OwnMotion
+from rsbench.vision.mono_fusion import Flows, OwnMotion
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 160.0
 COUNT = 14
@@ -128,3 +128,21 @@ def test_a_pair_that_a_way_does_not_explain_keeps_its_own_motion(monkeypatch: py
     assert all(each is pair.found for each in with_shared_trajectory([pair] * 2))
     monkeypatch.setattr(mono_correction, "camera_trajectory", lambda *rest: None)
     assert all(each is pair.found for each in with_shared_trajectory([pair] * 3))
+
+
+def test_flow_that_waits_takes_little_memory_and_is_hardly_changed() -> None:
+    rng = np.random.default_rng(0)
+
+    def kept(height: int, width: int) -> tuple[Flows, Flows | _RoundedFlows | None]:
+        two = rng.normal(0.0, 30.0, (2, height, width, 2)).astype(np.float32)
+        flows = Flows((two[0], two[1]), (abs(two[0, ..., 0]), abs(two[1, ..., 0])))
+        return flows, _kept(flows)
+
+    small, same = kept(480, 640)
+    assert same is small
+    large, rounded = kept(1080, 1920)
+    assert isinstance(rounded, _RoundedFlows)
+    again = rounded.restored()
+    for before, after in zip((*large.flow, *large.returns), (*again.flow, *again.returns), strict=True):
+        np.testing.assert_allclose(after, before, atol=1 / 128, rtol=1e-3)
+    assert kept(2160, 3840)[1] is None
