@@ -299,11 +299,10 @@ def _corrected(each: _Frame, turn: Turned, options: CorrectionOptions) -> Correc
     """Correct a frame with one neighbour and fill it from the other; or return why not."""
     line = turn.line(options.target_row)
     sources = [(each.before, 1), (each.after, 0)]
-    if line > (turn.camera.height - 1) / 2:
-        sources.reverse()
     good = [
         (pair.fusion, place, pair.found) for pair, place in sources if pair is not None and pair.fusion is not None
     ]
+    good.sort(key=lambda source: _readouts_away(*source[:2], line))
     why = "" if each.before is None else each.before.reason
     moment = CorrectedMoment(number=each.number, images={"left": each.image}, frames={}, found=None, reason=why)
     # A still camera needs no correction; an identical frame, however, replaces one that was not recorded.
@@ -320,6 +319,14 @@ def _corrected(each: _Frame, turn: Turned, options: CorrectionOptions) -> Correc
     beyond = Beyond(*good[1][:2], _target(*good[1][:2], line)) if len(good) > 1 else None
     fused = inpainted(turn.back(fusion.corrected(place, _target(fusion, place, line), beyond)), options)
     return replace(moment, frames={"left": fused}, found=turn.found(found))
+
+
+def _readouts_away(fusion: MonoFusion, place: int, line: float) -> float:
+    """Time from a line of frame ``place`` of a pair to the middle line of the other frame, in readouts."""
+    shutter = fusion.own.shutter
+    later = (line - (shutter.height - 1) / 2) / shutter.height
+    period = 1.0 / shutter.readout_ratio if shutter.readout_ratio > 0.0 else np.inf
+    return period + (later if place else -later)
 
 
 # Test whether a corrected frame is nearer to the truth than the frame as read.
