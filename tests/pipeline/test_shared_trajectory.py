@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -15,9 +17,9 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_correction
 from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, with_shared_trajectory
-from rsbench.pipeline.mono_sequence import _kept, _RoundedFlows, correct_frames
+from rsbench.pipeline.mono_sequence import _kept, _readouts_away, _RoundedFlows, correct_frames
 from rsbench.pipeline.sequence_capture import CorrectedMoment
-from rsbench.vision.mono_fusion import Flows, OwnMotion
+from rsbench.vision.mono_fusion import Flows, MonoFusion, OwnMotion
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 160.0
 COUNT = 14
@@ -146,3 +148,19 @@ def test_flow_that_waits_takes_little_memory_and_is_hardly_changed() -> None:
     for before, after in zip((*large.flow, *large.returns), (*again.flow, *again.returns), strict=True):
         np.testing.assert_allclose(after, before, atol=1 / 128, rtol=1e-3)
     assert kept(2160, 3840)[1] is None
+
+
+def test_the_neighbour_nearer_in_time_corrects_a_frame() -> None:
+    """After a missing frame it is the next one; with even times the side of the target's row decides."""
+
+    def first(periods: tuple[float, float], line: float) -> int:
+        pairs = [
+            SimpleNamespace(own=SimpleNamespace(shutter=RollingShutter(height=HEIGHT, readout_ratio=0.8 / period)))
+            for period in periods
+        ]
+        return min((0, 1), key=lambda k: _readouts_away(cast(MonoFusion, pairs[k]), 1 - k, line))
+
+    middle = (HEIGHT - 1) / 2
+    assert [first((1.0, 1.0), line) for line in (0.0, middle, HEIGHT - 1.0)] == [0, 0, 1]
+    assert [first((2.0, 1.0), line) for line in (0.0, middle)] == [1, 1]
+    assert first((1.0, 2.0), HEIGHT - 1.0) == 0
