@@ -613,7 +613,7 @@ class ImageSource(FrameSource):
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
-    """Time and memory to correct frames of one camera, measured on two cores (``benchmarks/footage_sizes.py``)."""
+    """Time and memory to correct frames of one camera, measured on two cores (``benchmarks/phone_video.py``)."""
 
     seconds: float
     """Seconds per frame and million pixels."""
@@ -630,4 +630,4 @@ class Forecast:
         return f"about {time} on two cores, {gigabytes:.1f} GB of memory"
 
 
-FORECAST = Forecast(seconds=2.5, bytes=450.0, start_s=10.0, start_bytes=4.3e8)
+FORECAST = Forecast(seconds=1.6, bytes=620.0, start_s=20.0, start_bytes=3.4e8)
