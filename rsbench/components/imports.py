@@ -227,7 +227,8 @@ def blaming(where: str, what: str) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:
         text = str(error).partition("\n")[0] if isinstance(error, RsbenchError) else exception_text(error)
-        raise RsbenchError(f"{where}: {what}: {text}") from error
+        remedy = "; install the package that has it" if isinstance(error, ModuleNotFoundError) else ""
+        raise RsbenchError(f"{where}: {what}: {text}{remedy}") from error
     finally:
         _threads.extend(each for each in threading.enumerate() if each not in before and not each.daemon)
 

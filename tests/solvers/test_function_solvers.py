@@ -238,6 +238,7 @@ WRONG = {
     "@rsbench.solver\ndef f(c, rig, shutter, spec=1): pass": ("rename the parameter 'spec'",),
     "@rsbench.solver(needs={'lefts'})\ndef f(c, rig, shutter): pass": ("'lefts' is no set of matches",),
     "@rsbench.solver(robust='no')\ndef f(c, rig, shutter): pass": ("robust = 'no'", "ransac, own"),
+    "@rsbench.solver(code=3)\ndef f(c, rig, shutter): pass": ("code = 3", "must be a text"),
     "@rsbench.solver(minimum=0)\ndef f(c, rig, shutter): pass": ("minimum", "above 0"),
     "f = rsbench.solver(len)": ("must decorate a function",),
     "@rsbench.solver\ndef f(c, r, s): pass\n@rsbench.solver\ndef g(c, r, s): pass": ("mine.py:f", "f, g"),

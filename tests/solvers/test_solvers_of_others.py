@@ -44,5 +44,6 @@ def test_the_motion_is_found_among_wrong_matches(name: str) -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("gtsam") is not None, reason="gtsam is installed")
 def test_a_package_that_is_missing_is_named_in_one_line() -> None:
-    with pytest.raises(rsbench.RsbenchError, match=r"gtsam_stereo\.py: cannot be imported: .*named 'gtsam'$"):
+    words = r"gtsam_stereo\.py: cannot be imported: .*named 'gtsam'; install the package that has it$"
+    with pytest.raises(rsbench.RsbenchError, match=words):
         load_solver_entry(FOLDER / "gtsam_stereo.py")

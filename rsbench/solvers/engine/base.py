@@ -456,6 +456,9 @@ class SolverOptions:
     def __post_init__(self) -> None:
         if self.robust not in get_args(Robust):
             raise ValueError(f"robust = {shown(self.robust)}: must be one of {', '.join(get_args(Robust))}")
+        for key in ("use", "code", "tuned_on"):
+            if not isinstance(value := getattr(self, key), str):
+                raise ValueError(f"{key} = {shown(value)}: must be a text")
         if not self.time_limit_s > 0.0:
             raise ValueError(f"time_limit_s = {self.time_limit_s}: must be a positive number of seconds")
 
