@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +30,7 @@ from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec
+from rsbench.vision.epipolar_search import reduction
 from rsbench.vision.fusion import Fused
 from rsbench.vision.images import eight_bit, local_variance
 from rsbench.vision.mono_fusion import Flows, MonoFusion, MonoFusionOptions, OwnMotion, find_flows
@@ -150,16 +152,22 @@ class FoundOwnMotion:
 
 def refusal(images: Sequence[NDArray[Any]], flows: Flows) -> str:
     """Why two frames (H, W[, 3]) of one camera cannot be corrected; empty when they can."""
-    variances = [local_variance(image) for image in eight_bit(list(images))]
+    height, width = flows.shape
+    small = [image if image.shape[:2] == flows.shape else _shrunk(image, width, height) for image in images]
+    variances = [local_variance(image) for image in eight_bit(small)]
     for name, variance in zip(("first", "second"), variances, strict=True):
         if np.mean(variance > _TEXTURE_LEVELS**2) < _TEXTURED:
             return f"the {name} frame shows no texture: its motion cannot be estimated"
     clear = variances[1] >= np.quantile(variances[1], 1.0 - _CLEAREST)
-    if float(np.quantile(np.linalg.norm(flows.flow[1][clear], axis=-1), _MOST)) < _STILL_PX * flows.scale:
+    if float(np.quantile(np.linalg.norm(flows.flow[1][clear], axis=-1), _MOST)) < _STILL_PX:
         return STILL
     if float(np.mean(flows.returns[1] < _RETURNS_PX)) < _LEAST_RETURNING:
         return CUT
     return ""
+
+
+def _shrunk(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
@@ -174,7 +182,8 @@ def flow_matches(flows: Flows, rng: np.random.Generator) -> FloatArray:
     good = np.flatnonzero(inside & (flows.returns[1] < _RETURNS_PX))
     chosen = rng.choice(good, min(_MATCHES, good.size), replace=False)
     here = np.stack([chosen % width, chosen // width], axis=-1).astype(np.float64)
-    return np.concatenate([here + flow.reshape(-1, 2)[chosen], here], axis=-1)
+    there = here + flow.reshape(-1, 2)[chosen]
+    return np.concatenate([flows.in_frame(there), flows.in_frame(here)], axis=-1)
 
 
 def trajectory_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatArray:
@@ -182,7 +191,7 @@ def trajectory_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatA
 
     A match that ends at such a pixel is continued by a match of the next pair, which begins there.
     """
-    height, width = flows.returns[0].shape
+    height, width = flows.shape
     rng = np.random.default_rng(seed)
     chosen = rng.choice(height * width, min(pixels, height * width), replace=False)
     y, x = np.divmod(chosen, width)
@@ -190,7 +199,8 @@ def trajectory_matches(flows: Flows, seed: int, pixels: int = _PIXELS) -> FloatA
     for frame, (flow, returns) in enumerate(zip(flows.flow, flows.returns, strict=True)):
         there = here + flow[y, x]
         good = (returns[y, x] < _RETURNS_PX) & np.all((there >= 0.0) & (there <= [width - 1, height - 1]), axis=-1)
-        out.append(np.concatenate([there, here] if frame else [here, there], axis=-1)[good])
+        ends = flows.in_frame(here[good]), flows.in_frame(there[good])
+        out.append(np.concatenate(ends[::-1] if frame else ends, axis=-1))
     return rng.permutation(np.concatenate(out))
 
 
@@ -321,8 +331,8 @@ PIXELS = 300
 _LEAST = 50
 """Fewest matches of a pair in a trajectory."""
 _FLOW_PX = 0.15
-"""A trajectory explains a pair if its error is below this error of dense flow (root mean square, px), or not above
-the error of the pair's own motion."""
+"""A trajectory explains a pair if its error is below this error of dense flow (root mean square, px of the size at
+which the flow is found), or not above the error of the pair's own motion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -391,7 +401,7 @@ def _trajectory_motions(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundO
     owns = [pair.found.own for _, pair in run if pair.found is not None]
     if len(run) < _FEWEST_PAIRS or owns[0].shutter.readout_ratio == 0.0:
         return {}
-    periods = np.array([pair.period for _, pair in run])
+    periods, camera = np.array([pair.period for _, pair in run]), owns[0].rig.camera
     # Ratios are relative to the period of each pair, at most 1.
     ratio = float(np.max(periods * [own.shutter.readout_ratio for own in owns]))
     trajectories = camera_trajectory(
@@ -401,10 +411,10 @@ def _trajectory_motions(run: Sequence[tuple[int, SeenPair]]) -> dict[int, FoundO
         owns[0].shutter.with_ratio(min(ratio, 1.0)),
         np.concatenate([[0.0], np.cumsum(periods)]),
     )
-    out = dict[int, FoundOwnMotion]()
+    out, flow_px = dict[int, FoundOwnMotion](), _FLOW_PX * reduction((camera.height, camera.width))
     for (number, pair), own, steady, path in zip(run, owns, motions, trajectories or [], strict=False):
         errors = [error_px(each, pair.matches, own.rig, own.shutter, own.side) for each in (path, steady)]
-        if pair.found is not None and errors[0] <= max(errors[1], _FLOW_PX):
+        if pair.found is not None and errors[0] <= max(errors[1], flow_px):
             out[number] = with_motion(pair.found, path)
     return out
 

@@ -52,10 +52,6 @@ from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOpti
 
 _AT_ONCE = 2
 """Number of pairs that are processed in parallel; parts of a pair's work use two cores by themselves."""
-_PENDING, _PENDING_BYTES = 14, 4e8
-"""Number of pairs that wait for later ones, and the memory that their flow may take."""
-_ROUNDED_PX = 1 / 64
-"""Step to which the flow of large frames is rounded while it waits: a fraction of its error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,8 +70,7 @@ class _Seen(NamedTuple):
     number: int
     """Number of the first frame."""
     images: tuple[NDArray[Any], NDArray[Any]]
-    flows: Flows | _RoundedFlows | None
-    """See ``_kept``; None: it is computed again."""
+    flows: Flows
     found: FoundOwnMotion | None
     reason: str
     """Why they cannot be corrected; empty if they can."""
@@ -232,33 +227,7 @@ def _analyse(
     if gyro is not None and samples is None and found is not None:
         found = replace(found, unused=NOT_COVERED)
     matches = trajectory_matches(flows, options.seed, PIXELS) if gyro is None else np.zeros((0, 4))
-    return _Seen(number, images, _kept(flows), found, reason, matches)
-
-
-class _RoundedFlows(NamedTuple):
-    """``Flows`` in half the memory."""
-
-    flow: tuple[NDArray[np.int16], NDArray[np.int16]]
-    """In steps of ``_ROUNDED_PX``."""
-    returns: tuple[NDArray[np.float16], NDArray[np.float16]]
-    scale: float
-
-    def restored(self) -> Flows:
-        first, second = (each * np.float32(_ROUNDED_PX) for each in self.flow)
-        there, back = (each.astype(np.float32) for each in self.returns)
-        return Flows((first, second), (there, back), self.scale)
-
-
-def _kept(flows: Flows) -> Flows | _RoundedFlows | None:
-    """The flow of a pair that waits for others: as it is, rounded if it is large, or None if it is very large."""
-    size = _PENDING * sum(each.nbytes for each in (*flows.flow, *flows.returns))
-    if size <= _PENDING_BYTES:
-        return flows
-    if size > 2.0 * _PENDING_BYTES:
-        return None
-    first, second = (np.clip(np.rint(each / _ROUNDED_PX), -32767, 32767).astype(np.int16) for each in flows.flow)
-    there, back = (each.astype(np.float16) for each in flows.returns)
-    return _RoundedFlows((first, second), (there, back), flows.scale)
+    return _Seen(number, images, flows, found, reason, matches)
 
 
 def _first_motion(
@@ -286,13 +255,11 @@ def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: Cor
     if found is None:
         return _Pair(fusion=None, found=None, reason=seen.reason)
     images = [turn.image(image) for image in seen.images]
-    flows = find_flows(images) if seen.flows is None else seen.flows
-    flows = flows.restored() if isinstance(flows, _RoundedFlows) else flows
     corrector = options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
     if isinstance(found.own.motion, InertialMotion):  # the motion is not from a trajectory
-        found = with_best_motion(found, flows, options.robust, options.seed)
-    return _Pair(fusion=MonoFusion(images, found.own, flows, corrector.fusion), found=found, reason="")
+        found = with_best_motion(found, seen.flows, options.robust, options.seed)
+    return _Pair(fusion=MonoFusion(images, found.own, seen.flows, corrector.fusion), found=found, reason="")
 
 
 def _corrected(each: _Frame, turn: Turned, options: CorrectionOptions) -> CorrectedMoment:
@@ -310,14 +277,15 @@ def _corrected(each: _Frame, turn: Turned, options: CorrectionOptions) -> Correc
     if stays or not good:
         return replace(moment, reason=why or (each.after.reason if each.after else ""))
     fusion, place, found = good[0]
+    target = _target(fusion, place, line)
+    places = fusion.places(place, target)
     # A gyroscope measures shakes between frames, which the parabolas of ``expected_errors`` do not follow.
     if fusion.own.shutter.readout_ratio > 0.0 and not isinstance(fusion.own.motion, GyroMotion):
-        drawn = fusion.places(place, _target(fusion, place, line))[..., :2]
-        errors = expected_errors(turn.image(each.image), drawn, [pair[:2] for pair in good], line)
+        errors = expected_errors(turn.image(each.image), places, [pair[:2] for pair in good], line)
         if errors[0] > _LARGEST_RATIO[len(good)] * errors[1]:
             return replace(moment, reason=UNTRUSTED)
     beyond = Beyond(*good[1][:2], _target(*good[1][:2], line)) if len(good) > 1 else None
-    fused = inpainted(turn.back(fusion.corrected(place, _target(fusion, place, line), beyond)), options)
+    fused = inpainted(turn.back(fusion.corrected(place, target, beyond, places)), options)
     return replace(moment, frames={"left": fused}, found=turn.found(found))
 
 
@@ -353,14 +321,20 @@ def expected_errors(
 
     Args:
         image: the frame (H, W[, C]), with rows read from the top.
-        drawn: (H, W, 2) position of each of its pixels in the corrected frame, px.
+        drawn: (H, W, 2 or 3) position of each of its pixels in the corrected frame, px.
         seen: the pairs that contain the frame, and its index in each; the readout ratio must be above 0.
         line: the line at whose time the target is.
     """
-    grey = cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), _SMOOTHED_PX)
-    height, width = grey.shape
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    ahead, good, ends = (line - y) / height, np.ones(grey.shape, dtype=np.bool_), list[tuple[Any, Any]]()
+    lines, flows = len(image), seen[0][0].flows
+    height, width = flows.shape
+    grey = cv2.resize(grey_u8(image), (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), _SMOOTHED_PX)
+    columns, rows = (
+        ((np.arange(n) + 0.5) * s).astype(np.intp) for n, s in zip((width, height), flows.scale, strict=True)
+    )
+    away = (drawn[np.ix_(rows, columns)][..., :2] - np.stack(np.meshgrid(columns, rows), axis=-1)) / flows.scale
+    ahead, good = ((line - rows) / lines)[:, None], np.ones(grey.shape, dtype=np.bool_)
+    ends = list[tuple[Any, Any]]()
     for fusion, place in seen:  # times in readouts, which pairs of different lengths share
         flow, period = fusion.flows.flow[place], (1.0 - 2.0 * place) / fusion.own.shutter.readout_ratio
         ends.append((period + flow[..., 1] / height, flow))
@@ -373,7 +347,7 @@ def expected_errors(
         moved = moved + (ahead * (ahead - a) / (b * (b - a)))[..., None] * to_last
     slopes = [cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125) for dx in (1, 0)]
     errors = []
-    for off in (drawn - np.stack([x, y], axis=-1) - moved, moved):
+    for off in (away - moved, moved):
         length = np.linalg.norm(off, axis=-1)
         levels = slopes[0] * off[..., 0] + slopes[1] * off[..., 1]
         levels *= np.minimum(1.0, _CLIPPED_PX / np.maximum(length, 1e-6))

@@ -503,7 +503,7 @@ def sweep_frames(
     height, width = search_size(greys[0].shape, options)
     camera = rig.sensor(side).resized(width, height)
     small = [np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)) for grey in greys]
-    poses = [_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
+    poses = [line_poses(rig, shutter, motion, side, frame, height) for frame in FRAMES]
     maps = [reprojection_of(camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
     gain = parallax_gain(camera, *maps)
     count = min(max(math.ceil(gain * most / options.step_px) + 1, _FEWEST), options.planes)
@@ -533,7 +533,7 @@ def largest_seen(
     It is searched at a quarter of the size or less and over the largest expected parallax: flow may have lost near
     objects, whose depth would then not be searched.
     """
-    poses = [_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
+    poses = [line_poses(rig, shutter, motion, side, frame, greys[0].shape[0]) for frame in FRAMES]
     maps = [reprojection_of(rig.sensor(side), poses[frame], poses[1 - frame]) for frame in FRAMES]
     gain = max(parallax_gain(rig.sensor(side), *maps), 1e-9)
     longest = max(greys[0].shape) // reduction(greys[0].shape)
@@ -555,17 +555,19 @@ def search_size(shape: tuple[int, ...], options: SweepOptions) -> tuple[int, int
     return max(shape[0] // shrink, 8), max(shape[1] // shrink, 8)
 
 
-_ENOUGH = 1 << 21
-"""Largest number of pixels, just above 1920 x 1080: more do not improve motion and depth
+_ENOUGH = 1 << 20
+"""Largest number of pixels, between 1280 x 720 and 1920 x 1080: more do not improve motion and depth
 (``benchmarks/footage_sizes.py``)."""
 
 
 def reduction(shape: tuple[int, ...]) -> int:
-    """Factor by which frames (H, W[, C]) are shrunk before motion and depth are estimated: 2 for 4K, 1 for HD."""
+    """Factor by which frames (H, W[, C]) are shrunk before motion and depth are estimated: 3 for 4K, 2 for HD."""
     return max(math.ceil(math.sqrt(shape[0] * shape[1] / _ENOUGH) - 1e-9), 1)
 
 
-def _poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, height: int) -> Pose:
+def line_poses(
+    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int, height: int
+) -> Pose:
     """``cam_from_world`` of the rows of a frame of ``height`` rows, each at the mean time of its own."""
     scale = shutter.lines(side) / height
     rows = (np.arange(height) + 0.5) * scale - 0.5

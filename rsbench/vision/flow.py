@@ -19,7 +19,14 @@ from rsbench.vision.images import grey_u8
 F32 = NDArray[np.float32]
 
 
-def dense_flow(first: NDArray[Any], second: NDArray[Any], start: F32 | None = None, *, quick: bool = False) -> F32:
+_FINE_STRIDE, _FINE_STEPS = 5, 12
+"""Distance between patches, px, and descents of each, at full resolution: twice as fast as OpenCV's (3 and 25), with
+flow that differs by 0.02 px (median)."""
+
+
+def dense_flow(
+    first: NDArray[Any], second: NDArray[Any], start: F32 | None = None, *, quick: bool = False, fine: bool = False
+) -> F32:
     """Displacement (H, W, 2), px, from ``first`` to ``second`` (H, W[, 3]), uint8 or uint16.
 
     Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016 (OpenCV).
@@ -27,9 +34,14 @@ def dense_flow(first: NDArray[Any], second: NDArray[Any], start: F32 | None = No
     Args:
         start: (H, W, 2) px, an approximation; None: no motion.
         quick: take a fifth of the time, with less accuracy: as the start of an alignment.
+        fine: take three times the time, and match at full resolution, not at half of it: for shrunk images.
     """
     presets = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
     dis = cv2.DISOpticalFlow.create(presets[quick])
+    if fine:
+        dis.setFinestScale(0)
+        dis.setPatchStride(_FINE_STRIDE)
+        dis.setGradientDescentIterations(_FINE_STEPS)
     near = None if start is None else start.copy()  # OpenCV overwrites it
     return np.asarray(dis.calc(grey_u8(first), grey_u8(second), near), dtype=np.float32)
 

@@ -28,7 +28,15 @@ from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import WarpOptions, draw_within, line_maps, move_pixels
-from rsbench.vision.epipolar_search import SweepOptions, Swept, largest_seen, reduction, search_size, sweep_frames
+from rsbench.vision.epipolar_search import (
+    SweepOptions,
+    Swept,
+    largest_seen,
+    line_poses,
+    reduction,
+    search_size,
+    sweep_frames,
+)
 from rsbench.vision.flow import dense_flow, returns_px
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import grey_u8, map_frames, resample
@@ -114,15 +122,34 @@ _FLOW_BYTES = 100.0
 
 
 class Flows(NamedTuple):
-    """Dense flow of both frames of one camera."""
+    """Dense flow of both frames of one camera, at the size (h, w) at which it was found; px are pixels of that size.
+
+    Large frames (H, W) are shrunk for it by ``reduction``.
+    """
 
     flow: tuple[F32, F32]
-    """(H, W, 2) px, of each frame to the other."""
+    """(h, w, 2) px, of each frame to the other."""
     returns: tuple[F32, F32]
-    """(H, W) px between a pixel and the end of its flow there and back, the flow of the border beyond it; px of
-    the size at which the flow was found."""
-    scale: float = 1.0
-    """Pixels of the frames for one of that size."""
+    """(h, w) px between a pixel and the end of its flow there and back, the flow of the border beyond it."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    """W / w and H / h."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(h, w)."""
+        height, width = self.returns[0].shape
+        return height, width
+
+    def in_frame(self, places: FloatArray) -> FloatArray:
+        """Places (n, 2) in the frames, px of the frames, for places in images of the flow's size."""
+        return places if self.scale == (1.0, 1.0) else (places + 0.5) * self.scale - 0.5
+
+    def of_frame(self, number: int, shape: tuple[int, ...]) -> F32:
+        """Flow (H, W, 2) of a frame of a ``shape`` (H, W[, C]), px of the frames."""
+        if self.scale == (1.0, 1.0):
+            return self.flow[number]
+        whole = cv2.resize(self.flow[number], (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(np.multiply(whole, np.float32(self.scale), out=whole))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,16 +184,15 @@ class OwnMotion:
 def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
     """Flow of two frames to each other (H, W[, 3]), uint8 or uint16; found at a size of ``reduction``."""
     height, width = images[0].shape[:2]
-    scale = reduction(images[0].shape)
-    if scale > 1:
-        size = max(width // scale, 1), max(height // scale, 1)
-        small = find_flows([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
-        factors = np.array([width / size[0], height / size[1]], np.float32)
-        flow = [np.asarray(cv2.resize(each, (width, height)) * factors) for each in small.flow]
-        returns = [np.asarray(cv2.resize(each, (width, height))) for each in small.returns]
-        return Flows((flow[0], flow[1]), (returns[0], returns[1]), float(scale))
-    both = map_frames(lambda i: dense_flow(images[i], images[1 - i]), FRAMES, height * width, _FLOW_BYTES)
-    return Flows((both[0], both[1]), (returns_px(*both), returns_px(*both[::-1])))
+    size = max(width // reduction(images[0].shape), 1), max(height // reduction(images[0].shape), 1)
+    is_shrunk = size != (width, height)
+    if is_shrunk:
+        images = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
+    both = map_frames(
+        lambda i: dense_flow(images[i], images[1 - i], fine=is_shrunk), FRAMES, size[0] * size[1], _FLOW_BYTES
+    )
+    returns = returns_px(*both), returns_px(*both[::-1])
+    return Flows((both[0], both[1]), returns, (width / size[0], height / size[1]))
 
 
 class _Layer(NamedTuple):
@@ -204,18 +230,23 @@ class MonoFusion:
         self.images, self.own, self.flows, self.options = images, own, flows, options or MonoFusionOptions()
         self._layers = self._find_layers()
 
-    def corrected(self, frame: int, target_tau: float, beyond: Beyond | None = None) -> Fused:
+    def corrected(
+        self, frame: int, target_tau: float, beyond: Beyond | None = None, places: FloatArray | None = None
+    ) -> Fused:
         """The frame at a time, in frame periods; its depth is in the motion's unit.
 
-        ``beyond``: another pair that contains the frame, whose other frame may show what neither frame here does.
+        Args:
+            beyond: another pair that contains the frame, whose other frame may show what neither frame here does.
+            places: ``places`` of the frame at that time if they are known; they are overwritten.
         """
-        image, buffer, origin = self._drawn(frame, target_tau)
+        places = self.places(frame, target_tau) if places is None else places
+        image, buffer, origin = self._drawn(frame, places)
         others = [Beyond(self, frame, target_tau)] + ([] if beyond is None else [beyond])
         for pair, same, tau in others if self.options.fill else []:
             empty, stretched = origin == Origin.NOBODY, (origin == Origin.GUESSED) & (pair is self)
             if not np.any(empty | stretched):
                 continue
-            other, behind, how = pair._drawn(1 - same, tau, empty | stretched)
+            other, behind, how = pair._drawn(1 - same, pair.places(1 - same, tau), empty | stretched)
             behind *= _unit(self._layers[frame].rho, pair._layers[same].rho)
             # An edge uncovers what is farther than itself.
             take = (how == Origin.HERE) & (empty | (stretched & (behind <= _BEHIND * buffer)))
@@ -236,33 +267,33 @@ class MonoFusion:
             return [_Layer(np.zeros(shape, np.float32), np.ones(shape, np.float32), known) for _ in FRAMES]
         if own.far:
             return [_Layer(np.zeros(shape, np.float32), np.zeros(shape, np.float32), known) for _ in FRAMES]
-        poses = [row_poses(own.rig, own.shutter, own.motion, own.side, frame) for frame in FRAMES]
-        maps = [reprojection_of(own.rig.sensor(own.side), poses[frame], poses[1 - frame]) for frame in FRAMES]
-        pick = _picked(shape, search_size(shape, self.options.sweep))
-        met = [
-            (rho, miss / np.float32(self.flows.scale))
-            for rho, miss in (_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES)
-        ]
+        size = self.flows.shape
+        camera = own.rig.sensor(own.side).resized(*size[::-1])
+        poses = [line_poses(own.rig, own.shutter, own.motion, own.side, frame, size[0]) for frame in FRAMES]
+        maps = [reprojection_of(camera, poses[frame], poses[1 - frame]) for frame in FRAMES]
+        pick = _picked(size, search_size(shape, self.options.sweep))
+        met = [_triangulated(self.flows.flow[frame], maps[frame], pick) for frame in FRAMES]
         offs = [off[np.ix_(*pick)] for off in self.flows.returns]
         greys = [grey_u8(image) for image in self.images]
         known, options = (greys, own.rig, own.shutter, own.motion, own.side), self.options.sweep
-        gain = parallax_gain(own.rig.sensor(own.side), *maps)
+        gain = parallax_gain(camera, *maps)
         most = max(_range(offs, met, gain), largest_seen(*known, options))
         swept, same = sweep_frames(*known, most, options), _SAME_PX / max(gain, 1e-9)
         leaves = [_leaves(flow)[np.ix_(*pick)] for flow in self.flows.flow]
         return [_layer(swept[frame], offs[frame], *met[frame], leaves[frame], shape, same) for frame in FRAMES]
 
     def _drawn(
-        self, frame: int, target_tau: float, wanted: Mask | None = None
+        self, frame: int, moved: FloatArray, wanted: Mask | None = None
     ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
-        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame at a time.
+        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame whose pixels are ``moved`` as by ``places``.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
 
         Args:
+            moved: (H, W, 3), overwritten.
             wanted: (H, W) pixels that are drawn, by ``measured`` pixels alone and nowhere stretched; None: all.
         """
-        moved, tears = self.places(frame, target_tau), self.own.motion is not None
+        tears = self.own.motion is not None
         if wanted is not None:
             moved[~self._layers[frame].measured] = np.nan
             if tears:
@@ -280,7 +311,7 @@ class MonoFusion:
     def places(self, frame: int, target_tau: float) -> FloatArray:
         """(H, W, 3) target x, y, px, and inverse depth there, of every pixel of a frame."""
         own, layer = self.own, self._layers[frame]
-        flow = self.flows.flow[frame]
+        flow = self.flows.of_frame(frame, self.images[frame].shape)
         height, width = flow.shape[:2]
         rows = np.stack([np.zeros(height), np.arange(height)], axis=-1)
         here, rate = own.shutter.pixel_time(rows, frame, own.side), float(own.shutter.rate(own.side)[1])
