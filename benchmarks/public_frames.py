@@ -100,16 +100,16 @@ def psnr(estimate: Image, truth: Image, mask: NDArray[np.bool_] | None = None) -
 
 
 def pairs_in(folder: Path) -> Iterator[tuple[FrameSet, Path]]:
-    """Pairs below a folder by set, each once however many repositories have it."""
-    seen = set[bytes]()
+    """Pairs below a folder by set, each once: of the copies in several repositories, the one with most truths."""
     for each in SETS:
+        found = dict[bytes, Path]()
         for first in sorted(folder.glob(f"**/{each.name}/*/rs_0.png")):
             pair = first.parent
             digest = hashlib.sha256(first.read_bytes() + (pair / "rs_1.png").read_bytes()).digest()
             truths = [path.read_bytes() for path in truths_of(pair).values()]
-            if digest not in seen and len(set(truths)) == len(truths):
-                seen.add(digest)
-                yield each, pair
+            if len(set(truths)) == len(truths) > len(truths_of(found[digest]) if digest in found else ()):
+                found[digest] = pair
+        yield from ((each, pair) for pair in found.values())
 
 
 def truths_of(pair: Path) -> dict[int, Path]:

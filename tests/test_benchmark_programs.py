@@ -311,3 +311,16 @@ def test_damaged_numbers_are_one_line(
     assert kitti.main([str(folder)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"{name}: every line must hold twelve numbers" in line
+
+
+def test_of_copies_of_a_public_pair_the_one_with_most_truths_counts(tmp_path: Path) -> None:
+    """Whatever the names of the folders; a copy with one image as both truths does not count."""
+    both = {"gs_0_m.png": b"first", "gs_1_m.png": b"second"}
+    copies = {"a": {"gs_1.png": b"second"}, "b": both, "c": dict.fromkeys(both, b"second")}
+    for name, truths in copies.items():
+        folder = tmp_path / name / "demo/Carla/seq_01"
+        folder.mkdir(parents=True)
+        for file, content in ({"rs_0.png": b"0", "rs_1.png": b"1"} | truths).items():
+            (folder / file).write_bytes(content)
+    public = programs.program("benchmarks/public_frames.py")
+    assert [pair for _, pair in public.pairs_in(tmp_path)] == [tmp_path / "b/demo/Carla/seq_01"]
