@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
@@ -42,6 +43,8 @@ PAIRS = 24
 """Most pairs of frames from which the shift is estimated; they are evenly spaced in the video."""
 _STEP = 1.0 / 32
 """Step of the search, frame periods; a tenth of the period of a hand's fastest shakes at 30 frames/s."""
+_ROWS = 9
+"""Number of rows over which a pair's rate is averaged."""
 _FREEDOM = 4.0
 """Degrees of freedom of the t distribution of the differences, which gives wrong pairs little weight."""
 _LEAST_RATE = 2e-4
@@ -79,7 +82,7 @@ class PairRates(NamedTuple):
     starts: FloatArray
     """(n,) time of the first row of each pair's first frame, frame periods."""
     rates: FloatArray
-    """(n, 3) rad per frame period, in the convention of ``Correspondences.gyro``."""
+    """(n, 3) ``mean_turn``, rad per frame period, in the convention of ``Correspondences.gyro``."""
 
 
 def pair_rates(
@@ -114,8 +117,15 @@ def pair_rates(
         motion = find_own_motion(flows, rig, turn.shutter, "left", robust, seed).own.motion
         if motion is not None:
             starts.append(float(number) if begins is None else float(begins[number]))
-            rates.append(motion.w)
+            rates.append(mean_turn(motion, turn.shutter.readout_ratio))
     return PairRates(np.array(starts), np.reshape(rates, (-1, 3)))
+
+
+def mean_turn(motion: Motion, readout_ratio: float) -> FloatArray:
+    """(3,) mean over the rows of the rotation vector during one period from each row's time."""
+    rows = np.linspace(0.0, readout_ratio, _ROWS)
+    before, after = motion.body_from_world(rows)[0], motion.body_from_world(rows + 1.0)[0]
+    return np.mean(so3.log(after @ np.swapaxes(before, -1, -2)), axis=0)
 
 
 def with_clock_corrected(

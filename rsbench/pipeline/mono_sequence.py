@@ -20,6 +20,7 @@ from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.imu import GyroMotion
+from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -37,12 +38,13 @@ from rsbench.pipeline.mono_correction import (
     Turned,
     find_steady_motion,
     group_of,
+    motion_of_pair,
     refusal,
+    shared_trajectory,
     trajectory_matches,
     turned,
     with_best_motion,
     with_selected_model,
-    with_shared_trajectory,
 )
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.sequence_capture import CorrectedMoment
@@ -65,7 +67,7 @@ class _Pair:
 
 
 class _Seen(NamedTuple):
-    """Two successive frames as read, with their flow and a first motion."""
+    """Two successive frames as read, with their flow and, with a gyroscope, their motion."""
 
     number: int
     """Number of the first frame."""
@@ -75,7 +77,9 @@ class _Seen(NamedTuple):
     reason: str
     """Why they cannot be corrected; empty if they can."""
     matches: FloatArray
-    """See ``trajectory_matches``."""
+    """(n, 4), see ``trajectory_matches``; (0, 4) with a gyroscope or a reason."""
+    period: float
+    """Time between the frames, frame periods."""
 
 
 def options_of_camera(inpaint: bool | None, seed: int, target_row: float) -> CorrectionOptions:
@@ -175,17 +179,17 @@ def _pairs(
     def kept(seen: Iterable[_Seen]) -> Iterator[SeenPair]:
         for each in seen:
             waiting.append(each)
-            yield SeenPair(found=each.found, matches=each.matches, period=_span(each.number, starts)[1])
+            yield SeenPair(matches=each.matches, period=each.period)
 
-    def ready(at: tuple[_Seen, FoundOwnMotion | None]) -> tuple[_Seen, _Pair | None]:
-        seen, found = at
-        return seen, None if seen.number < first else _ready(seen, found, turn, options)
+    def ready(at: tuple[_Seen, Motion | None]) -> tuple[_Seen, _Pair | None]:
+        seen, path = at
+        return seen, None if seen.number < first else _ready(seen, path, turn, options)
 
-    def found_in_order(motions: Iterator[FoundOwnMotion | None]) -> Iterator[tuple[_Seen, FoundOwnMotion | None]]:
-        for found in motions:
+    def in_order(paths: Iterator[Motion | None]) -> Iterator[tuple[_Seen, Motion | None]]:
+        for path in paths:
             while waiting[0].number < first:
                 yield waiting.popleft(), None
-            yield waiting.popleft(), found
+            yield waiting.popleft(), path
         while waiting:
             yield waiting.popleft(), None
 
@@ -193,8 +197,9 @@ def _pairs(
     for number, (before, image) in itertools.islice(pairs, begin):
         yield number + 1, before, image, None
     seen = kept(map_ahead(look, pairs, _AT_ONCE, _AT_ONCE))
-    motions = (each.found for each in seen) if gyro is not None else with_shared_trajectory(seen, begin, first)
-    for each, pair in map_ahead(ready, found_in_order(motions), _AT_ONCE, _AT_ONCE):
+    rig = StereoRig.of_one(turn.camera)
+    paths = (None for _ in seen) if gyro is not None else shared_trajectory(seen, rig, turn.shutter, begin, first)
+    for each, pair in map_ahead(ready, in_order(paths), _AT_ONCE, _AT_ONCE):
         yield each.number + 1, *each.images, pair
 
 
@@ -215,50 +220,58 @@ def _analyse(
     period: float,
 ) -> _Seen:
     """Flow and a first motion of a pair; ``gyro``: (n, 4) of the sequence in axes of ``turn``; frame periods."""
-    turn = turn.paced(period)
+    turn, nothing = turn.paced(period), np.zeros((0, 4))
     check_alike({f"frame {number + place}": image for place, image in enumerate(images)})
     given = [turn.image(image) for image in images]
     flows = find_flows(given)
-    samples = None
-    if gyro is not None:
-        samples = around(gyro, start, start + period * (1.0 + turn.shutter.readout_ratio))
-    local = None if samples is None else (samples - [start, 0.0, 0.0, 0.0]) * [1.0 / period, *3 * [period]]
-    found, reason = _first_motion(given, flows, turn, options, local)
-    if gyro is not None and samples is None and found is not None:
-        found = replace(found, unused=NOT_COVERED)
-    matches = trajectory_matches(flows, options.seed, PIXELS) if gyro is None else np.zeros((0, 4))
-    return _Seen(number, images, flows, found, reason, matches)
+    reason = refusal(given, flows)
+    if gyro is None:
+        matches = nothing if reason else trajectory_matches(flows, options.seed, PIXELS)
+        return _Seen(number, images, flows, None, reason, matches, period)
+    samples = around(gyro, start, start + period * (1.0 + turn.shutter.readout_ratio))
+    found, reason = _motion_by_gyro(samples, reason, flows, turn, options, start, period)
+    return _Seen(number, images, flows, found, reason, nothing, period)
 
 
-def _first_motion(
-    images: Sequence[NDArray[Any]],
+def _motion_by_gyro(
+    samples: FloatArray | None,
+    reason: str,
     flows: Flows,
     turn: Turned,
     options: CorrectionOptions,
-    gyro: FloatArray | None,
+    start: float,
+    period: float,
 ) -> tuple[FoundOwnMotion | None, str]:
-    """The motion over two frames, or why they cannot be corrected."""
+    """The motion over two frames by a gyroscope's samples, or why there is none; None: they do not cover the pair.
+
+    ``reason``: why the flow alone determines no motion; empty if it does.
+    """
     rig, shutter = StereoRig.of_one(turn.camera), turn.shutter
-    if reason := refusal(images, flows):
-        if gyro is None or reason in (STILL, CUT):
+    local = None if samples is None else (samples - [start, 0.0, 0.0, 0.0]) * [1.0 / period, *3 * [period]]
+    if reason:
+        if local is None or reason in (STILL, CUT):
             return None, reason
-        return rotation_alone(rig, shutter, "left", gyro), ""
+        return rotation_alone(rig, shutter, "left", local), ""
     search = options.robust, options.seed
     found = find_steady_motion(flows, rig, shutter, "left", *search)
-    if gyro is None:
-        return found, ""
-    return with_gyro(with_selected_model(found, flows, *search), flows, gyro, *search), ""
+    if local is None:
+        return replace(found, unused=NOT_COVERED), ""
+    return with_gyro(with_selected_model(found, flows, *search), flows, local, *search), ""
 
 
-def _ready(seen: _Seen, found: FoundOwnMotion | None, turn: Turned, options: CorrectionOptions) -> _Pair:
-    """Prepare the fusion of a pair with its final motion."""
-    if found is None:
+def _ready(seen: _Seen, path: Motion | None, turn: Turned, options: CorrectionOptions) -> _Pair:
+    """Prepare the fusion of a pair with its final motion; ``path``: see ``motion_of_pair``."""
+    if seen.reason:
         return _Pair(fusion=None, found=None, reason=seen.reason)
-    images = [turn.image(image) for image in seen.images]
+    turn, search = turn.paced(seen.period), (options.robust, options.seed)
+    images, found = [turn.image(image) for image in seen.images], seen.found
+    if found is None:
+        rig = StereoRig.of_one(turn.camera)
+        found = motion_of_pair(path, seen.matches, seen.flows, rig, turn.shutter, *search)
+    elif isinstance(found.own.motion, InertialMotion):  # the motion is not from a gyroscope
+        found = with_best_motion(found, seen.flows, *search)
     corrector = options.corrector.component
     assert isinstance(corrector, MonoFusionCorrector)
-    if isinstance(found.own.motion, InertialMotion):  # the motion is not from a trajectory
-        found = with_best_motion(found, seen.flows, options.robust, options.seed)
     return _Pair(fusion=MonoFusion(images, found.own, seen.flows, corrector.fusion), found=found, reason="")
 
 

@@ -20,8 +20,8 @@ F32 = NDArray[np.float32]
 
 
 _FINE_STRIDE, _FINE_STEPS = 5, 12
-"""Distance between patches, px, and descents of each, at full resolution: twice as fast as OpenCV's (3 and 25), with
-flow that differs by 0.02 px (median)."""
+"""Distance between patches, px, and descents of each, at full resolution: twice as fast as OpenCV's preset (3 and
+25), with flow that differs by 0.02 px (median)."""
 
 
 def dense_flow(

@@ -122,9 +122,9 @@ _FLOW_BYTES = 100.0
 
 
 class Flows(NamedTuple):
-    """Dense flow of both frames of one camera, at the size (h, w) at which it was found; px are pixels of that size.
+    """Dense flow of both frames (H, W) of one camera, in pixels of the size (h, w) at which it was found.
 
-    Large frames (H, W) are shrunk for it by ``reduction``.
+    Large frames are shrunk for it by ``reduction``.
     """
 
     flow: tuple[F32, F32]
@@ -149,7 +149,7 @@ class Flows(NamedTuple):
         if self.scale == (1.0, 1.0):
             return self.flow[number]
         whole = cv2.resize(self.flow[number], (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(np.multiply(whole, np.float32(self.scale), out=whole))
+        return np.asarray(np.multiply(whole, np.array(self.scale, np.float32), out=whole))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,7 +285,7 @@ class MonoFusion:
     def _drawn(
         self, frame: int, moved: FloatArray, wanted: Mask | None = None
     ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
-        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame whose pixels are ``moved`` as by ``places``.
+        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame with pixels at the places ``moved``.
 
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
 

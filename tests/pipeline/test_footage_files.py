@@ -18,6 +18,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import MotionCard
 from rsbench.pipeline import mono_sequence
 from rsbench.pipeline.footage import FrameSource, read_frame
+from rsbench.pipeline.mono_correction import FoundOwnMotion, flow_matches
 from rsbench.pipeline.mono_sequence import correct_frames, options_of_camera
 from rsbench.storage.untrusted_files import PIXELS, check_size
 from rsbench.storage.videos import Times, VideoFile, upright, write_frames
@@ -235,10 +236,13 @@ def test_large_frames_are_searched_at_a_smaller_size(monkeypatch: pytest.MonkeyP
     whole = find_flows([first, second])
     monkeypatch.setattr(epipolar_search, "_ENOUGH", 320 * 240)
     small = find_flows([first, second])
-    assert (whole.scale, small.scale) == (1.0, 2.0) and small.flow[0].shape == (480, 640, 2)
+    assert whole.shape == (480, 640) and small.shape == (240, 320) and small.scale == (2.0, 2.0)
     for flows in (whole, small):
-        inner = flows.flow[0][40:-40, 60:-60]
+        inner = flows.of_frame(0, first.shape)[40:-40, 60:-60]
         assert np.percentile(np.abs(inner - [-13.0, 0.0]), 95) < 0.3
+        matches = flow_matches(flows, np.random.default_rng(0))
+        assert np.percentile(np.abs(matches[:, :2] - matches[:, 2:] - [13.0, 0.0]), 90) < 0.3
+        assert matches[:, 2:].min(axis=0).max() < 60.0 and matches[:, 2].max() > 560.0
 
 
 SPEED = 5.0
@@ -272,11 +276,11 @@ def test_a_gyroscope_s_samples_are_those_of_the_frames_own_times(monkeypatch: py
     """A rate of turn that grows with time, over a pair two periods long that begins at 1."""
     taken = dict[int, Any]()
 
-    def found(images: Any, flows: Any, turn: Any, corrector: Any, gyro: Any) -> tuple[None, str]:
-        taken[len(taken)] = (gyro, turn.shutter.readout_ratio)
-        return None, "not asked for"
+    def with_gyro(found: FoundOwnMotion, flows: Any, gyro: Any, *rest: Any) -> FoundOwnMotion:
+        taken[len(taken)] = (gyro, found.own.shutter.readout_ratio)
+        return found
 
-    monkeypatch.setattr(mono_sequence, "_first_motion", found)
+    monkeypatch.setattr(mono_sequence, "with_gyro", with_gyro)
     tau = np.linspace(-1.0, 6.0, 71)
     samples = np.column_stack([tau, 0.01 * tau, 0.0 * tau, 0.0 * tau])
     frames = [_seen(np.full(SIZE[0], float(k))) for k in range(3)]

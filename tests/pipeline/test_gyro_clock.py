@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rsbench.components.motion_models import AcceleratedMotion
 from rsbench.core import so3
-from rsbench.pipeline.mono_gyro import PairRates, find_clock
+from rsbench.pipeline.mono_gyro import PairRates, find_clock, mean_rates, mean_turn
 
 Array = np.ndarray
 RATIO, FARTHEST = 0.8, 15.0
@@ -60,3 +61,17 @@ def test_a_steady_turn_few_pairs_and_another_gyroscope_tell_nothing() -> None:
 
 def test_a_shift_beyond_what_is_looked_for_is_not_told() -> None:
     assert not find_clock(_pairs(), _samples(6.25), RATIO, 4.0).told
+
+
+@pytest.mark.parametrize("start", [0.0, 3.0])
+def test_the_rate_of_an_accelerated_pair_is_that_of_a_gyroscope_on_it(start: float) -> None:
+    """About a fixed axis rotation vectors add up, so that the gyroscope's mean is exact.
+
+    The rotation between the first rows alone would be that of half a readout earlier.
+    """
+    motion = AcceleratedMotion([0.0, 0.02, 0.0], [0.1, 0.0, 0.0], 0.3)
+    tau = np.linspace(-1.0, 4.0, 501)
+    samples = np.column_stack([tau + start, motion.velocity(tau)[0]])
+    expected = mean_rates(samples, np.array([start]), RATIO)[0]
+    np.testing.assert_allclose(mean_turn(motion, RATIO), expected, rtol=1e-3)
+    assert abs(motion.w[1] / expected[1] - 1.0) > 0.05

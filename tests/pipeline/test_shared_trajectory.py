@@ -12,13 +12,21 @@ import pytest
 from numpy.typing import NDArray
 
 from rsbench.components.motion_models import InertialMotion
+from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_correction
-from rsbench.pipeline.mono_correction import FoundOwnMotion, SeenPair, group_of, with_shared_trajectory
-from rsbench.pipeline.mono_sequence import _kept, _readouts_away, _RoundedFlows, correct_frames
+from rsbench.pipeline.mono_correction import (
+    FoundOwnMotion,
+    SeenPair,
+    group_of,
+    motion_of_pair,
+    shared_trajectory,
+)
+from rsbench.pipeline.mono_sequence import _readouts_away, correct_frames
 from rsbench.pipeline.sequence_capture import CorrectedMoment
+from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import Flows, MonoFusion, OwnMotion
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 160.0
@@ -87,22 +95,20 @@ def test_a_run_that_goes_on_writes_the_same_frames(whole: list[CorrectedMoment],
         np.testing.assert_array_equal(ours.shown["left"].depth, theirs.shown["left"].depth)
 
 
-def test_pairs_are_told_in_order_with_those_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which pairs a way is made of: the group and two on either side, cut where a pair shows no motion."""
+def test_pairs_are_grouped_in_order_with_those_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trajectory is fitted to a group and two pairs on either side, and ends at a pair that shows no motion."""
     runs: list[list[int]] = []
 
-    def noted(run: list[tuple[int, SeenPair]]) -> dict[int, FoundOwnMotion]:
-        runs.append([number for number, _ in run])
-        return {}
+    def noted(run: list[SeenPair], *rest: object) -> list[str]:
+        runs.append([int(pair.matches[0, 0]) for pair in run])
+        return [f"{number} in {len(run)}" for number in runs[-1]]
 
     monkeypatch.setattr(mono_correction, "_trajectory_motions", noted)
-    monkeypatch.setattr(mono_correction, "_is_usable", lambda pair: pair.found is not None)
-    marks = [FoundOwnMotion(own=OWN, robust=None, reason=str(k)) for k in range(25)]
-    pairs = [SeenPair(found=None if k == 14 else mark, matches=np.zeros((0, 4))) for k, mark in enumerate(marks)]
-    told = list(with_shared_trajectory(pairs))
-    assert [None if each is None else each.reason for each in told] == [
-        None if k == 14 else str(k) for k in range(25)
-    ]
+    pairs = [SeenPair(matches=np.full((0 if k == 14 else 60, 4), float(k))) for k in range(25)]
+    found = list(shared_trajectory(pairs, OWN.rig, OWN.shutter))
+    expected = [f"{k} in 12" for k in range(10)] + [f"{k} in 6" for k in range(10, 14)] + [None]
+    expected += [f"{k} in 7" for k in range(15, 20)] + [f"{k} in 7" for k in range(20, 25)]
+    assert found == expected
     assert runs == [
         list(range(12)),
         list(range(8, 14)),
@@ -112,42 +118,44 @@ def test_pairs_are_told_in_order_with_those_beside_them(monkeypatch: pytest.Monk
     first = 16
     begin = group_of(first)[0]
     assert begin == 8
-    assert list(with_shared_trajectory(pairs[begin:], begin, first)) == told[first:]
-    assert list(with_shared_trajectory([], 0, 0)) == []
+    assert list(shared_trajectory(pairs[begin:], OWN.rig, OWN.shutter, begin, first)) == found[first:]
+    assert list(shared_trajectory([], OWN.rig, OWN.shutter)) == []
 
 
-def test_a_pair_that_a_way_does_not_explain_keeps_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or where there are fewer than three pairs in a row, or no way is found."""
+def test_a_pair_that_a_trajectory_does_not_explain_keeps_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     here = np.random.default_rng(0).uniform(20.0, 100.0, (200, 2))
-    pair = SeenPair(
-        found=FoundOwnMotion(own=OWN, robust=None),
-        matches=np.concatenate([here, here + np.array([6.0, 0.0])], axis=1),
-    )
-    along, across = InertialMotion([0.0] * 3, [-1.0, 0.0, 0.0]), InertialMotion([0.0] * 3, [0.0, 1.0, 0.0])
-    monkeypatch.setattr(mono_correction, "camera_trajectory", lambda *rest: [along, across, along])
-    told = list(with_shared_trajectory([pair] * 3))
-    assert [each is pair.found for each in told] == [False, True, False]
-    assert all(each is pair.found for each in with_shared_trajectory([pair] * 2))
+    matches = np.concatenate([here, here + np.array([6.0, 0.0])], axis=1)
+    flow = np.tile(np.array([6.0, 0.0], np.float32), (HEIGHT, WIDTH, 1))
+    flows, estimated = Flows((flow, -flow), (flow[..., 1], flow[..., 1])), list[object]()
+    own = FoundOwnMotion(own=OWN, robust=None)
+    monkeypatch.setattr(mono_correction, "find_steady_motion", lambda *rest: estimated.append(rest) or own)
+
+    def motion(path: InertialMotion | None) -> FoundOwnMotion:
+        return motion_of_pair(path, matches, flows, OWN.rig, OWN.shutter, RobustOptions())
+
+    along = InertialMotion([0.0] * 3, [-1.0, 0.0, 0.0])
+    explained = motion(along)
+    assert explained.own.motion is along and not estimated
+    assert explained.robust is not None and explained.robust.inlier_count == explained.robust.match_count == 200
+    across = InertialMotion([0.0] * 3, [0.0, 1.0, 0.0])
+    assert motion(across) is own and motion(None) is own and len(estimated) == 2
+    pairs = [SeenPair(matches=matches)] * 3
+    assert list(shared_trajectory(pairs[:2], OWN.rig, OWN.shutter)) == [None] * 2
     monkeypatch.setattr(mono_correction, "camera_trajectory", lambda *rest: None)
-    assert all(each is pair.found for each in with_shared_trajectory([pair] * 3))
+    assert list(shared_trajectory(pairs, OWN.rig, OWN.shutter)) == [None] * 3
 
 
-def test_flow_that_waits_takes_little_memory_and_is_hardly_changed() -> None:
-    rng = np.random.default_rng(0)
-
-    def kept(height: int, width: int) -> tuple[Flows, Flows | _RoundedFlows | None]:
-        two = rng.normal(0.0, 30.0, (2, height, width, 2)).astype(np.float32)
-        flows = Flows((two[0], two[1]), (abs(two[0, ..., 0]), abs(two[1, ..., 0])))
-        return flows, _kept(flows)
-
-    small, same = kept(480, 640)
-    assert same is small
-    large, rounded = kept(1080, 1920)
-    assert isinstance(rounded, _RoundedFlows)
-    again = rounded.restored()
-    for before, after in zip((*large.flow, *large.returns), (*again.flow, *again.returns), strict=True):
-        np.testing.assert_allclose(after, before, atol=1 / 128, rtol=1e-3)
-    assert kept(2160, 3840)[1] is None
+def test_the_start_of_a_trajectory_turns_as_the_camera_does() -> None:
+    """Truth: points at rest, seen by a global-shutter camera that turns and moves; and one match sixty times."""
+    rng, camera = np.random.default_rng(1), OWN.rig.camera
+    points = rng.uniform([-3.0, -2.0, 3.0], [3.0, 2.0, 9.0], (400, 3))
+    w, d = np.deg2rad([1.0, -2.0, 0.5]), np.array([0.1, 0.05, -0.2])
+    seen = [camera.project(points), camera.project(points @ so3.exp(w).T + d)]
+    inside = np.all([(p >= 0.0) & (p <= [WIDTH - 1, HEIGHT - 1]) for p in seen], axis=(0, 2))
+    found = mono_correction._global_shutter_motion(np.concatenate(seen, axis=1)[inside], camera)
+    np.testing.assert_allclose(found.w, w, atol=1e-3)
+    assert abs(found.d @ d) > 0.999 * np.linalg.norm(d)
+    assert not np.any(mono_correction._global_shutter_motion(np.zeros((60, 4)), camera).w)
 
 
 def test_the_neighbour_nearer_in_time_corrects_a_frame() -> None:
