@@ -100,6 +100,8 @@ _SUSPECT = 4.0
 _TRIED, _TRIED_KNOTS, _STEPS_TRIED, _STEPS_ADDED, _TRIED_TAILS = 4, 0.5, 12, 3, Tails(3.0, 0.3)
 """Number of windows in which directions of one camera's translation are tried, the knots and steps of that, the
 steps for each further window, and the error distribution."""
+_WALLS = 4
+"""Most times at which a trajectory is tried with all later translations negated, and most such changes."""
 _DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
 """(n, 3) axes and diagonals; their opposites are as good."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -516,9 +518,33 @@ def first_curve_of_camera(
     while last - first < count:
         first, last = max(first - 1, 0), min(last + 1, count)
         curve = fitted(curve, _STEPS_ADDED).curve
-    if np.mean(np.sign(inverse_depths(curve, tracks.ends, tracks.starts, tracks.focal))) < 0.0:
+    best = fitted(curve, _STEPS_ADDED)
+    for _ in range(_WALLS):
+        near = _signs(best.curve, tracks)
+        walls = 1 + np.flatnonzero(near[:-1] * near[1:] < 0.0)
+        others = [fitted(_mirrored(best.curve, times[wall]), _STEPS_TRIED) for wall in walls[:_WALLS]]
+        other = min(others, key=lambda each: each.equations.cost, default=best)
+        if other.equations.cost >= best.equations.cost:
+            break
+        best = other
+    curve = best.curve
+    if np.sum(_signs(curve, tracks)) < 0.0:
         curve = from_pose_at(make_curve(curve.first, curve.interval, curve.R, -curve.p), 0.0)
     return approximated(lambda tau: evaluate(curve, tau)[0], (curve.first, curve.last), interval)
+
+
+def _signs(curve: Curve, tracks: TimedTracks) -> FloatArray:
+    """(n,) mean sign of the inverse depths in each window, -1 to 1."""
+    signs = np.sign(inverse_depths(curve, tracks.ends, tracks.starts, tracks.focal))
+    return np.array([np.mean(signs[own]) if len(own) else 0.0 for own in tracks.members])
+
+
+def _mirrored(curve: Curve, start: float) -> Curve:
+    """The spline with all translations after a time negated."""
+    taus = curve.first + curve.interval * (np.arange(len(curve.p)) - 1.0)
+    middle = evaluate(curve, np.array([start]))[0]
+    p = np.where(taus[:, None] > start, -2.0 * (middle.R[0].T @ middle.t[0]) - curve.p, curve.p)
+    return make_curve(curve.first, curve.interval, curve.R, p)
 
 
 def continued(curve: Curve, motions: Sequence[Motion | None], start: int, last: float) -> Curve:

@@ -287,26 +287,46 @@ def draw_within(moved: F64, stretch: float) -> tuple[F32, F32]:
 
     Neighbours that are more than ``stretch`` px apart are not joined.
     """
-    joined = np.zeros(moved.shape[:2], dtype=np.uint8)
-    _join(moved, stretch, joined)
+    return draw_joined(moved, joined_within(moved, stretch))
+
+
+def draw_joined(moved: F64, joined: U8) -> tuple[F32, F32]:
+    """``draw_within`` for given neighbours (H, W) that are joined, in the bits of ``connect``."""
     source_map = np.full((*joined.shape, 2), np.nan, dtype=np.float32)
     buffer = np.full(joined.shape, -1.0, dtype=np.float32)
     draw_moved(moved, joined, source_map, buffer)
     return source_map, buffer
 
 
+def joined_within(moved: F64, stretch: float) -> U8:
+    """(H, W) bits of ``connect``: neighbours of ``moved`` (H, W, 3) that are at most ``stretch`` px apart."""
+    joined = np.zeros(moved.shape[:2], dtype=np.uint8)
+    _join(moved, stretch * stretch, joined)
+    return joined
+
+
+def joined_inside(mask: NDArray[np.bool_]) -> U8:
+    """(H, W) bits of ``connect``: neighbours that are both in a mask."""
+    joined = np.zeros(mask.shape, dtype=np.uint8)
+    joined[:, :-1][mask[:, :-1] & mask[:, 1:]] = RIGHT
+    joined[:-1] |= np.uint8(BELOW) * (mask[:-1] & mask[1:])
+    return joined
+
+
 @compiled(error_model="numpy")
-def _join(moved: F64, stretch: float, joined: U8) -> None:
-    """Fill ``joined`` (H, W) with the bits of ``connect``."""
+def _join(moved: F64, square: float, joined: U8) -> None:
+    """Fill ``joined`` (H, W) with the bits of ``connect``; ``square``: of the largest distance, px^2."""
     height, width = joined.shape
     for y in range(height):
         for x in range(width):
+            u, v, bits = moved[y, x, 0], moved[y, x, 1], 0
             if x + 1 < width:
-                along = np.hypot(moved[y, x + 1, 0] - moved[y, x, 0], moved[y, x + 1, 1] - moved[y, x, 1])
-                joined[y, x] = RIGHT if along <= stretch else 0
+                du, dv = moved[y, x + 1, 0] - u, moved[y, x + 1, 1] - v
+                bits = RIGHT if du * du + dv * dv <= square else 0
             if y + 1 < height:
-                along = np.hypot(moved[y + 1, x, 0] - moved[y, x, 0], moved[y + 1, x, 1] - moved[y, x, 1])
-                joined[y, x] |= BELOW if along <= stretch else 0
+                du, dv = moved[y + 1, x, 0] - u, moved[y + 1, x, 1] - v
+                bits |= BELOW if du * du + dv * dv <= square else 0
+            joined[y, x] = bits
 
 
 _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))

@@ -133,7 +133,9 @@ def resample(image: NDArray[Any], positions: F32, interpolation: Interpolation =
         return values
     largest = np.float32(np.iinfo(image.dtype).max)
     # Adding a half and truncating rounds, several times faster than np.rint.
-    return (np.clip(values, 0.0, largest) + np.float32(0.5)).astype(image.dtype)
+    np.clip(values, 0.0, largest, out=values)
+    values += np.float32(0.5)
+    return values.astype(image.dtype)
 
 
 def _resample_few(

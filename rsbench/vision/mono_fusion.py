@@ -27,7 +27,17 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.correction import WarpOptions, draw_within, line_maps, move_pixels
+from rsbench.vision.correction import (
+    BELOW,
+    RIGHT,
+    LineMaps,
+    WarpOptions,
+    draw_joined,
+    joined_inside,
+    joined_within,
+    line_maps,
+    move,
+)
 from rsbench.vision.epipolar_search import (
     SweepOptions,
     Swept,
@@ -119,6 +129,9 @@ _STRETCH = 2.5
 Between 2 and 3: on rendered frames 2 gained 0.05 dB over 3, on real ones it lost as much."""
 _BEHIND = 1.02
 _FLOW_BYTES = 100.0
+_BLOCK, _BLOCKS_AROUND = 8, 4
+"""Side, px, of blocks of pixels that are moved only if their middle comes near a hole, at most so many blocks away:
+more than a block stretched by ``_STRETCH`` reaches."""
 
 
 class Flows(NamedTuple):
@@ -237,7 +250,7 @@ class MonoFusion:
 
         Args:
             beyond: another pair that contains the frame, whose other frame may show what neither frame here does.
-            places: ``places`` of the frame at that time if they are known; they are overwritten.
+            places: ``places`` of the frame at that time if they are known.
         """
         places = self.places(frame, target_tau) if places is None else places
         image, buffer, origin = self._drawn(frame, places)
@@ -246,7 +259,8 @@ class MonoFusion:
             empty, stretched = origin == Origin.NOBODY, (origin == Origin.GUESSED) & (pair is self)
             if not np.any(empty | stretched):
                 continue
-            other, behind, how = pair._drawn(1 - same, pair.places(1 - same, tau), empty | stretched)
+            wanted = empty | stretched
+            other, behind, how = pair._drawn(1 - same, pair.places(1 - same, tau, wanted), wanted)
             behind *= _unit(self._layers[frame].rho, pair._layers[same].rho)
             # An edge uncovers what is farther than itself.
             take = (how == Origin.HERE) & (empty | (stretched & (behind <= _BEHIND * buffer)))
@@ -290,67 +304,133 @@ class MonoFusion:
         HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
 
         Args:
-            moved: (H, W, 3), overwritten.
-            wanted: (H, W) pixels that are drawn, by ``measured`` pixels alone and nowhere stretched; None: all.
+            moved: (H, W, 3) see ``places``.
+            wanted: (H, W) pixels that are drawn, nowhere stretched; None: all.
         """
         tears = self.own.motion is not None
-        if wanted is not None:
-            moved[~self._layers[frame].measured] = np.nan
-            if tears:
-                moved[~_reaching(moved, wanted)] = np.nan
-        source_map, buffer = draw_within(moved, _STRETCH if tears else np.inf)
+        joined = joined_within(moved, _STRETCH if tears else np.inf)
+        if wanted is not None and tears:
+            joined &= joined_inside(_reaching(moved, wanted))
+        source_map, buffer = draw_joined(moved, joined)
         origin = np.where(buffer >= 0.0, np.uint8(Origin.HERE), np.uint8(Origin.NOBODY))
         if tears and wanted is None:
-            moved[~_beside_tears(moved)] = np.nan
-            whole, behind = draw_within(moved, np.inf)
+            whole, behind = draw_joined(moved, joined_inside(_beside_tears(joined)))
             stretched = (buffer < 0.0) & (behind >= 0.0)
             source_map[stretched], buffer[stretched] = whole[stretched], behind[stretched]
             origin[stretched] = Origin.GUESSED
         return resample(self.images[frame], source_map, self.options.warp.interpolation), buffer, origin
 
-    def places(self, frame: int, target_tau: float) -> FloatArray:
-        """(H, W, 3) target x, y, px, and inverse depth there, of every pixel of a frame."""
+    def places(self, frame: int, target_tau: float, wanted: Mask | None = None) -> FloatArray:
+        """(H, W, 3) target x, y, px, and inverse depth there, of every pixel of a frame.
+
+        ``wanted`` (H, W): only the ``measured`` pixels in blocks that may reach these pixels are moved; the others
+        are NaN.
+        """
         own, layer = self.own, self._layers[frame]
         flow = self.flows.of_frame(frame, self.images[frame].shape)
         height, width = flow.shape[:2]
         rows = np.stack([np.zeros(height), np.arange(height)], axis=-1)
         here, rate = own.shutter.pixel_time(rows, frame, own.side), float(own.shutter.rate(own.side)[1])
-        moved, weight = np.zeros((3, height, width)), np.ones_like(layer.flow_share)
+        maps = None
         if own.motion is not None:
             target = own.rig.cam_from_world(own.motion, target_tau, own.side)
             poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
-            move_pixels(layer.rho, line_maps(own.rig.sensor(own.side), poses, target), moved)
-            weight = layer.flow_share
-        places = np.zeros((height, width, 3))
-        _weigh(flow, layer.rho, weight, moved, target_tau - here, float(1 - 2 * frame), rate, places)
+            maps = line_maps(own.rig.sensor(own.side), poses, target)
+        given = flow, layer.rho, layer.flow_share, maps, target_tau - here, float(1 - 2 * frame), rate
+        if wanted is None:
+            places, drawn = np.empty((height, width, 3)), np.ones((height, width), np.bool_)
+        else:
+            places, drawn = np.full((height, width, 3), np.nan), layer.measured
+        if wanted is not None and maps is not None:
+            near = _blocks_near(wanted)
+            chosen = np.zeros_like(near)
+            _mark_blocks(*given, near, chosen)
+            drawn = drawn & np.repeat(np.repeat(chosen, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width]
+        _fill_places(*given, drawn, places)
         return places
 
 
-@compiled(error_model="numpy")
-def _weigh(
+@compiled(error_model="numpy", inline="always")
+def _place(
+    x: int,
+    y: int,
     flow: F32,
     rho: F32,
     weight: F32,
-    moved: FloatArray,
+    maps: LineMaps | None,
     ahead: FloatArray,
     period: float,
     rate: float,
-    places: FloatArray,
-) -> None:
-    """Fill ``places`` (H, W, 3) with the mean of scaled flow, of this ``weight`` (H, W), and ``moved`` (3, H, W).
+) -> tuple[float, float, float]:
+    """Target x, y, px, and inverse depth there, of a pixel: the mean of its place by scaled flow, of this ``weight``
+    (H, W), and of that by ``maps``; scaled flow alone if there are no maps.
 
     ``ahead`` (H,) is the time from each row to the target. Rows are read evenly, ``rate`` each, so the time that
     passes along the flow is a line in it; a flow that ends at the time where it began has no speed.
     """
+    passed = period + flow[y, x, 1] * rate
+    share = ahead[y] / passed if abs(passed) > 1e-3 else 0.0
+    u, v, s = x + share * flow[y, x, 0], y + share * flow[y, x, 1], float(rho[y, x])
+    if maps is not None:
+        of_flow, moved = float(weight[y, x]), move(maps, maps.columns, x, y, rho[y, x])
+        u = of_flow * u + (1.0 - of_flow) * moved[0]
+        v = of_flow * v + (1.0 - of_flow) * moved[1]
+        s = of_flow * s + (1.0 - of_flow) * moved[2]
+    return u, v, s
+
+
+@compiled(error_model="numpy")
+def _fill_places(
+    flow: F32,
+    rho: F32,
+    weight: F32,
+    maps: LineMaps | None,
+    ahead: FloatArray,
+    period: float,
+    rate: float,
+    drawn: Mask,
+    places: FloatArray,
+) -> None:
+    """Fill ``places`` (H, W, 3) of the pixels in ``drawn`` (H, W)."""
     height, width = rho.shape
     for y in range(height):
         for x in range(width):
-            passed = period + flow[y, x, 1] * rate
-            share = ahead[y] / passed if abs(passed) > 1e-3 else 0.0
-            of_flow = float(weight[y, x])
-            places[y, x, 0] = of_flow * (x + share * flow[y, x, 0]) + (1.0 - of_flow) * moved[0, y, x]
-            places[y, x, 1] = of_flow * (y + share * flow[y, x, 1]) + (1.0 - of_flow) * moved[1, y, x]
-            places[y, x, 2] = of_flow * rho[y, x] + (1.0 - of_flow) * moved[2, y, x]
+            if drawn[y, x]:
+                u, v, s = _place(x, y, flow, rho, weight, maps, ahead, period, rate)
+                places[y, x, 0], places[y, x, 1], places[y, x, 2] = u, v, s
+
+
+@compiled(error_model="numpy")
+def _mark_blocks(
+    flow: F32,
+    rho: F32,
+    weight: F32,
+    maps: LineMaps | None,
+    ahead: FloatArray,
+    period: float,
+    rate: float,
+    near: Mask,
+    chosen: Mask,
+) -> None:
+    """Mark blocks of pixels whose middle moves into one of the blocks ``near``."""
+    height, width = rho.shape
+    rows, columns = near.shape
+    for i in range(rows):
+        for j in range(columns):
+            y, x = min(i * _BLOCK + _BLOCK // 2, height - 1), min(j * _BLOCK + _BLOCK // 2, width - 1)
+            u, v, _ = _place(x, y, flow, rho, weight, maps, ahead, period, rate)
+            if abs(u) < 1e9 and abs(v) < 1e9:
+                column = min(max(int(u) // _BLOCK, 0), columns - 1)
+                chosen[i, j] = near[min(max(int(v) // _BLOCK, 0), rows - 1), column]
+
+
+def _blocks_near(wanted: Mask) -> Mask:
+    """Blocks of pixels with a ``wanted`` one (H, W) at most ``_BLOCKS_AROUND`` blocks away."""
+    height, width = wanted.shape
+    padded = np.pad(wanted, ((0, -height % _BLOCK), (0, -width % _BLOCK)))
+    blocks = padded.reshape(-(-height // _BLOCK), _BLOCK, -(-width // _BLOCK), _BLOCK).any(axis=(1, 3))
+    side = 2 * _BLOCKS_AROUND + 1
+    return np.asarray(cv2.dilate(blocks.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def _reaching(moved: FloatArray, wanted: Mask) -> Mask:
@@ -373,15 +453,14 @@ def _fill_reaching(moved: FloatArray, near: NDArray[np.uint8], reaching: NDArray
                 reaching[y, x] = near[j, i]
 
 
-def _beside_tears(moved: FloatArray) -> Mask:
-    """(H, W) the corners of all quads of ``moved`` (H, W, 3) of which a side is longer than ``_STRETCH``."""
-    beside = np.zeros(moved.shape[:2], np.uint8)
-    for axis in (0, 1):
-        steps = np.diff(moved[..., :2], axis=axis)
-        long = ~(np.hypot(steps[..., 0], steps[..., 1]) <= _STRETCH)
-        first, second = (np.moveaxis(beside, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
-        long = np.moveaxis(long, axis, 0)
-        first[long], second[long] = 1, 1
+def _beside_tears(joined: NDArray[np.uint8]) -> Mask:
+    """(H, W) the corners of all quads of which a side is not joined, for bits (H, W) of ``connect``."""
+    beside = np.zeros(joined.shape, np.uint8)
+    along, down = joined[:, :-1] & RIGHT == 0, joined[:-1] & BELOW == 0
+    beside[:, :-1] |= along
+    beside[:, 1:] |= along
+    beside[:-1] |= down
+    beside[1:] |= down
     return np.asarray(cv2.dilate(beside, np.ones((3, 3), np.uint8)) > 0)
 
 
