@@ -102,6 +102,8 @@ _TRIED, _TRIED_KNOTS, _STEPS_TRIED, _STEPS_ADDED, _TRIED_TAILS = 4, 0.5, 12, 3, 
 steps for each further window, and the error distribution."""
 _WALLS = 4
 """Most times at which a trajectory is tried with all later translations negated, and most such changes."""
+_ONE_SIGN = 0.95
+"""Mean sign of the inverse depths below which a fit may be a local minimum, and other starts are tried."""
 _DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
 """(n, 3) axes and diagonals; their opposites are as good."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -490,8 +492,9 @@ def first_curve_of_camera(
     Motions of single windows, which assume a constant speed, are often so wrong that a fit from them ends in a
     local minimum. So several directions of translation are tried in some windows in the middle, and the best fit
     to these is extended to the other windows one by one: points that are seen again determine them. A trajectory
-    with all translations and inverse depths negated fits as well; in the returned one most points are in front of
-    the camera.
+    with all translations and inverse depths negated fits as well, and a fit may pass from one into the other where
+    the camera nearly stops: one side is then negated. If points are still on both sides of the camera, windows at
+    the ends are tried as well. In the returned trajectory most points are in front of the camera.
 
     Args:
         tracks: tracks that extend over several windows.
@@ -501,32 +504,47 @@ def first_curve_of_camera(
     """
     count = len(tracks.members)
     times = np.arange(count + 1.0) if times is None else times
-    start, first = first_curve(motions, tracks, span, _TRIED_KNOTS, times), max((count - _TRIED) // 2, 0)
-    last, ahead = min(first + _TRIED, count), start.first + start.interval * (np.arange(len(start.p)) - 1.0)
-    ahead, turn = ahead - times[first], evaluate(start, times[first : first + 1])[0].R[0]
+    start = first_curve(motions, tracks, span, _TRIED_KNOTS, times)
+    taus = start.first + start.interval * (np.arange(len(start.p)) - 1.0)
 
-    def fitted(curve: Curve, steps: int) -> _Place:
+    def fitted(curve: Curve, steps: int, first: int = 0, last: int = count) -> _Place:
+        """The fit to the windows from ``first`` to before ``last``."""
         counts = np.ones(len(tracks))
         for own in (*tracks.members[:first], *tracks.members[last:]):
             counts[own] = 0.0
         descent = Descent(tracks, _TRIED_TAILS, prior, counts)
         return descend(descent, descent.place(curve, None), steps, DAMPING)
 
-    speeds = _SHORT * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)) @ turn
-    tried = (make_curve(start.first, start.interval, start.R, ahead[:, None] * speed) for speed in speeds)
-    curve = min((fitted(each, _STEPS_TRIED) for each in tried), key=lambda each: each.equations.cost).curve
-    while last - first < count:
-        first, last = max(first - 1, 0), min(last + 1, count)
-        curve = fitted(curve, _STEPS_ADDED).curve
-    best = fitted(curve, _STEPS_ADDED)
-    for _ in range(_WALLS):
-        near = _signs(best.curve, tracks)
-        walls = 1 + np.flatnonzero(near[:-1] * near[1:] < 0.0)
-        others = [fitted(_mirrored(best.curve, times[wall]), _STEPS_TRIED) for wall in walls[:_WALLS]]
-        other = min(others, key=lambda each: each.equations.cost, default=best)
-        if other.equations.cost >= best.equations.cost:
-            break
-        best = other
+    def extended(first: int) -> _Place:
+        """The best direction in the windows from ``first`` on, extended to all windows."""
+        last, turn = min(first + _TRIED, count), evaluate(start, times[first])[0].R
+        speeds = _SHORT * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)) @ turn
+        straight = ((taus - times[first])[:, None] * speed for speed in speeds)
+        tried = [make_curve(start.first, start.interval, start.R, p) for p in straight]
+        places = [fitted(each, _STEPS_TRIED, first, last) for each in tried]
+        curve = min(places, key=lambda each: each.equations.cost).curve
+        while last - first < count:
+            first, last = max(first - 1, 0), min(last + 1, count)
+            curve = fitted(curve, _STEPS_ADDED, first, last).curve
+        return fitted(curve, _STEPS_ADDED)
+
+    def repaired(best: _Place) -> _Place:
+        """The fit with all translations after some times negated, if that reduces the cost."""
+        for _ in range(_WALLS):
+            near = _signs(best.curve, tracks)
+            walls = 1 + np.flatnonzero(near[:-1] * near[1:] < 0.0)
+            others = [fitted(_mirrored(best.curve, times[wall]), _STEPS_TRIED) for wall in walls[:_WALLS]]
+            other = min(others, key=lambda each: each.equations.cost, default=best)
+            if other.equations.cost >= best.equations.cost:
+                break
+            best = other
+        return best
+
+    spare = max(count - _TRIED, 0)
+    best = repaired(extended(spare // 2))
+    if np.min(np.abs(_signs(best.curve, tracks))) < _ONE_SIGN:
+        others = (repaired(extended(first)) for first in {0, spare} - {spare // 2})
+        best = min(best, *others, key=lambda each: each.equations.cost)
     curve = best.curve
     if np.sum(_signs(curve, tracks)) < 0.0:
         curve = from_pose_at(make_curve(curve.first, curve.interval, curve.R, -curve.p), 0.0)
@@ -534,9 +552,11 @@ def first_curve_of_camera(
 
 
 def _signs(curve: Curve, tracks: TimedTracks) -> FloatArray:
-    """(n,) mean sign of the inverse depths in each window, -1 to 1."""
-    signs = np.sign(inverse_depths(curve, tracks.ends, tracks.starts, tracks.focal))
-    return np.array([np.mean(signs[own]) if len(own) else 0.0 for own in tracks.members])
+    """(n,) mean sign of the inverse depths in each window, -1 to 1, in which points far away count little."""
+    rho = inverse_depths(curve, tracks.ends, tracks.starts, tracks.focal)
+    most = 2.0 * float(np.median(np.abs(rho))) + 1e-300
+    near = np.clip(rho, -most, most)
+    return np.array([np.sum(near[own]) / (np.sum(np.abs(near[own])) + 1e-300) for own in tracks.members])
 
 
 def _mirrored(curve: Curve, start: float) -> Curve:

@@ -130,8 +130,8 @@ Between 2 and 3: on rendered frames 2 gained 0.05 dB over 3, on real ones it los
 _BEHIND = 1.02
 _FLOW_BYTES = 100.0
 _BLOCK, _BLOCKS_AROUND = 8, 4
-"""Side, px, of blocks of pixels that are moved only if their middle comes near a hole, at most so many blocks away:
-more than a block stretched by ``_STRETCH`` reaches."""
+"""Side, px, of blocks of pixels that are moved only if their middle comes near a hole; and how many blocks that is:
+more than one stretched by ``_STRETCH`` covers."""
 
 
 class Flows(NamedTuple):
@@ -337,10 +337,8 @@ class MonoFusion:
             poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
             maps = line_maps(own.rig.sensor(own.side), poses, target)
         given = flow, layer.rho, layer.flow_share, maps, target_tau - here, float(1 - 2 * frame), rate
-        if wanted is None:
-            places, drawn = np.empty((height, width, 3)), np.ones((height, width), np.bool_)
-        else:
-            places, drawn = np.full((height, width, 3), np.nan), layer.measured
+        places = np.full((height, width, 3), np.nan)
+        drawn = np.ones((height, width), np.bool_) if wanted is None else layer.measured
         if wanted is not None and maps is not None:
             near = _blocks_near(wanted)
             chosen = np.zeros_like(near)
@@ -362,8 +360,8 @@ def _place(
     period: float,
     rate: float,
 ) -> tuple[float, float, float]:
-    """Target x, y, px, and inverse depth there, of a pixel: the mean of its place by scaled flow, of this ``weight``
-    (H, W), and of that by ``maps``; scaled flow alone if there are no maps.
+    """Target x, y, px, and inverse depth there, of a pixel: the mean of its places by scaled flow, with ``weight``
+    (H, W), and by ``maps``; scaled flow alone if there are no maps.
 
     ``ahead`` (H,) is the time from each row to the target. Rows are read evenly, ``rate`` each, so the time that
     passes along the flow is a line in it; a flow that ends at the time where it began has no speed.

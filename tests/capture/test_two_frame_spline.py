@@ -392,9 +392,12 @@ def hand(seed: int) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
     return at
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, 4, 106, 308])
 def test_directions_of_a_hand_held_camera_do_not_depend_on_the_start(seed: int) -> None:
-    """From a start with one direction, a fit had directions wrong by 100 deg for seed 3 and all opposite for 4."""
+    """From a start with one direction, a fit had directions wrong by 100 deg for seed 3 and all opposite for 4.
+
+    The hands of 106 and 308 nearly stop once: extended past that, the fit had opposite directions on one side.
+    """
     camera, at, rng = PinholeCamera.centred(640, 480, 540.0), hand(seed), np.random.default_rng(seed)
     points, frames = rng.uniform([-4.0, -3.0, 2.5], [4.0, 3.0, 7.0], (900, 3)), list[FloatArray]()
     for frame in range(13):

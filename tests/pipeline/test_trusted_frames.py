@@ -14,6 +14,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import RollingShutter
 from rsbench.pipeline import mono_sequence
 from rsbench.pipeline.mono_sequence import UNTRUSTED, correct_frames, expected_errors
+from rsbench.vision.mono_fusion import Flows
 
 HEIGHT, WIDTH, RATIO = 60, 80, 0.8
 TAU_OF_ROW = RATIO / HEIGHT
@@ -31,9 +32,17 @@ def pair(place: int) -> tuple[Any, int]:
     """The flow of that frame of a pair along ``path``, which is horizontal: rows stay, and their times."""
     start = TAU_OF_ROW * Y
     to = path(start + 1.0 - 2.0 * place) - path(start)
-    flow, returns = np.stack([to, np.zeros_like(to)], axis=-1), np.zeros_like(to)
+    flow, returns = np.stack([to, np.zeros_like(to)], axis=-1).astype(np.float32), np.zeros(to.shape, np.float32)
     own = SimpleNamespace(shutter=RollingShutter(height=HEIGHT, readout_ratio=RATIO))
-    return SimpleNamespace(own=own, flows=SimpleNamespace(flow=[flow, flow], returns=[returns, returns])), place
+    return SimpleNamespace(own=own, flows=Flows((flow, flow), (returns, returns))), place
+
+
+def _halved(flows: Flows) -> Flows:
+    """The flow as found at half the size: one px of it is two of the frame, over which the image changes twice as
+    much."""
+    first, second = (each[::2, ::2] / np.float32(2.0) for each in flows.flow)
+    returns = flows.returns[0][::2, ::2]
+    return Flows((first, second), (returns, returns), (2.0, 2.0))
 
 
 def drawn_at(line: float) -> np.ndarray:
@@ -51,6 +60,11 @@ def test_errors_are_those_of_places_times_gradients() -> None:
     assert same == kept and off == pytest.approx(1.0, rel=0.15)  # half a px of 2 levels
     by_line, _ = expected_errors(IMAGE, true, [pair(0)], line)
     assert 1e-3 < by_line / kept < 0.2
+    half = [
+        (SimpleNamespace(own=each.own, flows=_halved(each.flows)), place) for each, place in (pair(1), pair(0))
+    ]
+    small, kept_small = expected_errors(IMAGE, true, half, line)  # both in px of that size
+    assert small < 1e-3 * kept_small and kept_small == pytest.approx(kept, rel=0.15)
     worse, _ = expected_errors(IMAGE, 2.0 * np.stack([X, Y], axis=-1) - true, [pair(1), pair(0)], line)
     assert worse > 3.0 * kept  # moved the wrong way
 
