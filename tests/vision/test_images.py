@@ -91,18 +91,6 @@ def _positions(rng: np.random.Generator, n: int, low: float, high: float) -> np.
     return rng.uniform(low, high, (n, n, 2)).astype(np.float32)
 
 
-def test_cubic_reproduces_parabolas() -> None:
-    """Keys' kernel is exact to second order: the values of any quadratic come back, here to float32."""
-    y, x = np.mgrid[:20, :24].astype(np.float64)
-
-    def value(px: np.ndarray, py: np.ndarray) -> np.ndarray:
-        return 0.3 + 0.02 * px - 0.01 * py + 0.001 * px**2 - 0.002 * px * py + 0.0015 * py**2
-
-    at = _positions(np.random.default_rng(0), 30, 2.0, 16.0)
-    got = resample(value(x, y).astype(np.float32), at)
-    np.testing.assert_allclose(got, value(at[..., 0].astype(float), at[..., 1].astype(float)), atol=3e-7)
-
-
 @pytest.mark.parametrize("channels", [0, 1, 3, 4])
 def test_cubic_is_separable_keys_convolution(channels: int) -> None:
     """Against the kernel's definition, summed over the whole image, for every number of channels."""
