@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import MovingObject, RelativeMotion, poses_of
+from rsbench.core.geometry import MovingObject, RelativeMotion
 from rsbench.core.motion import Motion
 from rsbench.core.projection import project_at
 from rsbench.core.rig import SIDES, StereoRig
@@ -50,11 +50,6 @@ def test_a_rig_about_a_camera_has_that_camera_for_its_body() -> None:
     assert RIG.about("left").about("middle") == RIG
     with pytest.raises(ValueError, match="origin"):
         RIG.about("top")  # pyrefly: ignore[bad-argument-type]
-
-
-def test_depth_and_disparity_of_nothing_are_nan() -> None:
-    assert np.all(np.isnan(RIG.depth([0.0, -1.0, np.nan])))
-    assert np.all(np.isnan(RIG.disparity([0.0, -1.0, np.nan])))
 
 
 @pytest.mark.parametrize("baseline", [0.0, -0.1, float("nan"), float("inf")])
@@ -96,11 +91,6 @@ def test_the_right_camera_may_be_late_and_read_another_way() -> None:
     assert not (shutter.plain or shutter.rows_together)
     with pytest.raises(ValueError, match=r"right_delay = 0\.25: only rows from the top"):
         shutter.row_time(0, 0)
-
-
-def test_rows_from_the_bottom_in_both_cameras_are_read_together() -> None:
-    shutter = RollingShutter(height=8, readout_ratio=0.5, scan="bottom")
-    assert shutter.rows_together and not shutter.plain
 
 
 @pytest.mark.parametrize(
@@ -154,7 +144,3 @@ def test_the_rig_seen_from_an_object(model: type[Motion], own: type[Motion]) -> 
     R = relative.body_from_world(tau).R
     np.testing.assert_allclose((after.R - before.R) / (2 * step), so3.hat(w_rate) @ R, atol=1e-8)
     np.testing.assert_allclose((after.t - before.t) / (2 * step), t_rate, atol=1e-8)
-
-
-def test_without_objects_there_are_no_poses() -> None:
-    assert poses_of((), np.zeros(3)) is None

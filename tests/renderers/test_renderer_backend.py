@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes.util
 import errno
 import importlib.metadata
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -274,24 +272,6 @@ def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
             time.sleep(0.01)
 
 
-def test_wheel_without_its_symbolic_links_still_loads(tmp_path: Path) -> None:
-    """As left by installers that do not run the wheel's start-up hook."""
-    wheels = [c for c in llvm.candidates({}) if c.source == "karellen-llvm-core"]
-    if not wheels:
-        pytest.skip("karellen-llvm-core is not installed")
-    runtime = wheels[0].path.parent / "x86_64-unknown-linux-gnu"
-    (tmp_path / "lib" / runtime.name).mkdir(parents=True)
-    library = Path(shutil.copy(wheels[0].path, tmp_path / "lib"))
-    for file in runtime.glob("*.so.1.0"):
-        shutil.copy(file, tmp_path / "lib" / runtime.name)
-    [candidate] = llvm.candidates({"DRJIT_LIBLLVM_PATH": str(library)})
-    assert [path.name for path in candidate.preload] == ["libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0"]
-    assert llvm.probe(candidate).ok
-    if ctypes.util.find_library("c++") is None:
-        library.touch()  # another key, so that the good news about it is not recalled
-        assert not llvm.probe(Candidate(path=library, source="DRJIT_LIBLLVM_PATH")).ok
-
-
 def test_candidates_come_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(llvm, "_MINIMUM_BYTES", 0)
     for name in ("libLLVM-18.so.1", "libLLVM.so.20.1", "libLLVM-15.so", "libLLVM.so.9"):
@@ -304,20 +284,6 @@ def test_candidates_come_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert not {"libLLVM-15.so", "libLLVM.so.9"} & set(names)
     only = list(llvm.candidates({"DRJIT_LIBLLVM_PATH": "/mine.so"}))
     assert [candidate.path for candidate in only] == [Path("/mine.so")]
-
-
-@pytest.mark.parametrize(
-    ("path", "version"),
-    [
-        ("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1", 15),
-        ("/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1", 19),
-        ("/usr/lib/llvm-18/lib/libLLVM.so.1", 18),
-        ("/opt/homebrew/Cellar/llvm@17/17.0.6/lib/libLLVM.dylib", 17),
-        ("/opt/somewhere/libLLVM.so", 0),
-    ],
-)
-def test_version_in_path(path: str, version: int) -> None:
-    assert llvm.version_in_path(path) == version
 
 
 def test_good_news_is_remembered_and_bad_news_is_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -360,12 +326,6 @@ def test_a_damaged_or_unwritable_cache_is_no_cache(
     assert llvm.recall("k") is None
 
 
-def test_without_a_driver_cuda_costs_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "driver_library", lambda: None)
-    monkeypatch.setattr(llvm, "run_child", lambda *arguments: pytest.fail("started a process"))
-    assert not backend.probe_cuda().ok
-
-
 def test_doctor_reports_and_outlives_everything_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = {row.component: row for row in diagnosis.doctor_report()}
     assert rows["scalar_rgb"].status == "ok" and rows["OpenEXR works"].status == "ok"
@@ -401,11 +361,3 @@ def test_the_doctor_says_what_to_do_on_each_kind_of_machine(monkeypatch: pytest.
     monkeypatch.setattr(diagnosis.platform, "machine", lambda: "arm64")
     assert "tested on Linux x86-64 alone" in diagnosis.advice(good)[0]
     assert diagnosis.advice([row(each.component, "fail", "x") for each in good])[-1].startswith("nothing renders")
-
-
-def test_importing_options_and_render_is_cheap() -> None:
-    code = (
-        "import sys, rsbench.renderers.options, rsbench.renderers.render\n"
-        "assert not {'mitsuba', 'drjit', 'trimesh'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
