@@ -235,6 +235,7 @@ FEW_ROWS = rsbench.RollingShutter(height=9, readout_ratio=0.8)
         (lambda: rsbench.pose_errors({}, MOTION, RIG), "found: must be what estimate_motion returned"),  # pyrefly: ignore[bad-argument-type]
         (lambda: rsbench.match([FLAT] * 3), "got 3; four are needed"),
         (lambda: rsbench.match([FLAT.astype(float)] * 4), "image left 0: must be .* got float64"),
+        (lambda: rsbench.match([FLAT, FLAT, FLAT, FLAT[:9]]), "image right 1: is .* but image left 0"),
         (lambda: rsbench.match([FLAT[..., None]] * 4), r"image left 0: must have shape \(H, W\) or"),
         (lambda: rsbench.stereo_depth(FLAT[:9], FLAT[:9], RIG), "left: is 900 x 9 pixels, the rig"),
         (lambda: rsbench.correct([FLAT[:9]] * 4, RIG), "image left 0: is 900 x 9 pixels"),

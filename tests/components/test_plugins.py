@@ -235,19 +235,6 @@ def test_an_installed_class_is_found_by_name_and_by_card(tmp_path: Path, monkeyp
     assert offer.origin == "hello_package"
 
 
-def test_a_package_that_vanished_is_an_error_of_its_name_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = "[rsbench.greetings]\ngone = hello_that_went:Hello\nodd = :::\nhi = hello:Hello\n"
-    install(tmp_path, monkeypatch, "leftover", points)
-    (tmp_path / "hello.py").write_text(MODULE, "utf-8")
-    assert {"gone", "odd", "hi"} <= set(list_names(GREETINGS))
-    assert word(load_entry(GREETINGS, "hi")) == "hello "
-    for name, part in (("gone", "hello_that_went"), ("odd", "cannot be loaded")):
-        message = refusal(name)
-        assert part in message and "leftover" in message
-
-
 @pytest.mark.parametrize(
     "text", ["[rsbench.greetings]\nno equals sign\n", "[rsbench.greetings\n", "\0\n", "= x\n"]
 )
@@ -268,15 +255,6 @@ def test_one_package_twice_on_the_path_is_no_clash(tmp_path: Path, monkeypatch: 
         (tmp_path / folder / "hello.py").write_text(MODULE, "utf-8")
     assert word(load_entry(GREETINGS, "hi")) == "hello "
     assert list_names(GREETINGS).count("hi") == 1
-
-
-def test_a_clash_is_an_error_of_that_name_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "hello.py").write_text(MODULE, "utf-8")
-    install(tmp_path, monkeypatch, "one", "[rsbench.greetings]\ntwice = hello:Hello\nhi = hello:Hello\n")
-    install(tmp_path, monkeypatch, "two", "[rsbench.greetings]\ntwice = other:Hello\n")
-    assert word(load_entry(GREETINGS, "hi")) == "hello "
-    message = refusal("twice")
-    assert "hello:Hello of one" in message and "other:Hello of two" in message
 
 
 @dataclass(frozen=True)

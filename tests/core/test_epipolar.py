@@ -14,7 +14,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.motion import Motion
 from rsbench.core.projection import ProjectionStatus, project_at, rs_project
 from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.core.se3 import Pose, inverse, transform
+from rsbench.core.se3 import Pose, compose, inverse, transform
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
@@ -55,6 +55,17 @@ def _world_constraint(motion: Motion, side: Side, match: FloatArray, shutter: Ro
 
 def _numeric_gradient(motion: Motion, side: Side, match: FloatArray, step: float = 1e-3) -> FloatArray:
     return derivatives(lambda moved: _world_constraint(motion, side, moved), match, step)
+
+
+def test_row_pair_pose_is_the_chain_through_the_world() -> None:
+    for motion in MOTIONS:
+        for side in SIDES:
+            cam0 = RIG.cam_from_world(motion, 0.8 * 120.5 / 800, side)
+            cam1 = RIG.cam_from_world(motion, 1 + 0.8 * 700.25 / 800, side)
+            expected = compose(cam1, inverse(cam0))
+            found = epipolar.row_pair_pose(RIG, SHUTTER, motion, side, 120.5, 700.25)
+            np.testing.assert_allclose(found.R, expected.R, rtol=0, atol=1e-15)
+            np.testing.assert_allclose(found.t, expected.t, rtol=0, atol=1e-15)
 
 
 @few

@@ -311,21 +311,6 @@ def test_the_descent_from_affine_frames_is_exact_on_the_paper_s_motion(size: flo
     assert np.all(affine_errors(AffineSolver(), size, 100) < [1e-9, 1e-8])
 
 
-def test_samples_are_of_seven_and_have_two_motions_each() -> None:
-    c, solver = left(simulation(pairs=60)), AffineSolver()
-    assert solver.sample_sizes(c) == {"left": 7}
-    rng, samples = np.random.default_rng(0), list[Correspondences]()
-    for _ in range(6):
-        chosen = rng.choice(60, 7, replace=False)
-        samples.append(replace(c, left=c.left[chosen], affine=c.affine[chosen]))
-    together = solver.propose_all(samples, STEREO, SHUTTER)
-    for sample, motions in zip(samples, together, strict=True):
-        alone = solver.propose(sample, STEREO, SHUTTER)
-        for one, other in zip(alone, motions, strict=True):
-            np.testing.assert_allclose([*one.w, *one.d], [*other.w, *other.d], atol=1e-12)
-        assert rotation_error(alone[0].w, W) < 1e-4 < rotation_error(alone[1].w, W) < 0.02
-
-
 def test_the_robust_search_draws_matches_with_their_frames() -> None:
     """Tracks beside them have no frames and are left alone."""
     s = simulation(pairs=80, noise_px=0.1, affine_noise=0.02, outlier_ratio=0.3)

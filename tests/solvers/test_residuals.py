@@ -30,7 +30,6 @@ from rsbench.solvers.engine.packed import (
     each_term,
     heavy_tailed,
     pack,
-    solve_triples,
     t_distribution,
 )
 from rsbench.solvers.refined import RefinedSolver
@@ -172,20 +171,6 @@ def test_a_point_that_comes_up_to_the_camera_ends_no_search(shutter: RollingShut
             theta = np.array([0.0, 0.0, 0.0, *(0.5 * towards * rng.normal(size=2)), towards * (1.0 - left)])
             cost, gradient, H = one.normal_equations(theta)
             assert cost >= 0.0 and np.all(np.isfinite(gradient)) and np.all(np.isfinite(H))
-
-
-def test_a_sample_ends_where_the_general_descent_does() -> None:
-    s = solver_trials.trial(np.random.default_rng(3), tracks=60, noise_px=0.3)
-    packed = pack(s.correspondences, solver_trials.RIG, solver_trials.SHUTTER)
-    samples = np.arange(60).reshape(20, 3)
-    thetas = solve_triples(packed, samples, iterations=60)
-    for theta, sample in zip(thetas, samples, strict=True):
-        alone = pack(
-            Correspondences(tracks=s.correspondences.tracks[sample]), solver_trials.RIG, solver_trials.SHUTTER
-        )
-        minimum = levenberg_marquardt(alone.normal_equations, np.zeros(6), 60, 50.0)
-        cost, _, _ = alone.normal_equations(theta)
-        assert cost == pytest.approx(minimum.cost, rel=1e-6, abs=1e-9)
 
 
 @EACH_TIMED

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, final
@@ -37,13 +37,9 @@ from rsbench.solvers.engine.base import (
     load_solver_entry,
 )
 from rsbench.solvers.engine.ransac import (
-    BoolArray,
-    IntArray,
     RansacOptions,
     all_inlier_probability,
     log10_false_alarms,
-    msac_score,
-    ransac,
     required_iterations,
 )
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions
@@ -439,65 +435,6 @@ def test_an_own_loop_that_fails_has_its_own_reason() -> None:
     assert not any(np.any(mask) for mask in result.inliers.values())
 
 
-Line = tuple[float, float]
-
-
-@dataclass
-class LineEstimator:
-    """y = a x + b through points, in groups that are sampled separately."""
-
-    points: FloatArray
-    num_data: tuple[int, ...]
-    sample_size: tuple[int, ...]
-    refines: int = 0
-    generates: int = 0
-
-    def generate(self, samples: IntArray) -> Iterator[list[Line]]:
-        for sample in samples:
-            self.generates += 1
-            (x0, y0), (x1, y1) = self.points[sample]
-            a = (y1 - y0) / (x1 - x0) if x0 != x1 else 0.0
-            yield [(a, y0 - a * x0)] if x0 != x1 else []
-
-    def residuals(self, model: Line) -> FloatArray:
-        return self.points[:, 1] - model[0] * self.points[:, 0] - model[1]
-
-    def refine(self, model: Line, inliers: BoolArray) -> Line | None:
-        self.refines += 1
-        a, b = np.polyfit(self.points[inliers, 0], self.points[inliers, 1], 1)
-        return float(a), float(b)
-
-
-def line_problem(outlier_ratio: float, seed: int = 0, n: int = 100) -> tuple[LineEstimator, BoolArray]:
-    rng = np.random.default_rng(seed)
-    x = rng.uniform(0, 10, n)
-    y = 2.0 * x - 1.0 + rng.normal(0, 0.01, n)
-    bad = np.arange(n) < round(outlier_ratio * n)
-    y[bad] = rng.uniform(-20, 20, np.count_nonzero(bad))
-    return LineEstimator(np.column_stack([x, y]), (n,), (2,)), ~bad
-
-
-@pytest.mark.parametrize("outlier_ratio", [0.0, 0.3, 0.6])
-def test_finds_the_line(outlier_ratio: float) -> None:
-    estimator, good = line_problem(outlier_ratio)
-    report = ransac(estimator, RansacOptions(threshold=0.03), np.random.default_rng(1))
-    assert report.success and report.model is not None
-    # A hundred points of noise 0.01 over a range of 10 fix the slope to 0.001.
-    assert report.model == pytest.approx((2.0, -1.0), abs=0.02)
-    assert np.count_nonzero(report.inliers & good) >= 0.98 * np.count_nonzero(good)
-    assert np.count_nonzero(report.inliers & ~good) <= 2
-    residuals = np.abs(estimator.residuals(report.model))
-    np.testing.assert_array_equal(report.inliers, residuals <= 0.03)
-    assert report.score == msac_score(residuals, 0.03)
-
-
-def test_nan_residuals_count_as_outliers() -> None:
-    estimator, _ = line_problem(0.0)
-    estimator.points[3, 1] = np.nan
-    report = ransac(estimator, RansacOptions(threshold=0.05, lo_steps=0, final_steps=0), np.random.default_rng(0))
-    assert report.success and not report.inliers[3]
-
-
 def test_all_inlier_probability_by_hand() -> None:
     # 3 of 5 good, samples of 2: 3/5 * 2/4.
     assert all_inlier_probability((3,), (5,), (2,)) == pytest.approx(0.3)
@@ -514,18 +451,6 @@ def test_required_iterations_by_hand() -> None:
     assert required_iterations(0.0, 0.99) == math.inf
     # (1 - p) rounds to 1: the logarithm must not.
     assert required_iterations(1e-18, 0.5) == pytest.approx(math.log(2) * 1e18)
-
-
-def test_stops_after_the_required_iterations() -> None:
-    """Exactly half of 40 points are good: p = C(20, 2) / C(40, 2) = 0.2436, so 24.7 samples for 99.9 %."""
-    estimator, _ = line_problem(0.5, n=40)
-    report = ransac(
-        estimator, RansacOptions(threshold=0.05, confidence=0.999, min_iterations=1), np.random.default_rng(0)
-    )
-    good = np.count_nonzero(report.inliers)
-    expected = required_iterations(all_inlier_probability((int(good),), (40,), (2,)), 0.999)
-    assert 20 <= good <= 21
-    assert report.iterations == math.ceil(expected) == estimator.generates
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,8 @@ def refusal(read: Callable[[], Any]) -> str:
     ("sequences", "message"),
     [
         (["../other"], "name = '../other': must be a folder's name"),
+        (["/tmp"], "name = '/tmp': must be a folder's name"),
+        ([".."], "must be a folder's name"),
         (["a\\b"], "must be a folder's name"),
         (["planes\n"], "must be a folder's name"),
         (["x" * 200], "must be a folder's name"),

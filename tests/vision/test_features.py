@@ -22,7 +22,6 @@ from rsbench.vision.features import (
     align,
     best_two,
     close_loops,
-    content_key,
     detect,
     forget_features,
     match_stereo_frames,
@@ -295,14 +294,6 @@ def test_a_track_stays_one_in_all_sets() -> None:
     np.testing.assert_allclose(found.tracks, np.concatenate(ends, axis=1)[:2], atol=0.02)
     assert [len(found.left), len(found.right), len(found.stereo_0), len(found.stereo_1)] == [3, 3, 2, 3]
     assert np.count_nonzero(unlinked_pairs(found, "left")) == np.count_nonzero(unlinked_pairs(found, "right")) == 1
-
-
-def test_images_are_told_apart_by_all_that_they_are() -> None:
-    image = np.arange(24, dtype=np.uint8).reshape(4, 6)
-    others = (image + np.uint8(1), image.reshape(6, 4), image.view(np.int8))
-    assert content_key(image.copy()) == content_key(image)
-    assert content_key(np.asfortranarray(image)) == content_key(image)
-    assert len({content_key(image), *map(content_key, others)}) == 4
 
 
 def test_features_are_those_of_the_image_and_the_options_that_are_asked_for() -> None:

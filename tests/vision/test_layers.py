@@ -34,7 +34,6 @@ from rsbench.vision.layers import (
     MovingCamera,
     PlaneOptions,
     fronto_parallel,
-    label_pixels,
     planes_seen,
     refined,
 )
@@ -133,40 +132,6 @@ def test_planes_are_where_rays_meet_them() -> None:
             assert found == pytest.approx(1.0 / z, abs=1e-14)
     behind = planes_seen(planes, Pose(np.eye(3), np.array([0.0, 0.0, -3.0])))  # beyond the one at 2.5
     assert np.all(np.isnan(behind[2])) and np.all(np.isfinite(behind[:2]))
-
-
-def test_pixels_find_their_layers_and_who_hides_them(filmed: Filmed) -> None:
-    """With the true motion and planes: what is left is the assignment."""
-    greys = [cv2.cvtColor(filmed.problem.images[view], cv2.COLOR_RGB2GRAY).astype(np.float32) for view in LEFT]
-    planes = np.zeros((4, 3))
-    planes[1:, 2] = 1.0 / DEPTHS
-    found = label_pixels((greys[0], greys[1]), filmed.camera, planes, LabelOptions(), 0.5)
-    for view in LEFT:
-        frame, truth = view[1], filmed.depth[view]
-        rho = np.take_along_axis(filmed.camera.inverse_depths(planes, frame), found.labels[frame][None], axis=0)[0]
-        off = wrong(1.0 / np.maximum(rho, 1e-9), truth)
-        assert np.mean(off[inside(truth)]) < 0.03
-        grid = filmed.world.rig.camera.pixel_grid()
-        tau = filmed.world.shutter.pixel_time(grid, frame, "left")
-        _, centre, rays = filmed.world.depth_along(
-            filmed.world.rig.cam_from_world(filmed.world.motion, tau, "left"), grid
-        )
-        other = rs_project(
-            filmed.world.rig,
-            filmed.world.shutter,
-            filmed.world.motion,
-            "left",
-            1 - frame,
-            centre + truth[..., None] * rays,
-        )
-        there = np.isfinite(other.depth)
-        nearest, _, _ = filmed.world.depth_along(
-            filmed.world.rig.cam_from_world(filmed.world.motion, np.where(there, other.tau, 0.0), "left"),
-            np.where(there[..., None], other.pixels, 0.0),
-        )
-        visible = there & (nearest > other.depth * (1 - 1e-6))
-        # Beside borders windows see two surfaces.
-        assert np.mean((found.seen[frame] != visible)[inside(truth)]) < 0.05
 
 
 def test_exact_matches_on_layers_give_the_exact_motion_and_planes(filmed: Filmed) -> None:

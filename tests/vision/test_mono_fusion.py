@@ -140,19 +140,6 @@ def test_where_no_law_explains_the_flow_the_flow_moves_everything(
     assert with_wrong < 1.1 * with_flow
 
 
-def test_without_a_motion_everything_is_scaled_flow(scene: Any, seen: Seen) -> None:
-    """At the time of a row, the pixels of that row stay where they are."""
-    own = OwnMotion(rig=scene.rig.about("left"), shutter=scene.shutter, side="left", motion=None)
-    fusion = MonoFusion(seen.images, own, seen.flows)
-    places = fusion.places(1, float(scene.shutter.row_time(100, 1)))
-    np.testing.assert_allclose(places[100, :, 0], np.arange(320), atol=1e-9)  # rounding
-    # The whole flow leads to the other frame: at the time of its end a pixel is at its end.
-    x, y = 160, 120
-    end = np.array([x, y]) + seen.flows.flow[1][y, x]
-    there = fusion.places(1, float(scene.shutter.row_time(end[1], 0)))[y, x, :2]
-    np.testing.assert_allclose(there, end, atol=1e-4)  # float32 of the flow
-
-
 def test_what_cannot_be_corrected_says_why() -> None:
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)), (0, 0), 2.0)

@@ -117,14 +117,6 @@ def test_derivatives_are_those_of_the_errors() -> None:
         )  # rounding over the step: 1e-9
 
 
-def test_errors_are_pixels_along_the_row() -> None:
-    n = line_at(np.array([150.0, 170.0]), np.array([0.3, 1.0, 0.1]))
-    w = np.radians([1.0, 2.0, -3.0])
-    curve = curve_of(n, w, True, (20, 300))
-    at = Turned.by(points_of([curve + np.array([0.25, 0.0])]), w)
-    np.testing.assert_allclose(np.abs(at.errors(n[None])), 0.25, atol=1e-10)
-
-
 def test_stated_deviations_are_those_of_noise() -> None:
     """White noise counts as one error in eight px: it errs by less than stated, and not by a tenth of that."""
     w, ratios = np.radians([1.0, -1.0, 2.0]), list[float]()

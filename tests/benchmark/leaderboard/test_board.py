@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -45,10 +46,11 @@ from rsbench.benchmark.leaderboard.submissions import (
     read_submission,
     write_template,
 )
-from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Split
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, Limits, Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.components.cards import parse_card
 from rsbench.core.errors import RsbenchError
+from rsbench.jobs.isolation import Outcome
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.report.board_page import build_site
 from rsbench.solvers.engine.base import BESIDE, load_solver_entry
@@ -289,6 +291,38 @@ def test_runs_are_the_same_however_they_are_cut(tmp_path: Path, monkeypatch: pyt
     assert scores_of(SPLIT, path)["auc_10"].mean() > 0.3  # the conventions of inputs and answers agree
 
 
+def test_a_problem_that_takes_too_much_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It alone, with the reason; and what was done without limits is not taken for it."""
+    split = small_split(3)
+    write_inputs(split, (simulated_problem(1, number) for number in range(3)), tmp_path / "in")
+    limits = Limits(seconds=5.0)
+
+    def one_too_long(
+        serve: Any,
+        jobs: Any,
+        workers: int,
+        environment: object,
+        *arguments: object,
+        seconds_of: Any,
+        memory_mb: Any,
+    ) -> Any:
+        run = serve(*arguments)
+        for job in jobs:
+            assert seconds_of(job) == 5.0 and memory_mb is None and len(job.problems) == 1
+            late = job.problems == ("p001",)
+            value = None if late else run(job)
+            yield job, Outcome(value=value, reason="took longer than 5 s" if late else "", output="")
+
+    monkeypatch.setattr(running, "finished_jobs", jobs_here)
+    monkeypatch.setattr(running, "run_jobs", one_too_long)
+    for chosen in (Limits(), limits):
+        (path,) = run_cards(split, ["gs-8pt"], tmp_path / "in", tmp_path / "work", limits=chosen)
+        answers = lines_of(path)[1:]
+        assert [answer["name"] for answer in answers] == ["p000", "p001", "p002"]
+        assert ("took longer" in answers[1].get("reason", "")) == (chosen == limits)
+    assert scores_of(split, path)["failure"][1] == 1.0
+
+
 def test_frames_with_given_matches(smoke_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Through the command line: the matches that are exported are enough for a motion of rendered frames."""
     monkeypatch.setattr(running, "finished_jobs", jobs_here)
@@ -374,7 +408,9 @@ FAULTS: dict[str, tuple[str, str]] = {
     "another split": (_text(_header(split="dev-00000000")), "split = 'dev-00000000': the truth at hand"),
     "another protocol": (_text(_header(protocol="pose-1")), "protocol = 'pose-1'"),
     "no protocol": (_text(_header(protocol="points-9")), "'points-9'"),
+    "unknown key of the header": (_text(_header(autors="me")), "unknown key 'autors' (did you mean 'authors'?)"),
     "path for a name": (_text(_header(method="../../etc/passwd")), "method = '../../etc/passwd'"),
+    "hidden folder": (_text(_header(method=".rsbench")), "method = '.rsbench'"),
     "zero byte": (_text(_header(method="a\0b")), "method = "),
     "no name": (_text(_header(method="")), "method = ''"),
     "two lines in a text": (_text(_header(authors="a\nb")), "authors: must be one line"),
@@ -385,6 +421,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "uses magic": (_text(_header(uses=["magic"])), "'magic' is unknown"),
     "unknown problem": (_text(_changed(name="p01")), 'name = "p01": is no problem'),
     "the same problem twice": (_text([*TRUTH, FIRST]), ":14: name = 'p000': is that of line 2 too"),
+    "what overflows": (_text(_changed(d=[0.0, 1e300, 0.0])), ":2: d: numbers must lie within 1e+09 of 0"),
     "a denormal direction": (
         _text(_changed(d=[5e-324, 0.0, 0.0])),
         ":2: d: has length 4.94066e-324: must be 0, or",
@@ -398,6 +435,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "another point": (_text(_changed(reference_point="right")), ":2: reference_point = 'right'"),
     "negative time": (_text(_changed(seconds=-1.0)), ":2: seconds = -1.0"),
     "small covariance": (_text(_changed(covariance=[[1.0]])), ":2: covariance: must be 6 x 6"),
+    "half a covariance": (_text(_changed(covariance=np.triu(np.ones((6, 6))).tolist())), "must be symmetric"),
     "two names": (_text(TRUTH[:1]) + '{"name": "p000", "name": "p001"}\n', ":2: not valid JSON: the key 'name'"),
     "uses it twice": (_text(_header(uses=["left"] * 6000)), "uses: names something twice"),
     "a dot at the end": (_text(_header(method="mine.")), "method = 'mine.': cannot be"),

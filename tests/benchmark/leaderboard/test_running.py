@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import lzma
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,8 @@ from rsbench.benchmark.leaderboard.board import (
     restore,
     splits_of,
 )
-from rsbench.benchmark.leaderboard.submissions import check_submission, write_oracles, write_truth
+from rsbench.benchmark.leaderboard.picture_track import _serve_rows
+from rsbench.benchmark.leaderboard.submissions import check_submission, read_submission, write_oracles, write_truth
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.cli import reproduce_leaderboard
@@ -263,6 +265,17 @@ def test_a_run_that_was_cut_off_goes_on(workers: int, splits: dict[str, Split], 
     assert not (tmp_path / "cut" / ".rsbench" / "scoring").exists()
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_who_is_at_fault_fails_alone(workers: int, splits: dict[str, Split], tmp_path: Path) -> None:
+    """A picture that went after the file was read: the other entry is scored."""
+    split = splits["depth"]
+    broken, whole = (read_submission(write_truth(split, tmp_path / name), split) for name in ("broken", "whole"))
+    pictures_of(broken.folder / "predictions.jsonl")[0].unlink()
+    fault, table = split.track.mark([broken, whole], split, workers, lambda word: None, None)
+    assert isinstance(fault, RsbenchError) and "left_1.exr: is missing" in str(fault)
+    assert isinstance(table, pd.DataFrame) and np.all(table["bad_1"] == 0.0)
+
+
 def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Split], tmp_path: Path) -> None:
     split = splits["depth"]
     paths = list(write_oracles(split, tmp_path / "oracles"))
@@ -270,6 +283,19 @@ def test_a_fault_is_told_after_the_others_are_on_the_board(splits: dict[str, Spl
     with pytest.raises(RsbenchError, match=r"left_1\.exr: 7680 pixels are negative"):
         add_all(tmp_path / "board", paths, split, {"command": ORACLES})
     assert [*entered(tmp_path / "board", split)] == ["constant"]
+
+
+def test_a_child_says_that_the_truth_has_changed(splits: dict[str, Split], tmp_path: Path) -> None:
+    """In this process, as a child would."""
+    split = splits["depth"]
+    first, second = split.truths
+    changed = replace(first.shown, files=dict.fromkeys(first.shown.files, "0" * 64))
+    broken = replace(split, truths=(replace(first, pictures=changed), second))
+    run = _serve_rows([read_submission(write_truth(split, tmp_path), split)], broken)
+    with pytest.raises(RsbenchError, match=r"is not the file that dataset\.json names"):
+        run(first.name)
+    (row,) = run(second.name)
+    assert isinstance(row, dict) and row["bad_1"] == 0.0
 
 
 ENTRIES = {"pose-2": ["gs-p3p", "gs-8pt"], "readout-3": ["rs-stereo-refined"], "correction-3": ["rotation-only"]}

@@ -34,7 +34,6 @@ from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.storage.work_folder import work_folder
 
 SETTING = load_sweep("noise").setting.changed({"points": 30, "noise_px": 0.1}, "test")
 CARD = SweepCard(
@@ -124,11 +123,6 @@ def test_trials_of_others_are_neither_removed_nor_taken_for_ours(tmp_path: Path,
     with pytest.raises(RsbenchError, match="'rsbench simulate' did not make it; move it away"):
         run_sweep(CARD, tmp_path / "out", force=force)
     assert (place / "000.npz").read_bytes() == b"mine"
-
-
-def test_two_commands_do_not_share_a_folder(finished: Path) -> None:
-    with work_folder(finished), pytest.raises(RsbenchError, match="is at work there"):
-        run_sweep(CARD, finished)
 
 
 MISCHIEF = """
