@@ -95,3 +95,34 @@ def test_matches_refuse_what_are_no_rows_of_finite_numbers(name: str, value: Any
         refused(lambda wrong=wrong: ANY.Correspondences(**{name: wrong}))
     if not isinstance(value, list):
         refused(lambda: ANY.Correspondences(**{name: [row]}))
+
+
+def test_functions_refuse_what_is_no_rig_shutter_or_motion() -> None:
+    rig, shutter = (
+        ANY.StereoRig(camera=camera(), baseline=0.1),
+        ANY.RollingShutter(height=24, readout_ratio=1),
+    )
+    motion = ANY.LinearMotion([0, 0, 0.01], [0, 0, 0.1])
+    for wrong in ("x", None, motion):
+        refused(lambda wrong=wrong: ANY.simulate(wrong, shutter, motion))
+    refused(lambda: ANY.simulate(rig, rig, motion))
+    refused(lambda: ANY.simulate(rig, shutter, [0.1, 0.2, 0.3]))
+    for points in (
+        ["a", "b", "c"],
+        [0.0, 1e300, 1.0],
+        [np.inf, 0.0, 1.0],
+        np.ma.masked_array(np.ones(3), [False, True, False]),
+    ):
+        refused(lambda points=points: ANY.project(points, rig, shutter, motion))
+    for size in (("32", 24), (None, 24), (32.5, 24), (32, True)):
+        refused(lambda size=size: ANY.PinholeCamera.centred(*size, 30.0))
+    refused(lambda: ANY.estimate_motion(ANY.Correspondences(), rig, shutter, threshold_px=True))
+
+
+@pytest.mark.parametrize("kind", [int, float, np.int64, np.int8, np.float32, np.float64])
+def test_numbers_of_every_real_type_are_taken(kind: Any) -> None:
+    one = kind(1)
+    assert ANY.StereoRig(camera=camera(fx=one), baseline=one).disparity(2.0) == 0.5
+    assert ANY.RollingShutter(height=8, readout_ratio=one).readout_ratio == 1.0
+    np.testing.assert_array_equal(ANY.LinearMotion([one] * 3, np.array([one] * 3)).w, np.ones(3))
+    assert ANY.Correspondences(left=[[one] * 4]).left.dtype == np.float64

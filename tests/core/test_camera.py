@@ -113,6 +113,15 @@ def test_pixels_are_opencvs_or_the_papers(lens: Lens) -> None:
     np.testing.assert_allclose(camera.project(X), pixels, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("brown", [PHONE, ACTION])
+def test_a_rational_lens_without_a_denominator_is_brown_and_conradys(brown: Lens) -> None:
+    xy = np.random.default_rng(3).uniform(-0.7, 0.7, (200, 2))
+    rational = Lens(model="rational", **{name: getattr(brown, name) for name in ("k1", "k2", "p1", "p2", "k3")})
+    assert rational.reach == pytest.approx(min(brown.reach, np.tan(WIDEST)), rel=1e-12)
+    for found, expected in zip(rational.distort(xy), brown.distort(xy), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+
+
 @settings(max_examples=40)
 @given(st.floats(-0.9, 1.5), st.floats(0.0, 1.0), st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=2))
 def test_two_spheres_are_inverted_up_to_where_they_fold(xi: float, alpha: float, direction: list[float]) -> None:

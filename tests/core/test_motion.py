@@ -230,6 +230,21 @@ def test_parameters_make_the_motion_again(motion: Motion) -> None:
 STILL = [0.0] * 6
 
 
+def test_explicit_poses_fix_the_motion() -> None:
+    given = {"interval": 0.4, "poses": control(3, 8)}
+    w, d = SplineMotion.endpoint(given) or (None, None)
+    assert w is not None and d is not None
+    motion = SplineMotion(w, d, **given)
+    # The poses are seen through the spline, which passes near them, and from its own pose at time 0.
+    near = Pose(so3.exp(control(3, 8)[:, :3]), control(3, 8)[:, 3:])
+    R, t = motion.body_from_world(0.4 * np.arange(1, 6))
+    expected = compose(Pose(near.R[2:7], near.t[2:7]), inverse(Pose(near.R[1], near.t[1])))
+    assert np.max(so3.angle(R @ np.swapaxes(expected.R, -1, -2))) < 0.2
+    assert np.max(np.abs(t - expected.t)) < 0.2
+    with pytest.raises(ValueError, match="must be those of its poses"):
+        SplineMotion(w, 1.1 * d, **given)
+
+
 def _spectral(spectrum: Any) -> dict[str, Any]:
     return {"interval": 0.5, "spectrum": spectrum}
 
@@ -522,6 +537,11 @@ def test_rates_and_forces_integrate_back_to_the_poses(name: str) -> None:
     end = inverse(motion.body_from_world(1.8))
     assert so3.angle(R.T @ end.R) < 1e-7
     np.testing.assert_allclose(p, end.t, rtol=0, atol=2e-5)
+
+
+def test_at_rest_one_feels_that_one_does_not_fall() -> None:
+    felt = inertial(LinearMotion(np.zeros(3), np.zeros(3)), 0.3, 0.1, DOWN)
+    np.testing.assert_allclose([felt.turn, felt.force], [np.zeros(3), -DOWN], rtol=0, atol=1e-15)
 
 
 def test_a_turn_to_the_right_is_positive_about_the_axis_down() -> None:

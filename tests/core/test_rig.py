@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rsbench.components.motion_models import AcceleratedMotion, LinearMotion, TwistMotion
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.geometry import MovingObject, RelativeMotion
+from rsbench.core.geometry import MovingObject, RelativeMotion, poses_of
 from rsbench.core.motion import Motion
 from rsbench.core.projection import project_at
 from rsbench.core.rig import SIDES, StereoRig
@@ -144,3 +144,7 @@ def test_the_rig_seen_from_an_object(model: type[Motion], own: type[Motion]) -> 
     R = relative.body_from_world(tau).R
     np.testing.assert_allclose((after.R - before.R) / (2 * step), so3.hat(w_rate) @ R, atol=1e-8)
     np.testing.assert_allclose((after.t - before.t) / (2 * step), t_rate, atol=1e-8)
+
+
+def test_without_objects_there_are_no_poses() -> None:
+    assert poses_of((), np.zeros(3)) is None

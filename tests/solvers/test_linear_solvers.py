@@ -147,6 +147,19 @@ def test_chosen_matches_stand_apart(seed: int, n: int) -> None:
     assert np.max(left_out) <= least
 
 
+def test_nine_far_apart_solve_better_than_any_nine() -> None:
+    errors = []
+    for seed in range(30):
+        s = trial(np.random.default_rng([7, seed]), pairs=100, noise_px=1e-3)
+        c = s.correspondences
+        nine = Correspondences(left=c.left[:9], right=c.right[:9])
+        estimates = [LinearSolver(sampling="nine-apart").estimate(c, RIG, SHUTTER)]
+        estimates.append(LinearSolver().estimate(nine, RIG, SHUTTER))
+        errors.append([rotation_error(found.w, s.motion.w) for found in estimates])
+    apart, any_nine = np.median(errors, axis=0)
+    assert apart < any_nine
+
+
 def estimate_linear(w: FloatArray, d: FloatArray, shutter: RollingShutter = SHUTTER, noise_px: float = 0.0) -> str:
     c = matches_of(LinearMotion(w, d), seed=1, shutter=shutter, pairs=100, noise_px=noise_px)
     return LinearSolver().estimate(c, RIG, shutter).reason
