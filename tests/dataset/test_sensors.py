@@ -265,3 +265,8 @@ def test_an_exposure_without_noise_is_no_fault(tmp_path: Path) -> None:
     generate_dataset(load_dataset_card(str(card)), tmp_path / "out")
     content = read_content(read_sequence(tmp_path / "out" / "grey"), set())
     assert list(sensor_faults(content, ())) == []
+
+
+def test_a_card_says_what_its_sensor_cannot_be() -> None:
+    with pytest.raises(ValueError, match=r"exposure_s = 0.2: longer than frame_period_s = 0.1"):
+        _card(Sensor(exposure_s=0.2))
