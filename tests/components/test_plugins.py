@@ -257,6 +257,15 @@ def test_one_package_twice_on_the_path_is_no_clash(tmp_path: Path, monkeypatch: 
     assert list_names(GREETINGS).count("hi") == 1
 
 
+def test_a_clash_is_an_error_of_that_name_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "hello.py").write_text(MODULE, "utf-8")
+    install(tmp_path, monkeypatch, "one", "[rsbench.greetings]\ntwice = hello:Hello\nhi = hello:Hello\n")
+    install(tmp_path, monkeypatch, "two", "[rsbench.greetings]\ntwice = other:Hello\n")
+    assert word(load_entry(GREETINGS, "hi")) == "hello "
+    message = refusal("twice")
+    assert "hello:Hello of one" in message and "other:Hello of two" in message
+
+
 @dataclass(frozen=True)
 class Polite(Greeting):
     inner: Greeting | None = None
