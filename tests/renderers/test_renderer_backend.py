@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes.util
 import errno
 import importlib.metadata
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -214,6 +216,7 @@ def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
 def test_dr_jit_imported_first_with_an_unsuitable_llvm_or_none_is_refused(library: Path | None) -> None:
     code = """
 import os
+import shutil
 import drjit
 del os.environ["DRJIT_LIBLLVM_PATH"]
 from rsbench.renderers.backend import start_backend
@@ -270,6 +273,24 @@ def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
         while child.read_text().rpartition(")")[2].split()[0] not in ("Z", "X"):  # dead, and not buried yet
             assert time.perf_counter() < end, "the child lives on"
             time.sleep(0.01)
+
+
+def test_wheel_without_its_symbolic_links_still_loads(tmp_path: Path) -> None:
+    """As left by installers that do not run the wheel's start-up hook."""
+    wheels = [c for c in llvm.candidates({}) if c.source == "karellen-llvm-core"]
+    if not wheels:
+        pytest.skip("karellen-llvm-core is not installed")
+    runtime = wheels[0].path.parent / "x86_64-unknown-linux-gnu"
+    (tmp_path / "lib" / runtime.name).mkdir(parents=True)
+    library = Path(shutil.copy(wheels[0].path, tmp_path / "lib"))
+    for file in runtime.glob("*.so.1.0"):
+        shutil.copy(file, tmp_path / "lib" / runtime.name)
+    [candidate] = llvm.candidates({"DRJIT_LIBLLVM_PATH": str(library)})
+    assert [path.name for path in candidate.preload] == ["libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0"]
+    assert llvm.probe(candidate).ok
+    if ctypes.util.find_library("c++") is None:
+        library.touch()  # another key, so that the good news about it is not recalled
+        assert not llvm.probe(Candidate(path=library, source="DRJIT_LIBLLVM_PATH")).ok
 
 
 def test_candidates_come_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
