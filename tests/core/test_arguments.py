@@ -107,6 +107,7 @@ def test_functions_refuse_what_is_no_rig_shutter_or_motion() -> None:
         refused(lambda wrong=wrong: ANY.simulate(wrong, shutter, motion))
     refused(lambda: ANY.simulate(rig, rig, motion))
     refused(lambda: ANY.simulate(rig, shutter, [0.1, 0.2, 0.3]))
+    refused(lambda: ANY.simulate(rig, shutter, motion, noise_px=-1.0))
     for points in (
         ["a", "b", "c"],
         [0.0, 1e300, 1.0],

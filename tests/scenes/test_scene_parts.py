@@ -19,6 +19,7 @@ from rsbench.scenes.parts import (
     assemble,
     beam,
     block,
+    cushion,
     flat,
     house,
     leaned,
@@ -80,6 +81,14 @@ def test_volumes(piece: Piece, volume: float) -> None:
     assert mesh.is_watertight
     # 360 segments of a circle lose 2 pi^2 / 3 / 360^2 = 5e-5 of its area.
     assert mesh.volume == pytest.approx(volume, rel=1e-4)
+
+
+def test_a_cushion_fits_its_box() -> None:
+    piece = cushion("a", (1, 2, 1), (0, 0, 3))
+    assert_sound(piece)
+    assert 0 < solid(piece).volume < 2
+    corners = piece.points.reshape(-1, 3)
+    assert np.all(corners >= (-0.5, -1, 3)) and np.all(corners <= (0.5, 1, 4))
 
 
 def test_a_cylinder_is_smooth_and_its_texture_is_unrolled() -> None:
