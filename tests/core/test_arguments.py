@@ -14,6 +14,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 import rsbench
+from rsbench.benchmark.simulated.simulation import SimulationOptions
 from rsbench.components.motion_models import InertialMotion
 from rsbench.core.camera import Lens
 
@@ -107,7 +108,7 @@ def test_functions_refuse_what_is_no_rig_shutter_or_motion() -> None:
         refused(lambda wrong=wrong: ANY.simulate(wrong, shutter, motion))
     refused(lambda: ANY.simulate(rig, rig, motion))
     refused(lambda: ANY.simulate(rig, shutter, [0.1, 0.2, 0.3]))
-    refused(lambda: ANY.simulate(rig, shutter, motion, noise_px=-1.0))
+    refused(lambda: SimulationOptions(gyro_noise_deg=-1.0))
     for points in (
         ["a", "b", "c"],
         [0.0, 1e300, 1.0],
