@@ -180,6 +180,7 @@ FAULTS: dict[str, Fault] = {
     "flow mask: nothing is out of view": fault(
         "flow_mask/left_1.png", classes(PixelClass.OUT_OF_VIEW, PixelClass.UNSOLVED), "not solved"
     ),
+    "disparity mask: sky is no class": fault("disparity_mask/right_0.png", classes(SKY, 9), "holds 9: "),
     "normals negated": fault("normals/left_0.exr", np.negative, "point away from the camera"),
     "normals with y and z exchanged": fault("normals/left_1.exr", lambda n: n[..., [0, 2, 1]], "flat pixels"),
     "normals scaled": fault("normals/right_0.exr", scaled(0.9)),

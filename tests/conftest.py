@@ -44,7 +44,6 @@ settings.load_profile("same")
 import_untried()
 
 LARGE_SCENES = (
-    "test_depth_by_rays.py",
     "test_installed_wheel.py",
     "test_built_scenes.py",
     "test_paper_sequences.py",

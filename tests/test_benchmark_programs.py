@@ -15,39 +15,13 @@ import pytest
 from programs import ROOT
 
 from rsbench.benchmark.leaderboard.track import PUBLIC_SEED
-from rsbench.benchmark.simulated.simulation import SimulationOptions, random_motion, simulate
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
-from rsbench.core.shutter import RollingShutter
 from rsbench.solvers.engine.base import load_solver_entry
 
 
 @pytest.fixture(scope="module")
 def lines() -> ModuleType:
     return programs.program("benchmarks/line_triplets.py")
-
-
-def test_failures_err_by_half_a_turn_and_exact_features_by_nothing(lines: ModuleType) -> None:
-    motion = random_motion(np.random.default_rng(0), np.radians(2.0), 0.3)
-    still = RollingShutter(height=900, readout_ratio=0.0)
-    c = simulate(lines.RIG, still, motion, SimulationOptions(tracks=20), np.random.default_rng(0)).correspondences
-    row = lines.errors(c, lines.RIG, motion)
-    assert row["e_R_lines"] == row["e_T_lines"] == 180.0
-    assert row["e_R_both"] == row["e_R_points"] < 1e-8
-    assert lines.errors(Correspondences(), lines.RIG, motion)["e_R_both"] == 180.0
-
-
-def test_the_table_has_a_row_for_each_thing_with_medians_and_the_share_that_is_right(lines: ModuleType) -> None:
-    kinds = {f"{e}_{kind}": 1.0 for e in ("e_R", "e_T") for kind in ("points", "lines", "both")}
-    rows = [
-        {"of": "room", "tracks": 10 * k, "lines": 20, "right": 19, "ms_both": 7.0, **kinds, "e_R_both": 0.1 * k}
-        for k in range(1, 12)
-    ]
-    head, rule, line = lines.told(pd.DataFrame(rows)).split("\n")
-    cells = line.strip("| ").split(" | ")
-    assert cells[:3] == ["room", "11", "60, 20"] and cells[3].startswith("0.95 [")
-    assert cells[6].startswith("0.6 [") and cells[-1] == "7"
-    assert head.count("|") == rule.count("|") == line.count("|") == 12
 
 
 SWEEP_FOLDER = ROOT / "results/trajectory"
@@ -106,41 +80,6 @@ def tuning() -> ModuleType:
     return programs.program("benchmarks/tune_solvers.py")
 
 
-def test_one_option_at_a_time_differs_and_the_house_s_loop_is_for_those_in_it(tuning: ModuleType) -> None:
-    for name, own in (("rs-r6p", True), ("rs-zhuang-8pt", False)):
-        entry = load_solver_entry(name)
-        assert (entry.options.robust == "own") == own
-        card, *others = tuning.settings_of(entry.solver, own)
-        assert card.option == "card" and card.solver == entry.solver
-        assert any(each.option.startswith("loop.") for each in others) != own
-        for each in others:
-            changed = {k for k, v in vars(each.solver).items() if v != vars(card.solver)[k]}
-            assert len(changed) + (each.loop != card.loop) == 1
-
-
-def test_intervals_hold_for_all_settings_together(tuning: ModuleType) -> None:
-    """Of gains of nothing, one in twenty tables may show one beyond 0."""
-    rng, beyond = np.random.default_rng(0), 0
-    for _ in range(60):
-        low, high = tuning.gain_intervals(rng.normal(0.0, 0.1, (40, 5)))
-        beyond += bool(np.any((low > 0.0) | (high < 0.0)))
-    assert beyond <= 9  # 3 expected; the bootstrap of 40 is somewhat narrow
-    low, high = tuning.gain_intervals(np.full((40, 2), 0.25))
-    assert np.allclose([low, high], 0.25, rtol=0.0, atol=1e-12)
-
-
-def test_the_card_stands_unless_another_setting_is_better_beyond_its_interval(tuning: ModuleType) -> None:
-    card = tuning.Setting("card", "", load_solver_entry("rs-r6p").solver, tuning.RobustOptions())
-    rng = np.random.default_rng(1)
-    errors = rng.uniform(0.5, 4.5, 40)
-    settings = [(card, errors), (card, errors + rng.normal(-0.02, 0.5, 40)), (card, errors + 1.0)]
-    assert [row["best"] for row in tuning.rows_of("rs-r6p", settings)] == [True, False, False]
-    settings.append((card, errors - 0.4))
-    rows = tuning.rows_of("rs-r6p", settings)
-    assert [row["best"] for row in rows] == [False, False, False, True]
-    assert rows[-1]["gain"] == pytest.approx(0.08, abs=1e-12)
-
-
 def test_what_is_committed_is_of_a_seed_of_its_own_and_the_cards_stand(tuning: ModuleType) -> None:
     assert tuning.SEED != PUBLIC_SEED
     table = pd.read_csv(TUNING_FOLDER / "tuning.csv", keep_default_na=False)
@@ -172,23 +111,6 @@ def test_errors_that_add_in_squares_cross_where_they_do(crossing: ModuleType) ->
         assert found == pytest.approx(np.sqrt(vision**2 - a**2) / b, rel=1e-12)
     assert crossing.crossing(VALUES, gyro, np.full(4, 0.1)) == 0.0
     assert crossing.crossing(VALUES, gyro, np.full(4, 6.0)) == np.inf
-
-
-def test_a_length_that_is_not_found_is_the_larger_error(crossing: ModuleType) -> None:
-    gyro = np.array([0.1, 0.2, np.inf, np.inf])
-    assert crossing.crossing(VALUES, gyro, np.full(4, 0.5)) == 3.0
-    assert crossing.crossing(VALUES, gyro, np.full(4, np.inf)) == np.inf
-
-
-def test_the_interval_holds_the_crossing_of_what_was_drawn_from(crossing: ModuleType) -> None:
-    """Rayleigh errors: those of two Gaussian parts, whose squares add."""
-    rng = np.random.default_rng(0)
-    noise = rng.standard_normal((2, 2, 200))
-    gyro = np.stack([np.hypot(0.2, 0.5 * x) * np.hypot(*noise[0]) for x in VALUES])
-    vision = np.stack([1.0 * np.hypot(*noise[1])] * len(VALUES))
-    row = crossing.crossing_row(VALUES, gyro, vision, 0)
-    truth = np.sqrt(1.0 - 0.2**2) / 0.5
-    assert row["low"] < truth < row["high"] and row["high"] / row["low"] < 2.0
 
 
 def test_committed_crossings_are_those_of_the_committed_medians(crossing: ModuleType) -> None:
@@ -268,14 +190,6 @@ def test_the_drift_is_the_distance_at_the_end(kitti: ModuleType) -> None:
     assert kitti.drift(list(zip(left, right, strict=True))) == "drift 2.00 m over 1 m, 200.0%"
 
 
-def test_exchanged_cameras_are_refused_in_every_window(
-    kitti: ModuleType, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    kitti.main([str(folder), "--left", "image_1", "--right", "image_0"])
-    out = capsys.readouterr().out
-    assert "exchanged" in out and "2 of 2 windows refused" in out
-
-
 def test_a_wrong_focal_length_leaves_the_baseline(kitti: ModuleType, folder: Path) -> None:
     rig = kitti.read_rig(folder, folder / "image_0" / "000000.png", 1.1)
     np.testing.assert_allclose([rig.camera.fx, rig.camera.fy, rig.baseline], [1.1 * F, 1.1 * F, BASELINE])
@@ -288,17 +202,6 @@ def test_what_is_missing_is_named(
     (folder / name).unlink()
     assert kitti.main([str(folder)]) == 2
     assert name in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "words", [("--ratio", "nan"), ("--ratio", "half"), ("--ratio", "1.5"), ("--every", "0"), ("--focal", "3")]
-)
-def test_options_that_mean_nothing_are_refused(
-    kitti: ModuleType, folder: Path, words: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as end:
-        kitti.main([str(folder), *words])
-    assert end.value.code == 2 and f"argument {words[0]}: {words[1]!r} must be" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["calib.txt", "poses.txt"])

@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from programs import ROOT
-from scipy.optimize import brentq
 
 from rsbench.components.motion_models import AcceleratedMotion, InertialMotion, LinearMotion, TwistMotion
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, Side, StereoRig
-from rsbench.core.shutter import RollingShutter
+from rsbench.core.rig import SIDES, Side
 from rsbench.interop.readers.rig_files import Readout, read_rig_file
 from rsbench.pipeline.footage import read_rig_card
 
@@ -69,19 +67,6 @@ def test_laws_are_those_of_the_models_with_their_end_points(programs_: Programs)
         np.testing.assert_allclose(t, true.t, atol=1e-12)
 
 
-def test_a_shaken_body_starts_at_rest_in_the_world_and_shakes_as_strongly_as_said(programs_: Programs) -> None:
-    motion = programs_.motion
-    law = motion.shaken(np.random.default_rng(3), 1.0, 0.15, 0.45)
-    R, t = law.body(np.zeros(1))
-    np.testing.assert_allclose(R[0], np.eye(3), atol=1e-15)
-    np.testing.assert_allclose(t[0], 0.0, atol=1e-15)
-    tau = np.linspace(0.0, 200.0, 4001)
-    rest = motion.centres(law, tau) - tau[:, None] * law.v
-    expected = np.sqrt(np.sum(law.amplitudes[3:] ** 2, axis=1) / 2.0)  # of a sum of sines
-    np.testing.assert_allclose(np.std(rest, axis=0), expected, rtol=0.05)  # 30 periods or more of the slowest
-    assert np.all((law.amplitudes[3:] > 0.002) & (law.amplitudes[3:] < 0.008))
-
-
 def test_depth_is_that_of_a_wall(programs_: Programs) -> None:
     """z = n c / (n ray) of a pixel's ray, in the camera of its line; infinite beside the wall."""
     foreign, law = programs_.rig.equal(ratio=0.8, **SMALL), programs_.motion.Linear(W, D)
@@ -100,20 +85,6 @@ def test_depth_is_that_of_a_wall(programs_: Programs) -> None:
     true = distance[:, None] / np.sum(normal[:, None] * rays, axis=-1)
     np.testing.assert_allclose(found[known], true[known], rtol=1e-5)  # of float32
     assert 0.4 < np.mean(known) < 0.9
-
-
-@pytest.mark.parametrize(("ratio", "scans", "k1"), CASES)
-@pytest.mark.parametrize("side", SIDES)
-def test_dots_are_drawn_where_the_row_equation_has_them(
-    programs_: Programs, ratio: float, scans: tuple[str, str], k1: float, side: Side
-) -> None:
-    foreign = programs_.rig.equal(ratio=ratio, scans=scans, k1=k1, **SMALL)
-    rig, shutter = programs_.case.ours(foreign)
-    law = programs_.motion.Twist(W, D)
-    motion = TwistMotion(*programs_.motion.between(law, 0.0, 1.0))
-    points = _points(np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 4)))
-    image = _dots(programs_, foreign, law, points, side)
-    assert _found(image, [_seen(rig, shutter, motion, side, point) for point in points], 12.0) >= 8
 
 
 def _points(directions: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -146,23 +117,6 @@ def _dots(programs_: Programs, rig: Any, law: Any, points: NDArray[np.float64], 
     camera = rig.camera(side)
     image: NDArray[np.float32] = programs_.frames.trace(world, camera, rig.poses(law, side, camera.times(1)))
     return image
-
-
-def _seen(
-    rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, point: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """The pixel of frame 1 that is read just when it shows the point, by bisection of the time."""
-
-    def pixel(tau: float) -> NDArray[np.float64]:
-        R, t = rig.cam_from_world(motion, tau, side)
-        return rig.camera.project(R @ point + t)
-
-    def late(tau: float) -> float:
-        return float(shutter.pixel_time(pixel(tau), 1, side)) - tau
-
-    if not late(0.9) * late(2.1) < 0.0:
-        return None
-    return pixel(float(brentq(late, 0.9, 2.1, xtol=1e-12)))
 
 
 @pytest.mark.parametrize("row", RIGS)
@@ -262,39 +216,6 @@ def _nearest(quads: list[Any], start: NDArray[np.float64], ray: NDArray[np.float
     return min(hits)[1]
 
 
-@pytest.mark.parametrize("row", RIGS)
-def test_rectified_points_are_those_of_the_ideal_rig_in_axes_that_turn_into_the_bodys(
-    programs_: Programs, row: str
-) -> None:
-    foreign, rng = programs_.frames.RIGS[row], np.random.default_rng(3)
-    new = programs_.rectify.rectified(foreign)
-    rig, ideal = (programs_.case.ours(each)[0] for each in (foreign, new.rig))
-    points = rng.uniform(-0.35, 0.35, (40, 3)) * [4.0, 4.0, 1.0] + [0.0, 0.0, 4.0]
-    for side in SIDES:
-        seen = rig.eye(side).project(points + rig.offset(side))
-        there = points @ new.body + ideal.offset(side)  # body from new axes, of rows
-        np.testing.assert_allclose(new.pixels(side, seen), ideal.camera.project(there), atol=0.01)
-        sensor, shown = rig.sensor(side), new.shown(side)
-        image = np.zeros((sensor.height, sensor.width), dtype=np.uint8)
-        assert new.resample(side, image).shape == shown.shape == (ideal.camera.height, ideal.camera.width)
-        assert np.mean(shown) > 0.5
-
-
-def test_a_line_of_a_rolling_frame_is_that_of_the_global_frame_at_its_time(programs_: Programs) -> None:
-    frames, law = programs_.frames, programs_.motion.Twist(W, D)
-    world = programs_.world.random_world(np.random.default_rng(2), np.zeros((1, 3)), 25.0)
-    rig = programs_.rig.equal(ratio=0.8, scans=("bottom", "left"), k1=-0.2, **SMALL)
-    for side, line in (("left", 0), ("left", 77), ("right", 31), ("right", 159)):
-        camera = rig.camera(side)
-        tau = camera.times(0)
-        rolling = frames.trace(world, camera, rig.poses(law, side, tau))
-        still = frames.trace(world, camera, rig.poses(law, side, tau[line : line + 1]))
-        at = np.s_[line] if camera.rows else np.s_[:, line]
-        np.testing.assert_allclose(rolling[at], still[at], atol=1e-3)  # grey levels; rounding of float32
-        assert np.mean(np.abs(rolling - still)) > 1.0  # elsewhere they differ
-        assert np.min(rolling) > 0.0  # the room is closed
-
-
 def test_a_case_is_written_with_rigs_that_the_command_reads_and_poses_that_are_true(
     programs_: Programs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -314,20 +235,3 @@ def test_a_case_is_written_with_rigs_that_the_command_reads_and_poses_that_are_t
     np.testing.assert_allclose(programs_.motion.matrices(poses[:, :3]), R, atol=1e-10)
     np.testing.assert_allclose(poses[:, 3:], t, atol=1e-10)
     assert len(list(tmp_path.rglob("*.png"))) == 12  # two cameras, three times, rolling and global
-
-
-def test_the_table_finds_no_error_in_the_truth_and_counts_failures(programs_: Programs) -> None:
-    table = programs_.table
-    truth = {"frames": 2, "motions": [{"w": W.tolist(), "d": D.tolist()}]}
-    e_R, e_T = table._motion_errors({"motion": {"w": W.tolist(), "d": (2.0 * D).tolist()}}, truth)
-    assert e_R < 1e-9 and e_T < 1e-5
-    turned = [-value for value in D]
-    assert table._motion_errors({"motion": {"w": [0.0] * 3, "d": turned}}, truth)[1] == pytest.approx(180.0)
-    known = {"row": "twist", "seed": 0, "frames": 2, "true_ratio": 0.8}
-    found = table.Outcome(**known, way="untold", ratio=0.75, sigma=0.02, psnr=28.0, gain=2.0, worst_gain=1.0)
-    failed = table.Outcome(**known, way="told", failed=True, message="exit 1: no motion")
-    assert found.deviations == pytest.approx(2.5)
-    *cases, head, rule, line = table.table([failed, found]).split("\n")
-    assert "exit 1: no motion" in cases[2] and {row.count("|") for row in cases[:4]} == {12}
-    assert head.count("|") == rule.count("|") == line.count("|")
-    assert line.startswith("| twist | 1 + 1 | 1 + 0 | 1 of 1 | 2.5 |")

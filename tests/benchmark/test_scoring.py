@@ -91,21 +91,6 @@ def test_the_sign_of_the_translation_counts() -> None:
     assert errors(d=-2.0 * D)["e_s"] == pytest.approx(np.log(2.0), rel=1e-12)
 
 
-def test_arrays_score_as_their_elements_do() -> None:
-    rng = np.random.default_rng(0)
-    w, d, true_w, true_d = rng.standard_normal((4, 7, 3, 3))
-    success, metric = rng.random((2, 7, 3)) > 0.3
-    w[0, 0] = np.nan
-    kwargs: dict[str, Any] = {"rig": RIG, "reference_point": "left"}
-    together = pose_errors(w, d, true_w=true_w, true_d=true_d, success=success, metric=metric, **kwargs)
-    for k in np.ndindex(7, 3):
-        alone = pose_errors(
-            w[k], d[k], true_w=true_w[k], true_d=true_d[k], success=success[k], metric=metric[k], **kwargs
-        )
-        for name in WORST_POSE:
-            np.testing.assert_allclose(together[name][k], alone[name], rtol=1e-13, equal_nan=True)
-
-
 def test_a_point_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ValueError, match="reference_point = 'Left': must be 'body' or 'left'"):
         errors(reference_point="Left")

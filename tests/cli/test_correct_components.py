@@ -1,4 +1,4 @@
-"""``rsbench correct`` with a matcher, features, a corrector and solvers that are not its own."""
+"""``rsbench correct`` with a matcher, features and a corrector that are not its own."""
 
 from __future__ import annotations
 
@@ -70,22 +70,6 @@ class Negative(Corrector):
                               depth=problem.depth[view])
         return out
 """
-SOLVER = """
-import os
-from rsbench.solvers.engine.base import Solver, SolverSpec
-
-class Exits(Solver):
-    '''Ends its process.'''
-
-    spec = SolverSpec(
-        needs={"tracks"}, minimum={"tracks": 3}, metric=True, motion_model="linear", shutter="rolling",
-        reference_point="body", reference="this file", assumes="nothing",
-    )
-
-    def estimate(self, correspondences, rig, shutter):
-        print("last words")
-        os._exit(3)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +80,6 @@ def strangers(tmp_path_factory: pytest.TempPathFactory, castle: Sequence) -> Pat
         ("matcher", MATCHER, "Flat"),
         ("features", FEATURES, "Known"),
         ("corrector", CORRECTOR, "Negative"),
-        ("solver", SOLVER, "Exits"),
     ):
         (folder / f"strange_{name}.py").write_text(text)
         (folder / f"{name}.toml").write_text(f'class = "strange_{name}:{cls}"\n')
@@ -143,16 +126,6 @@ def test_a_component_that_answers_nonsense_is_one_line(castle: Sequence, strange
     card.write_text((strangers / "corrector.toml").read_text() + "[parameters]\nwrong = true\n")
     result = correct(castle, tmp_path, "--corrector", card)
     assert_refused(result, "corrector 'wrong': left 0: image must be uint8 (96, 128, 3), got uint8 (5, 128, 3)")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_solver_that_ends_its_process_fails_alone(castle: Sequence, strangers: Path, tmp_path: Path) -> None:
-    cards = ("--features", strangers / "features.toml", "--solver", strangers / "solver.toml")
-    result = correct(castle, tmp_path, *cards)
-    assert result.returncode == 1, result.stderr
-    *_, line = result.stderr.splitlines()
-    assert "not corrected: solver 'solver' found no motion: " in line and "exit code 3" in line, result.stderr
-    assert "last words" not in result.stdout
     assert not (tmp_path / "out").exists()
 
 

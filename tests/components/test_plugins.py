@@ -150,31 +150,6 @@ def test_parameters_are_those_of_the_constructor(tmp_path: Path, parameters: str
     assert part in refusal(write(tmp_path, rest=f"[parameters]\n{parameters}"))
 
 
-def test_a_constructor_may_take_any_word_even_one_of_the_language(tmp_path: Path) -> None:
-    module = MODULE.replace("times=1", "**words").replace("self.times = times", "self.times = words['lambda']")
-    assert word(load_entry(GREETINGS, write(tmp_path, module=module, rest="[parameters]\nlambda = 3"))) == (
-        "hello hello hello "
-    )
-
-
-def test_a_subclass_of_a_dataclass_may_have_its_own_constructor(tmp_path: Path) -> None:
-    module = """
-from dataclasses import dataclass
-from test_plugins_contract import Greeting
-
-@dataclass(frozen=True)
-class Base(Greeting):
-    times: int = 1
-    def word(self):
-        return f"{self.times}"
-
-class Hello(Base):
-    def __init__(self, half):
-        super().__init__(times=2 * half)
-"""
-    assert word(load_entry(GREETINGS, write(tmp_path, module=module, rest="[parameters]\nhalf = 4"))) == "8"
-
-
 @pytest.mark.parametrize("field", ["times: 'Nowhere' = 1", "times: complex = 1j", "times: Greeting = None"])
 def test_fields_that_no_card_can_hold_only_matter_when_a_card_sets_them(tmp_path: Path, field: str) -> None:
     module = f"""
@@ -246,13 +221,6 @@ def test_an_edited_helper_is_a_change_of_the_key(tmp_path: Path) -> None:
     assert words == ["hi ", "servus "] and len(keys) == 2
 
 
-def test_the_users_own_path_keeps_its_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    card = write(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    load_entry(GREETINGS, card)
-    assert sys.path[0] == str(tmp_path)
-
-
 # Installed packages
 
 
@@ -265,19 +233,6 @@ def test_an_installed_class_is_found_by_name_and_by_card(tmp_path: Path, monkeyp
     assert load_class(GREETINGS, "hello:Hello", tmp_path / "some.toml") is type(entry.component)
     (offer,) = [offer for offer in offers(GREETINGS) if offer.name == "hi"]
     assert offer.origin == "hello_package"
-
-
-def test_a_package_that_vanished_is_an_error_of_its_name_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = "[rsbench.greetings]\ngone = hello_that_went:Hello\nodd = :::\nhi = hello:Hello\n"
-    install(tmp_path, monkeypatch, "leftover", points)
-    (tmp_path / "hello.py").write_text(MODULE, "utf-8")
-    assert {"gone", "odd", "hi"} <= set(list_names(GREETINGS))
-    assert word(load_entry(GREETINGS, "hi")) == "hello "
-    for name, part in (("gone", "hello_that_went"), ("odd", "cannot be loaded")):
-        message = refusal(name)
-        assert part in message and "leftover" in message
 
 
 @pytest.mark.parametrize(

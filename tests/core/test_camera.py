@@ -226,11 +226,6 @@ def test_beyond_the_fold_there_is_no_pixel_instead_of_a_wrong_one() -> None:
     assert np.all(np.isnan(found[0])) and np.all(np.isfinite(found[1]))
 
 
-def test_behind_a_fisheye_there_is_no_pixel() -> None:
-    camera = replace(PLAIN, lens=FISHEYE)
-    assert np.all(np.isnan(camera.project([[1.0, 0.0, -0.1], [100.0, 0.0, 1.0]])))
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [

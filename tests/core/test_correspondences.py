@@ -199,23 +199,6 @@ def test_repeats_are_those_of_a_search_over_all(seed: int) -> None:
     np.testing.assert_array_equal(repeated(rows, others), np.any(apart <= JOIN_TOLERANCE_PX, axis=1))
 
 
-@pytest.mark.parametrize("missing", ["left", "stereo_0", "stereo_1"])
-def test_nothing_to_join_is_no_track(missing: str) -> None:
-    tracks = points(5)
-    sets = {"left": tracks[:, [0, 1, 4, 5]], "stereo_0": tracks[:, :4], "stereo_1": tracks[:, 4:]}
-    del sets[missing]
-    joined = join_stereo(Correspondences(**sets))
-    assert len(joined.correspondences.tracks) == 0
-    assert joined.alone == {name: 5 if name in sets else 0 for name in ("stereo_0", "stereo_1")}
-
-
-def test_the_same_match_many_times_is_one_measurement() -> None:
-    tracks = np.repeat(points(1), 200, axis=0)
-    joined = join_stereo(as_sets(tracks, 0.0, np.random.default_rng(0)))
-    assert joined.alone == {"stereo_0": 0, "stereo_1": 0}
-    assert not np.any(unlinked_pairs(joined.correspondences, "left"))
-
-
 @given(seed=st.integers(0, 10_000), columns=st.sampled_from([2, 4, 8]), count=st.sampled_from([1, 3]))
 def test_nearest_within_finds_what_a_tree_finds(seed: int, columns: int, count: int) -> None:
     rng = np.random.default_rng(seed)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
-from rsbench.core.correspondences import Correspondences
 from rsbench.core.epipolar import rs_sampson_error
 from rsbench.core.projection import back_project, rs_project, rs_project_near
 from rsbench.core.rig import SIDES, StereoRig
@@ -71,7 +70,7 @@ def test_impossible_extrinsics_are_refused(
 
 @pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
 @pytest.mark.parametrize("scanning", SCANS.values(), ids=SCANS)
-def test_projection_returns_from_where_it_went_and_solvers_find_the_motion(
+def test_projection_returns_from_where_it_went_and_matches_meet_the_constraint(
     rig: StereoRig, scanning: Scanning
 ) -> None:
     shutter = rig.shutter_of(scanning, 0.8)
@@ -96,11 +95,6 @@ def test_projection_returns_from_where_it_went_and_solvers_find_the_motion(
     assert len(tracks) > 60
     for side, columns in (("left", [0, 1, 4, 5]), ("right", [2, 3, 6, 7])):
         assert np.max(np.abs(rs_sampson_error(rig, shutter, motion, side, tracks[:, columns]))) < 1e-6
-    solver = load_solver_entry("rs-stereo-refined").solver
-    found = solver.estimate(Correspondences(tracks=tracks), rig, shutter)
-    assert found.success, found.reason
-    np.testing.assert_allclose(found.w, motion.w, atol=1e-7)
-    np.testing.assert_allclose(found.d, motion.d, atol=1e-7)
 
 
 def test_solvers_of_the_ideal_rig_refuse_another_by_name() -> None:

@@ -102,32 +102,6 @@ def test_velocity_is_the_derivative_of_the_pose(model: Model, w: FloatArray, d: 
     np.testing.assert_allclose((after.t - before.t) / (2 * step), t_rate, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_times_of_any_shape(model: Model) -> None:
-    motion = model(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
-    for shape in ((), (1,), (2, 3)):
-        tau = np.linspace(0, 1, int(np.prod(shape))).reshape(shape)
-        R, t = motion.body_from_world(tau)
-        w_rate, t_rate = motion.velocity(tau)
-        assert (R.shape, t.shape) == ((*shape, 3, 3), (*shape, 3))
-        assert w_rate.shape == t_rate.shape == (*shape, 3)
-
-
-def test_the_given_arrays_are_copied_and_frozen() -> None:
-    w = np.array([0.1, 0.2, 0.3])
-    motion = LinearMotion(w, w)
-    w[0] = 9.0
-    assert motion.w[0] == 0.1
-    with pytest.raises(ValueError, match="read-only"):
-        motion.d[0] = 1.0
-
-
-@pytest.mark.parametrize("bad", [[1.0, 2.0], [1.0, 2.0, np.nan], [[1.0, 2.0, 3.0]], 4.0])
-def test_anything_but_three_finite_numbers_is_refused(bad: object) -> None:
-    with pytest.raises(ValueError, match="motion d must be 3 finite numbers"):
-        LinearMotion(np.zeros(3), bad)  # pyrefly: ignore[bad-argument-type]
-
-
 accelerations = st.floats(-0.45, 3.0)
 
 
@@ -253,6 +227,9 @@ def test_parameters_make_the_motion_again(motion: Motion) -> None:
     np.testing.assert_allclose(moved.body_from_world(1.0).t, -motion.d, rtol=0, atol=1e-12)
 
 
+STILL = [0.0] * 6
+
+
 def test_explicit_poses_fix_the_motion() -> None:
     given = {"interval": 0.4, "poses": control(3, 8)}
     w, d = SplineMotion.endpoint(given) or (None, None)
@@ -266,9 +243,6 @@ def test_explicit_poses_fix_the_motion() -> None:
     assert np.max(np.abs(t - expected.t)) < 0.2
     with pytest.raises(ValueError, match="must be those of its poses"):
         SplineMotion(w, 1.1 * d, **given)
-
-
-STILL = [0.0] * 6
 
 
 def _spectral(spectrum: Any) -> dict[str, Any]:
@@ -310,16 +284,6 @@ def test_a_spline_refuses_what_it_cannot_be(parameters: dict[str, object], words
 def test_a_spline_of_half_a_turn_is_refused() -> None:
     with pytest.raises(ValueError, match="shorter than pi"):
         SplineMotion([0.0, 3.2, 0.0], np.zeros(3))
-
-
-def test_the_pose_alone_of_a_spline_is_that_of_its_pose_with_velocity() -> None:
-    """To the bit: a frame's rows are asked for one way, and for channels of truth the other."""
-    motion = SplineMotion([0.02, 0.01, -0.03], [0.1, 0.0, 0.2], seed=4)
-    inside = np.concatenate([np.linspace(0.0, motion.lasts, 97), motion.interval * np.arange(5)])
-    for tau in (inside, np.array([-0.3, 0.5]), np.array([0.5, motion.lasts + 0.1])):
-        whole, alone = motion._spline.at(tau)[0], motion.body_from_world(tau)
-        np.testing.assert_array_equal(alone.R, whole.R)
-        np.testing.assert_array_equal(alone.t, whole.t)
 
 
 def _motion(bands: list[list[float]], path: list[float] = STILL, **others: Any) -> SplineMotion:

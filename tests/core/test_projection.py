@@ -116,15 +116,6 @@ def test_a_global_shutter_projects_at_the_time_of_its_frame_bit_for_bit(side: Si
     np.testing.assert_array_equal(seen.status == ProjectionStatus.SEEN, inside)
 
 
-def test_without_motion_the_shutter_does_not_matter() -> None:
-    X = _points(4)
-    slow, instant = (
-        rs_project(RIG, RollingShutter(height=80, readout_ratio=ratio), STILL, "left", 1, X)
-        for ratio in (1.0, 0.0)
-    )
-    np.testing.assert_array_equal(slow.pixels, instant.pixels)
-
-
 def _moving_down(speed: float) -> LinearMotion:
     """Points at depth 5 move down the image by ``speed`` rows per row time."""
     return LinearMotion(np.zeros(3), np.array([0.0, speed * 5.0 / (100.0 * SHUTTER.h), 0.0]))
@@ -170,12 +161,6 @@ def test_a_point_seen_twice_reports_its_first_row_and_rows_outside_do_not_count(
     assert seen.status == (ProjectionStatus.TWICE if twice else ProjectionStatus.SEEN)
     # A residual of 1e-9 px moves a root by 1e-9 / f', and f' = h dz (y1 - y2) / Z is 1e-4 at the closest pair.
     assert seen.pixels[1] == pytest.approx(first, abs=1e-4 if twice else 1e-6)
-
-
-@pytest.mark.parametrize("dz", [-1.0, 1.0])
-def test_complex_roots_are_never_seen(dz: float) -> None:
-    motion, X = _with_roots(80.0, 40.0**2 + 0.01, dz, 5.0)
-    assert rs_project(RIG, SHUTTER, motion, "left", 0, X).status == ProjectionStatus.NEVER
 
 
 @pytest.mark.parametrize(

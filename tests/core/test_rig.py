@@ -52,11 +52,6 @@ def test_a_rig_about_a_camera_has_that_camera_for_its_body() -> None:
         RIG.about("top")  # pyrefly: ignore[bad-argument-type]
 
 
-def test_depth_and_disparity_of_nothing_are_nan() -> None:
-    assert np.all(np.isnan(RIG.depth([0.0, -1.0, np.nan])))
-    assert np.all(np.isnan(RIG.disparity([0.0, -1.0, np.nan])))
-
-
 @pytest.mark.parametrize("baseline", [0.0, -0.1, float("nan"), float("inf")])
 def test_a_baseline_that_is_not_positive_is_refused(baseline: float) -> None:
     with pytest.raises(ValueError, match="baseline"):
@@ -96,11 +91,6 @@ def test_the_right_camera_may_be_late_and_read_another_way() -> None:
     assert not (shutter.plain or shutter.rows_together)
     with pytest.raises(ValueError, match=r"right_delay = 0\.25: only rows from the top"):
         shutter.row_time(0, 0)
-
-
-def test_rows_from_the_bottom_in_both_cameras_are_read_together() -> None:
-    shutter = RollingShutter(height=8, readout_ratio=0.5, scan="bottom")
-    assert shutter.rows_together and not shutter.plain
 
 
 @pytest.mark.parametrize(

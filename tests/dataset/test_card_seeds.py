@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from yard_dataset import boxes_card
 
-from rsbench.dataset.card import DatasetCard, MotionCard, SequenceCard, load_dataset_card
-
-STRATA = ("mild", "moderate", "aggressive")
+from rsbench.dataset.card import DatasetCard, MotionCard, SequenceCard
 
 
 def _card(**changes: object) -> DatasetCard:
@@ -36,13 +34,6 @@ def test_axes_change_with_seed_and_sequence_and_keep_their_lengths() -> None:
     for motion in motions:
         np.testing.assert_allclose(np.linalg.norm(motion.w), np.deg2rad(2.0), rtol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(motion.d), 0.3, rtol=1e-12)
-
-
-def test_given_axes_stay() -> None:
-    motion = MotionCard(rotation_deg=2.0, rotation_axis=(0, 0, 2), translation=1.0, translation_axis="random")
-    card = _card(motion=motion).expanded()
-    for sequence in card.sequence:
-        np.testing.assert_allclose(card.motion_of(sequence).w, [0, 0, np.deg2rad(2.0)], rtol=1e-12)
 
 
 def test_an_axis_is_not_used_before_it_is_drawn() -> None:
@@ -73,12 +64,3 @@ def test_contradictions_are_refused(changes: dict[str, object], message: str) ->
 def test_an_axis_is_numbers_or_random() -> None:
     with pytest.raises(ValueError, match='three numbers or "random"'):
         MotionCard(rotation_deg=2.0, rotation_axis="up", translation=0.3, translation_axis="random")
-
-
-def test_the_strata_share_scenes_and_axes() -> None:
-    cards = [load_dataset_card(name) for name in STRATA]
-    assert all(len(card.sequence) == 30 for card in cards)
-    for sequences in zip(*(card.sequence for card in cards), strict=True):
-        assert len({sequence.name for sequence in sequences}) == 1
-        axes = {sequence.motion.rotation_axis for sequence in sequences if sequence.motion}
-        assert len(axes) == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -309,24 +308,6 @@ def test_twins_that_cannot_be_are_refused(tmp_path: Path) -> None:
             parse_card(DatasetCard, asdict(yard_card(tmp_path)) | {"twins": list(twins)}, "mine.toml")
     card = yard_card(tmp_path, twins=("first", "last", "middle", 24))
     assert card.twins_of(card.sequence[0]) == (24, 47)
-
-
-def test_help_names_every_channel() -> None:
-    import typing
-
-    from rsbench.cli import generate
-
-    (option,) = (each for each in typing.get_args(generate._Channels) if hasattr(each, "help"))
-    assert all(f" {name}" in option.help for name in CHANNELS)
-
-
-def test_values_that_are_no_class_are_refused(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rsbench.dataset import channels as module
-
-    read: Callable[..., NDArray[np.uint8]] = lambda path, size: np.full((48, 64), 9, np.uint8)  # noqa: E731
-    monkeypatch.setattr(module, "read_grey_png", read)
-    with pytest.raises(RsbenchError, match=r"flow_mask/left_0\.png: holds 9"):
-        sequence.classes("flow", "left", 0)
 
 
 # Verification

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -70,7 +69,3 @@ def test_a_card_names_the_licence_of_what_it_makes() -> None:
     assert (card.license, replace(card, license="CC0-1.0").license) == ("CC-BY-4.0", "CC0-1.0")
     with pytest.raises(ValueError, match="license = 'of mine': must be an SPDX name"):
         replace(card, license="of mine")
-
-
-def test_the_manifest_names_the_licence(smoke_dataset: Path) -> None:
-    assert json.loads((smoke_dataset / "dataset.json").read_text("utf-8"))["license"] == "CC-BY-4.0"

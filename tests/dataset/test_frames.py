@@ -197,17 +197,6 @@ def test_a_motion_from_a_later_time_on_is_the_same_way(motion: Motion) -> None:
         assert all(np.max(np.linalg.norm(v, axis=1)) <= b + 1e-12 for v, b in zip(inside, bounds, strict=True))
 
 
-def test_a_longer_shake_begins_as_a_shorter_one_and_stays_smooth() -> None:
-    short, long = (SplineMotion([0.02, 0, 0.01], [0.1, 0, 0.2], seed=5, periods=n) for n in (2.0, 7.0))
-    tau = np.linspace(0.0, 1.99, 40)
-    np.testing.assert_allclose(long.body_from_world(tau).t, short.body_from_world(tau).t, rtol=0, atol=1e-12)
-    assert long.lasts >= 7.0 and short.lasts >= 2.0
-    knots = 0.25 * np.arange(1, 28)
-    for k in range(2):  # twice continuously differentiable at the knots of all seven periods
-        low, high = (np.stack(long.accelerations(knots + by))[k] for by in (-1e-9, 1e-9))
-        np.testing.assert_allclose(low, high, rtol=0, atol=1e-5)
-
-
 # Flow
 
 

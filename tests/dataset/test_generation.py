@@ -6,10 +6,8 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,15 +44,6 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Small:
     return Small(card, folder / "dataset")
 
 
-def test_rendered_depth_agrees_between_all_frames(smoke_dataset: Path) -> None:
-    reports = verify_dataset(smoke_dataset)
-    assert [report.faults for report in reports] == [(), ()]
-    for report in reports:
-        for agreement in report.agreements:
-            assert agreement.compared > 0.1 * 96 * 128, "too little is compared to prove anything"
-            assert agreement.p99 < 1e-4
-
-
 def test_manifest_states_the_paper_conventions(smoke_dataset: Path) -> None:
     sequences = {sequence.name: sequence for sequence in read_dataset(smoke_dataset)}
     castle = sequences["castle"]
@@ -79,30 +68,6 @@ def child(card: Path, out: Path, progress: str) -> list[str]:
         "generate_dataset(load_dataset_card(sys.argv[1]), Path(sys.argv[2]), progress=step)"
     )
     return [sys.executable, "-c", code, str(card), str(out)]
-
-
-def _frames(folder: Path) -> int:
-    """Images and depths below a folder from which others move them meanwhile."""
-    return sum(name.endswith((".png", ".exr")) for _, _, names in os.walk(folder) for name in names)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("files", [1, 20])
-def test_killed_run_resumes_to_the_bytes_of_an_undisturbed_one(small: Small, tmp_path: Path, files: int) -> None:
-    """Killed in its first sequence, of 8 images and 8 depths, and in its second."""
-    out = tmp_path / "killed"
-    # A child that waits after each step is killed between the files that the test waits for and the end.
-    process = subprocess.Popen(child(small.card, out, "time.sleep(0.1)"))
-    deadline = time.monotonic() + 120
-    while _frames(out) < files and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL, "it ended by itself"
-    assert list(out.rglob("*.png"))
-    with pytest.raises(RsbenchError, match="not a dataset"):
-        read_dataset(out)
-    assert generate_dataset(load_dataset_card(str(small.card)), out) == (["a", "b"] if files < 16 else ["b"])
-    assert bytes_below(out, HIDDEN) == bytes_below(small.dataset, HIDDEN)
 
 
 def test_damaged_sequence_is_rendered_again_and_sound_ones_are_kept(small: Small, tmp_path: Path) -> None:
@@ -165,15 +130,6 @@ def test_bad_card_is_one_line_and_leaves_nothing(
     with refused(message):
         generate_dataset(load_dataset_card(str(card)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_motion_card_gives_exact_magnitudes() -> None:
-    card = MotionCard(
-        rotation_deg=0.4, rotation_axis=(0.6, 1.0, -0.5), translation=0.3, translation_axis=(1, 2, 3)
-    )
-    motion = card.motion()
-    assert np.linalg.norm(motion.w) == pytest.approx(np.deg2rad(0.4), rel=1e-15)
-    np.testing.assert_allclose(motion.d, 0.3 * np.array([1, 2, 3]) / np.sqrt(14), rtol=1e-15)
 
 
 def test_only_names_the_sequences_that_exist() -> None:

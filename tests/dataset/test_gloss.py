@@ -18,7 +18,7 @@ from trimesh.visual.material import PBRMaterial
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import DatasetCard, load_dataset_card
-from rsbench.dataset.generation import estimate_dataset, generate_dataset
+from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence import read_sequence
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.storage.files import read_grey_png, read_json, read_mask, write_mask
@@ -131,11 +131,6 @@ def test_resuming_makes_a_lost_mask_again(sound: Path, card: DatasetCard, tmp_pa
     (out / "hall" / ONE.gloss).unlink()
     assert generate_dataset(card, out) == ["hall"]
     assert (out / "hall" / ONE.gloss).read_bytes() == kept
-
-
-def test_an_estimate_counts_masks(sound: Path, card: DatasetCard) -> None:
-    files = [path for path in sound.rglob("*") if path.is_file() and ".rsbench" not in path.parts]
-    assert estimate_dataset(card, lambda name: None).files == len(files)
 
 
 def test_a_mask_holds_two_values(sound: Path, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from pathlib import Path
@@ -17,8 +16,8 @@ from rsbench.dataset.generation import generate_dataset
 from rsbench.dataset.sequence_identity import SceneHashes, scene_key
 from rsbench.jobs.process_jobs import LostJobsError
 from rsbench.storage import files
-from rsbench.storage.files import HASHES, FileHashes, sha256
-from rsbench.storage.work_folder import HIDDEN, work_folder
+from rsbench.storage.files import FileHashes, sha256
+from rsbench.storage.work_folder import work_folder
 
 
 @pytest.fixture(scope="module")
@@ -212,8 +211,3 @@ def test_lost_jobs_end_a_command_with_code_1(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.setattr(generation, "generate_dataset", lose)
     result = run_here("generate", "smoke", "--out", tmp_path)
     assert result.returncode == 1 and "sequence a (killed by signal 9 (SIGKILL), 3 times)" in result.stderr
-
-
-def test_hidden_files_are_no_part_of_the_dataset(dataset: Path) -> None:
-    listed = json.loads((dataset / "dataset.json").read_text())["files"]
-    assert not any(HIDDEN in path for path in listed) and (dataset / HASHES).is_file()

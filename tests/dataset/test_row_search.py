@@ -80,11 +80,3 @@ def test_it_finds_the_pixels_that_bracketing_finds(
     np.testing.assert_allclose(landed.pixels[seen], exact, rtol=0, atol=NEAR_PX)
     eyes = inverse(geometry.rig.cam_from_world(geometry.motion, tau, target.side)).t
     np.testing.assert_allclose(landed.eyes[seen], eyes, rtol=0, atol=1e-9)
-
-
-def test_rows_alone_have_the_bits_that_they_have_among_others() -> None:
-    geometry = _geometry(None, LinearMotion([0.05, -0.1, 0.08], [0.2, -0.1, 0.3]))
-    X, grid = _points(geometry, ImageView("rs", "left", 0), np.random.default_rng(6))
-    target = ImageView("rs", "left", 1)
-    whole, some = find(geometry, target, X, grid[..., 1]), find(geometry, target, X[1:3], grid[1:3, :, 1])
-    np.testing.assert_array_equal(whole.pixels[1:3], some.pixels)

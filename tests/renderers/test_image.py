@@ -187,12 +187,6 @@ def test_rows_have_the_same_bits_by_themselves(sensor: Sensor) -> None:
     assert len(rows_needed(sensor, [70], len(light))) < 60
 
 
-def test_without_both_nothing_is_done() -> None:
-    light, rows = _scene(), list(range(45))
-    assert rows_needed(NOISY, rows, 45) is rows
-    np.testing.assert_array_equal(_image(light, NOISY), to_srgb8(expose(light, NOISY, 7, 45, rows), 1.0))
-
-
 def test_the_noise_of_a_mosaic_is_drawn_before_it_is_interpolated() -> None:
     """Variances of pixels of each place in the pattern: of the pixel itself, or of the mean of its neighbours."""
     sensor, size = replace(NOISY, mosaic="GBRG", bit_depth=12), 160

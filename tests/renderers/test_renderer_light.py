@@ -20,7 +20,6 @@ from rsbench.dataset.sequence_identity import scene_hash, scene_key
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.options import Integrator, RendererOptions
-from rsbench.renderers.pixel_samples import facet_points, subpixel_grid
 from rsbench.renderers.render import Frame, LinePoses, render, render_global
 from rsbench.renderers.scene import MitsubaScene, _loaded
 from rsbench.scenes.load import irradiance_map, lit_by, load_scene, read_environment
@@ -66,17 +65,6 @@ def wall(quad: Any, z: float = 5.0, size: float = 20.0, **extra: Any) -> SceneMe
 
 def linear(srgb: float) -> float:
     return srgb / 12.92 if srgb <= 0.04045 else ((srgb + 0.055) / 1.055) ** 2.4
-
-
-@pytest.mark.parametrize("samples", [1, 4, 16, 25])
-def test_subpixel_grid_is_stratified_with_distinct_coordinates(samples: int) -> None:
-    grid = subpixel_grid(samples)
-    k = round(samples**0.5)
-    cells = np.floor((grid + 0.5) * k).astype(int)
-    assert len({tuple(cell) for cell in cells.tolist()}) == samples
-    centred = (np.arange(samples) + 0.5) / samples - 0.5
-    for axis in (0, 1):
-        np.testing.assert_allclose(np.sort(grid[:, axis]), centred, atol=1e-7)
 
 
 def test_an_edge_lies_at_its_sub_pixel_place(quad: Any) -> None:
@@ -468,13 +456,6 @@ def test_a_mirror_image_stands_where_geometry_says(quad: Any, integrator: Integr
     np.testing.assert_allclose([x, y], expected, atol=0.1)
 
 
-def test_facets_are_spread_evenly_and_one_is_the_middle() -> None:
-    np.testing.assert_array_equal(facet_points(1), [[0.5, 0.5]])
-    points = facet_points(16)
-    assert points.min() > 0 and points.max() < 1
-    assert len({tuple(cell) for cell in np.floor(4 * points).astype(int).tolist()}) == 16
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"sky_rays": 2}, {"integrator": "path"}], ids=str)
 def test_single_pass_is_stitched_with_gloss(town: Scene, row_poses: Any, options: dict[str, Any]) -> None:
@@ -553,16 +534,6 @@ def test_reflectances_have_the_bits_of_mitsubas(
         theirs = np.array(_loaded(material).eval_diffuse_reflectance(hit))
         np.testing.assert_array_equal(ours, np.broadcast_to(theirs, ours.shape))
         assert material.texture is None or size == (1, 1) or np.ptp(ours) > 0.5
-
-
-def test_textures_come_back_from_their_bytes(scene: MitsubaScene, materials: list[Material]) -> None:
-    assert scene._reflectances is not None
-    for number, material in enumerate(materials):
-        texture = scene._reflectances.texture(shape_of(scene, number))
-        if material.texture is None:
-            assert texture is None
-        else:
-            np.testing.assert_array_equal(texture, material.texture)
 
 
 def test_coordinates_beyond_all_measure_end_within_the_texture(scene: MitsubaScene) -> None:

@@ -24,7 +24,7 @@ from rsbench.renderers.options import Integrator, RendererOptions
 from rsbench.renderers.pixel_samples import instant_count, instant_of, instant_times
 from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.sensor import make_sensor, pose_table
+from rsbench.renderers.sensor import make_sensor
 from rsbench.scenes.model import Light, Material, Scene
 
 CAMERA = PinholeCamera(width=32, height=24, fx=26.0, fy=27.0, cx=14.0, cy=12.5)
@@ -69,23 +69,6 @@ def test_only_the_first_frame_compiles(scene: MitsubaScene, row_poses: Any, inte
     assert {entry["hash"] for entry in later} <= {entry["hash"] for entry in first}
 
 
-def test_plugin_row_equals_global_shutter_row_in_mitsubas_own_loop(scene: MitsubaScene, row_poses: Any) -> None:
-    import mitsuba as mi
-
-    R, t = row_poses(24, w=(0.1, -0.1, 0.3), d=(0.2, 0.1, 0.5))
-    integrator = mi.load_dict({"type": "path", "max_depth": 3})
-
-    def image(R: Any, t: Any) -> Any:
-        sensor = make_sensor(CAMERA, R, t)
-        return np.array(mi.render(scene.textured(), sensor=sensor, integrator=integrator, spp=4, seed=11))
-
-    rolling = image(R, t)
-    for row in (0, 9, 23):
-        frozen = image(np.tile(R[row], (24, 1, 1)), np.tile(t[row], (24, 1)))
-        np.testing.assert_array_equal(rolling[row], frozen[row])
-        assert np.abs(rolling - frozen).max() > 0.05
-
-
 def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: Any) -> None:
     """Mitsuba's render loop and film, against ours: another sampler, the same expectation."""
     import mitsuba as mi
@@ -113,14 +96,6 @@ def test_film_positions_are_half_a_pixel_beyond_pixel_coordinates(scene: Mitsuba
         np.testing.assert_allclose(np.array(ray.d).ravel(), d / np.linalg.norm(d), atol=1e-6)
         np.testing.assert_allclose(np.array(ray.o).ravel(), -R[y].T @ t[y], atol=1e-6)
         np.testing.assert_array_equal(np.array(weight).ravel(), 1.0)
-
-
-def test_pose_table_holds_the_inverse_pose(row_poses: Any) -> None:
-    R, t = row_poses(24, w=(0.4, 0.2, -0.3), d=(0.2, 0.1, 0.5))
-    table = pose_table(CAMERA, R, t).astype(np.float64)
-    np.testing.assert_allclose(table[:, :9].reshape(-1, 3, 3) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-6)
-    centre = table[:, 9:]
-    np.testing.assert_allclose(np.einsum("hij,hj->hi", R, centre) + t, 0.0, atol=1e-6)
 
 
 BARREL = Lens(model="brown-conrady", k1=-0.28, k2=0.07, p1=0.002, p2=-0.001, k3=0.004)

@@ -19,7 +19,7 @@ from rsbench.benchmark.studies.fig4_panels import (
 )
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import read_dataset
-from rsbench.report.paper_figures import INVENTED, caption, depth_scale, draw_fig4, few_colours, panel_images
+from rsbench.report.paper_figures import INVENTED, caption, draw_fig4, panel_images
 from rsbench.report.pictures import INVALID
 from rsbench.solvers.linear import LinearSolver
 from rsbench.vision.quality import psnr
@@ -72,14 +72,6 @@ def test_colours_of_depth_errors_tell_sizes_and_inventions_apart(panels: Panels)
     assert tuple(row[6]) == INVENTED and tuple(row[7]) == INVALID
 
 
-def test_ticks_of_depth_are_where_their_colours_are(panels: Panels) -> None:
-    scale = depth_scale(panels)
-    depths = [float(text.removesuffix(" m")) for text in scale.ticks]
-    # Two digits are printed.
-    np.testing.assert_allclose(1.0 / np.array(depths), list(scale.ticks.values()), rtol=0.05)
-    assert depths == sorted(depths, reverse=True) and scale.low == min(scale.ticks.values())
-
-
 def test_agreement_is_grey_and_distortion_is_coloured(panels: Panels) -> None:
     images = panel_images(panels)
     assert len(images) == 6
@@ -121,11 +113,3 @@ def test_the_stored_literal_figures_are_by_the_papers_own_components() -> None:
     rows = list(csv.DictReader(text.splitlines()))
     assert {int(row["ransac_seed"]) for row in rows} >= set(range(5)) and len(rows) % len(VIEWS) == 0
     assert all(row.items() >= ({"sequence": "castle"} | PAPERS).items() for row in rows)
-
-
-def test_few_colours_are_few_and_near() -> None:
-    rng = np.random.default_rng(0)
-    smooth = np.clip(np.cumsum(rng.normal(0, 1, (60, 80, 3)), axis=1) + 128, 0, 255).astype(np.uint8)
-    reduced = few_colours(smooth)
-    assert len(np.unique(reduced.reshape(-1, 3), axis=0)) <= 256
-    assert np.mean(np.abs(reduced.astype(int) - smooth)) < 6

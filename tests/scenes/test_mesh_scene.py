@@ -84,20 +84,6 @@ def test_smooth_normals_of_a_sphere_point_outward(tmp_path: Path) -> None:
     assert np.min(np.sum(truth * mesh.normals, axis=1)) > np.cos(np.deg2rad(12))
 
 
-def test_a_factor_multiplies_the_texture_in_linear_light(tmp_path: Path) -> None:
-    image = Image.fromarray(np.full((2, 2, 3), 255, dtype=np.uint8))
-    mesh = quad_of(tmp_path, material=PBRMaterial(baseColorTexture=image, baseColorFactor=[128, 255, 0, 255]))
-    assert mesh.material.texture is not None
-    # 128/255 linear is 188 in sRGB (IEC 61966-2-1).
-    assert np.abs(mesh.material.texture[0, 0].astype(int) - (188, 255, 0)).max() <= 1
-
-
-def test_a_plain_factor_becomes_an_srgb_colour(tmp_path: Path) -> None:
-    mesh = quad_of(tmp_path, material=PBRMaterial(baseColorFactor=[55, 128, 255, 255]))
-    assert mesh.material.texture is None
-    assert np.asarray(mesh.material.colour) * 255 == pytest.approx([128, 188, 255], abs=1)
-
-
 def test_face_colours_survive(tmp_path: Path) -> None:
     box = trimesh.creation.box()
     box.visual.face_colors = [[10 * k, 255 - 10 * k, 7, 255] for k in range(12)]

@@ -15,17 +15,10 @@ from commands import refused, run_here
 
 from rsbench.benchmark.simulated.contract import (
     CHECKS,
-    RIG,
-    D,
     Finding,
-    W,
     check_solver,
-    degenerate_cases,
-    misreading,
 )
 from rsbench.core.errors import RsbenchError
-from rsbench.core.pose_errors import translation_of_offset
-from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import (
     MotionEstimate,
     SolverEntry,
@@ -57,15 +50,6 @@ def test_every_solver_keeps_the_contract(name: str) -> None:
     assert [finding for finding in findings if finding.verdict == "failed"] == []
     warnings = {(name, finding.check) for finding in findings if finding.verdict == "warning"}
     assert warnings == {(solver, check) for solver, check in ALLOWED_WARNINGS if solver == name}
-
-
-def test_the_degenerate_cases_are_what_they_are_called() -> None:
-    cases = degenerate_cases()
-    assert len(cases["two matches"][0].left) == 2 and len(cases["no matches"][0].tracks) == 0
-    c, _ = cases["no motion"]
-    np.testing.assert_allclose(c.tracks[:, :4], c.tracks[:, 4:], atol=1e-7)
-    c, _ = cases["negative disparity"]
-    assert np.all(c.tracks[:, 0] < c.tracks[:, 2])
 
 
 # Solvers that break it. All answer as the refined solver does, but for one thing.
@@ -225,13 +209,6 @@ def test_a_biased_solver_is_a_warning(tmp_path: Path) -> None:
     findings = check_solver(bad_entry(tmp_path, "bias", "return replace(right, w=1.01 * right.w)"), isolated=False)
     finding = found(findings, "finds the truth")
     assert finding.verdict == "warning" and "rotation 1.0e-02 off however small the motion is" in finding.why
-
-
-@pytest.mark.parametrize(("point", "own"), [("body", D), ("left", None)])
-def test_the_truth_is_no_misreading(point: str, own: FloatArray | None) -> None:
-    d = translation_of_offset(W, D, RIG.offset("left")) if own is None else own
-    assert misreading(W, d, W, D, RIG, point) is None
-    assert "of the body" in str(misreading(W, D, W, D, RIG, "left"))
 
 
 # The command

@@ -38,7 +38,6 @@ from rsbench.solvers.free_velocities import (
     extract,
     from_row,
     jets,
-    refine,
     signed,
     system,
 )
@@ -128,21 +127,6 @@ def test_the_uniform_model_is_read_off_its_own_coefficients() -> None:
         assert max(off(extract(-2.0 * coefficients(truth, 2)[0], 2)[0], truth)) < 1e-9
 
 
-def test_half_the_turn_within_the_frames_has_half_of_the_uniform_model_s_error() -> None:
-    """I + s [w]x is off a rotation by the square of the turn; but the singular value that tells it falls too."""
-    errors = []
-    for turn in (0.01, 0.005):
-        each = []
-        for seed in range(3):
-            truth = free_motion(turn, seed)
-            rows = Rows.of(matches_of(truth, 100, seed), CAMERA, CAMERA.cy)
-            F, _ = null_vector(system(rows.x, rows.y, 2), True, 1e-14)
-            assert F is not None
-            each.append(off(extract(F, 2)[0], truth)[0])
-        errors.append(np.median(each))
-    assert errors[0] < 1e-3 and 1.5 < errors[0] / errors[1] < 3.0
-
-
 @pytest.mark.parametrize("refinement", ["none", "sampson"])
 def test_the_linear_solver_is_exact_on_its_own_model(refinement: Literal["none", "sampson"]) -> None:
     solver, truth = DaiSolver(refinement=refinement), free_motion()
@@ -205,28 +189,6 @@ def test_points_vote_for_the_sign_of_t_where_t_passes_zero_within_the_image() ->
         assert front(right.flipped(), rows) == 0
 
 
-def test_the_twin_has_the_same_errors_where_all_translations_are_along_one_line() -> None:
-    still = FreeMotion(so3.exp(W), D / np.linalg.norm(D), *np.zeros((4, 3)))
-    rows = Rows.of(matches_of(still, 30), CAMERA, CAMERA.cy)
-    np.testing.assert_allclose(sampson(still.twin(), rows), 0.0, atol=1e-9)
-    assert signed(still.twin(), rows)[1] == 0
-
-
-def test_the_twelve_parameters_leave_an_error_of_first_order_in_the_velocities() -> None:
-    """The essential matrix of all matches is none of the middle rows', and the correction does not touch it."""
-    solver, errors = TwelveParameterSolver(refinement="none"), list[float]()
-    for share in (1.0, 0.5):
-        each = []
-        for seed in range(6):
-            m = free_motion(0.05, seed)
-            m = m._replace(v0=share * m.v0, v1=share * m.v1, w0=share * m.w0, w1=share * m.w1)
-            found = solver.linear(Rows.of(matches_of(m, 60, seed), CAMERA, CAMERA.cy))
-            assert isinstance(found, list)
-            each.append(off(found[0], m)[1])
-        errors.append(np.median(each))
-    assert 1.5 < errors[0] / errors[1] < 3.0
-
-
 def test_gradient_is_that_of_finite_differences() -> None:
     """To first order in the errors: those here are a hundredth of a pixel."""
     m = free_motion(0.1)
@@ -244,34 +206,6 @@ def test_derivatives_of_the_coefficients_are_those_of_differences(degree: int) -
     m = free_motion(0.1 * (degree - 1))
     numeric = derivatives(lambda step: coefficients(m.moved(step), degree)[0], np.zeros(6 + 6 * degree), 1e-6)
     np.testing.assert_allclose(coefficients(m, degree)[1][: 6 + 6 * degree], numeric.T, atol=1e-9)
-
-
-@pytest.mark.parametrize("turning", [False, True])
-def test_the_descent_ends_where_no_step_is_better(turning: bool) -> None:
-    """Of what it says it minimises, by steps of a hundredth of a standard deviation and more."""
-    m = free_motion(0.1 * turning)
-    matches = matches_of(m, 60) + 0.1 * np.random.default_rng(0).standard_normal((60, 4))
-    rows = Rows.of(matches, CAMERA, CAMERA.cy)
-
-    def cost(motion: FreeMotion) -> float:
-        motion = motion.of_unit_length()
-        fast = float(np.sum(motion.v0**2 + motion.v1**2)) * (CAMERA.height / CAMERA.fy) ** 2 / 60
-        return float(np.sum(sampson(motion, rows) ** 2)) * (1.0 + fast)
-
-    end, least = refine(m.at_rest(), rows, turning=turning, most=100)
-    assert cost(end) == pytest.approx(least, rel=1e-12)
-    for step in 1e-4 * np.random.default_rng(1).standard_normal((40, 18 if turning else 12)):
-        assert cost(end.moved(step)) > least
-
-
-def test_sampson_errors_vanish_on_exact_matches_and_are_distances_else() -> None:
-    m = free_motion(0.1)
-    matches = matches_of(m, 30)
-    assert np.max(np.abs(sampson(m, Rows.of(matches, CAMERA, CAMERA.cy)))) < 1e-9
-    noisy = matches + 0.1 * np.random.default_rng(0).standard_normal(matches.shape)
-    # One of four normal components: their mean square is the noise's, of thirty within 2.6 standard deviations.
-    squares = sampson(m, Rows.of(noisy, CAMERA, CAMERA.cy)) ** 2
-    assert np.mean(squares) == pytest.approx(0.01, rel=0.67)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.02])
@@ -330,20 +264,6 @@ def test_simulated_frames_are_those_of_planes_by_finite_differences() -> None:
     assert np.all(np.max(np.abs(left_over), axis=(0, 1)) > 1e-3)
 
 
-def test_frames_of_a_plane_are_those_of_its_homography() -> None:
-    """Of a global shutter: R + d n^T of the plane n.X = 1 that ``shape`` promises, by differences."""
-    options, still = SimulationOptions(pairs=40, affine=True, shape="plane"), replace(SHUTTER, readout_ratio=0.0)
-    c = simulate(STEREO, still, LinearMotion(W, D), options, np.random.default_rng(0)).correspondences
-    H = so3.exp(W) + np.outer(D, [0.05, -0.2 / 6.0, 1.0 / 6.0])
-
-    def moved(pixels: FloatArray) -> FloatArray:
-        return CAMERA.project(CAMERA.unproject(pixels) @ H.T)
-
-    start, end = c.left[:, :2], c.left[:, 2:]
-    np.testing.assert_allclose(moved(start), end, atol=1e-9)
-    np.testing.assert_allclose(c.affine.reshape(-1, 2, 2), derivatives(moved, start, 1e-4), atol=1e-7)
-
-
 def test_noise_of_frames_is_a_share_of_their_size() -> None:
     exact, noisy = (simulation(pairs=400, affine_noise=noise).correspondences for noise in (0.0, 0.1))
     np.testing.assert_array_equal(noisy.left, exact.left)
@@ -389,21 +309,6 @@ def test_half_the_motion_has_an_eighth_of_the_rotation_s_and_a_quarter_of_the_di
 @pytest.mark.parametrize("size", [4.0, 1.0])
 def test_the_descent_from_affine_frames_is_exact_on_the_paper_s_motion(size: float) -> None:
     assert np.all(affine_errors(AffineSolver(), size, 100) < [1e-9, 1e-8])
-
-
-def test_samples_are_of_seven_and_have_two_motions_each() -> None:
-    c, solver = left(simulation(pairs=60)), AffineSolver()
-    assert solver.sample_sizes(c) == {"left": 7}
-    rng, samples = np.random.default_rng(0), list[Correspondences]()
-    for _ in range(6):
-        chosen = rng.choice(60, 7, replace=False)
-        samples.append(replace(c, left=c.left[chosen], affine=c.affine[chosen]))
-    together = solver.propose_all(samples, STEREO, SHUTTER)
-    for sample, motions in zip(samples, together, strict=True):
-        alone = solver.propose(sample, STEREO, SHUTTER)
-        for one, other in zip(alone, motions, strict=True):
-            np.testing.assert_allclose([*one.w, *one.d], [*other.w, *other.d], atol=1e-12)
-        assert rotation_error(alone[0].w, W) < 1e-4 < rotation_error(alone[1].w, W) < 0.02
 
 
 def test_the_robust_search_draws_matches_with_their_frames() -> None:

@@ -33,7 +33,7 @@ from rsbench.core.camera import Lens
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import scale_error
-from rsbench.core.rig import Side, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.isolated_components import SolverRunner
@@ -42,8 +42,6 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.poselib import P3pSolver
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.solvers.triplets import (
-    PATTERNS,
-    Features,
     LineErrors,
     LineTripletSolver,
     Triplets,
@@ -157,11 +155,6 @@ def test_scaled_matches_took_one_frame_period() -> None:
     np.testing.assert_allclose(scaled.tracks[:, [2, 3, 6, 7]], expected - [40, 0, 40, 0], atol=1e-9)
 
 
-def test_without_readout_scaling_changes_nothing() -> None:
-    c = hundred(0, "linear", 0.5, tracks=True).correspondences
-    np.testing.assert_allclose(scale_flow(c, RIG, GLOBAL).tracks, c.tracks, atol=1e-9)
-
-
 def test_scaled_solver_declares_what_its_inner_one_does(tmp_path: Path) -> None:
     solver = load_solver("gs-poselib-scaled")
     assert isinstance(solver, FlowScaledSolver)
@@ -216,20 +209,6 @@ def test_the_end_is_opencv_s_least_squares() -> None:
         d = t[:, 0] + so3.exp(w[:, 0]) @ o - o
         np.testing.assert_allclose(found.w, w[:, 0], atol=1e-8)
         np.testing.assert_allclose(found.d, d, atol=1e-7)
-
-
-@pytest.mark.parametrize("known", [(0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)])
-def test_every_kind_of_three_triplets_gives_the_exact_motion(known: tuple[int, int, int]) -> None:
-    sides: tuple[Side, ...] = ("left", "right", "left")
-    views: list[View] = [(0 if frame else 1, side) for frame, side in zip(known, sides, strict=True)]
-    errors = []
-    for seed in range(30):
-        s = global_tracks(seed, 3)
-        pose = newton(Triplets.of(s.correspondences.tracks, views, RIG))
-        truth = s.motion.body_from_world(1.0)
-        errors.append(max(np.abs(pose.R - truth.R).max(), np.abs(pose.t - truth.t).max()))
-    # Rounding; another root, or none, in few.
-    assert np.mean(np.array(errors) < 1e-9) >= 0.9 and np.median(errors) < 1e-13
 
 
 def test_points_known_in_frame_0_are_poselib_s_generalised_absolute_pose() -> None:
@@ -293,35 +272,6 @@ def test_three_exact_features_of_any_kind_give_the_motion(tracks: int, lines: in
     assert np.mean(np.array(found) < 1e-9) >= 0.9 and np.median(found) < 1e-12
 
 
-@pytest.mark.parametrize(("size", "least"), [(1.0, 0.9), (2.5, 0.75)])
-def test_minimal_samples_find_the_motion_from_none(size: float, least: float) -> None:
-    """Each pattern of third images, three lines and mixed: the share that ends at the truth."""
-    found = list[float]()
-    for seed, lines in itertools.product(range(15), (1, 3)):
-        s = line_trial(seed, 3 - lines, 16, size=size)
-        c = steep(s, lines)
-        features = Features.of(c.tracks, c.lines, RIG)
-        for views in PATTERNS:
-            pose = newton(features.triplets(np.arange(3), views, RIG))
-            found.append(float(np.abs(pose.R - s.motion.body_from_world(1.0).R).max()))
-    assert np.mean(np.array(found) < 1e-9) >= least
-
-
-def test_stereo_gives_points_of_the_true_line() -> None:
-    """Against projection by the camera's own model: both points lie on the line in each image."""
-    s = line_trial(0, 0, 40)
-    lines = steep(s, 40).lines
-    ends = stereo_ends(line_rays(lines, RIG), RIG)
-    pose = s.motion.body_from_world(1.0)
-    for frame, k in itertools.product((0, 1), (0, 1)):
-        X = ends[:, 0] @ pose.R.T + pose.t if frame else ends[:, 0]
-        image = RIG.camera.project(X + RIG.offset(("left", "right")[k]))
-        a, b = np.moveaxis(lines[:, 8 * frame + 4 * k : 8 * frame + 4 * k + 4].reshape(-1, 2, 2), 1, 0)
-        u = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
-        off = (image - a[:, None]) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-        assert np.abs(np.sum(off * u[:, None], axis=-1)).max() < 1e-8
-
-
 def test_errors_of_a_line_are_those_of_the_best_line() -> None:
     """Against SciPy's search over two points in space."""
     s = line_trial(4, 0, 8, noise_px=0.5)
@@ -374,29 +324,6 @@ def test_lines_help_points_and_do_alone() -> None:
     assert np.all(mean["lines"] < [0.1, 1.5])
 
 
-def test_noise_of_lines_other_than_that_of_points_is_weighed() -> None:
-    """Points ten times as exact: lines must not spoil them."""
-    apart = []
-    for seed in range(8):
-        s, noisy = line_trial(seed, 60, 60, 0.05), line_trial(seed, 60, 60, 0.5)
-        c = replace(s.correspondences, lines=noisy.correspondences.lines)
-        both, alone = (SOLVER.estimate(g, RIG, GLOBAL) for g in (c, replace(c, lines=c.lines[:0])))
-        apart.append((errors_deg(both, s.motion)[0], errors_deg(alone, s.motion)[0]))
-    both_error, alone_error = np.sqrt(np.mean(np.square(apart), axis=0))
-    assert both_error < 1.1 * alone_error
-
-
-def test_order_and_ends_mean_nothing() -> None:
-    s = line_trial(2, 20, 40, 0.3, 0.2)
-    c, rng = s.correspondences, np.random.default_rng(1)
-    swapped = c.lines.reshape(-1, 4, 2, 2).copy()
-    swapped[::2, 1] = swapped[::2, 1, ::-1]
-    swapped[1::3, 2] = swapped[1::3, 2, ::-1]
-    other = replace(c, tracks=rng.permutation(c.tracks), lines=rng.permutation(swapped.reshape(-1, 16)))
-    one, two = (SOLVER.estimate(g, RIG, GLOBAL) for g in (c, other))
-    np.testing.assert_allclose(np.concatenate([one.w, one.d]), np.concatenate([two.w, two.d]), atol=1e-7)
-
-
 def test_lines_without_depth_are_left_out_and_too_few_are_a_failure() -> None:
     x = np.linspace(100.0, 800.0, 10)
     flat = np.tile(np.stack([x, x, x + 50.0, x + 2.0], axis=1), (1, 4))
@@ -431,12 +358,6 @@ def test_parallel_lines_leave_the_motion_open() -> None:
         told += not (found.success and found.direction_known)
         assert found.success == np.all(np.isfinite(found.d)) and found.direction_known == (not found.reason)
     assert told >= 5  # noise bends the lines apart, by which the others believe their shift
-
-
-def test_random_lines_have_no_consensus() -> None:
-    lines = np.random.default_rng(0).uniform(0.0, 899.0, (60, 16))
-    found = SOLVER.estimate(Correspondences(lines=lines), RIG, GLOBAL)
-    assert not found.success and found.reason
 
 
 def test_lines_pass_the_lens_the_loop_and_the_runner() -> None:

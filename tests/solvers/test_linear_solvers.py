@@ -195,28 +195,6 @@ def test_null_vector_refuses_ambiguity(unit_columns: bool) -> None:
     assert null_vector(A * [1, 1, 1, 1, 0], unit_columns)[0] is None
 
 
-def test_the_literal_reading_takes_the_null_vector_of_a_as_it_is() -> None:
-    """With noise the scaling decides: the smallest singular value's vector minimises |A X| over |X| = 1."""
-    rng = np.random.default_rng(0)
-    A = rng.standard_normal((30, 5)) * [1.0, 10.0, 1.0, 0.1, 1.0]
-    literal, scaled = (null_vector(A, unit_columns)[0] for unit_columns in (False, True))
-    assert literal is not None and scaled is not None
-    residuals = [float(np.linalg.norm(A @ X) / np.linalg.norm(X)) for X in (literal, scaled)]
-    # Independent of any decomposition routine for matrices: the least eigenvalue of A^T A.
-    assert residuals[0] ** 2 == pytest.approx(np.linalg.eigvalsh(A.T @ A)[0], rel=1e-9)
-    assert residuals[1] > 1.01 * residuals[0]
-
-
-def test_scaling_columns_costs_the_rotation_at_a_tenth_of_a_pixel() -> None:
-    """A reviewer measured, with 100 + 100 matches, 0.31, 0.41 deg literally and 1.68, 1.95 with unit columns."""
-    literal, scaled = (
-        median_errors(LinearSolver(scaling=how), trials=40, pairs=100, noise_px=0.1)
-        for how in ("none", "unit-columns")
-    )
-    assert 0.2 < literal[0] < 0.5 and 0.25 < literal[1] < 0.65
-    assert scaled[0] > 3 * literal[0] and scaled[1] > 3 * literal[1]
-
-
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10**6))
 def test_choices_left_open_agree_without_noise(seed: int) -> None:

@@ -15,13 +15,10 @@ from solver_trials import (
     D,
     W,
     assert_second_order,
-    errors_deg,
     errors_of_size,
-    matches_of,
     trial,
 )
 
-from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.so3 import FloatArray
@@ -101,26 +98,6 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     # Errors of 100 px and second derivatives of 1e3 px: 1e-8 and 1e-9 px over the step.
     numeric = derivatives(at, np.zeros(12), 1e-6)
     np.testing.assert_allclose(errors(data, start, X)[1], numeric, rtol=1e-6, atol=1e-4)
-
-
-def of_six(solver: R6pSolver) -> float:
-    """Median error of the direction, degrees, of six exact points each, where the body turns by 8 degrees."""
-    size, found = np.radians(8.0) / float(np.linalg.norm(W)), list[float]()
-    motion = LinearMotion(size * W, size * D)
-    for seed in range(30):
-        c = matches_of(motion, seed=seed, tracks=6, depth=(4.0, 10.0))
-        found.append(errors_deg(solver.estimate(c, RIG, SHUTTER), motion)[1])
-    return float(np.median(found))
-
-
-def test_p3p_takes_the_double_linearisation_where_the_single_one_is() -> None:
-    """Rotation between frames is in no linearisation then, only the one within the frame."""
-    still, p3p, single = (
-        of_six(R6pSolver(linearisation=kind, start=start, refinement="none"))
-        for kind, start in (("double", "still"), ("double", "p3p"), ("single", "still"))
-    )
-    assert p3p < 0.5 * still
-    assert 0.5 * single < p3p < 2.0 * single
 
 
 def test_a_plane_leaves_a_pitch_a_rise_and_a_speed_along_the_axis_open() -> None:

@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 import solver_trials
 from differences import derivatives
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import chi2, t
-from stereo_transfer import rs_stereo_transfer
 
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
 from rsbench.components.motion_models import LinearMotion
@@ -30,11 +27,9 @@ from rsbench.solvers.engine.levenberg_marquardt import levenberg_marquardt
 from rsbench.solvers.engine.packed import (
     HeavyTailed,
     Packed,
-    damped_step,
     each_term,
     heavy_tailed,
     pack,
-    solve_triples,
     t_distribution,
 )
 from rsbench.solvers.refined import RefinedSolver
@@ -78,36 +73,12 @@ def parts(s: Simulation, packed: Packed) -> list[Packed]:
     return [pack(each, s.rig, s.shutter, model) for each in sets]
 
 
-def middle(tracks: FloatArray) -> FloatArray:
-    """x, y, disparity (n, 3) of stereo matches (n, 4)."""
-    return np.column_stack([0.5 * (tracks[:, :2] + tracks[:, 2:]), tracks[:, 0] - tracks[:, 2]])
-
-
 @EACH
 def test_pair_residuals_equal_the_numpy_sampson_error(case: str) -> None:
     s, packed, theta = problem(case, noise_px=2.0)
     matches = {side: getattr(s.correspondences, side) for side in SIDES}
     expected = [rs_sampson_error(s.rig, s.shutter, s.motion, side, matches[side]) for side in SIDES]
     np.testing.assert_allclose(packed.pair_residuals(theta), np.concatenate(expected), atol=1e-10)
-
-
-@EACH_MODEL
-def test_track_errors_equal_the_whitened_numpy_transfer(case: str) -> None:
-    s, packed, theta = problem(case, noise_px=1.0)
-    tracks = s.correspondences.tracks
-
-    def transfer(tracks: FloatArray) -> FloatArray:
-        return rs_stereo_transfer(s.rig, s.shutter, s.motion, middle(tracks[:, :4]), middle(tracks[:, 4:]))
-
-    # Derivative by all eight coordinates; the row differences are the two equations that the motion leaves alone.
-    rows = np.zeros((2, 8))
-    rows[0, [1, 3]], rows[1, [5, 7]] = (1, -1), (1, -1)
-    D = derivatives(transfer, tracks, 1e-3)
-    D = np.concatenate([D, np.broadcast_to(rows, (len(D), 2, 8))], axis=1)
-    error = np.concatenate([transfer(tracks), tracks @ rows.T], axis=1)
-    expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(D @ np.swapaxes(D, 1, 2)), error)
-    # 1e-6: the central differences.
-    np.testing.assert_allclose(packed.track_squares(theta), expected, rtol=1e-6)
 
 
 @EACH
@@ -202,59 +173,6 @@ def test_a_point_that_comes_up_to_the_camera_ends_no_search(shutter: RollingShut
             assert cost >= 0.0 and np.all(np.isfinite(gradient)) and np.all(np.isfinite(H))
 
 
-@settings(max_examples=50)
-@given(seed=st.integers(0, 10**6), damping=st.sampled_from([0.0, 1e-4, 1.0]))
-def test_step_solves_the_damped_normal_equations(seed: int, damping: float) -> None:
-    rng = np.random.default_rng(seed)
-    J, gradient, step = rng.standard_normal((9, 6)), rng.standard_normal(6), np.zeros(6)
-    H = J.T @ J
-    assert damped_step(H, gradient, damping, step)
-    expected = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
-    # Rounding grows with the condition of H.
-    np.testing.assert_allclose(step, expected, rtol=1e-13 * np.linalg.cond(H), atol=1e-12)
-
-
-def test_no_step_from_a_singular_matrix() -> None:
-    column = np.arange(1.0, 7.0)
-    for H in (np.zeros((6, 6)), np.outer(column, column), np.full((6, 6), np.nan)):
-        assert not damped_step(H, np.ones(6), 0.0, np.zeros(6))
-
-
-@pytest.mark.parametrize("model", ["linear", "twist", "inertial", "accelerated"])
-def test_exact_samples_give_the_motion(model: str) -> None:
-    s = solver_trials.trial(np.random.default_rng(3), model=model, tracks=60)
-    packed = pack(s.correspondences, solver_trials.RIG, solver_trials.SHUTTER, model)
-    samples = np.arange(60).reshape(20, 3)
-    thetas = solve_triples(packed, samples, iterations=20)
-    truth = packed.theta(s.motion.w, s.motion.d)
-    # Three points in almost one direction leave a motion weakly determined: a few samples may not arrive.
-    assert np.median(np.abs(thetas - truth)) < 1e-9
-    assert np.mean(np.max(np.abs(thetas - truth), axis=1) < 1e-6) >= 0.9
-
-
-def test_a_sample_ends_where_the_general_descent_does() -> None:
-    s = solver_trials.trial(np.random.default_rng(3), tracks=60, noise_px=0.3)
-    packed = pack(s.correspondences, solver_trials.RIG, solver_trials.SHUTTER)
-    samples = np.arange(60).reshape(20, 3)
-    thetas = solve_triples(packed, samples, iterations=60)
-    for theta, sample in zip(thetas, samples, strict=True):
-        alone = pack(
-            Correspondences(tracks=s.correspondences.tracks[sample]), solver_trials.RIG, solver_trials.SHUTTER
-        )
-        minimum = levenberg_marquardt(alone.normal_equations, np.zeros(6), 60, 50.0)
-        cost, _, _ = alone.normal_equations(theta)
-        assert cost == pytest.approx(minimum.cost, rel=1e-6, abs=1e-9)
-
-
-@EACH_TIMED
-def test_the_truth_explains_exact_matches(case: str) -> None:
-    _, packed, theta = problem(case, 0.0, pairs=20)
-    # 1e-9 px of the row equation, and two Gauss-Newton steps to the point.
-    assert np.max(packed.track_squares(theta)) < 1e-14
-    assert np.max(np.abs(packed.pair_residuals(theta))) < 1e-7
-    assert packed.in_front(theta) == len(packed.pairs) == 40
-
-
 @EACH_TIMED
 @pytest.mark.parametrize("tracks", [True, False])
 def test_the_solver_finds_the_motion(case: str, tracks: bool) -> None:
@@ -296,17 +214,6 @@ def tailed_problem(noise: float = 0.3, pairs: int = 30, tracks: int = 40) -> tup
     sets = {name: heavy(getattr(c, name), noise, 3.0, rng) for name in ("left", "right", "tracks")}
     packed = pack(Correspondences(**sets), solver_trials.RIG, solver_trials.SHUTTER)
     return packed, packed.theta(MOTION.w, MOTION.d)
-
-
-def test_the_terms_of_each_sum_to_the_normal_equations() -> None:
-    packed, theta = tailed_problem()
-    each = each_term(packed, theta)
-    cost, gradient, H = packed.normal_equations(theta)
-    np.testing.assert_allclose(0.5 * np.sum(each.squares), cost + 0.5 * np.sum(packed.row_checks), rtol=1e-12)
-    np.testing.assert_allclose(np.sum(each.gradients, axis=0), gradient, rtol=1e-10, atol=1e-10 * np.abs(H).max())
-    np.testing.assert_allclose(np.sum(each.hessians, axis=0), H, rtol=1e-10, atol=1e-12 * np.abs(H).max())
-    expected = np.concatenate([packed.pair_residuals(theta) ** 2, packed.track_squares(theta)])
-    np.testing.assert_allclose(each.squares, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("nu", [3.0, 5.0])
@@ -440,21 +347,6 @@ def test_a_wrong_pair_of_great_leverage_does_not_bend_the_motion(
     assert found is not None and found.covariance is not None
     error = np.concatenate([found.w - MOTION.w, found.d - MOTION.d])
     assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)))
-
-
-def test_leverages_are_bounded(bent: tuple[Correspondences, Packed, FloatArray]) -> None:
-    _, packed, theta = bent
-
-    def share_of_the_pair(tailed: HeavyTailed) -> float:
-        each = each_term(tailed, theta)
-        H = np.einsum("n,nij->nij", tailed.weights(each.squares), each.hessians)
-        return float(np.trace(np.linalg.solve(np.sum(H, axis=0), H[0])))
-
-    tailed = heavy_tailed(packed, theta, 0.2)
-    assert tailed is not None
-    assert share_of_the_pair(replace(tailed, trust=np.ones(len(tailed.trust)))) > 0.7
-    # The other leverages move as its weight falls: to a tenth.
-    assert share_of_the_pair(tailed) == pytest.approx(0.2, rel=0.1)
 
 
 def test_few_measurements_are_left_to_least_squares() -> None:

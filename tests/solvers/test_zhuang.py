@@ -67,20 +67,6 @@ def test_nine_matches_have_the_true_acceleration_among_the_eigenvalues() -> None
         assert s[-1] < 1e-10 * s[0]
 
 
-def test_nine_noisy_matches_without_a_real_acceleration_give_a_motion_without_one() -> None:
-    solver, found = SOLVERS["constant", "none"], list[float]()
-    for seed in range(40):
-        noise = 0.1 * np.random.default_rng([1, seed]).normal(size=(9, 4))
-        matches = Correspondences(left=instantaneous(9, 0.4, seed).left + noise)
-        flow = Flow.of(matches, LEFT, SHUTTER)
-        if not accelerations(*flow.system()):
-            (one,) = solver.propose(matches, LEFT, SHUTTER)
-            assert one.success, one.reason
-            assert one.motion_parameters["acceleration"] == 0.0
-            found.append(float(rotation_error(one.w, W)))
-    assert len(found) > 5 and np.degrees(np.median(found)) < 1.0
-
-
 @pytest.mark.parametrize("kind", ["none", "constant"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_translation_along_an_axis_is_exact(kind: str, axis: int) -> None:

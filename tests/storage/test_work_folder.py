@@ -220,14 +220,6 @@ def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(
     assert listed(tmp_path, ".json") == listed(tmp_path / "nothing") == []
 
 
-def test_all_is_done_at_the_end() -> None:
-    done: list[int] = []
-    with background_writer() as later:
-        for k in range(50):
-            later(done.append, k)
-    assert sorted(done) == list(range(50))
-
-
 def test_the_first_error_is_raised(tmp_path: Path) -> None:
     """A full disk, say: the folder of the second file is missing."""
     with pytest.raises(RsbenchError, match="lost"), background_writer() as later:
@@ -274,12 +266,6 @@ def test_a_slow_disk_holds_the_renderer_up() -> None:
 
 class _Large:
     pass
-
-
-def test_an_error_of_who_hands_over_work_goes_on() -> None:
-    with pytest.raises(ZeroDivisionError), background_writer() as later:
-        later(int, "1")
-        raise ZeroDivisionError
 
 
 def test_results_come_in_order_and_few_are_ahead() -> None:

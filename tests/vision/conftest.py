@@ -185,11 +185,14 @@ class Truth:
     """(H, W) the frame saw the point: inside its outermost pixel centres and not hidden."""
 
 
-def truth_at(world: World, side: Side, frame: int, tau: float) -> Truth:
-    """Closed-form truth of a correction: rays of the target, their points, and ``rs_project`` of these."""
-    rig, camera = world.rig, world.rig.camera
-    image, _ = world.still(side, tau)
-    depth, centre, rays = world.depth_along(rig.cam_from_world(world.motion, tau, side), camera.pixel_grid())
+def truth_at(world: World, side: Side, frame: int, tau: float, target: Side | None = None) -> Truth:
+    """Closed-form truth of a correction: rays of the target, their points, and ``rs_project`` of these.
+
+    The target is the camera that saw the frame, unless another one is named.
+    """
+    rig, camera, target = world.rig, world.rig.camera, target or side
+    image, _ = world.still(target, tau)
+    depth, centre, rays = world.depth_along(rig.cam_from_world(world.motion, tau, target), camera.pixel_grid())
     points = centre + np.where(np.isfinite(depth), depth, 1e9)[..., None] * rays
     seen = rs_project(rig, world.shutter, world.motion, side, frame, points)
     known = np.isfinite(seen.depth)

@@ -98,17 +98,6 @@ def test_occlusion_order(world: Build, shapes: Any, truth: Build) -> None:
     assert not np.any(got.mask[hidden])
 
 
-def test_coverage_at_depth_edges_has_no_cracks(world: Build, shapes: Any, truth: Build) -> None:
-    """Torn edges still cover what the frame saw on both sides: half a pixel beyond the centres belongs to each."""
-    Plane, _ = shapes
-    card = Plane((0.1, 0, 1), 3.0, lambda X: (np.abs(X[..., 0]) < 0.5) & (np.abs(X[..., 1]) < 0.4))
-    scene = world((card, Plane((0, 0.2, 1), 9.0)), w_deg=(0.3, -0.4, 1.0))
-    expected = truth(scene, "left", 1, 1.0)
-    got = _correct(scene)
-    grown = cv2.erode(expected.visible.astype(np.uint8), np.ones((3, 3))) > 0
-    assert np.mean(got.mask[grown]) > 0.9995
-
-
 def test_sky_moves_by_rotation_alone(world: Build, shapes: Any) -> None:
     """At infinity the map is K R K^-1 of the row's pose, whatever the translation, and everything hides it."""
     scene = world((), d=(0.5, -0.3, 0.4), w_deg=(1.0, -2.0, 1.5), sky=True)
@@ -169,52 +158,6 @@ def test_image_is_that_of_the_global_shutter(world: Build, shapes: Any, truth: B
     assert psnr(image, expected.image, mask) < 30.0
     linear = _correct(scene, options=WarpOptions(interpolation="linear"))
     assert psnr(linear.image, expected.image, mask) < psnr(got.image, expected.image, mask) - 6
-
-
-def test_grey_colour_and_16_bit_agree(world: Build, shapes: Any) -> None:
-    scene = world((shapes[0]((0.2, 0.3, 1.0), 6.0),))
-    image, depth = scene.rolling("left", 0)
-    arguments: Any = (depth, scene, ("left", 0))
-    colour = correct_frame((image * 65535).astype(np.uint16), *arguments)
-    grey = correct_frame((image[..., 1] * 65535).astype(np.uint16), *arguments)
-    single = correct_frame((image[..., 1:2] * 65535).astype(np.uint16), *arguments)
-    assert colour.image.dtype == np.uint16
-    np.testing.assert_array_equal(colour.image[..., 1], grey.image)
-    np.testing.assert_array_equal(single.image[..., 0], grey.image)
-    assert not np.any(grey.image[~grey.mask])
-
-
-def test_flow_is_back_projection_and_projection(world: Build, shapes: Any) -> None:
-    """Equations 11a and 11b done by the geometry core, and the flow and the map invert each other."""
-    scene = world((shapes[0]((0.2, 0.3, 1.0), 6.0),))
-    arguments: Any = (scene, ("right", 1))
-    _, depth = scene.rolling("right", 1)
-    depth[3, 4] = np.nan
-    flow = correction_flow(depth, *arguments, target_tau=1.3)
-    points = back_project(scene.rig, scene.shutter, scene.motion, "right", 1, scene.rig.camera.pixel_grid(), depth)
-    expected = project_at(scene.rig, scene.motion, "right", 1.3, points)[..., :2] - scene.rig.camera.pixel_grid()
-    np.testing.assert_allclose(flow, expected, atol=1e-5)
-    assert np.all(np.isnan(flow[3, 4])) and np.count_nonzero(np.isnan(flow)) == 2
-    got = _correct(scene, "right", 1, 1.3)
-    there = cv2.remap(np.nan_to_num(flow), np.nan_to_num(got.source_map), None, cv2.INTER_LINEAR)
-    there += got.source_map - scene.rig.camera.pixel_grid()
-    away = got.mask & (np.linalg.norm(got.source_map - [4, 3], axis=-1) > 2)
-    last = np.array(depth.shape[::-1]) - 1.0  # beyond the outermost centres there is no flow to interpolate
-    away &= np.all((got.source_map >= 0.0) & (got.source_map <= last), axis=-1)
-    assert np.abs(there[away]).max() < GEOMETRY_PX
-
-
-def test_isolated_pixels_cover_their_cells(world: Build, shapes: Any) -> None:
-    """A pixel without valid neighbours draws one cell of a pixel: it covers one or two target pixels, or four."""
-    scene = world((shapes[0]((0.0, 0.0, 1.0), 6.0),))
-    image, depth = scene.rolling("left", 1)
-    lonely = np.full_like(depth, np.nan)
-    lonely[40:120:10, 40:160:10] = depth[40:120:10, 40:160:10]
-    got = correct_frame(image.astype(np.float32), lonely, scene, ("left", 1))
-    count = np.count_nonzero(np.isfinite(lonely))
-    assert count <= np.count_nonzero(got.mask) <= 1.3 * count  # the area of the cells: motion magnifies a little
-    nearest = np.abs(got.source_map[got.mask] - np.rint(got.source_map[got.mask] / 10) * 10)
-    assert nearest.max() <= 0.5 + 1e-5
 
 
 def test_other_poses_and_twist_motion(world: Build, shapes: Any, truth: Build) -> None:

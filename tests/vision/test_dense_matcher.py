@@ -23,7 +23,6 @@ from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.dense_matcher import (
     DenseMatcher,
     DenseOptions,
-    corners,
     dense_tracks,
     start_of_flow,
     stereo_by_flow,
@@ -67,14 +66,6 @@ def test_tracks_follow_the_true_flow(scene: Any, images: Images) -> None:
     assert len(found.tracks) > 300 and found.covariance.shape == (len(found.tracks), 3)
     assert np.median(error) < 0.03
     assert np.mean(~(error < 0.5)) < 0.03
-
-
-def test_pairs_are_the_halves_of_tracks(images: Images) -> None:
-    found = DenseMatcher().match(images)
-    np.testing.assert_array_equal(found.left, found.tracks[:, [0, 1, 4, 5]])
-    np.testing.assert_array_equal(found.right, found.tracks[:, [2, 3, 6, 7]])
-    np.testing.assert_array_equal(found.stereo_0, found.tracks[:, :4])
-    np.testing.assert_array_equal(found.stereo_1, found.tracks[:, 4:])
 
 
 def test_predicted_deviations_order_the_errors(scene: Any, images: Images) -> None:
@@ -138,18 +129,6 @@ def test_images_of_other_sizes_are_refused(images: Images) -> None:
         dense_tracks({**images, ("right", 1): images["right", 1][:-1]})
     with pytest.raises(ValueError, match="levels"):
         DenseOptions(levels=0)
-
-
-def test_corners_are_the_strongest_of_their_cells() -> None:
-    """White dots on black, one to a cell."""
-    image, places = np.zeros((80, 104), dtype=np.float32), list[tuple[int, int]]()
-    for y in range(8, 72, 8):
-        for x in range(8, 96, 8):
-            places.append((x + 4, y + 3))
-            image[y + 3, x + 4] = 200.0
-    found = corners(image, 80 * 104 // 64)
-    distance = np.linalg.norm(found[:, None] - np.array(places), axis=-1).min(axis=1)
-    assert len(found) == len(places) and np.all(distance <= 1.5)
 
 
 # Any rig

@@ -15,7 +15,7 @@ from rsbench.core.rig import StereoRig, View
 from rsbench.core.shutter import Scanning
 from rsbench.vision.epipolar_search import census as census_of
 from rsbench.vision.epipolar_search import depth_from_motion, ones
-from rsbench.vision.reprojection import parallax_gain, reproject_pixels, reprojection_of
+from rsbench.vision.reprojection import reproject_pixels, reprojection_of
 
 Build = Callable[..., Any]
 
@@ -118,13 +118,3 @@ def test_places_are_those_of_the_projection(lens: Lens | None, scanning: dict[st
     # Between two lines the place is taken as straight; positions are float32.
     np.testing.assert_allclose(places[both], exact.pixels[both], atol=2e-4)
     np.testing.assert_allclose(depth[both] / factors[both], exact.depth[both], rtol=1e-4)
-
-
-def test_the_gain_is_the_parallax_of_a_sideways_step() -> None:
-    rig = StereoRig(camera=PinholeCamera.centred(40, 30, 50.0), baseline=0.3)
-    shutter, still = Scanning().shutter_of(40, 30, 0.5), LinearMotion(np.zeros(3), np.zeros(3))
-    left, right = (row_poses(rig, shutter, still, side, 0) for side in ("left", "right"))
-    gain = parallax_gain(
-        rig.camera, reprojection_of(rig.camera, left, right), reprojection_of(rig.camera, right, left)
-    )
-    np.testing.assert_allclose(gain, 50.0 * 0.3)  # the disparity at 1 m

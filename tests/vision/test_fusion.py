@@ -68,7 +68,7 @@ def test_holes_show_what_the_other_frames_saw(scene: Any, truth: Build) -> None:
     expected = truth(scene, "left", 0, 0.0)
     elsewhere = np.zeros(expected.visible.shape, dtype=bool)
     for side, frame in (("right", 0), ("left", 1), ("right", 1)):
-        elsewhere |= _seen_from_left_target(scene, side, frame)
+        elsewhere |= truth(scene, side, frame, 0.0, target="left").visible
     hole = ~expected.visible & elsewhere
     assert hole.sum() > 200
     # A pixel at the very rim of a surface may go to either side of it.
@@ -78,24 +78,6 @@ def test_holes_show_what_the_other_frames_saw(scene: Any, truth: Build) -> None:
     assert np.mean(wrong) < 0.02
     # Resampling a texture of waves of ten pixels and more costs less than an rms of 0.018.
     assert psnr(fused.image, expected.image.astype(np.float32), filled) > 35.0
-
-
-def _seen_from_left_target(scene: Any, side: Any, frame: int) -> np.ndarray:
-    """Target pixels (left camera, time 0) whose point a frame saw: its own row equation and visibility."""
-    from rsbench.core.projection import rs_project
-
-    camera = scene.rig.camera
-    pose = scene.rig.cam_from_world(scene.motion, 0.0, "left")
-    depth, centre, rays = scene.depth_along(pose, camera.pixel_grid())
-    points = centre + np.where(np.isfinite(depth), depth, 1e9)[..., None] * rays
-    seen = rs_project(scene.rig, scene.shutter, scene.motion, side, frame, points)
-    known = np.isfinite(seen.depth)
-    poses = scene.rig.cam_from_world(scene.motion, np.where(known, seen.tau, 0.0), side)
-    nearest, _, _ = scene.depth_along(poses, np.where(known[..., None], seen.pixels, 0.0))
-    limit = np.array([camera.width - 1, camera.height - 1])
-    with np.errstate(invalid="ignore"):
-        inside = np.all((seen.pixels >= 0) & (seen.pixels <= limit), axis=-1)
-    return known & inside & (np.minimum(nearest, 1e9) >= seen.depth * (1 - 1e-6))
 
 
 def test_nearer_surfaces_hide_farther_ones_among_the_fillers(scene: Any) -> None:

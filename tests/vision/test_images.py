@@ -16,10 +16,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import FRAMES, SIDES
+from rsbench.core.rig import SIDES
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.features import SiftMatcher, refine_matches
 from rsbench.vision.images import ahead, at_full_size, guided_upsample, halved, map_ahead, map_frames, resample
 from rsbench.vision.stereo_depth import SgmOptions, depth_metrics, stereo_disparity
 
@@ -34,20 +33,6 @@ def test_a_halved_ramp_has_the_values_of_the_places_that_it_stands_for(shape: tu
     places = at_full_size(np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2), shape)
     for each, place in zip(small, places.T, strict=True):
         np.testing.assert_allclose(2.0 * each.reshape(-1), place, atol=1.6)  # whole grey levels of half a pixel
-
-
-def test_matches_that_are_aligned_are_as_good_as_those_of_the_full_size(scene: Any, u8: Build) -> None:
-    """Left-right matches against the true disparity of their rows."""
-    images = {(side, k): u8(scene.rolling(side, k)[0]) for k in FRAMES for side in SIDES}
-    truth = scene.rig.disparity(scene.rolling("left", 0)[1])
-    off = {}
-    for half in (False, True):
-        matches = refine_matches(images, SiftMatcher(half=half).match(images))
-        x, y, other, _ = matches.stereo_0.T
-        places = np.rint(np.stack([y, x])).astype(int)
-        off[half] = float(np.median(np.abs(x - other - truth[tuple(places)])))
-        assert len(matches.stereo_0) > 30
-    assert off[True] < 1.5 * off[False] + 0.02
 
 
 def test_borders_lie_where_the_image_has_them() -> None:
@@ -89,18 +74,6 @@ def test_the_faster_chain_is_ours_alone() -> None:
 
 def _positions(rng: np.random.Generator, n: int, low: float, high: float) -> np.ndarray:
     return rng.uniform(low, high, (n, n, 2)).astype(np.float32)
-
-
-def test_cubic_reproduces_parabolas() -> None:
-    """Keys' kernel is exact to second order: the values of any quadratic come back, here to float32."""
-    y, x = np.mgrid[:20, :24].astype(np.float64)
-
-    def value(px: np.ndarray, py: np.ndarray) -> np.ndarray:
-        return 0.3 + 0.02 * px - 0.01 * py + 0.001 * px**2 - 0.002 * px * py + 0.0015 * py**2
-
-    at = _positions(np.random.default_rng(0), 30, 2.0, 16.0)
-    got = resample(value(x, y).astype(np.float32), at)
-    np.testing.assert_allclose(got, value(at[..., 0].astype(float), at[..., 1].astype(float)), atol=3e-7)
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4])

@@ -34,8 +34,6 @@ from rsbench.vision.layers import (
     MovingCamera,
     PlaneOptions,
     fronto_parallel,
-    grouped,
-    label_pixels,
     planes_seen,
     refined,
 )
@@ -136,50 +134,6 @@ def test_planes_are_where_rays_meet_them() -> None:
     assert np.all(np.isnan(behind[2])) and np.all(np.isfinite(behind[:2]))
 
 
-def test_groups_are_as_many_as_are_needed() -> None:
-    rng = np.random.default_rng(0)
-    centres, counts = [2.0, 6.0, 25.0], [400, 8, 60]
-    values = np.concatenate([c + rng.normal(scale=0.2, size=n) for c, n in zip(centres, counts, strict=True)])
-    found = grouped(np.append(values, 60.0), PlaneOptions(thickness_px=0.5))  # one stray
-    # Three standard deviations of a median of eight, 1.25 x 0.2 / sqrt(8).
-    np.testing.assert_allclose(found, centres, atol=0.27)
-    assert len(grouped(np.linspace(1.0, 50.0, 500), PlaneOptions(most=4))) == 4
-
-
-def test_pixels_find_their_layers_and_who_hides_them(filmed: Filmed) -> None:
-    """With the true motion and planes: what is left is the assignment."""
-    greys = [cv2.cvtColor(filmed.problem.images[view], cv2.COLOR_RGB2GRAY).astype(np.float32) for view in LEFT]
-    planes = np.zeros((4, 3))
-    planes[1:, 2] = 1.0 / DEPTHS
-    found = label_pixels((greys[0], greys[1]), filmed.camera, planes, LabelOptions(), 0.5)
-    for view in LEFT:
-        frame, truth = view[1], filmed.depth[view]
-        rho = np.take_along_axis(filmed.camera.inverse_depths(planes, frame), found.labels[frame][None], axis=0)[0]
-        off = wrong(1.0 / np.maximum(rho, 1e-9), truth)
-        assert np.mean(off[inside(truth)]) < 0.03
-        grid = filmed.world.rig.camera.pixel_grid()
-        tau = filmed.world.shutter.pixel_time(grid, frame, "left")
-        _, centre, rays = filmed.world.depth_along(
-            filmed.world.rig.cam_from_world(filmed.world.motion, tau, "left"), grid
-        )
-        other = rs_project(
-            filmed.world.rig,
-            filmed.world.shutter,
-            filmed.world.motion,
-            "left",
-            1 - frame,
-            centre + truth[..., None] * rays,
-        )
-        there = np.isfinite(other.depth)
-        nearest, _, _ = filmed.world.depth_along(
-            filmed.world.rig.cam_from_world(filmed.world.motion, np.where(there, other.tau, 0.0), "left"),
-            np.where(there[..., None], other.pixels, 0.0),
-        )
-        visible = there & (nearest > other.depth * (1 - 1e-6))
-        # Beside borders windows see two surfaces.
-        assert np.mean((found.seen[frame] != visible)[inside(truth)]) < 0.05
-
-
 def test_exact_matches_on_layers_give_the_exact_motion_and_planes(filmed: Filmed) -> None:
     matches, camera = exact_matches(filmed.world, 120), filmed.camera
     layer = np.argmin(np.abs(filmed_depths(filmed, matches)[:, None] - DEPTHS), axis=1)
@@ -201,17 +155,6 @@ def filmed_depths(filmed: Filmed, matches: np.ndarray) -> np.ndarray:
     tau = filmed.world.shutter.pixel_time(matches[:, :2], 0, "left")
     pose = filmed.world.rig.cam_from_world(filmed.world.motion, tau, "left")
     return filmed.world.depth_along(pose, matches[:, :2])[0]
-
-
-def test_a_layer_that_is_thick_does_not_bend_the_motion(filmed: Filmed) -> None:
-    """One layer for all depths: matches count across their epipolar curves, where they are exact."""
-    matches, camera = exact_matches(filmed.world, 120), filmed.camera
-    planes = np.array([[0.0, 0.0, 0.2]])
-    one = Followed(matches, np.zeros(len(matches), dtype=np.int64))
-    motion, _ = refined([one], camera, planes)
-    # Along the curves they miss by up to 5 px.
-    assert np.degrees(np.linalg.norm(motion.w - filmed.true.w)) < 0.01
-    assert off_degrees(motion.d, filmed.true.d) < 0.5
 
 
 def test_layers_motion_and_frames_of_its_own_model(filmed: Filmed, u8: Any) -> None:

@@ -13,13 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsbench.core.camera import Lens, PinholeCamera
-from rsbench.core.correspondences import Correspondences
 from rsbench.core.projection import back_project, project_at, row_poses, rs_project_near
-from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import Scanning
 from rsbench.vision.correction import correct_frame, correction_flow
 from rsbench.vision.epipolar_search import depth_from_motion
-from rsbench.vision.feature_matcher import of_sensors
 from rsbench.vision.fusion import Origin, SourceView, fuse
 from rsbench.vision.quality import psnr
 from rsbench.vision.reprojection import distort, optics_of
@@ -110,15 +107,6 @@ def test_flow_is_back_projection_and_projection(scene: Any, case: str) -> None:
     np.testing.assert_allclose(correction_flow(depth, real, ("right", 1), target_tau=1.3), expected, atol=1e-4)
 
 
-def test_a_lens_without_distortion_is_none(scene: Any) -> None:
-    """The ideal camera is the special case: the loops with a lens that does nothing give the same frame."""
-    image, depth = scene.rolling("left", 1)
-    nothing = _seen(scene, Lens(model="brown-conrady"))
-    alone, through = (correct_frame(image.astype(np.float32), depth, one, ("left", 1)) for one in (scene, nothing))
-    np.testing.assert_array_equal(alone.mask, through.mask)
-    np.testing.assert_allclose(alone.source_map, through.source_map, atol=1e-4)  # float32 of pixels
-
-
 @pytest.mark.parametrize("case", ["barrel", "fisheye", "columns", "fisheye, columns from the right, late"])
 def test_holes_are_filled_from_the_other_frames(scene: Any, truth: Build, case: str) -> None:
     real = _seen(scene, *CASES[case])
@@ -199,9 +187,3 @@ def test_disparities_lie_on_the_pixels_of_the_sensor(scene: Any, u8: Build, lens
         assert np.mean(np.isfinite(error)) > 0.9
         assert np.nanmedian(error) < 0.05
         assert np.nanquantile(error, 0.95) < 0.5
-
-
-def test_no_match_is_none_behind_a_lens_too() -> None:
-    camera = replace(PinholeCamera.centred(64, 48, 60.0), lens=Lens(model="brown-conrady", k1=-0.1))
-    found = of_sensors(Correspondences(left=np.full((1, 4), 30.0)), StereoRig(camera=camera, baseline=1.0))
-    assert found.left.shape == (1, 4) and found.right.shape == (0, 4) and found.tracks.shape == (0, 8)

@@ -21,14 +21,13 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, temporal_pairs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
-from rsbench.core.rig import SIDES, VIEWS, StereoRig
+from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
 from rsbench.interop.readers.gyro_log import read_gyro_log
 from rsbench.pipeline.mono_correction import (
     FoundOwnMotion,
-    MonoFusionCorrector,
     find_own_motion,
     refusal,
     select_motion_model,
@@ -39,7 +38,6 @@ from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.solvers.engine.robust_motion import RobustEstimate, RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
 from rsbench.storage.files import read_json, read_png, write_png
-from rsbench.vision.corrector import CorrectionProblem, load_corrector
 from rsbench.vision.fusion import Fused, Origin, finished
 from rsbench.vision.mono_fusion import Flows, MonoFusion, OwnMotion, continued, find_flows
 
@@ -142,30 +140,6 @@ def test_where_no_law_explains_the_flow_the_flow_moves_everything(
     assert with_wrong < 1.1 * with_flow
 
 
-def test_holes_are_not_filled_by_pixels_whose_place_is_a_guess(seen: Seen) -> None:
-    """Flow that does not return, and no search that agrees: the other frame fills nothing by such pixels."""
-    fusion = MonoFusion(seen.images, seen.own, seen.flows)
-    filled = fusion.corrected(1, 1.5).origin == Origin.OTHER_FRAME
-    guessed = np.zeros(filled.shape, dtype=bool)
-    fusion._layers[0] = fusion._layers[0]._replace(measured=guessed)
-    unfilled = fusion.corrected(1, 1.5).origin
-    assert np.any(filled) and not np.any(unfilled == Origin.OTHER_FRAME)
-    assert np.all(np.isin(unfilled[filled], [Origin.NOBODY, Origin.GUESSED]))
-
-
-def test_without_a_motion_everything_is_scaled_flow(scene: Any, seen: Seen) -> None:
-    """At the time of a row, the pixels of that row stay where they are."""
-    own = OwnMotion(rig=scene.rig.about("left"), shutter=scene.shutter, side="left", motion=None)
-    fusion = MonoFusion(seen.images, own, seen.flows)
-    places = fusion.places(1, float(scene.shutter.row_time(100, 1)))
-    np.testing.assert_allclose(places[100, :, 0], np.arange(320), atol=1e-9)  # rounding
-    # The whole flow leads to the other frame: at the time of its end a pixel is at its end.
-    x, y = 160, 120
-    end = np.array([x, y]) + seen.flows.flow[1][y, x]
-    there = fusion.places(1, float(scene.shutter.row_time(end[1], 0)))[y, x, :2]
-    np.testing.assert_allclose(there, end, atol=1e-4)  # float32 of the flow
-
-
 def test_what_cannot_be_corrected_says_why() -> None:
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)), (0, 0), 2.0)
@@ -175,20 +149,6 @@ def test_what_cannot_be_corrected_says_why() -> None:
     assert "nothing moves" in refusal([textured, textured], find_flows([textured, textured]))
     moved = np.roll(textured, 4, axis=1)
     assert refusal([textured, moved], find_flows([textured, moved])) == ""
-
-
-@pytest.mark.slow
-def test_the_corrector_is_found_by_name_and_keeps_cameras_apart(scene: Any, u8: Any) -> None:
-    corrector = load_corrector("mono-fusion").component
-    assert isinstance(corrector, MonoFusionCorrector)
-    images = {(side, frame): u8(scene.rolling(side, frame)[0]) for side in SIDES for frame in (0, 1)}
-    known = {"rig": scene.rig, "shutter": scene.shutter, "motion": None, "depth": None, "guess": None}
-    problem = CorrectionProblem(images=images, target_row=120.0, **known)
-    black = {view: image if view[0] == "left" else np.zeros_like(image) for view, image in images.items()}
-    alone = corrector.correct(replace(problem, images=black), VIEWS)
-    both = corrector.correct(problem, VIEWS)
-    assert not alone["right", 0].success and "no texture" in alone["right", 0].reason
-    np.testing.assert_array_equal(alone["left", 0].image, both["left", 0].image)
 
 
 Y, X = np.mgrid[0:120, 0:160].astype(np.float64)

@@ -131,15 +131,6 @@ def test_a_change_of_anything_computes_what_depends_on_it(
         score.scoring_version.cache_clear()
 
 
-def test_the_whole_source_counts() -> None:
-    files: list[Path] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(score, "hash_of_files", lambda folder, found: files.extend(found) or "")
-        score.scoring_version.__wrapped__()
-    package = Path(score.__file__).parents[2]
-    assert set(files) == set(package.rglob("*.py"))
-
-
 def test_a_metric_that_failed_is_asked_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(metric: Any, case: Any) -> dict[str, float]:
         raise RsbenchError("took too long")

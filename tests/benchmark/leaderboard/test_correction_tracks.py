@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,10 @@ from rsbench.benchmark.leaderboard import running
 from rsbench.benchmark.leaderboard.correction_tracks import TrueFrame, placed, seen_alike
 from rsbench.benchmark.leaderboard.picture_track import SharedWork
 from rsbench.benchmark.leaderboard.pictures import parts_within
-from rsbench.benchmark.leaderboard.splits import with_gyro
 from rsbench.benchmark.leaderboard.tracks import TRACKS
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.sequence import read_dataset
-from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.quality import Picture, ssim
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
@@ -115,15 +111,6 @@ def test_oracles_have_their_places(planes: Path, tmp_path: Path) -> None:
     assert np.all(found["fusion-true"]["placed"] > found["uncorrected"]["placed"])
     assert {score.key for score in split.track.scores} <= set(found["truth"]) and "flip_all" not in found["truth"]
     assert lines_of(tmp_path / "truth" / "predictions.jsonl")[0]["protocol"] == "correction-2"
-
-
-def test_correctors_have_the_motion_whose_model_the_matches_prefer() -> None:
-    """As ``rsbench correct`` has; of the first protocol it stays that of the solver's own model."""
-    first, second = (TRACKS[name].chain("fusion") for name in ("correction", "correction-2"))  # pyrefly: ignore[missing-attribute]
-    assert first.options.motion_model is None and second.options.motion_model == "auto"
-    assert first.key == CorrectionOptions().key
-    assert second.key == CorrectionOptions(motion_model="auto").key != first.key
-    assert (second.entry.key, second.uses) == (first.entry.key, first.uses)
 
 
 # A second number: how it looks
@@ -261,19 +248,6 @@ def test_a_gyroscope_is_given_where_there_is_one(rendered: Path, tmp_path: Path)
     # The tracks that do not give it are as they were.
     other = TRACKS["correction"].split(rendered).truths[0].shown
     assert "imu/measured.csv" not in other.files
-
-
-def test_samples_of_a_pair_of_many_frames_have_its_own_times(rendered: Path) -> None:
-    """As those of the sequence, from its frame on; the pair before it is one period earlier."""
-    sequence = next(iter(read_dataset(rendered)))
-    (problem,) = TRACK.problems(rendered, None, 1)
-    later = replace(sequence, first=1, channels=())
-    given, shifted = (with_gyro(problem, each).correspondences.gyro for each in (sequence, later))
-    both = np.isin(np.round(shifted[:, 0] + 1.0, 9), np.round(given[:, 0], 9))
-    assert np.count_nonzero(both) > 10
-    rows = {round(float(row[0]), 9): row[1:] for row in given}
-    for row in shifted[both]:
-        np.testing.assert_array_equal(row[1:], rows[round(float(row[0] + 1.0), 9)])
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +24,6 @@ from leaderboards import (
     ASK_PICTURES,
     PLANES,
     Line,
-    entered,
     files_below,
     lines_of,
     named,
@@ -35,9 +34,7 @@ from leaderboards import (
 )
 
 from rsbench.benchmark.leaderboard.board import add, entries_of, merge, place, rescore
-from rsbench.benchmark.leaderboard.picture_track import PictureTrack
 from rsbench.benchmark.leaderboard.pictures import PARTINGS, WINDOW, columns, texture
-from rsbench.benchmark.leaderboard.standings import standings
 from rsbench.benchmark.leaderboard.submissions import (
     check_submission,
     write_oracles,
@@ -248,19 +245,6 @@ def _submitted(board: Path, split: Split, folder: Path, method: str, factor: flo
     path = _changed(write_truth(split, folder / method), lambda z: factor * z)
     head, *answers = lines_of(path)
     add(board, write(path, [{**head, "method": method, "uses": ["images"]}, *answers]), split, {})
-
-
-def test_copies_tie_and_boards_merge(splits: dict[str, Split], tmp_path: Path) -> None:
-    split, board, other = splits["depth"], tmp_path / "board", tmp_path / "other"
-    for where, name, factor in ((board, "a", 1.2), (board, "b", 1.01), (other, "copy", 1.2)):
-        _submitted(where, split, tmp_path, name, factor)
-    assert merge(other, board) == [f"depth-1/{split.name}/copy"]
-    found = {line.scored.header.method: line for line in standings([*entered(board, split).values()])}
-    assert next(iter(found)) == "b" and found["a"].rank == found["copy"].rank and "copy" in found["a"].ties
-    files = ["pictures/planes.0/left_1.exr", "pictures/planes.1/left_1.exr"]
-    assert sorted(found["copy"].scored.files) == files and rescore(board, split) == {}
-    with pytest.raises(RsbenchError, match="with other predictions"):
-        _submitted(board, split, tmp_path / "again", "a", 1.3)
 
 
 def test_pictures_that_were_changed_are_named(splits: dict[str, Split], tmp_path: Path) -> None:
@@ -553,21 +537,6 @@ def _folder(path: Path) -> Path:
     """Without pictures."""
     path.mkdir()
     return path
-
-
-@pytest.mark.parametrize(("track", "worst"), [("depth", 1.0), ("correction", 255.0)])
-def test_a_failure_is_the_worst_in_the_same_parts(
-    track: str, worst: float, splits: dict[str, Split], tmp_path: Path
-) -> None:
-    split = splits[track]
-    path = write_truth(split, tmp_path)
-    right = scores_of(split, path)
-    failed = scores_of(split, lines_of(path)[:1], _folder(tmp_path / "none"))
-    for parting in PARTINGS:
-        for name in columns(cast(PictureTrack, split.track).part_score, parting):
-            assert list(right[name].isna()) == list(failed[name].isna())
-            assert set(right[name].dropna()) <= {0.0} and set(failed[name].dropna()) <= {worst}
-    assert failed[columns(cast(PictureTrack, split.track).part_score, ROWS)[0]].notna().all()
 
 
 @pytest.mark.parametrize("track", ASK_PICTURES)

@@ -28,7 +28,7 @@ from rsbench.benchmark.leaderboard.motion_tracks import bound_text
 from rsbench.benchmark.leaderboard.standings import Standing, better, ranks, standings, table, ties
 from rsbench.benchmark.leaderboard.track import Split
 from rsbench.benchmark.leaderboard.tracks import TRACKS
-from rsbench.benchmark.statistics import mean_interval, scene_means, score_interval
+from rsbench.benchmark.statistics import mean_interval, score_interval
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.errors import RsbenchError
 from rsbench.core.pose_errors import translation_of_offset
@@ -36,11 +36,6 @@ from rsbench.report.board_page import build_site
 from rsbench.storage.files import read_json, write_json
 
 ANY = frozenset({"left"})
-
-
-def test_scenes_count_alike() -> None:
-    values = np.array([[1.0, 3.0, 10.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_array_equal(scene_means(values, ["b", "b", "a"]), [[10.0, 2.0], [1.0, 0.0]])
 
 
 @pytest.mark.parametrize(("scenes", "problems"), [(9, 24), (250, 1)])
@@ -111,16 +106,6 @@ def test_all_ranks_hold_at_once() -> None:
         told += sum(r.high - r.low < len(truth) - 1 for r in found)
     assert held / trials >= 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / trials)
     assert told > 5 * trials  # they say something
-
-
-@pytest.mark.parametrize("scenes", [6, 60])
-def test_ranks_of_two_equal_entries_hold_as_often_as_they_say(scenes: int) -> None:
-    """Of two entries nothing is corrected: the one test errs in 5 % of tables, and both ranks with it."""
-    trials = 2000
-    tables = _tables(np.random.default_rng(5), np.array([0.6, 0.6]), scenes, trials)
-    found = [ranks(means.mean(axis=1), better(means), [ANY] * 2) for means in tables]
-    held = np.mean([all(rank[1:] == (1, 2) for rank in each) for each in found])
-    assert 0.93 <= held <= 0.97
 
 
 def test_pairs_are_those_of_scipy_and_of_holm() -> None:

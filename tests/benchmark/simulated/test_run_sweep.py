@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import shutil
 import sys
@@ -35,7 +34,6 @@ from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.essential_matrix import EightPointSolver
 from rsbench.storage.files import load_arrays, read_json, save_arrays, write_json
-from rsbench.storage.work_folder import work_folder
 
 SETTING = load_sweep("noise").setting.changed({"points": 30, "noise_px": 0.1}, "test")
 CARD = SweepCard(
@@ -125,34 +123,6 @@ def test_trials_of_others_are_neither_removed_nor_taken_for_ours(tmp_path: Path,
     with pytest.raises(RsbenchError, match="'rsbench simulate' did not make it; move it away"):
         run_sweep(CARD, tmp_path / "out", force=force)
     assert (place / "000.npz").read_bytes() == b"mine"
-
-
-def test_two_commands_do_not_share_a_folder(finished: Path) -> None:
-    with work_folder(finished), pytest.raises(RsbenchError, match="is at work there"):
-        run_sweep(CARD, finished)
-
-
-DEADLY = """
-import os
-
-def serve(limit):
-    return lambda job: os._exit(9)
-"""
-
-
-@pytest.mark.slow
-def test_a_worker_killed_twice_is_one_line_that_names_its_trials(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "deadly.py").write_text(DEADLY)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(module, "_serve_jobs", importlib.import_module("deadly").serve)
-    with pytest.raises(
-        RsbenchError,
-        match=r"small, low, rotation_deg = 1, trials 0 to 6 .ended its process with exit code 9, 3 times.*again",
-    ):
-        run_sweep(replace(CARD, values=(1.0,), variant=CARD.variant[:1]), tmp_path / "killed")
-    sys.modules.pop("deadly")
 
 
 MISCHIEF = """

@@ -11,7 +11,6 @@ from rsbench.benchmark.simulated.run_sweep import (
     at_bound,
     over_bound,
     score_trials,
-    statistics,
     summary_row,
 )
 from rsbench.benchmark.simulated.sweep_card import Cell, load_sweep
@@ -98,15 +97,3 @@ def test_errors_at_the_bound_against_known_distributions() -> None:
         # 30 000 draws know the mean of such a distribution to 0.4 %, its median to 0.7 %; three of those.
         assert found["bound_mean"] == pytest.approx(mean, rel=0.015)
         assert found["bound_median"] == pytest.approx(median, rel=0.02)
-
-
-def test_the_statistics_at_the_bound_are_those_of_errors_that_reach_it() -> None:
-    """The bound of a statistic and that statistic of ideal errors agree, with trials that differ tenfold."""
-    rng = np.random.default_rng(3)
-    axes = rng.uniform(0.1, 1.0, (4000, 1)) * rng.uniform(0.2, 1.0, (4000, 3))
-    errors = np.linalg.norm(axes * rng.standard_normal(axes.shape), axis=1)
-    found, told = statistics(errors, 0), at_bound(axes, 1)
-    for name in ("mean", "median"):
-        low, high = found[f"{name}_low"], found[f"{name}_high"]
-        assert low is not None and high is not None
-        assert low - 0.01 <= told[f"bound_{name}"] <= high + 0.01
