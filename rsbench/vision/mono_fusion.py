@@ -130,8 +130,8 @@ Between 2 and 3: on rendered frames 2 gained 0.05 dB over 3, on real ones it los
 _BEHIND = 1.02
 _FLOW_BYTES = 100.0
 _BLOCK, _BLOCKS_AROUND = 8, 4
-"""Side, px, of blocks of pixels that are moved only if their middle comes near a hole; and how many blocks that is:
-more than one stretched by ``_STRETCH`` covers."""
+"""Side, px, of blocks of pixels that are moved only if their middle comes near a hole; and the largest distance to
+it, in blocks, which is more than one that is stretched by ``_STRETCH`` covers."""
 
 
 class Flows(NamedTuple):
