@@ -544,7 +544,7 @@ def first_curve_of_camera(
     best = repaired(extended(spare // 2))
     if np.min(np.abs(_signs(best.curve, tracks))) < _ONE_SIGN:
         others = (repaired(extended(first)) for first in {0, spare} - {spare // 2})
-        best = min(best, *others, key=lambda each: each.equations.cost)
+        best = min([best, *others], key=lambda each: each.equations.cost)
     curve = best.curve
     if np.sum(_signs(curve, tracks)) < 0.0:
         curve = from_pose_at(make_curve(curve.first, curve.interval, curve.R, -curve.p), 0.0)
