@@ -419,6 +419,16 @@ def test_directions_of_a_hand_held_camera_do_not_depend_on_the_start(seed: int) 
     assert np.rad2deg(max(angles)) < 5.0
 
 
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_a_few_pairs_without_a_common_motion_raise_no_error(count: int) -> None:
+    """Points then lie on both sides of the camera, for which other windows are tried if there are any."""
+    rng, camera = np.random.default_rng(count), PinholeCamera.centred(640, 480, 540.0)
+    pairs = [rng.uniform([20.0, 20.0] * 2, [620.0, 460.0] * 2, (120, 4)) for _ in range(count)]
+    start = make_motion("linear", np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    found = camera_trajectory(pairs, [start] * count, StereoRig.of_one(camera).about("left"), SHUTTER)
+    assert found is None or len(found) == count
+
+
 def law_of(matches: FloatArray) -> InertialMotion:
     solver = RefinedSolver(motion_model=InertialMotion.name, one_camera=True)
     given, rng = Correspondences(left=matches), np.random.default_rng(0)
