@@ -30,7 +30,6 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import (
     BELOW,
     RIGHT,
-    LineMaps,
     WarpOptions,
     draw_joined,
     joined_inside,
@@ -50,7 +49,7 @@ from rsbench.vision.epipolar_search import (
 from rsbench.vision.flow import dense_flow, returns_px
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import grey_u8, map_frames, resample
-from rsbench.vision.reprojection import Reprojection, look, look_between, parallax_gain, reprojection_of
+from rsbench.vision.reprojection import LineMaps, Reprojection, look, look_between, parallax_gain, reprojection_of
 from rsbench.vision.stereo_depth import fill_holes
 
 F32 = NDArray[np.float32]

@@ -60,9 +60,9 @@ def test_errors_are_those_of_places_times_gradients() -> None:
     assert same == kept and off == pytest.approx(1.0, rel=0.15)  # half a px of 2 levels
     by_line, _ = expected_errors(IMAGE, true, [pair(0)], line)
     assert 1e-3 < by_line / kept < 0.2
-    half = [
-        (SimpleNamespace(own=each.own, flows=_halved(each.flows)), place) for each, place in (pair(1), pair(0))
-    ]
+    half: list[tuple[Any, int]] = []
+    for each, place in (pair(1), pair(0)):
+        half.append((SimpleNamespace(own=each.own, flows=_halved(each.flows)), place))
     small, kept_small = expected_errors(IMAGE, true, half, line)  # both in px of that size
     assert small < 1e-3 * kept_small and kept_small == pytest.approx(kept, rel=0.15)
     worse, _ = expected_errors(IMAGE, 2.0 * np.stack([X, Y], axis=-1) - true, [pair(1), pair(0)], line)
