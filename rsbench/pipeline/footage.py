@@ -617,6 +617,8 @@ class Forecast:
 
     seconds: float
     """Seconds per frame and million pixels."""
+    frame_s: float
+    """Seconds per frame of any size."""
     bytes: float
     """Bytes of memory per pixel."""
     start_s: float
@@ -624,10 +626,10 @@ class Forecast:
 
     def words(self, frames: int, pixels: int) -> str:
         """Text with the time and memory for a number of frames with a number of pixels each."""
-        seconds = self.start_s + self.seconds * frames * pixels / 1e6
+        seconds = self.start_s + frames * (self.frame_s + self.seconds * pixels / 1e6)
         gigabytes = (self.start_bytes + self.bytes * pixels) / 1e9
         time = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
         return f"about {time} on two cores, {gigabytes:.1f} GB of memory"
 
 
-FORECAST = Forecast(seconds=1.6, bytes=620.0, start_s=20.0, start_bytes=3.4e8)
+FORECAST = Forecast(seconds=0.8, frame_s=0.25, bytes=620.0, start_s=20.0, start_bytes=3.4e8)
