@@ -330,8 +330,8 @@ PIXELS = 300
 """Pixels for ``trajectory_matches`` in a sequence: fewer than for two frames, as each frame is in two pairs."""
 _LEAST = 50
 """Fewest matches of a pair in a trajectory."""
-_EPIPOLAR_PX = 0.5
-"""Distance from the epipolar line of an inlier of a first motion, px."""
+_FIVE_POINTS, _EPIPOLAR_PX = 5, 0.5
+"""Fewest matches of an essential matrix, and distance from the epipolar line of an inlier, px."""
 _NORMAL_QUARTILE = 0.6745
 """Median of the absolute value of a standard normal variable."""
 _FLOW_PX = 0.15
@@ -376,12 +376,8 @@ def motion_of_pair(
         robust, seed: see ``find_own_motion``.
     """
     error = np.inf if path is None else error_px(path, matches, rig, shutter)
-    own = (
-        None
-        if error <= _FLOW_PX * max(flows.scale)
-        else find_steady_motion(flows, rig, shutter, "left", robust, seed)
-    )
-    if own is not None:
+    if error > _FLOW_PX * max(flows.scale):
+        own = find_steady_motion(flows, rig, shutter, "left", robust, seed)
         law = own.own.motion
         if path is None or law is None or error > _AS_GOOD * error_px(law, matches, rig, shutter):
             return with_best_motion(own, flows, robust, seed)
@@ -468,8 +464,10 @@ def _global_shutter_motion(matches: FloatArray, camera: PinholeCamera) -> Linear
     successive frames do not turn by more than 90 degrees.
     """
     first, second = (camera.fx * camera.unproject(matches[:, k : k + 2])[:, :2] for k in (0, 2))
-    K = np.diag([camera.fx, camera.fx, 1.0])
-    E, _ = cv2.findEssentialMat(first, second, K, cv2.USAC_MAGSAC, 0.99, _EPIPOLAR_PX)
+    seen = np.all(np.isfinite(first + second), axis=-1)  # a lens may show no ray at a match
+    K, E = np.diag([camera.fx, camera.fx, 1.0]), None
+    if np.count_nonzero(seen) >= _FIVE_POINTS:
+        E, _ = cv2.findEssentialMat(first[seen], second[seen], K, cv2.USAC_MAGSAC, 0.99, _EPIPOLAR_PX)
     if E is None:
         return LinearMotion(np.zeros(3), np.array([1.0, 0.0, 0.0]))
     *rotations, d = cv2.decomposeEssentialMat(E[:3])

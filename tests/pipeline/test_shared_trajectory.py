@@ -155,7 +155,8 @@ def test_the_start_of_a_trajectory_turns_as_the_camera_does() -> None:
     found = mono_correction._global_shutter_motion(np.concatenate(seen, axis=1)[inside], camera)
     np.testing.assert_allclose(found.w, w, atol=1e-3)
     assert abs(found.d @ d) > 0.999 * np.linalg.norm(d)
-    assert not np.any(mono_correction._global_shutter_motion(np.zeros((60, 4)), camera).w)
+    for nothing in (np.zeros((60, 4)), np.full((60, 4), np.nan)):
+        assert not np.any(mono_correction._global_shutter_motion(nothing, camera).w)
 
 
 def test_the_neighbour_nearer_in_time_corrects_a_frame() -> None:
