@@ -74,6 +74,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
+    for name in ("framestamp.txt", "gyro.txt", "reshape"):
+        if not (folder / name).exists():
+            parser.error(f"{folder}: there is no {name}; give the folder 20200109_145447 of the repository")
     stamps, gyro = np.loadtxt(folder / "framestamp.txt"), np.loadtxt(folder / "gyro.txt", delimiter=",")
     times = (gyro[:, 3] - stamps[FIRST_FRAME]) / PERIOD_S
     samples = np.column_stack([times, -PERIOD_S * gyro[:, [1, 0, 2]]])[(times > -6.0) & (times < 115.0)]

@@ -219,7 +219,7 @@ def _analyse(
     start: float,
     period: float,
 ) -> _Seen:
-    """Flow and a first motion of a pair; ``gyro``: (n, 4) of the sequence in axes of ``turn``; frame periods."""
+    """Flow of a pair and, with a gyroscope, its motion; ``gyro``: (n, 4) of the sequence in axes of ``turn``."""
     turn, nothing = turn.paced(period), np.zeros((0, 4))
     check_alike({f"frame {number + place}": image for place, image in enumerate(images)})
     given = [turn.image(image) for image in images]
@@ -242,9 +242,12 @@ def _motion_by_gyro(
     start: float,
     period: float,
 ) -> tuple[FoundOwnMotion | None, str]:
-    """The motion over two frames by a gyroscope's samples, or why there is none; None: they do not cover the pair.
+    """The motion over two frames with a gyroscope, or the reason why there is none.
 
-    ``reason``: why the flow alone determines no motion; empty if it does.
+    Args:
+        samples: (n, 4) tau, w around the pair; None: they do not cover it, and flow alone gives the motion.
+        reason: why flow alone gives no motion; empty if it does.
+        start, period: first time and length of the pair, frame periods.
     """
     rig, shutter = StereoRig.of_one(turn.camera), turn.shutter
     local = None if samples is None else (samples - [start, 0.0, 0.0, 0.0]) * [1.0 / period, *3 * [period]]
