@@ -22,7 +22,6 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
-from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_cards import MotionCard as MotionCard
 from rsbench.dataset.motion_cards import (
     MovingCard,
@@ -32,6 +31,7 @@ from rsbench.dataset.motion_cards import (
     generator,
     parts_along,
 )
+from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.sequence import check_sizes, sequence_manifest
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.scenes.model import Start

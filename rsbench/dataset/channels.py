@@ -32,19 +32,17 @@ from rsbench.dataset.imu import (
     write_imu,
 )
 from rsbench.dataset.layout import frames_of
-from rsbench.dataset.matches import (
+from rsbench.dataset.point_channels import (
+    AffineFrames,
     LabelledMatches,
     Matching,
+    Tracks,
+    make_affine,
     make_matches,
+    make_tracks,
     matcher_record,
 )
 from rsbench.dataset.timing import TIMING_MANIFEST, read_timing_table, table_file, timing_files, write_timing
-from rsbench.dataset.tracks import (
-    AffineFrames,
-    Tracks,
-    make_affine,
-    make_tracks,
-)
 from rsbench.dataset.views import (
     ImageView,
     PixelClass,

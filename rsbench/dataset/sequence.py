@@ -43,8 +43,8 @@ from rsbench.dataset.layout import (
     twins_of,
     whole_frames,
 )
-from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_cards import MovingManifest, check_moving
+from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.views import numbers_of
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses

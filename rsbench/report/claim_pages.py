@@ -9,8 +9,16 @@ import pandas as pd
 
 from rsbench.benchmark.simulated.sweep_card import SweepCard
 from rsbench.benchmark.statistics import format_interval
-from rsbench.benchmark.studies.claims import CLAIMS, GLOBAL, GRID_NOISE_PX, GRID_TRIALS, OURS, SETTINGS, Claim
-from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
+from rsbench.benchmark.studies.claims import (
+    CLAIMS,
+    GLOBAL,
+    GRID_NOISE_PX,
+    GRID_TRIALS,
+    IMAGE_CLAIMS,
+    OURS,
+    SETTINGS,
+    Claim,
+)
 from rsbench.report.markup import table_lines
 
 _CLAIMS = f"""# What became of the paper's claims

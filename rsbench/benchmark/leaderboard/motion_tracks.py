@@ -66,7 +66,7 @@ from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion, TrajectoryMotion
-from rsbench.dataset.matches import MATCHED, arranged, looks, seen_near
+from rsbench.dataset.point_channels import MATCHED, arranged, looks, seen_near
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.views import FAR
 from rsbench.jobs.process_jobs import Workers
