@@ -37,6 +37,7 @@ from rsbench.core.pose_errors import (
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.storage.untrusted_files import naming
 
 
 @final
@@ -279,7 +280,5 @@ def score(metric: MetricEntry, case: Case | None) -> dict[str, float]:
     names = [column.name for column in columns]
     if not isinstance(found, Mapping) or sorted(map(str, found)) != sorted(names):
         raise RsbenchError(f"metric {metric.name!r}: must return a value for each of {', '.join(names)}")
-    try:
+    with naming(f"metric {metric.name!r}: must return numbers", TypeError, ValueError):
         return {name: float(found[name]) for name in names}
-    except (TypeError, ValueError) as error:
-        raise RsbenchError(f"metric {metric.name!r}: must return numbers: {error}") from error

@@ -35,7 +35,7 @@ from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.sequence import check_sizes, sequence_manifest
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.scenes.model import Start
-from rsbench.storage.untrusted_files import check_name
+from rsbench.storage.untrusted_files import check_name, naming
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,10 +354,8 @@ class DatasetCard(Scanning):
         Raises:
             RsbenchError: a channel is not available for its cameras.
         """
-        try:
+        with naming(f"dataset {self.name}"):
             return replace(self, channels=names)
-        except ValueError as error:
-            raise RsbenchError(f"dataset {self.name}: {error}") from error
 
     def shard(self, part: int, parts: int) -> DatasetCard:
         """The card with every ``parts``-th sequence, beginning with number ``part``, counted from 1.
@@ -486,11 +484,9 @@ def load_dataset_card(
     """
     path = card_path("datasets", name_or_path)
     card = read_dataset_card(path)
-    try:
+    with naming(path):
         card = card if trajectory is None else card.along(trajectory)
         return (replace(card, seeds=seeds) if seeds else card).expanded(path.parent)
-    except ValueError as error:
-        raise RsbenchError(f"{path}: {error}") from error
 
 
 def read_dataset_card(path: Path) -> DatasetCard:

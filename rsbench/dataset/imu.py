@@ -27,7 +27,7 @@ from rsbench.dataset.timing import write_rows
 from rsbench.renderers.image import Sensor
 from rsbench.scenes.model import Start, Viewpoint
 from rsbench.storage.files import write_json
-from rsbench.storage.untrusted_files import inside, read_text
+from rsbench.storage.untrusted_files import inside, naming, read_text
 
 IMU_MANIFEST, MEASURED, TRUE = "imu/imu.json", "imu/measured.csv", "imu/true.csv"
 IMU_FILES = (IMU_MANIFEST, MEASURED, TRUE)
@@ -208,12 +208,10 @@ def _read_table(path: Path, columns: str) -> tuple[NDArray[np.int64], FloatArray
         RsbenchError: missing, or not such a table.
     """
     header, *lines = read_text(path).splitlines() or [""]
-    try:
+    with naming(f"{path}: not a table of numbers", ValueError, OverflowError):
         cells = [line.split(",") for line in lines]
         times = np.array([int(row[0]) for row in cells], dtype=np.int64)
         values = np.array([[float(cell) for cell in row[1:]] for row in cells])
-    except (ValueError, OverflowError) as error:
-        raise RsbenchError(f"{path}: not a table of numbers: {error}") from error
     if header != columns or values.shape != (len(lines), columns.count(",")) or not len(lines):
         raise RsbenchError(f"{path}: must have the columns {columns}")
     if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):

@@ -19,7 +19,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences, repeated
-from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import Geometry
 from rsbench.core.projection import (
     ProjectionStatus,
@@ -35,7 +34,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.views import FAR, PixelClass, Rays
 from rsbench.storage.files import save_arrays
-from rsbench.storage.untrusted_files import load_arrays
+from rsbench.storage.untrusted_files import load_arrays, naming
 
 if TYPE_CHECKING:
     from rsbench.core.geometry import Geometry
@@ -76,10 +75,8 @@ class ArrayFile:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read the file; RsbenchError as of ``load_arrays``, and for arrays that are not possible."""
-        try:
+        with naming(path, TypeError, ValueError):
             return cls(**load_arrays(path))
-        except (TypeError, ValueError) as error:
-            raise RsbenchError(f"{path}: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,7 +14,7 @@ from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.renderers.image import Sensor
 from rsbench.storage.files import write_bytes, write_json
-from rsbench.storage.untrusted_files import read_text
+from rsbench.storage.untrusted_files import naming, read_text
 
 TIMING_MANIFEST = "timing.json"
 TIMING_COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"
@@ -84,10 +84,8 @@ def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:
         RsbenchError: missing, or not such a table.
     """
     header, *lines = read_text(path).splitlines() or [""]
-    try:
+    with naming(f"{path}: not a table of whole numbers", ValueError, OverflowError):
         table = np.array([[int(cell) for cell in line.split(",")] for line in lines], dtype=np.int64)
-    except (ValueError, OverflowError) as error:
-        raise RsbenchError(f"{path}: not a table of whole numbers: {error}") from error
     if header != TIMING_COLUMNS or table.shape != (height, 4) or np.any(table[:, 0] != np.arange(height)):
         raise RsbenchError(f"{path}: must have the columns {TIMING_COLUMNS} and rows 0 to {height - 1}")
     return table

@@ -41,7 +41,7 @@ from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.process_jobs import Workers
 from rsbench.storage.files import read_table, write_bytes, write_json, write_table
-from rsbench.storage.untrusted_files import NAME, parse_json, read_bytes, read_json
+from rsbench.storage.untrusted_files import NAME, naming, parse_json, read_bytes, read_json
 from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
@@ -575,13 +575,11 @@ def _only(data: bytes, split: Split, part: Split, where: str) -> bytes:
 
 
 def _unpacked(file: Path) -> bytes:
-    try:
+    with naming(f"{file}: is no xz file", lzma.LZMAError):
         unpacker = lzma.LZMADecompressor()
         data = unpacker.decompress(read_bytes(file), SUBMISSION_BYTES)
         if not unpacker.eof:
             raise RsbenchError(f"{file}: is cut off, or larger than {SUBMISSION_BYTES} bytes")
-    except lzma.LZMAError as error:
-        raise RsbenchError(f"{file}: is no xz file: {error}") from error
     return data
 
 

@@ -78,7 +78,7 @@ from rsbench.pipeline.problem import COLUMNS, Problem
 from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.storage.files import read_table, write_bytes
-from rsbench.storage.untrusted_files import read_bytes
+from rsbench.storage.untrusted_files import naming, read_bytes
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import between_pixels
 
@@ -186,10 +186,8 @@ class SolverTrack(Track):
 
     def check_entry(self, entry: SolverEntry) -> None:
         """Raises RsbenchError when a solver does not fit the track."""
-        try:
+        with naming(f"solver {entry.name!r}"):
             self.check_uses(uses_of(entry, self.gives_readout))
-        except ValueError as error:
-            raise RsbenchError(f"solver {entry.name!r}: {error}") from error
 
     def runnable(self, card: str) -> Runnable:
         entry = self.entry_of(card)

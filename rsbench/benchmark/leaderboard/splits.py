@@ -31,7 +31,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manife
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.problem import Problem
-from rsbench.storage.untrusted_files import check_name, read_text
+from rsbench.storage.untrusted_files import check_name, naming, read_text
 from rsbench.vision.feature_matcher import load_features
 
 Range = tuple[float, float]
@@ -411,10 +411,8 @@ def label_of(folder: Path) -> str:
 
 
 def _checked_name(name: str, where: Path) -> str:
-    try:
+    with naming(where):
         check_name(name)
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
     return name
 
 

@@ -31,7 +31,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.problem import Problem, problem_record
-from rsbench.storage.untrusted_files import check_name
+from rsbench.storage.untrusted_files import check_name, naming
 
 KNOWLEDGE = {
     "left": "matches over time of the left camera",
@@ -170,10 +170,8 @@ class Header:
 
     def check_uses(self, track: Track, where: str) -> None:
         """Raises RsbenchError when the method uses an input that its track does not give."""
-        try:
+        with naming(where):
             track.check_uses(self.uses)
-        except ValueError as error:
-            raise RsbenchError(f"{where}: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)

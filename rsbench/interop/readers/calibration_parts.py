@@ -36,7 +36,7 @@ from rsbench.core.lens_fit import (
 from rsbench.core.rig import Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import MB, parse_json, read_text
+from rsbench.storage.untrusted_files import MB, naming, parse_json, read_text
 
 _LONGEST = 8 * MB
 """Largest file, bytes; COLMAP lists a camera for each image of a collection."""
@@ -325,10 +325,8 @@ def table_of(size: Sequence[float] | FloatArray | None, intrinsics: Sequence[flo
 
 def camera_of(table: Table, where: str) -> PinholeCamera:
     """The camera of a table; RsbenchError if its values are impossible."""
-    try:
+    with naming(where):
         return parse_card(CameraTable, _still(table), where).camera()
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
 
 
 def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | None:
@@ -340,10 +338,8 @@ def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | Non
             f"{where}: distortion coefficients {values[len(names) :]} after the first {len(names)}: thin prisms "
             "and tilted sensors (s1 to s4, tauX, tauY) are not supported; calibrate without them"
         )
-    try:
+    with naming(where):
         return Lens(model=model, **dict(zip(names, values, strict=False)))  # pyrefly: ignore[bad-argument-type]
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
 
 
 def brown(coefficients: Iterable[float], where: str) -> Lens | None:
@@ -382,11 +378,9 @@ def camera_table(
     if size is None:
         raise RsbenchError(f"{where}: {name}: fitting a Kannala-Brandt lens needs the size of the images; add it")
     fx, fy, cx, cy = intrinsics
-    try:
+    with naming(f"{where}: {name}"):
         camera = PinholeCamera(width=round(size[0]), height=round(size[1]), fx=fx, fy=fy, cx=cx, cy=cy)
         fit = kannala_brandt_of(camera, _PROFILES[name.lower()](*coefficients))
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {name}: {error}") from error
     camera_name = where.rsplit(": ", 1)[-1]
     words = f"{name} of {camera_name} became the nearest kannala-brandt, within {fit.error_px:.2g} px"
     return table_of(size, (fit.fx, fit.fy, cx, cy), fit.lens), words
