@@ -204,6 +204,11 @@ def format_interval(value: float, low: float, high: float) -> str:
     return f"{rounded(value, digits)} [{rounded(low, digits)}, {rounded(high, digits)}]"
 
 
+def with_ends(name: str, value: Any, low: Any, high: Any) -> dict[str, Any]:
+    """A number and the ends of its interval as columns of a table."""
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
 def decimals(low: float, high: float) -> int:
     """Decimals that an interval leaves to its value; negative: tens, hundreds. At most 9."""
     half = 0.5 * (high - low)

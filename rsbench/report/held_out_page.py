@@ -13,9 +13,9 @@ from scipy.special import stdtrit
 from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.standings import Standing, standings
 from rsbench.benchmark.leaderboard.tracks import track_of_id
-from rsbench.benchmark.statistics import COVERAGE, format_interval
+from rsbench.benchmark.statistics import COVERAGE, with_ends
 from rsbench.core.so3 import FloatArray
-from rsbench.report.markup import table_lines
+from rsbench.report.markup import frame_text, words_of
 from rsbench.storage.files import write_bytes
 
 DEV, TEST = "dev", "test"
@@ -39,7 +39,7 @@ def compared(dev: Sequence[Scored], test: Sequence[Scored]) -> pd.DataFrame:
         header, values = line.scored.header, [_scores(lines[split][name]) for split in (DEV, TEST)]
         row: dict[str, Any] = {"protocol": header.protocol, "method": name, "uses": line.uses, "code": header.code}
         row |= _numbers(DEV, line) | _numbers(TEST, lines[TEST][name])
-        rows.append(row | _triple("difference", *difference(*values)))
+        rows.append(row | with_ends("difference", *difference(*values)))
     return pd.DataFrame(rows).sort_values(f"{DEV}_score", ascending=False, kind="stable", ignore_index=True)
 
 
@@ -58,14 +58,10 @@ def _scores(line: Standing) -> FloatArray:
 
 def _numbers(split: str, line: Standing) -> dict[str, Any]:
     nothing = (np.nan, np.nan, np.nan)
-    found = _triple(f"{split}_score", *line.means[line.track.primary.key])
-    found |= _triple(f"{split}_rank", *(line.rank or nothing)) | {f"{split}_peers": line.peers}
-    found |= _triple(f"{split}_covers_95", *(line.calibration.covers[-1] if line.calibration else nothing))
+    found = with_ends(f"{split}_score", *line.means[line.track.primary.key])
+    found |= with_ends(f"{split}_rank", *(line.rank or nothing)) | {f"{split}_peers": line.peers}
+    found |= with_ends(f"{split}_covers_95", *(line.calibration.covers[-1] if line.calibration else nothing))
     return found | {f"{split}_{key}": line.medians[key] for key in ("e_R_deg", "e_T_deg")}
-
-
-def _triple(name: str, *triple: float) -> dict[str, float]:
-    return {f"{name}{end}": value for end, value in zip(("", "_low", "_high"), triple, strict=True)}
 
 
 # The page
@@ -90,8 +86,8 @@ def page(table: pd.DataFrame, about: Mapping[str, Any]) -> str:
     for protocol, rows in table.groupby("protocol", sort=False):
         score = track_of_id(str(protocol)).primary.title
         named = f"{protocol}, {score}: public split against `{about['splits'][protocol]['split']}`"
-        parts += [f"## {named}", _lines(_comparison(rows))]
-    parts += ["## Code of others, on the public splits", _lines(others(table))]
+        parts += [f"## {named}", frame_text(_comparison(rows))]
+    parts += ["## Code of others, on the public splits", frame_text(others(table))]
     return "\n\n".join(parts) + "\n"
 
 
@@ -104,7 +100,7 @@ def _comparison(rows: pd.DataFrame) -> pd.DataFrame:
         "in 95 %, held-out": f"{TEST}_covers_95",
     }
     return pd.DataFrame(
-        {"method": _name(row), **{title: _words(row, key) for title, key in titles.items()}}
+        {"method": _name(row), **{title: words_of(row, key) for title, key in titles.items()}}
         for row in rows.to_dict("records")
     )
 
@@ -116,18 +112,9 @@ def others(table: pd.DataFrame) -> pd.DataFrame:
     for row in sorted(rows, key=lambda row: (row["uses"].count("+"), row["uses"])):
         track = track_of_id(str(row["protocol"]))
         line = found.setdefault(row["method"], {"method": _name(row), "code": row["code"], "uses": row["uses"]})
-        line[f"{track.id}, {track.primary.title}"] = _words(row, f"{DEV}_score")
+        line[f"{track.id}, {track.primary.title}"] = words_of(row, f"{DEV}_score")
     return pd.DataFrame(list(found.values())).fillna("-")
 
 
 def _name(row: Mapping[Any, Any]) -> str:
     return str(row["method"]).replace("_", r"\_")
-
-
-def _words(row: Mapping[Any, Any], key: str) -> str:
-    value, low, high = (float(row[f"{key}{end}"]) for end in ("", "_low", "_high"))
-    return "-" if np.isnan(value) else format_interval(value, low, high)
-
-
-def _lines(table: pd.DataFrame) -> str:
-    return "\n".join(table_lines(list(table), table.itertuples(index=False)))

@@ -12,9 +12,9 @@ import pandas as pd
 
 from rsbench.benchmark.leaderboard.deviations import calibration, named_numbers
 from rsbench.benchmark.leaderboard.track import ORACLE, Split
-from rsbench.benchmark.statistics import format_interval, median_interval, share_interval
+from rsbench.benchmark.statistics import format_interval, median_interval, share_interval, with_ends
 from rsbench.capture.hypotheses import MODELS
-from rsbench.report.markup import table_lines
+from rsbench.report.markup import frame_text
 from rsbench.storage.files import write_bytes
 
 SPLINE = "continuous"
@@ -54,15 +54,11 @@ def _numbers(scores: pd.DataFrame) -> dict[str, float]:
     found: dict[str, float] = {"stated": int(scores["nees"].notna().sum())}
     for key in ("e_R_deg", "e_T_deg"):
         values = scores[key].to_numpy(dtype=np.float64)
-        found |= _triple(key, float(np.median(values)), *median_interval(values))
+        found |= with_ends(key, float(np.median(values)), *median_interval(values))
     stated = named_numbers(calibration(scores.assign(scene=range(len(scores))), _UNKNOWNS), scored=False)
     for key in ("nees_ratio", "covers_95"):
-        found |= _triple(key, *stated[key])
+        found |= with_ends(key, *stated[key])
     return found
-
-
-def _triple(name: str, *triple: float) -> dict[str, float]:
-    return {f"{name}{end}": value for end, value in zip(("", "_low", "_high"), triple, strict=True)}
 
 
 # The page
@@ -96,22 +92,18 @@ def page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFram
         "Made by `rsbench reproduce recorded`; all numbers are in [recordings.csv](recordings.csv) and\n"
         "[choices.csv](choices.csv), the boards in [tables](tables). `drone-mav` does not come with rsbench:\n"
         "cards/recordings/README.md says why, and how it is made.",
-        *([] if resampling is None else [about, _lines(_resampling(resampling))]),
+        *([] if resampling is None else [about, frame_text(_resampling(resampling))]),
         "Every method on every recording, 60 windows each: medians, the share of stated 95 % ellipsoids that\n"
         "contain the truth, and the median squared error by the stated covariance over that of a correct one.",
-        _lines(_methods(recordings)),
+        frame_text(_methods(recordings)),
         "Number of windows in which `rs-stereo-auto` chose a motion model, or a spline (`continuous`):",
-        _lines(_models(chosen)),
+        frame_text(_models(chosen)),
         "Its errors and its coverage there:",
-        _lines(_kinds(chosen)),
+        frame_text(_kinds(chosen)),
         "The same by the departure of the rows from an even turn, over the noise of a match:",
-        _lines(_departures(chosen)),
+        frame_text(_departures(chosen)),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _lines(table: pd.DataFrame) -> str:
-    return "\n".join(table_lines(list(table), table.itertuples(index=False)))
 
 
 def _resampling(table: pd.DataFrame) -> pd.DataFrame:
