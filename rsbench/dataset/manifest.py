@@ -319,7 +319,7 @@ def plans_of(card: DatasetCard, options: RendererOptions) -> dict[str, Plan]:
     Raises:
         RsbenchError: no such scene, viewpoint or mesh, or moving objects with an integrator that has none.
     """
-    scenes = lru_cache(maxsize=None)(_scene_card)
+    scenes = lru_cache(maxsize=None)(lambda name: read_scene_card(card_path("scenes", name))[0])
     mesh_hash = lru_cache(maxsize=None)(mesh_file_hash)
     return {
         each.name: _plan(card, each, options, scenes(each.scene)) | hashes_of_meshes(each.moving, mesh_hash)
@@ -359,10 +359,6 @@ def wanted_files(manifest: Plan, plan: Plan) -> list[str]:
     """Paths that a sequence of a plan must have, and those that its sequence.json lists; that one apart."""
     needed = files_of(with_gloss(plan, manifest.get("glossy") is True))
     return list({**dict.fromkeys(needed), **hashes_in(manifest)})
-
-
-def _scene_card(name: str) -> SceneCard:
-    return read_scene_card(card_path("scenes", name))[0]
 
 
 def _plan(card: DatasetCard, sequence: SequenceCard, options: RendererOptions, scene: SceneCard) -> Plan:

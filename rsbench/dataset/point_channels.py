@@ -37,7 +37,6 @@ from rsbench.storage.files import save_arrays
 from rsbench.storage.untrusted_files import load_arrays, naming
 
 if TYPE_CHECKING:
-    from rsbench.core.geometry import Geometry
     from rsbench.pipeline.frame_depth import Images
     from rsbench.vision.feature_matcher import FeatureEntry
 

@@ -246,7 +246,8 @@ def _read_record(folder: Path) -> Recorded:
     named = (record.header.protocol, record.header.split, record.header.method)
     if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
         raise RsbenchError(f"{path}: header: is of {'/'.join(named)}, but the entry is in another folder")
-    record.header.check_uses(track_of_id(record.header.protocol), str(path))
+    with naming(path):
+        track_of_id(record.header.protocol).check_uses(record.header.uses)
     if hashlib.sha256(read_bytes(folder / FILES[0], SUBMISSION_BYTES)).hexdigest() != record.predictions_sha256:
         raise RsbenchError(
             f"{folder / FILES[0]}: has changed since it was scored; remove the entry, and submit it again"

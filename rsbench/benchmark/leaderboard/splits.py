@@ -99,13 +99,20 @@ def points_setting(seed: int, number: int) -> Setting:
         depth=(2.0, 10.0),
         rotation_deg=log_uniform(rng, (0.2, 8.0)),
         translation=log_uniform(rng, (0.05, 0.5)),
-        baseline=log_uniform(rng, (0.1, 0.6)),
-        noise_px=log_uniform(rng, (0.05, 1.0)),
-        readout_ratio=float(rng.uniform(0.1, 1.0)),
-        points=int(rng.integers(40, 201)),
-        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
-        shape="plane" if rng.random() < 0.2 else "box",
+        **circumstances(rng, (0.1, 0.6), (0.1, 1.0)),
     )
+
+
+def circumstances(rng: np.random.Generator, baseline: Range, readout: Range) -> dict[str, Any]:
+    """What the settings of all protocols draw last, and in this order."""
+    return {
+        "baseline": log_uniform(rng, baseline),
+        "noise_px": log_uniform(rng, (0.05, 1.0)),
+        "readout_ratio": float(rng.uniform(*readout)),
+        "points": int(rng.integers(40, 201)),
+        "outlier_ratio": float(rng.choice([0.0, 0.1, 0.3, 0.5])),
+        "shape": "plane" if rng.random() < 0.2 else "box",
+    }
 
 
 POINTS_1 = Draws(scope=("leaderboard",), problems=250, setting=points_setting, outlier_images="frame 1")
@@ -178,12 +185,7 @@ def setting_by_kind(seed: int, number: int) -> Setting:
         translation_axis=tuple(ahead.tolist()) if kind.drives else None,
         motion_model=model,
         motion_parameters=parameters.get(model, {}),
-        baseline=log_uniform(rng, kind.baseline),
-        noise_px=log_uniform(rng, (0.05, 1.0)),
-        readout_ratio=float(rng.uniform(*_READOUT)),
-        points=int(rng.integers(40, 201)),
-        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
-        shape="plane" if rng.random() < 0.2 else "box",
+        **circumstances(rng, kind.baseline, _READOUT),
     )
 
 

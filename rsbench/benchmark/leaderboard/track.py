@@ -31,7 +31,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.problem import Problem, problem_record
-from rsbench.storage.untrusted_files import check_name, naming
+from rsbench.storage.untrusted_files import check_name
 
 KNOWLEDGE = {
     "left": "matches over time of the left camera",
@@ -167,11 +167,6 @@ class Header:
             value = getattr(self, field.name)
             if isinstance(value, str) and (len(value) > _TEXT_CHARACTERS or not value.isprintable()):
                 raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
-
-    def check_uses(self, track: Track, where: str) -> None:
-        """Raises RsbenchError when the method uses an input that its track does not give."""
-        with naming(where):
-            track.check_uses(self.uses)
 
 
 @dataclass(frozen=True, kw_only=True)
