@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtr, betaincinv, stdtrit  # scipy.stats takes a second to load
 
-from rsbench.benchmark.seeds import generator
+from rsbench.components.seeds import generator
 from rsbench.core.so3 import FloatArray
 
 COVERAGE = 0.95

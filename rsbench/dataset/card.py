@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 from rsbench.components.cards import SHUTTER_KEY, card_path, in_all_tables, parse_card, read_toml, with_shutters
 from rsbench.components.imports import search
 from rsbench.components.rig_tables import RIG_KEY, RigTables, with_rig
+from rsbench.components.seeds import generator
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry
@@ -23,14 +24,7 @@ from rsbench.dataset.channels import Channel, check_channels
 from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.motion_cards import MotionCard as MotionCard
-from rsbench.dataset.motion_cards import (
-    MovingCard,
-    TrajectoryCard,
-    check_moving,
-    drawn,
-    generator,
-    parts_along,
-)
+from rsbench.dataset.motion_cards import MovingCard, TrajectoryCard, check_moving, drawn, parts_along
 from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.sequence import check_sizes, sequence_manifest
 from rsbench.renderers.image import Sensor, check_brightness

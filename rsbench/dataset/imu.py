@@ -6,7 +6,6 @@ given by its density.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.cards import parse_card
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.imu import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import Motion
@@ -139,8 +139,7 @@ def draw_samples(
     imu: Imu, motion: Motion, times_ns: NDArray[np.int64], frame_period_s: float, gravity: FloatArray, seed: str
 ) -> ImuSamples:
     """Measure a motion; the same seed draws the same noise whatever the motion."""
-    digest = hashlib.sha256(f"{seed}/imu".encode()).digest()
-    rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
+    rng = generator(f"{seed}/imu")
     noise, walk, start = deviations(imu)
     steps = rng.standard_normal((len(times_ns), 6)) * np.where(np.arange(len(times_ns))[:, None] > 0, walk, start)
     bias = np.cumsum(steps, axis=0)

@@ -6,7 +6,6 @@ feature matcher finds in two successive frames, labelled by the truth.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from rsbench.components.seeds import generator
 from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences, repeated
 from rsbench.core.geometry import Geometry
@@ -141,9 +141,7 @@ def _drawn(
     geometry: Geometry, view: View, depth: NDArray[np.float32], seed: str, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """World points (n, 3) and the pixels (n, 2) that see them."""
-    rng = np.random.default_rng(int.from_bytes(hashlib.sha256(seed.encode()).digest()[:16], "little"))
-    solid = np.flatnonzero(depth)
-    chosen = np.sort(rng.permutation(solid)[:count])
+    chosen = np.sort(generator(seed).permutation(np.flatnonzero(depth))[:count])
     y, x = np.divmod(chosen, depth.shape[1])
     pixels = np.column_stack([x, y]).astype(np.float64)
     return points_at(geometry, view, pixels, depth), pixels

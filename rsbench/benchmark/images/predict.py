@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.plan import NONE, HashOf, Places, Plan, Recipe, reference_of
 from rsbench.benchmark.images.store import Artefact, read_record
-from rsbench.benchmark.seeds import generator
+from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion

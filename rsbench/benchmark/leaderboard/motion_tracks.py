@@ -52,12 +52,12 @@ from rsbench.benchmark.leaderboard.track import (
     score_row,
 )
 from rsbench.benchmark.scoring import answered, pose_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_one_camera, motion_bound
 from rsbench.benchmark.simulated.contract import misreading
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.capture.model_choice import AUTO
 from rsbench.components.motion_models import TwistMotion
+from rsbench.components.seeds import generator
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.splits import KINDS, DrawnPoints, Draws, RigKind, circumstances
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.components.cards import choices, shipped_folder
 from rsbench.components.motion_models import fixed_endpoint
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.spline_motion import TrajectoryMotion

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.pictures import TruePictures
 from rsbench.benchmark.leaderboard.track import PUBLIC_SEED, Inputs, Split, Track, Truth
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import OutlierImages, Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion

@@ -26,13 +26,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
 from rsbench.benchmark.statistics import average_interval, share_interval, typical_interval, with_ends
 from rsbench.components.cards import parse_card
 from rsbench.components.imports import source_version
 from rsbench.components.motion_models import motion_model
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__

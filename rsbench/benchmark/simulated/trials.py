@@ -10,10 +10,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, bound_from_root, bound_of_one_camera, joined, motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.so3 import FloatArray
 from rsbench.jobs.isolation import EntryFailure

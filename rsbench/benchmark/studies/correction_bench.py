@@ -16,9 +16,9 @@ from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.scoring import motion_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.imports import hash_of_files
+from rsbench.components.seeds import generator
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
