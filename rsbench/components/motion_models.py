@@ -43,7 +43,6 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import naming
 
 MOTIONS: Kind[Motion, NoOptions] = Kind(
     singular="motion model",
@@ -114,10 +113,10 @@ def make_motion(name: str, w: ArrayLike, d: ArrayLike, parameters: Mapping[str, 
     model, where = motion_model(name), f"motion model {name!r}"
     check_parameters(name, parameters or {})
     if model.__module__.partition(".")[0] == "rsbench":
-        with naming(
-            where, TypeError, ValueError, ArithmeticError, LookupError
-        ):  # parameters of any type and shape
+        try:
             return model(w, d, **dict(parameters or {}))
+        except (TypeError, ValueError, ArithmeticError, LookupError) as error:  # parameters of any type and shape
+            raise RsbenchError(f"{where}: {error}") from error
     with blaming(where, "cannot be made"):
         motion = model(w, d, **dict(parameters or {}))
     _check_ends(motion, where)
@@ -147,8 +146,10 @@ def fixed_endpoint(name: str, parameters: Mapping[str, Any]) -> tuple[np.ndarray
         RsbenchError: no such model, or it cannot have such parameters.
     """
     check_parameters(name, parameters)
-    with naming(f"motion model {name!r}"):
+    try:
         return motion_model(name).endpoint(parameters)
+    except ValueError as error:
+        raise RsbenchError(f"motion model {name!r}: {error}") from error
 
 
 def _check_ends(motion: Motion, where: str) -> None:

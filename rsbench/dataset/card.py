@@ -21,7 +21,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
-from rsbench.dataset.imu import Imu
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
 from rsbench.dataset.motion_cards import MotionCard as MotionCard
 from rsbench.dataset.motion_cards import MovingCard, TrajectoryCard, check_moving, drawn, parts_along

@@ -20,16 +20,21 @@ from rsbench.core.geometry import FixedGeometry, Geometry
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.imu import (
+from rsbench.dataset.clock_channels import (
     IMU_FILES,
     IMU_MANIFEST,
+    TIMING_MANIFEST,
     Imu,
     ImuSamples,
     draw_samples,
     gravity_of,
     read_imu,
+    read_timing_table,
     sample_times_ns,
+    table_file,
+    timing_files,
     write_imu,
+    write_timing,
 )
 from rsbench.dataset.layout import frames_of
 from rsbench.dataset.point_channels import (
@@ -42,7 +47,6 @@ from rsbench.dataset.point_channels import (
     make_tracks,
     matcher_record,
 )
-from rsbench.dataset.timing import TIMING_MANIFEST, read_timing_table, table_file, timing_files, write_timing
 from rsbench.dataset.views import (
     ImageView,
     PixelClass,

@@ -28,8 +28,8 @@ from rsbench.core.se3 import Pose
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channels import SequenceTruth, write_channels, write_sequence_channels
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.destinations import FolderTarget, StoreTarget, open_destination
-from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import clean_file
 from rsbench.dataset.manifest import Files, Plan, SceneHashes, of_scene, plans_of, scene_hash, with_gloss
 from rsbench.dataset.point_channels import Matching

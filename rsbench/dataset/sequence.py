@@ -25,7 +25,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import CHANNELS, OBJECTS, ChannelReader, channel_files, check_channels
-from rsbench.dataset.imu import Imu
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.layout import (
     MOST_FRAMES,
     MOST_TWINS,

@@ -23,8 +23,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View
+from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.corrected_frames import write_origin
-from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_capture import find_matches_of_rig

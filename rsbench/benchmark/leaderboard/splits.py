@@ -25,7 +25,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.imu import MEASURED, gyro_samples
+from rsbench.dataset.clock_channels import MEASURED, gyro_samples
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest, read_pairs
 from rsbench.pipeline.frame_capture import find_matches_of_rig

@@ -23,7 +23,7 @@ from rsbench.core.geometry import FixedGeometry
 from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, View
-from rsbench.dataset.imu import gyro_samples
+from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.frame_capture import find_matches
