@@ -21,8 +21,8 @@ import numpy as np
 import pandas as pd
 
 from rsbench.benchmark.provenance import provenance
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, SimulationOptions, random_motion, simulate
+from rsbench.components.seeds import generator
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences

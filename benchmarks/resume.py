@@ -53,7 +53,7 @@ def fill(card: Path, put: Callable[[str, bytes], object]) -> None:
     """Put the files of a complete dataset; no dataset.json, as if the run was killed just before."""
     from rsbench.components.cards import load_card
     from rsbench.dataset.card import load_dataset_card
-    from rsbench.dataset.sequence_identity import of_scene, plans_of, wanted_files
+    from rsbench.dataset.manifest import of_scene, plans_of, wanted_files
     from rsbench.renderers.options import RendererOptions
 
     dataset, digest = load_dataset_card(str(card)), hashlib.sha256(b"x").hexdigest()

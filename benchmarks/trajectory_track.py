@@ -38,8 +38,8 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES
 from rsbench.dataset.card import read_dataset_card
+from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.pipeline import chain
 from rsbench.pipeline.chain import correct_four

@@ -35,9 +35,9 @@ from rsbench.benchmark.leaderboard.splits import POINTS_1
 from rsbench.benchmark.leaderboard.track import PUBLIC_SEED
 from rsbench.benchmark.provenance import provenance
 from rsbench.benchmark.scoring import pose_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.statistics import COVERAGE, RESAMPLES, average_interval
+from rsbench.components.seeds import generator
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.base import Solver, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from rsbench.core import so3
 from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
-from rsbench.dataset.matches import Arranged, MatchClass, Matching, labelled
+from rsbench.dataset.point_channels import AffineFrames, Arranged, MatchClass, Matching, jacobians_of, labelled
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.tracks import AffineFrames, jacobians_of
 from rsbench.dataset.views import NUMBER, PixelClass
 from rsbench.renderers.image import to_srgb8
 from rsbench.storage.files import read_exr, read_grey_png, read_png, save_arrays, write_exr, write_png, write_png16

@@ -15,7 +15,7 @@ from channel_faults import Fault, array, classes, copy_of, fault, one_view
 from numpy.typing import NDArray
 
 from rsbench.dataset.channels import AFFINE, TRACKS, matches_file
-from rsbench.dataset.imu import MEASURED, TRUE, ImuSamples, gravity_of, write_imu
+from rsbench.dataset.clock_channels import MEASURED, TRUE, ImuSamples, gravity_of, write_imu
 from rsbench.dataset.sequence import read_sequence
 
 Array = NDArray[Any]

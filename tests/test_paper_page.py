@@ -9,8 +9,7 @@ import re
 import pytest
 from documents import ROOT, results
 
-from rsbench.benchmark.studies.claims import CLAIMS
-from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS, judge_image_claims
+from rsbench.benchmark.studies.claims import CLAIMS, IMAGE_CLAIMS, judge_image_claims
 
 PAGE = (ROOT / "docs" / "explanation" / "paper.md").read_text("utf-8")
 ROWS = [

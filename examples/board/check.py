@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from rsbench.benchmark.leaderboard.doubt import outline
+from rsbench.benchmark.leaderboard.board import outline
 
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}"
 ANSWERS, OWNER, SIGNATURE, UPDATES = "predictions.jsonl", "owner.pub", "update.sig", "updates.txt"

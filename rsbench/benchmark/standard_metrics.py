@@ -9,7 +9,8 @@ from typing import final
 
 import numpy as np
 
-from rsbench.benchmark.metric_plugins import (
+from rsbench.benchmark.scoring import (
+    WORST_POSE,
     Column,
     DepthCase,
     DepthMetric,
@@ -17,8 +18,8 @@ from rsbench.benchmark.metric_plugins import (
     ImageMetric,
     PoseCase,
     PoseMetric,
+    pose_errors,
 )
-from rsbench.benchmark.scoring import WORST_POSE, pose_errors
 from rsbench.core.errors import RsbenchError
 from rsbench.vision.quality import LastSsim, flip, psnr
 from rsbench.vision.stereo_depth import depth_metrics

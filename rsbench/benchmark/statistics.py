@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtr, betaincinv, stdtrit  # scipy.stats takes a second to load
 
-from rsbench.benchmark.seeds import generator
+from rsbench.components.seeds import generator
 from rsbench.core.so3 import FloatArray
 
 COVERAGE = 0.95
@@ -202,6 +202,11 @@ def format_interval(value: float, low: float, high: float) -> str:
         return f"{value:.3g} [{low:.3g}, {high:.3g}]"
     digits = decimals(low, high)
     return f"{rounded(value, digits)} [{rounded(low, digits)}, {rounded(high, digits)}]"
+
+
+def with_ends(name: str, value: Any, low: Any, high: Any) -> dict[str, Any]:
+    """A number and the ends of its interval as columns of a table."""
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
 def decimals(low: float, high: float) -> int:

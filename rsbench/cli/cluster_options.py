@@ -81,7 +81,7 @@ def results_at(out: str, scheduler: str | None) -> Iterator[Path]:
             f"{shown(place)}: not with --scheduler, whose jobs write into a folder that all machines see: give a "
             "folder, or --workers"
         )
-    from rsbench.storage.mirror import mirrored
+    from rsbench.storage.object_store import mirrored
 
     with mirrored(place) as folder:
         yield folder

@@ -137,14 +137,10 @@ def late_progress(label: str) -> Iterator[Callable[[str], None]]:
             progress.stop()
 
 
-def print_table(title: str, frame: pd.DataFrame, digits: dict[str, int] | None = None) -> None:
-    """A data frame as a terminal table; ``digits`` gives decimals per column."""
+def print_table(title: str, frame: pd.DataFrame) -> None:
+    """A data frame as a terminal table."""
     numeric = {str(column) for column in frame.columns if frame[column].dtype.kind in "fiu"}
-    places = [(digits or {}).get(name) for name in frame.columns]
-    rows = [
-        [_cell(value, place) for value, place in zip(row, places, strict=True)]
-        for row in frame.itertuples(index=False)
-    ]
+    rows = [list(map(_cell, row)) for row in frame.itertuples(index=False)]
     print_rows(title, [str(column) for column in frame.columns], rows, numeric)
 
 
@@ -239,9 +235,7 @@ def _shared(least: Sequence[int], most: Sequence[int], room: int) -> Sequence[in
     return [low + min(each, level) for low, each in zip(least, wanted, strict=True)]
 
 
-def _cell(value: Any, digits: int | None) -> str:
+def _cell(value: Any) -> str:
     if value is None or value != value:
         return "-"
-    if isinstance(value, float):
-        return f"{value:.{3 if digits is None else digits}f}"
-    return str(value)
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -16,6 +16,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
 from rsbench.pipeline.footage import IMAGE_SUFFIXES, FrameSource, OneCameraCard, Part, RigCard, rig_card_of
 from rsbench.storage.files import check_out as can_be_written
+from rsbench.storage.untrusted_files import naming
 from rsbench.storage.videos import said_fps, written_as_video
 
 if TYPE_CHECKING:
@@ -318,10 +319,8 @@ def given_camera(
     if fov is not None:
         if not card.focal_unknown:
             raise RsbenchError("--fov: leave it out; the camera's file gives the focal length")
-        try:
+        with naming("--fov"):
             card = replace(card, fov_deg=fov)
-        except ValueError as error:
-            raise RsbenchError(f"--fov: {error}") from error
     _warn_of_other_rate(card, source, gyro.fps)
     return CorrectInput(card=card, out=out, footage=[files], words=given.words, gyro=gyro)
 

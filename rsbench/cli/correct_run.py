@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import deque
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -15,22 +16,14 @@ import typer
 
 from rsbench.capture.calibration import NO_ERRORS
 from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.capture.two_frame_estimate import Capture
 from rsbench.cli.compile_ahead import compiling_ahead
 from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.correct_input import CorrectInput, target_row
-from rsbench.cli.correct_output import (
-    SUBTITLE,
-    UNIT,
-    camera_facts,
-    listed,
-    motion_facts,
-    readout_words,
-    say_calibration,
-)
 from rsbench.components.imports import component_key
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES
-from rsbench.core.shutter import Scanning
+from rsbench.core.rig import SIDES, StereoRig
+from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.version import __version__
 from rsbench.dataset import corrected_frames as results
 from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
@@ -47,13 +40,84 @@ from rsbench.report.corrected_page import (
     draw_own_motion,
     draw_trajectory,
     most_changed,
+    sizes,
     write_page,
 )
-from rsbench.report.motion_figures import sizes
 from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, upright, write_frames
 from rsbench.vision.corrector import CorrectorEntry, NotCorrectedError, demand_corrected
 from rsbench.vision.correctors import FusionCorrector
 from rsbench.vision.fusion import finished
+
+_MOST_LISTED = 8
+SUBTITLE = "Rolling shutter to global shutter"
+UNIT = "length of the translation over one frame period"
+"""Unit of the depth of one camera's frames."""
+
+
+def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """What the page of four frames says of their motion."""
+    if motion is None:
+        return []
+    names = "rotation in a frame period", "translation in a frame period"
+    facts = [*zip(names, sizes(motion), strict=True)]
+    if motion["model_choice"]:
+        facts += [("motion model", motion["model_choice"]["text"])]
+    # Of each set of matches; those that the solver did not use are left out.
+    sets = ((name, inliers, motion["matches"][name]) for name, inliers in motion["inliers"].items())
+    agreeing = ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
+    noise = f"{motion['noise_px'] or float('nan'):.2f} px"
+    return [*facts, ("matches that agree", agreeing), ("noise of a match", noise)]
+
+
+def camera_facts(record: dict[str, Any]) -> dict[str, str]:
+    """Of the record of one camera: its focal length, and the clock of its gyroscope."""
+    focal, sigma = f"{record['camera']['fx']:.1f}", record["focal_length_sigma"]
+    how = "found"
+    if record["focal_length_assumed"]:
+        how = "assumed: the width of the image; the frames do not determine it"
+    facts = {"focal length": f"{focal} px (given)" if sigma is None else f"{focal} +- {sigma:.1f} px ({how})"}
+    clock = record.get("gyro_clock")
+    if clock is None:
+        return facts
+    words = f"{clock['shift']:+.3f} +- {clock['sigma']:.3f} frame periods off, and "
+    words += "set right" if clock["used"] else "left as it is"
+    if not clock["told"]:
+        words = "the frames do not show its offset; give `--gyro-offset`"
+    return {**facts, "gyroscope's clock": words}
+
+
+def readout_words(shutter: RollingShutter, capture: Capture | None, rig: StereoRig) -> str:
+    best = None if capture is None else capture.likeliest
+    if capture is None or best is None:
+        return f"{shutter.readout_ratio:.3f} (given)"
+    if not rig.metric:
+        side = f"from the {shutter.scan_of('left')}, which is the right side with a probability of"
+        return f"{best.ratio:.3f} +- {best.sigma:.3f} (found), {side} {best.probability:.0%}"
+    odds = f"probability that the cameras read so {best.probability:.0%}"
+    odds += "".join(f"; else {each.scans}" for each in capture.candidates[1:2])
+    text = f"{best.ratio:.3f} +- {best.sigma:.3f}, {best.scans} (found, {odds})"
+    if not capture.determined and capture.moved_px < 1.0:
+        text += f"; matches move by {capture.moved_px:.1f} px, so that it hardly matters"
+    if shutter.right_delay:
+        text += f"; right camera late by {best.delay:+.3f} +- {best.delay_sigma:.3f} frame periods"
+    if capture.offset_sigma > 0.0 and capture.windows == 1:
+        text += "; a rig whose calibration errs may err by more than one window says"
+    return text
+
+
+def say_calibration(record: dict[str, Any]) -> None:
+    if record["camera_note"]:
+        echo(record["camera_note"])
+    if record["calibration_note"]:
+        echo(f"errors of the calibration, taken from the matches: {record['calibration_note']}")
+
+
+def listed(frames: Iterable[tuple[int, str]]) -> str:
+    """Numbers of frames and why; of many the first ones."""
+    words = [f"frame {number} ({why})" for number, why in frames]
+    more = [f"and {len(words) - _MOST_LISTED} more, see motion.json"] if len(words) > _MOST_LISTED else []
+    return "; ".join(words[:_MOST_LISTED] + more)
+
 
 _PAGE_FRAMES = 6
 

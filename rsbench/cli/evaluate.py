@@ -110,7 +110,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
     from rsbench.benchmark.recordings import depth_scores, pose_scores
     from rsbench.interop.readers.layouts import read_others
     from rsbench.storage.files import check_out, write_table
-    from rsbench.storage.mirror import name_of
+    from rsbench.storage.object_store import name_of
     from rsbench.vision.stereo_matcher import load_matcher
 
     check_out(out)
@@ -182,7 +182,7 @@ def evaluate_dataset(
     from rsbench.benchmark.images.evaluation import open_evaluation
     from rsbench.cli.compile_ahead import compiling_ahead
     from rsbench.report.evaluation_page import summary_tables, write_report
-    from rsbench.storage.mirror import name_of
+    from rsbench.storage.object_store import name_of
 
     evaluation = open_evaluation(folder, out, options)
     with compiling_ahead(), progress_bar(f"evaluating {folder.name}", evaluation.steps) as advance:

@@ -26,6 +26,7 @@ from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.problem import read_problems
 from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
+from rsbench.storage.untrusted_files import naming
 from rsbench.vision.feature_matcher import load_features
 
 
@@ -87,10 +88,8 @@ def _of_frames(left: FrameSource, right: FrameSource, card: Path, options: Inspe
     say_notes("--rig", notes)
     rig = given.rig_of(first, second)
     ratio, scanning = given.readout_ratio, given.scanning
-    try:
+    with naming(card):
         shutter = None if ratio is None or scanning is None else rig.shutter_of(scanning, ratio)
-    except ValueError as error:
-        raise RsbenchError(f"{card}: {error}") from error
     if given.sigma:
         shown = spread_windows(left, right)
         rig, words = with_found_camera(rig, given.sigma, shown, options.chain, given.inputs, progress_bar)

@@ -16,6 +16,7 @@ from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo, late_progress, print_rows, progress_bar, say
 from rsbench.cli.names import complete, named
 from rsbench.core.errors import RsbenchError
+from rsbench.storage.untrusted_files import naming
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -550,10 +551,8 @@ def _track_of(file: Path) -> str:
     from rsbench.benchmark.leaderboard.tracks import track_of_id
 
     protocol, where = protocol_of(file)
-    try:
+    with naming(where, RsbenchError):
         return track_of_id(protocol).name
-    except RsbenchError as error:
-        raise RsbenchError(f"{where}: {error}") from error
 
 
 def _show(

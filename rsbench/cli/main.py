@@ -14,7 +14,6 @@ import typer
 
 from rsbench.cli import (
     correct,
-    digest,
     evaluate,
     exits,
     generate,
@@ -92,7 +91,7 @@ _COMMANDS = (
     ("compile", compile_, COMPILE_EPILOG),
     ("generate", generate.generate, generate.EPILOG),
     ("verify", verify.verify, verify.EPILOG),
-    ("digest", digest.digest, digest.EPILOG),
+    ("digest", verify.digest, verify.DIGEST_EPILOG),
     ("view", view, VIEW_EPILOG),
     ("export", export, EXPORT_EPILOG),
     ("solve", solve.solve, solve.EPILOG),

@@ -29,7 +29,7 @@ COMPONENTS = {
     "matchers": "rsbench.vision.stereo_matcher:STEREO_MATCHERS",
     "features": "rsbench.vision.feature_matcher:FEATURE_MATCHERS",
     "correctors": "rsbench.vision.corrector:CORRECTORS",
-    "metrics": "rsbench.benchmark.metric_plugins:METRICS",
+    "metrics": "rsbench.benchmark.scoring:METRICS",
 }
 """Kinds whose names may come from installed packages, and the location of their ``plugins.Kind``."""
 

@@ -27,9 +27,7 @@ from rsbench.components.plugins import Kind, offers
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.secret_split import read_secret
 from rsbench.report.board_page import build_site
-from rsbench.report.held_out_page import compared
-from rsbench.report.held_out_page import write_page as write_held_out
-from rsbench.report.recorded_page import by_recording, choices, write_page
+from rsbench.report.points_pages import by_recording, choices, compared, write_held_out_page, write_recorded_page
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.storage.files import write_bytes, write_json, write_table
 from rsbench.storage.untrusted_files import read_json
@@ -128,7 +126,7 @@ def recorded(out: Path, data: Path, workers: int | None) -> None:
     publish(board, folder, "rsbench reproduce recorded", tables_alone=True)
     write_table(folder / "recordings.csv", pd.concat(errors))
     write_table(folder / "choices.csv", pd.concat(chosen))
-    echo(f"page: {write_page(folder)}")
+    echo(f"page: {write_recorded_page(folder)}")
 
 
 def held_out(out: Path, data: Path, workers: int | None) -> None:
@@ -164,7 +162,7 @@ def held_out(out: Path, data: Path, workers: int | None) -> None:
         tables.append(compared(*scored))
     publish(board, folder, f"rsbench reproduce {HELD_OUT}", tables_alone=True)
     write_table(folder / "scores.csv", pd.concat(tables))
-    echo(f"page: {write_held_out(folder, about)}")
+    echo(f"page: {write_held_out_page(folder, about)}")
 
 
 def solvers_of_others() -> list[str]:

@@ -20,12 +20,12 @@ from rsbench.benchmark.studies.claims import (
     best_readings,
     holding_settings,
     judge_claims,
+    judge_image_claims,
     judge_settings,
     readings_of,
     settings_card,
     write_cards,
 )
-from rsbench.benchmark.studies.image_claims import judge_image_claims
 from rsbench.cli.console import echo
 from rsbench.cli.simulate import run_and_summarise
 from rsbench.report.claim_pages import claims_page, image_claims_page, readings_page, sweeps_page

@@ -91,7 +91,7 @@ def rig(
     if picture is not None:
         if picture.suffix.lower() not in (".svg", ".png", ".pdf"):
             raise RsbenchError(f"--picture {picture}: must end in .svg, .png or .pdf")
-        from rsbench.report.rig_picture import draw_rig
+        from rsbench.report.pictures import draw_rig
 
         drawn = _known_rig(found)
         if drawn is None:

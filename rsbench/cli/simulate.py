@@ -70,7 +70,7 @@ def simulate(
 ) -> None:
     """Simulate points seen by a moving rolling-shutter rig, solve for its motion, and tabulate the errors."""
     from rsbench.benchmark.simulated.sweep_card import load_sweep, with_options
-    from rsbench.storage.mirror import name_of
+    from rsbench.storage.object_store import name_of
 
     card = with_options(load_sweep(sweep), solver, trials, seed)
     if change:

@@ -26,7 +26,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.untrusted_files import CARD_BYTES, read_text
+from rsbench.storage.untrusted_files import CARD_BYTES, naming, read_text
 
 T = TypeVar("T")
 CardKind = Literal[
@@ -305,10 +305,8 @@ def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
         raise RsbenchError(f"{where}: shutter = {name!r}: must be a name (rsbench list shutters) or a path")
     if "readout_ratio" in left:
         raise RsbenchError(f"{where}: shutter and readout_ratio exclude each other; leave one out")
-    try:
+    with naming(f"{where}: shutter", RsbenchError):
         shutter = load_card(ShutterCard, "shutters", name)
-    except RsbenchError as error:
-        raise RsbenchError(f"{where}: shutter: {error}") from error
     period = left.setdefault("frame_period_s", 1.0 / shutter.fps)
     readout = 1e-3 * shutter.readout_ms
     if isinstance(period, int | float) and 0.0 < period < readout * (1 - 1e-9):

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 from rsbench.components.cards import SHUTTER_KEY, card_path, in_all_tables, parse_card, read_toml, with_shutters
 from rsbench.components.imports import search
 from rsbench.components.rig_tables import RIG_KEY, RigTables, with_rig
+from rsbench.components.seeds import generator
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry
@@ -20,22 +21,15 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.channels import Channel, check_channels
-from rsbench.dataset.imu import Imu
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.layout import MOST_FRAMES, MOST_TWINS
-from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_cards import MotionCard as MotionCard
-from rsbench.dataset.motion_cards import (
-    MovingCard,
-    TrajectoryCard,
-    check_moving,
-    drawn,
-    generator,
-    parts_along,
-)
+from rsbench.dataset.motion_cards import MovingCard, TrajectoryCard, check_moving, drawn, parts_along
+from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.sequence import check_sizes, sequence_manifest
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.scenes.model import Start
-from rsbench.storage.untrusted_files import check_name
+from rsbench.storage.untrusted_files import check_name, naming
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,10 +348,8 @@ class DatasetCard(Scanning):
         Raises:
             RsbenchError: a channel is not available for its cameras.
         """
-        try:
+        with naming(f"dataset {self.name}"):
             return replace(self, channels=names)
-        except ValueError as error:
-            raise RsbenchError(f"dataset {self.name}: {error}") from error
 
     def shard(self, part: int, parts: int) -> DatasetCard:
         """The card with every ``parts``-th sequence, beginning with number ``part``, counted from 1.
@@ -486,11 +478,9 @@ def load_dataset_card(
     """
     path = card_path("datasets", name_or_path)
     card = read_dataset_card(path)
-    try:
+    with naming(path):
         card = card if trajectory is None else card.along(trajectory)
         return (replace(card, seeds=seeds) if seeds else card).expanded(path.parent)
-    except ValueError as error:
-        raise RsbenchError(f"{path}: {error}") from error
 
 
 def read_dataset_card(path: Path) -> DatasetCard:

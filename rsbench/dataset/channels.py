@@ -20,30 +20,32 @@ from rsbench.core.geometry import FixedGeometry, Geometry
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.imu import (
+from rsbench.dataset.clock_channels import (
     IMU_FILES,
     IMU_MANIFEST,
+    TIMING_MANIFEST,
     Imu,
     ImuSamples,
     draw_samples,
     gravity_of,
     read_imu,
+    read_timing_table,
     sample_times_ns,
+    table_file,
+    timing_files,
     write_imu,
+    write_timing,
 )
 from rsbench.dataset.layout import frames_of
-from rsbench.dataset.matches import (
+from rsbench.dataset.point_channels import (
+    AffineFrames,
     LabelledMatches,
     Matching,
-    make_matches,
-    matcher_record,
-)
-from rsbench.dataset.timing import TIMING_MANIFEST, read_timing_table, table_file, timing_files, write_timing
-from rsbench.dataset.tracks import (
-    AffineFrames,
     Tracks,
     make_affine,
+    make_matches,
     make_tracks,
+    matcher_record,
 )
 from rsbench.dataset.views import (
     ImageView,
@@ -232,9 +234,12 @@ class TruthChannel:
         """
         return ""
 
+    table: ClassVar[tuple[str, ...]] = ()
+    """Files of the whole sequence, below its folder."""
+
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
         """Paths below the folder of a sequence."""
-        raise NotImplementedError
+        return self.table
 
     def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
         """File and values (H, W, ...) of one frame."""
@@ -314,7 +319,6 @@ class _Pictures(TruthChannel):
     """One file for each rolling-shutter frame, ``FOLDER/SIDE_FRAME.END``, and perhaps one for all."""
 
     end: ClassVar[str] = "exr"
-    table: ClassVar[tuple[str, ...]] = ()
 
     def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
         return (*self.table, *(self.file(*view) for view in views_of(frames)))
@@ -352,10 +356,7 @@ class _Instances(_Pictures):
 
 
 class _Inertial(TruthChannel):
-    name = "imu"
-
-    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
-        return IMU_FILES
+    name, table = "imu", IMU_FILES
 
     def write_whole(self, whole: SequenceTruth) -> None:
         imu, geometry, period = whole.imu, whole.geometry, whole.frame_period_s
@@ -366,23 +367,17 @@ class _Inertial(TruthChannel):
 
 
 class _Tracks(TruthChannel):
-    name, supports_moving = "tracks", False
-
-    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
-        return (TRACKS,)
+    name, supports_moving, table = "tracks", False, (TRACKS,)
 
     def write_whole(self, whole: SequenceTruth) -> None:
         whole.tracks.save(whole.folder / TRACKS)
 
 
 class _Affine(TruthChannel):
-    name, supports_moving = "affine", False
+    name, supports_moving, table = "affine", False, (AFFINE,)
 
     def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
         return "" if "tracks" in names else "channels: 'affine' belongs to the points of 'tracks': add 'tracks'"
-
-    def files(self, twins: Iterable[int], frames: int) -> Iterable[str]:
-        return (AFFINE,)
 
     def write_whole(self, whole: SequenceTruth) -> None:
         make_affine(whole.geometry, whole.tracks, whole.rays).save(whole.folder / AFFINE)
@@ -549,7 +544,8 @@ class ChannelReader:
         Raises:
             RsbenchError: the sequence does not have this channel, or the file cannot be read.
         """
-        return OBJECTS[channel].read_values(self._path(channel, file), self._size(_side_of(file)))
+        side: Side = "left" if PurePosixPath(file).name.startswith("left") else "right"
+        return OBJECTS[channel].read_values(self._path(channel, file), self._size(side))
 
     def offsets(
         self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
@@ -661,8 +657,3 @@ class ChannelReader:
         """Width and height of a camera's images."""
         camera = self.rig.sensor(side)
         return camera.width, camera.height
-
-
-def _side_of(file: str) -> Side:
-    """The camera of a file of one frame, FOLDER/SIDE_FRAME.END."""
-    return "left" if PurePosixPath(file).name.startswith("left") else "right"

@@ -16,9 +16,21 @@ from typing import NamedTuple
 
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, SequenceCard
-from rsbench.dataset.manifest import CROISSANT, DATASET, Files, croissant_of, manifest_of, says, write_manifest
+from rsbench.dataset.manifest import (
+    CROISSANT,
+    DATASET,
+    Files,
+    Plan,
+    SceneHashes,
+    check_same,
+    croissant_of,
+    hashes_in,
+    manifest_of,
+    says,
+    wanted_files,
+    write_manifest,
+)
 from rsbench.dataset.sequence import is_of_sequence
-from rsbench.dataset.sequence_identity import Plan, SceneHashes, check_same, hashes_in, wanted_files
 from rsbench.jobs.process_jobs import Cluster, Workers
 from rsbench.storage.files import HASHES, FileHashes, HashedFile, read_json, sha256, write_json
 from rsbench.storage.object_store import Listed, Store, cache_of, key_of, open_store

@@ -28,13 +28,12 @@ from rsbench.core.se3 import Pose
 from rsbench.core.version import __version__
 from rsbench.dataset.card import DatasetCard, SequenceCard
 from rsbench.dataset.channels import SequenceTruth, write_channels, write_sequence_channels
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.destinations import FolderTarget, StoreTarget, open_destination
-from rsbench.dataset.imu import Imu
 from rsbench.dataset.layout import clean_file
-from rsbench.dataset.manifest import Files
-from rsbench.dataset.matches import Matching
+from rsbench.dataset.manifest import Files, Plan, SceneHashes, of_scene, plans_of, scene_hash, with_gloss
+from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.sequence import files_of
-from rsbench.dataset.sequence_identity import Plan, SceneHashes, of_scene, plans_of, scene_hash, with_gloss
 from rsbench.dataset.views import ImageView, image_seed
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.jobs.process_jobs import Cluster, Workers, finished_jobs

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from rsbench.components.motion_models import (
     motion_record,
     read_motion,
 )
+from rsbench.components.seeds import generator
 from rsbench.core import so3
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import MovingObject
@@ -101,11 +101,6 @@ class MotionCard:
         }
         parameters = drawn_parameters(self.model, self.parameters, generator(f"{seed}/{name}/parameters"))
         return replace(self, parameters=parameters, **axes)
-
-
-def generator(text: str) -> np.random.Generator:
-    """The random generator for a purpose, which ``text`` names."""
-    return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
 
 
 def _random_axis(text: str) -> Vector:

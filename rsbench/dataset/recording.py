@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.storage.untrusted_files import naming
 
 PoseAt = Callable[[FloatArray], Pose]
 """``cam_from_world`` (..., 3, 3), (..., 3) at times (...), frame periods; NaN where it is not known."""
@@ -57,10 +57,8 @@ class Recording:
         if self.right_from_left is None or set(self.cameras) != set(SIDES):
             return None
         left, right = (self.cameras[side] for side in SIDES)
-        try:
+        with naming(self.name):
             return StereoRig.of_cameras(left, right, *self.right_from_left)
-        except ValueError as error:
-            raise RsbenchError(f"{self.name}: {error}") from error
 
     @property
     def shutter(self) -> RollingShutter | None:

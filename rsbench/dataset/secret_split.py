@@ -18,7 +18,7 @@ from rsbench.components.cards import card_path
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import DatasetCard, MotionCard, SequenceCard, Variation, read_dataset_card
 from rsbench.scenes.load import read_scene_card
-from rsbench.storage.untrusted_files import read_text
+from rsbench.storage.untrusted_files import naming, read_text
 
 SHORTEST = 16
 """Characters of a secret: shorter ones could be tried."""
@@ -98,15 +98,13 @@ def secret_card(
     if card.trajectory is not None:
         raise RsbenchError(f"{path}: trajectory: everybody who has the file knows the motion; take random axes")
     made = list[SequenceCard]()
-    try:
+    with naming(path):
         for number in range(_rounds(card, count)):
             drawn = [_drawn(each, secret, _again(number)) for each in _single(card, secret, number)]
             drawn.sort(key=lambda sequence: secret.digest("order", sequence.name, *_again(number)))
             if scenes is not None:
                 drawn = [replace(each, scene=str(_place(scenes, _scene(each.scene), number))) for each in drawn]
             made += drawn
-    except ValueError as error:
-        raise RsbenchError(f"{path}: {error}") from error
     made = made[:count]
     digits = len(str(len(made) - 1))
     named = tuple(replace(each, name=f"s{number:0{digits}d}") for number, each in enumerate(made))

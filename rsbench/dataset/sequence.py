@@ -25,7 +25,7 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import CHANNELS, OBJECTS, ChannelReader, channel_files, check_channels
-from rsbench.dataset.imu import Imu
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.layout import (
     MOST_FRAMES,
     MOST_TWINS,
@@ -43,12 +43,12 @@ from rsbench.dataset.layout import (
     twins_of,
     whole_frames,
 )
-from rsbench.dataset.matches import Matching
 from rsbench.dataset.motion_cards import MovingManifest, check_moving
+from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.views import numbers_of
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
-from rsbench.storage.untrusted_files import check_name, check_size, inside
+from rsbench.storage.untrusted_files import check_name, check_size, inside, naming
 
 FORMAT, OF_RIG = 1, 2
 FORMATS = (FORMAT, OF_RIG)
@@ -424,7 +424,7 @@ def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
     manifest = _parsed(SequenceManifest, content, path)
     if manifest.name != (is_named := os.path.basename(os.path.abspath(folder))):
         raise RsbenchError(f"{path}: name = {manifest.name!r}: must be the name of its folder, {is_named!r}")
-    try:
+    with naming(path, ValueError, RsbenchError):
         return Sequence(
             folder=folder,
             name=manifest.name,
@@ -444,8 +444,6 @@ def sequence_of(content: dict[str, Any], path: Path) -> Sequence:
             glossy=manifest.glossy,
             manifest=content,
         )
-    except (ValueError, RsbenchError) as error:
-        raise RsbenchError(f"{path}: {error}") from error
 
 
 def read_dataset(folder: Path) -> list[Sequence]:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
 from rsbench.benchmark.simulated.sweep_card import SweepCard
-from rsbench.benchmark.statistics import format_interval
-from rsbench.benchmark.studies.claims import CLAIMS, GLOBAL, GRID_NOISE_PX, GRID_TRIALS, OURS, SETTINGS, Claim
-from rsbench.benchmark.studies.image_claims import IMAGE_CLAIMS
-from rsbench.report.markup import table_lines
+from rsbench.benchmark.studies.claims import (
+    CLAIMS,
+    GLOBAL,
+    GRID_NOISE_PX,
+    GRID_TRIALS,
+    IMAGE_CLAIMS,
+    OURS,
+    SETTINGS,
+    Claim,
+)
+from rsbench.report.markup import table_lines, words_of
 
 _CLAIMS = f"""# What became of the paper's claims
 
@@ -187,7 +193,7 @@ def _figures(table: pd.DataFrame, head: Sequence[str], figures: Sequence[str], n
     named = [[f"{row[name]:g}" if name == "value" else row[name] for name in names] for row in rows]
     return table_lines(
         head,
-        ([*cells, *(_words(row, figure) for figure in figures)] for cells, row in zip(named, rows, strict=True)),
+        ([*cells, *(words_of(row, figure) for figure in figures)] for cells, row in zip(named, rows, strict=True)),
     )
 
 
@@ -217,11 +223,6 @@ def _wrong_motion(table: pd.DataFrame) -> list[str]:
     ]
     found = []
     for (variant, value), rows in table.groupby(["variant", "value"], sort=False):
-        cells = [_words(row, "e_T_median") for row in rows.to_dict("records")]
+        cells = [words_of(row, "e_T_median") for row in rows.to_dict("records")]
         found.append([variant, f"{value:g}", *cells])
     return lines + table_lines(["data follow", "rotation (deg)", *solvers], found)
-
-
-def _words(row: Mapping[Hashable, Any], name: str) -> str:
-    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
-    return "-" if pd.isna(value) else format_interval(value, low, high)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rsbench.benchmark.statistics import format_interval
 
 
 def rendered(template: str, *, trim: bool = False, **values: Any) -> str:
@@ -28,3 +31,14 @@ def table_lines(head: Sequence[object], rows: Iterable[Iterable[object]]) -> lis
     """The lines of a table in Markdown."""
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (head, *rows)]
     return [lines[0], "|" + "---|" * len(head), *lines[1:]]
+
+
+def frame_text(table: pd.DataFrame) -> str:
+    """A data frame, without its index, as a table in Markdown."""
+    return "\n".join(table_lines(list(table), table.itertuples(index=False)))
+
+
+def words_of(row: Mapping[Any, Any], name: str) -> str:
+    """The number of the columns of ``with_ends`` with its interval; a dash where there is none."""
+    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
+    return "-" if pd.isna(value) else format_interval(value, low, high)

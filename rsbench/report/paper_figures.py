@@ -17,7 +17,7 @@ from rsbench.benchmark.studies.claims import OURS, READINGS, Centre
 from rsbench.benchmark.studies.fig4_panels import LITERAL, Panels
 from rsbench.core.errors import RsbenchError
 from rsbench.report import pictures
-from rsbench.report.markup import table_lines
+from rsbench.report.markup import frame_text
 from rsbench.report.pictures import Image
 from rsbench.storage.files import read_table
 
@@ -263,7 +263,7 @@ What the paper does not state had to be chosen:
 
 def fig3_page(settings: pd.DataFrame) -> str:
     """Markdown around the figures, with the table of ``setting_table``."""
-    return _PAGE + "\n".join(table_lines(list(settings.columns), settings.itertuples(index=False))) + "\n"
+    return _PAGE + frame_text(settings) + "\n"
 
 
 TITLES = (

@@ -31,7 +31,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes, read_text
+from rsbench.storage.untrusted_files import check_image_size, check_size, naming, read_bytes, read_text
 from rsbench.storage.untrusted_files import load_arrays as load_arrays
 from rsbench.storage.untrusted_files import read_json as read_json
 from rsbench.storage.untrusted_files import sha256 as sha256
@@ -259,10 +259,8 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
 def read_pose_table(path: Path) -> FloatArray:
     """The numbers (H, 9) of a file of poses, in the order of ``POSE_COLUMNS``; RsbenchError as ``read_poses``."""
     lines = read_text(path).splitlines()
-    try:
+    with naming(f"{path}: not a table of numbers"):
         table = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
-    except ValueError as error:
-        raise RsbenchError(f"{path}: not a table of numbers: {error}") from error
     if not lines or lines[0] != POSE_COLUMNS or table.ndim != 2 or table.shape[1] != 9:
         raise RsbenchError(f"{path}: must have the columns {POSE_COLUMNS}")
     if not np.all(np.isfinite(table)) or not np.array_equal(table[:, 0], np.arange(len(table))):
@@ -278,10 +276,8 @@ def save_matches(path: Path, matches: Correspondences) -> None:
 
 def load_matches(path: Path) -> Correspondences:
     """Matches of ``save_matches``; RsbenchError as ``load_arrays``, or for arrays that are not matches."""
-    try:
+    with naming(path, TypeError, ValueError):
         return Correspondences(**load_arrays(path))
-    except (TypeError, ValueError) as error:
-        raise RsbenchError(f"{path}: {error}") from error
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

@@ -2,13 +2,22 @@
 
 A store holds complete objects by name and has no locks, links or renaming. An object that is being
 written becomes visible when it is complete, as on S3 and similar stores.
+
+A command whose results go to a store works in a local folder, whose files are uploaded. The folder lies in the
+user's cache. ``sent.json`` beside it records the completed and the pending transfers, so that a later command can
+detect whether the folder is newer than the store or others changed the store. Files are uploaded in the order in
+which they were written, so that a file that marks others as complete comes after them. Files of the hidden folder
+that a later run can use are uploaded too, so that another machine can resume.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
+import stat
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -16,8 +25,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rsbench.core.errors import RsbenchError
-from rsbench.storage.files import check_out
-from rsbench.storage.work_folder import temporary, user_cache
+from rsbench.storage.files import HASHES, check_out, read_json, write_json
+from rsbench.storage.work_folder import HIDDEN, LOCK, WORK, files_below, remove, temporary, user_cache, work_folder
 
 _URL = re.compile(r"[a-z][a-z0-9+.:-]+://")
 _LOCAL = ("file", "local")
@@ -172,3 +181,212 @@ def cache_of(url: str) -> Path:
 def key_of(url: str) -> str:
     """A short name for the records of a store."""
     return hashlib.sha256(url.encode()).hexdigest()[:16]
+
+
+_BEAT_S = 30.0
+_BROUGHT = 64
+"""Files of one download request."""
+_MARK = f"{HIDDEN}/{LOCK}"
+"""Makes the hidden folder one of rsbench's: empty at the store, where nothing can be locked."""
+_OF_THIS_MACHINE = (_MARK, HASHES)
+_urls: dict[Path, str] = {}
+"""URLs of the folders that are open in this process."""
+
+
+class _Known(NamedTuple):
+    """A file of the folder and its object, when they were last the same."""
+
+    here: str
+    """Time and size; empty: removed here, to be removed there."""
+    there: str
+    """Size and token; empty: being sent."""
+
+
+class _Mirror:
+    def __init__(self, store: Store, hidden: Path) -> None:
+        self.folder = hidden / "results"
+        self._store, self._work, self._record = store, hidden / WORK, hidden / "sent.json"
+        self._known: dict[str, _Known] = {}
+        try:
+            self._known = {path: _Known(*known) for path, known in read_json(self._record).items()}
+        except (RsbenchError, TypeError):  # none yet, or damaged: the state of the folder is unknown
+            remove(self.folder)
+
+    def bring(self) -> None:
+        """Make the folder equal to the store, or only add missing files if the folder is newer than the store."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        here, there = self._here(), self._there()
+        if self._is_ahead(here, there):
+            wanted = there.keys() - self._known.keys() - here.keys()
+        else:
+            same = {path for path in there if self._known.get(path) == (here.get(path), there[path])}
+            for path in here.keys() - same:
+                self._drop(path)
+            wanted = there.keys() - same
+            self._known = {path: self._known[path] for path in same}
+        self._save()
+        due = sorted(wanted)
+        for first in range(0, len(due), _BROUGHT):
+            self._download(due[first : first + _BROUGHT], there)
+        if (self.folder / HIDDEN).is_dir():
+            (self.folder / _MARK).touch()
+        (self._work / LOCK).touch()
+        self._store.upload({_MARK: self._work / LOCK})  # before minutes of work: whether it can be written
+
+    def send(self) -> None:
+        """Make the store equal to the folder; the pending changes are recorded first."""
+        here = self._here()
+        due = [path for path, now in here.items() if not self._is_sent(path, now)]
+        gone = sorted(self._known.keys() - here.keys())
+        if not due and not gone:
+            return
+        self._known |= {path: _Known(here[path], "") for path in due}
+        self._known |= {path: _Known("", self._known[path].there) for path in gone}
+        self._save()
+        self._remove(path for path in gone if not _is_hidden(path))  # old results must not be among new ones
+        for path in due:
+            self._upload(path)
+        self._remove(path for path in gone if _is_hidden(path))  # the results that were made of it are there now
+        there = self._there()
+        self._known |= {path: _Known(here[path], there[path]) for path in due if path in there}
+        for path in {*gone, *(path for path in due if path not in there)}:
+            del self._known[path]
+        self._save()
+
+    def keep_sending(self, done: threading.Event) -> None:
+        """Upload until ``done``; after an error it is tried again, and ``finish`` raises the last one."""
+        while not done.wait(_BEAT_S):
+            with contextlib.suppress(RsbenchError, OSError):
+                self.send()
+
+    def finish(self) -> None:
+        try:
+            self.send()
+            if not any(map(_is_hidden, self._known)):
+                self._store.remove(_MARK)
+        except RsbenchError as error:
+            raise RsbenchError(
+                f"{error}; results are kept in {self.folder}: the same command sends them"
+            ) from error
+
+    def _is_ahead(self, here: dict[str, str], there: dict[str, str]) -> bool:
+        """Whether neither others changed the store nor files here were removed since both were last equal."""
+        return all(
+            (known.there in ("", there.get(path)) or (not known.here and path not in there))
+            and (not known.here or path in here)
+            for path, known in self._known.items()
+        )
+
+    def _is_sent(self, path: str, now: str) -> bool:
+        known = self._known.get(path)
+        return known is not None and known.here == now and known.there != ""
+
+    def _here(self) -> dict[str, str]:
+        """Time and size of each file of the folder, in the order of writing."""
+        found: list[tuple[int, bool, str, int]] = []
+        for path in filter(_travels, files_below(self.folder)):
+            state = (self.folder / path).lstat()
+            if stat.S_ISREG(state.st_mode):
+                found.append((state.st_mtime_ns, path.endswith(".json"), path, state.st_size))
+        return {path: f"{time} {size}" for time, _, path, size in sorted(found)}
+
+    def _there(self) -> dict[str, str]:
+        return {path: listed.state for path, listed in self._store.listing().items() if _travels(path)}
+
+    def _save(self) -> None:
+        write_json(self._record, dict(self._known))
+
+    def _download(self, paths: list[str], there: dict[str, str]) -> None:
+        """Download files; each appears complete or not at all."""
+        partial = {path: self._work / str(number) for number, path in enumerate(paths)}
+        self._store.download(partial)
+        for path, file in partial.items():
+            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, self.folder / path)
+            state = (self.folder / path).lstat()
+            self._known[path] = _Known(f"{state.st_mtime_ns} {state.st_size}", there[path])
+        self._save()
+
+    def _upload(self, path: str) -> None:
+        try:
+            self._store.upload({path: self.folder / path})
+        except RsbenchError:
+            if (self.folder / path).exists():  # else the command has removed it meanwhile
+                raise
+
+    def _remove(self, paths: Iterable[str]) -> None:
+        for path in paths:
+            self._store.remove(path)
+
+    def _drop(self, path: str) -> None:
+        """Remove a file here, with the folders that are empty then: to a command they may be damaged results."""
+        (self.folder / path).unlink()
+        with contextlib.suppress(OSError):
+            for parent in Path(path).parents[:-1]:
+                (self.folder / parent).rmdir()
+
+
+def _is_hidden(path: str) -> bool:
+    return path.startswith(f"{HIDDEN}/")
+
+
+def _travels(path: str) -> bool:
+    """Whether a file is uploaded: complete, not a lock, and with a name that is valid on every system."""
+    *_, name = parts = path.split("/")
+    own = path in _OF_THIS_MACHINE or path.startswith(f"{HIDDEN}/{WORK}/")
+    plain = not {"", ".", ".."}.intersection(parts) and not re.search(r"[\\:]", path)
+    return plain and not own and not (name.startswith(".") and name.endswith(".partial"))
+
+
+@contextmanager
+def mirrored(url: str) -> Iterator[Path]:
+    """A folder of this machine in which a command works as in any, with the results that the store has.
+
+    Its files are uploaded while the command works and when it ends, also by an error. Other files in the store
+    stay as they are.
+
+    Raises:
+        RsbenchError: see ``Store`` and ``work_folder``; or the store refused results, which then stay in the
+            local folder.
+    """
+    store, hidden = open_store(url), cache_of(url)
+    with contextlib.ExitStack() as stack:
+        with _called(hidden, store.url):
+            stack.enter_context(work_folder(hidden, hidden))
+        mirror, done = _Mirror(store, hidden), threading.Event()
+        mirror.bring()
+        thread = threading.Thread(target=mirror.keep_sending, args=(done,), daemon=True)
+        thread.start()
+        _urls[mirror.folder] = store.url
+        try:
+            with _called(mirror.folder, store.url):
+                yield mirror.folder
+        except BaseException:
+            done.set()
+            thread.join()
+            with contextlib.suppress(RsbenchError, OSError):  # the command's own error is the one to report
+                mirror.finish()
+            raise
+        finally:
+            del _urls[mirror.folder]
+        done.set()
+        thread.join()
+        mirror.finish()
+
+
+@contextmanager
+def _called(folder: Path, url: str) -> Iterator[None]:
+    """Errors name the URL in place of the folder."""
+    try:
+        yield
+    except RsbenchError as error:
+        error.args = (str(error).replace(str(folder), url),)
+        raise
+
+
+def name_of(path: Path) -> str:
+    """The absolute path of a result, or its URL where it goes to a store."""
+    for folder, url in _urls.items():
+        if path.is_relative_to(folder):
+            return f"{url}/{path.relative_to(folder).as_posix()}"
+    return str(path.resolve())

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +13,14 @@ from rsbench.components.cards import card_path
 from rsbench.core import arguments
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES
+from rsbench.jobs.isolation import THREAD_VARIABLES, use_one_thread
+from rsbench.jobs.process_jobs import finished_jobs
 from rsbench.storage.files import read_json
 from rsbench.verification import manifest_checks
 from rsbench.verification.checks import STEPS, State, check_sequence, run_stage
 from rsbench.verification.findings import DepthAgreement, Finding, Progress, SequenceReport
+from rsbench.verification.reprojection import set_threads
 from rsbench.verification.rerender import Rerender, Rerenderer
-from rsbench.verification.verifying_jobs import reports_apart
 
 __all__ = [
     "DepthAgreement",
@@ -68,15 +73,16 @@ def verify_dataset(
     state = State(listing, manifest_checks.DATASET)
     run_stage(state, "dataset")
     reports = [SequenceReport(name=state.name, findings=tuple(state.findings))] if state.findings else []
-    options = stride, rerender, *_cards_and_files(scenes)
+    files = [path for path in scenes if path.suffix not in ("", ".toml")]
+    cards = [card_path("scenes", path) for path in scenes if path not in files]
     missing = manifest_checks.missing_sequences(listing)
     reports += [SequenceReport(name=name, findings=(each,)) for name, each in missing.items() if each is not None]
     names = [name for name in listing.names if name not in missing]
     if workers == 1 or len(names) < 2:
-        check = _checker(folder, *options, step)
+        check = _checker(folder, stride, rerender, cards, files, step)
         return reports + [check(name) for name in names]
     found = {}
-    for report in reports_apart(_checker, names, workers, rerender != "no", folder, *options):
+    for report in _reports_apart(names, workers, folder, stride, rerender, cards, files):
         found[report.name] = report
         for _ in range(_steps(listing)):
             step(report.name)
@@ -91,16 +97,42 @@ def _checker(
     files: Sequence[Path],
     step: Progress = lambda name: None,
 ) -> Callable[[str], SequenceReport]:
-    """What checks a sequence of a dataset by its name, one after the other."""
+    """A function that checks the sequence of a name; it keeps the scene of the last one."""
     listing = manifest_checks.Listing.of(folder, read_json(folder / manifest_checks.DATASET))
     again = None if rerender == "no" else Rerenderer(rerender, cards, files)
     return lambda name: verify_sequence(listing, name, stride, step, again)
 
 
-def _cards_and_files(named: Collection[Path]) -> tuple[list[Path], list[Path]]:
-    """Scene cards, and what is none by its name."""
-    files = [path for path in named if path.suffix not in ("", ".toml")]
-    return [card_path("scenes", path) for path in named if path not in files], files
+def _reports_apart(
+    names: list[str], workers: int, folder: Path, stride: int, rerender: Rerender, *named: list[Path]
+) -> Iterator[SequenceReport]:
+    """Reports of sequences as they are ready, from processes that share the cores; ``named`` as ``_checker``."""
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    environment = dict.fromkeys(THREAD_VARIABLES, "1") if threads == 1 else {}
+    given = threads, folder, stride, rerender, *named
+    with closing(finished_jobs(_serve, names, workers, environment, *given, name="sequence {}".format)) as found:
+        for _, report in found:
+            yield SequenceReport(
+                name=report["name"],
+                findings=tuple(Finding(**each) for each in report["findings"]),
+                agreements=tuple(DepthAgreement(**each) for each in report["agreements"]),
+                notes=tuple(report["notes"]),
+            )
+
+
+def _serve(
+    threads: int, folder: Path, stride: int, rerender: Rerender, cards: list[Path], files: list[Path]
+) -> Callable[[str], dict[str, Any]]:
+    """``_checker`` in a child process, whose reports are tables."""
+    set_threads(threads)
+    if threads == 1:
+        use_one_thread()
+    if rerender != "no":
+        from rsbench.renderers import backend
+
+        backend.set_threads(threads)
+    check = _checker(folder, stride, rerender, cards, files)
+    return lambda name: asdict(check(name))
 
 
 def verification_steps(manifest: Mapping[str, Any]) -> int:

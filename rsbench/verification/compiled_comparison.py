@@ -18,13 +18,19 @@ F32 = NDArray[np.float32]
 
 
 class Evidence(NamedTuple):
-    """Fields of ``depth_checks.DepthEvidence`` of a source, (h, w) each, which the loops fill in."""
+    """What partners show of every ``stride``-th pixel (h, w) of a depth map, which the loops fill in; in ``Bits``
+    each partner has one bit."""
 
     confirmed: Bits
+    """The partner sees the same surface there, or the same sky."""
     contradicted: Bits
+    """The partner sees through it, or sees a surface hardly before it."""
     near: Flags
+    """Some partner contradicts it by less than ``NEAR_MISS``."""
     hidden: Bits
+    """The partner sees a surface well before it: an occlusion, unless another says so too."""
     difference: F32
+    """Smallest relative difference from a partner; infinite where nothing was compared."""
 
 
 DEPTH_TOLERANCE = 1e-4
@@ -144,7 +150,7 @@ def vote_rows(
         shown: see there.
         span: of the target, the smallest and largest codes (H, W, 3) of the 3 x 3 pixels around each; how far
             beyond is allowed.
-        votes: see ``image_checks.ImageVotes``.
+        votes: of the source, see ``image_checks.compare``.
         bands: number of the band (H,) of each row; (2, B) filled in by nobody, for its shape.
         first, last: of the strided rows, without the last.
 

@@ -190,7 +190,7 @@ class Comparison:
     agreements: list[tuple[ImageView, ImageView, DepthAgreement]] = field(default_factory=list)
     evidence: dict[ImageView, depth_checks.DepthEvidence] = field(default_factory=dict)
     colour_agreements: list[image_checks.ColourAgreement] = field(default_factory=list)
-    votes: dict[ImageView, image_checks.ImageVotes] = field(default_factory=dict)
+    votes: dict[ImageView, NDArray[np.uint8]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     """Notes on what could not be compared well; these are no faults."""
 
@@ -199,7 +199,7 @@ class Comparison:
             view: depth_checks.DepthEvidence(each, self.stride) for view, each in self.content.maps.items()
         }
         pictures = self.content.pictures.items()
-        self.votes = {view: image_checks.ImageVotes.none(each.colours.shape[:2]) for view, each in pictures}
+        self.votes = {view: np.zeros((2, *each.colours.shape[:2]), np.uint8) for view, each in pictures}
 
     def pairs(self) -> Iterator[DepthAgreement | None]:
         """Compare one pair after the other; yields None for a pair with an unreadable file."""

@@ -57,29 +57,20 @@ _HOLE, _HITS_IN_HOLE = 7, 8
 
 @dataclass(eq=False)
 class DepthEvidence:
-    """What the partners of one depth map say of its pixels, gathered pair by pair: one bit for each partner."""
+    """What the partners of one depth map show of its pixels, gathered pair by pair."""
 
     map: DepthMap
     stride: int
-    confirmed: Bits = field(init=False)
-    """(h, w) the partner sees the same surface there, or the same sky."""
-    contradicted: Bits = field(init=False)
-    """(h, w) the partner sees through it, or sees a surface hardly before it."""
-    near: BoolArray = field(init=False)
-    """(h, w) some partner contradicts it by less than ``NEAR_MISS``."""
-    hidden: Bits = field(init=False)
-    """(h, w) the partner sees a surface well before it: an occlusion, unless another says so too."""
+    seen: Evidence = field(init=False)
     holes: Bits = field(init=False)
-    """(H, W) the partner sees a surface where this map says that there is none."""
-    difference: NDArray[np.float32] = field(init=False)
-    """(h, w) smallest relative difference from a partner; infinite where nothing was compared."""
+    """(H, W) a bit for each partner that sees a surface where this map has none."""
 
     def __post_init__(self) -> None:
         shape = self.map.depth[:: self.stride, :: self.stride].shape
-        self.confirmed, self.contradicted, self.hidden = np.zeros((3, *shape), dtype=np.uint8)
+        confirmed, contradicted, hidden = np.zeros((3, *shape), dtype=np.uint8)
+        near, difference = np.zeros(shape, dtype=np.bool_), np.full(shape, np.inf, dtype=np.float32)
+        self.seen = Evidence(confirmed, contradicted, near, hidden, difference)
         self.holes = np.zeros(self.map.depth.shape, dtype=np.uint8)
-        self.near = np.zeros(shape, dtype=np.bool_)
-        self.difference = np.full(shape, np.inf, dtype=np.float32)
 
     @property
     def surface(self) -> BoolArray:
@@ -115,7 +106,7 @@ def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojec
         weigh_rows,
         (reprojection.pixels, reprojection.relative),
         (source.map.flat, source.map.depth, source.stride),
-        Evidence(source.confirmed, source.contradicted, source.near, source.hidden, source.difference),
+        source.seen,
         (target.holes, target.map.depth),
         (int(source.bit(target.map.view)), int(target.bit(source.map.view))),
         apart,
@@ -166,22 +157,22 @@ def _fault(evidence: DepthEvidence, wrong: Collection[ImageView]) -> MapFault | 
         return MapFault(
             f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share
         )
-    good = (evidence.confirmed & trusted != 0) & surface
-    bad = (evidence.contradicted & trusted != 0) & ~good & surface
-    behind = (np.bitwise_count(evidence.hidden & trusted) >= 2) & ~good & surface
+    good = (evidence.seen.confirmed & trusted != 0) & surface
+    bad = (evidence.seen.contradicted & trusted != 0) & ~good & surface
+    behind = (np.bitwise_count(evidence.seen.hidden & trusted) >= 2) & ~good & surface
     if np.sum(behind) > _MOST_BEHIND * np.sum(good | bad | behind):
         bad |= behind
     if not np.any(bad | good):
-        if wrong and np.any(evidence.confirmed):
+        if wrong and np.any(evidence.seen.confirmed):
             return None
         what = "nothing can be compared with another frame" if np.any(surface) else "there is no surface"
         return MapFault(what, np.full(height, True), 0.0, uncompared=bool(np.any(surface)))
-    rows = _bad_rows(bad, good, evidence.near)
+    rows = _bad_rows(bad, good, evidence.seen.near)
     if np.any(rows):
         share = np.sum(bad[rows]) / max(1, np.sum((bad | good)[rows]))
         what = f"depth differs from what others see on {100 * share:.3g} % of the comparable pixels"
         return MapFault(what, np.repeat(rows, evidence.stride)[:height], float(np.sum(bad) / np.sum(bad | good)))
-    typical = float(np.median(evidence.difference[good])) if np.any(good) else 0.0
+    typical = float(np.median(evidence.seen.difference[good])) if np.any(good) else 0.0
     if typical > _TYPICAL:
         what = (
             f"depth differs typically by {typical:.1e} of itself from what others see, {_TYPICAL:.0e} is allowed"

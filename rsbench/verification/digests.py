@@ -13,8 +13,8 @@ import numpy as np
 
 from rsbench.components.cards import choices, shipped_folder
 from rsbench.core.errors import RsbenchError
+from rsbench.dataset.manifest import hashes_in
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest
-from rsbench.dataset.sequence_identity import hashes_in
 from rsbench.storage.files import read_depth, read_json, read_png, sha256
 from rsbench.storage.untrusted_files import NAME, inside, read_text
 

@@ -183,18 +183,6 @@ class ColourAgreement:
         return self.judged & ((self.beyond > allowed) | (self.better > 0))
 
 
-@dataclass(eq=False)
-class ImageVotes:
-    """(H, W) partners that see a pixel's surface, and those that see another colour there."""
-
-    seen: NDArray[np.uint8]
-    against: NDArray[np.uint8]
-
-    @classmethod
-    def none(cls, shape: tuple[int, int]) -> ImageVotes:
-        return cls(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
-
-
 def band_of_row(height: int) -> NDArray[np.int64]:
     """(H,) number of the band that a row belongs to."""
     bands = max(1, min(_BANDS, height // _LEAST_BAND))
@@ -244,15 +232,18 @@ def compare(
     target: Picture,
     surface: DepthMap,
     reprojection: Reprojection,
-    votes: ImageVotes,
+    votes: NDArray[np.uint8],
     stride: int = 1,
 ) -> ColourAgreement:
-    """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th."""
+    """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th.
+
+    To ``votes`` (2, H, W) it adds 1 at each pixel whose surface the target sees, and 1 where in another colour.
+    """
     shown = shown_by(source, surface, reprojection, stride)
     bands = band_of_row(len(shown.even))
     count = int(bands[-1]) + 1
     span, shape = (target.low, target.high, target.beyond), np.zeros((2, count), np.int64)
-    by_rows = partial(vote_rows, shown, span, (votes.seen, votes.against), (bands, shape))
+    by_rows = partial(vote_rows, shown, span, (votes[0], votes[1]), (bands, shape))
     pixels, beyond = np.sum(by_bands(by_rows, len(reprojection.relative)), axis=0)
     costs = _costs(shown, target, bands, int(np.sum(pixels)))
     refuted = np.zeros(costs[0].shape, dtype=np.bool_)
@@ -305,9 +296,9 @@ def wrong_images(agreements: list[ColourAgreement]) -> Iterator[tuple[ImageView,
         left = [each for each in left if worst not in (each.source, each.target)]
 
 
-def tile_rows(votes: ImageVotes) -> BoolArray:
+def tile_rows(votes: NDArray[np.uint8]) -> BoolArray:
     """(H,) rows of tiles in which most pixels look unlike what two partners show."""
-    seen, against = (np.asarray(each >= 2, dtype=np.int64) for each in (votes.seen, votes.against))
+    seen, against = (np.asarray(each >= 2, dtype=np.int64) for each in votes)
     height = seen.shape[0]
     rows, columns = np.arange(0, height, _TILE), np.arange(0, seen.shape[1], _TILE)
     seen, against = (

@@ -21,34 +21,32 @@ from rsbench.core.rig import VIEWS, View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, MATCHER, TRACKS, matches_file
-from rsbench.dataset.matches import (
+from rsbench.dataset.point_channels import (
     MATCHED,
+    AffineFrames,
     Arranged,
+    ArrayFile,
     LabelledMatches,
     MatchClass,
     Matching,
     MatchRays,
     PairLabels,
+    Tracks,
     arranged,
     at,
     classes_of,
+    jacobians_of,
     labelled,
+    look_for,
     looks,
+    make_affine,
     matched_frames,
     matcher_record,
-    seen_near,
-)
-from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.tracks import (
-    AffineFrames,
-    ArrayFile,
-    Tracks,
-    jacobians_of,
-    look_for,
-    make_affine,
     points_at,
+    seen_near,
     track_views,
 )
+from rsbench.dataset.sequence import Sequence
 from rsbench.dataset.views import FAR, ImageView, PixelClass, Rays
 from rsbench.verification.channel_checks import FEW_BENT, LEVEL
 from rsbench.verification.compiled_comparison import DEPTH_TOLERANCE

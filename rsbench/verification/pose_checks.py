@@ -12,9 +12,11 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import Side, views_of
 from rsbench.core.se3 import inverse
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.imu import (
+from rsbench.dataset.clock_channels import (
     IMU_MANIFEST,
     MEASURED,
+    TIMING_COLUMNS,
+    TIMING_MANIFEST,
     TRUE,
     Imu,
     ImuSamples,
@@ -23,10 +25,12 @@ from rsbench.dataset.imu import (
     imu_manifest,
     sample_times_ns,
     stamps_of,
+    table_file,
+    timing_manifest,
+    timing_table,
     true_samples,
 )
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.timing import TIMING_COLUMNS, TIMING_MANIFEST, table_file, timing_manifest, timing_table
 from rsbench.storage.files import read_pose_table
 from rsbench.verification.findings import Finding, cheapest_cause, reports_unreadable, rows_of
 

@@ -25,9 +25,9 @@ from rsbench.core.version import __version__
 from rsbench.dataset.channels import AFFINE, TRACKS
 from rsbench.dataset.generation import render_view
 from rsbench.dataset.layout import whole_frames
+from rsbench.dataset.manifest import mesh_file_hash, scene_hash
 from rsbench.dataset.motion_cards import MovingManifest
 from rsbench.dataset.sequence import Sequence
-from rsbench.dataset.sequence_identity import mesh_file_hash, scene_hash
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView, image_seed, image_views
 from rsbench.renderers.options import RendererOptions
 from rsbench.scenes.load import load_scene, read_scene_card

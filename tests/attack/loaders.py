@@ -241,7 +241,7 @@ def loaders(inputs: Path, results: dict[str, Path], folder: Path) -> list[Loader
 
 
 def _cards(inputs: Path, folder: Path) -> Iterator[Loader]:
-    from rsbench.benchmark.metric_plugins import load_metrics
+    from rsbench.benchmark.scoring import load_metrics
     from rsbench.benchmark.simulated.sweep_card import load_sweep
     from rsbench.components.cards import load_card
     from rsbench.dataset.card import load_dataset_card

@@ -45,8 +45,8 @@ from rsbench.core.projection import row_poses
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.card import CameraCard, DatasetCard, load_dataset_card
+from rsbench.dataset.clock_channels import write_timing
 from rsbench.dataset.sequence import Sequence, read_sequence
-from rsbench.dataset.timing import write_timing
 from rsbench.dataset.views import IMAGE_VIEWS, ImageView
 from rsbench.renderers.image import Sensor, compressed, expose, linear_of_codes, processed, rows_needed
 from rsbench.storage.files import (

@@ -22,9 +22,9 @@ from rsbench.components.cards import parse_card
 from rsbench.components.rig_tables import RigTables, tables_of
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import VIEWS
+from rsbench.dataset.clock_channels import write_timing
 from rsbench.dataset.manifest import croissant_of
 from rsbench.dataset.sequence import Sequence, read_sequence, sequence_manifest
-from rsbench.dataset.timing import write_timing
 from rsbench.storage.files import (
     read_depth,
     read_json,

@@ -20,7 +20,7 @@ from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.capture.calibration import offset_error
 from rsbench.capture.hypotheses import Known, Scans
 from rsbench.capture.two_frame_estimate import conclude, examine
-from rsbench.cli.correct_output import readout_words, say_calibration
+from rsbench.cli.correct_run import readout_words, say_calibration
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig

@@ -18,7 +18,7 @@ from rsbench.core.projection import rs_project, rs_project_near
 from rsbench.core.rig import StereoRig, View
 from rsbench.core.se3 import inverse, transform
 from rsbench.core.shutter import Scanning
-from rsbench.dataset.tracks import AffineFrames, Tracks, jacobians_of, track_views
+from rsbench.dataset.point_channels import AffineFrames, Tracks, jacobians_of, track_views
 
 TRACK_VIEWS = track_views(2)
 Array = NDArray[np.float64]

@@ -23,9 +23,8 @@ from rsbench.core.rig import FRAMES, SIDES, VIEWS
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.channels import CHANNELS, PAIR_CHANNELS, TRACKS, PairChannel, matches_file, named_channels
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.matches import MATCHED, MatchClass
+from rsbench.dataset.point_channels import MATCHED, MatchClass, jacobians_of
 from rsbench.dataset.sequence import Sequence, read_dataset, read_sequence
-from rsbench.dataset.tracks import jacobians_of
 from rsbench.dataset.views import ImageView, PixelClass
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions

@@ -19,8 +19,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.channels import Channel, write_sequence_channels
 from rsbench.dataset.generation import sequence_truth
+from rsbench.dataset.point_channels import track_views
 from rsbench.dataset.sequence import read_sequence
-from rsbench.dataset.tracks import track_views
 from rsbench.renderers import visibility
 from rsbench.renderers.visibility import Surfaces
 from rsbench.storage.files import read_json

@@ -17,7 +17,7 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion
-from rsbench.dataset.imu import (
+from rsbench.dataset.clock_channels import (
     MARGIN_S,
     MEASURED,
     TRUE,

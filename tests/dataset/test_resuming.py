@@ -13,7 +13,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.dataset import generation
 from rsbench.dataset.card import DatasetCard
 from rsbench.dataset.generation import generate_dataset
-from rsbench.dataset.sequence_identity import SceneHashes, scene_key
+from rsbench.dataset.manifest import SceneHashes, scene_key
 from rsbench.jobs.process_jobs import LostJobsError
 from rsbench.storage import files
 from rsbench.storage.files import FileHashes, sha256

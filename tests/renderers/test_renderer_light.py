@@ -16,7 +16,7 @@ from small_scenes import write_box_scene
 
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.dataset.sequence_identity import scene_hash, scene_key
+from rsbench.dataset.manifest import scene_hash, scene_key
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.image import to_srgb8
 from rsbench.renderers.options import Integrator, RendererOptions

@@ -12,7 +12,7 @@ from scipy.stats import ttest_ind
 from rsbench.benchmark.leaderboard.tracks import track_of_id
 from rsbench.benchmark.statistics import format_interval
 from rsbench.dataset.secret_split import read_secret
-from rsbench.report.held_out_page import DEV, OURS, TEST, difference, page
+from rsbench.report.points_pages import DEV, OURS, TEST, difference, held_out_page
 
 FOLDER = ROOT / "results/held-out"
 ANNOUNCED = json.loads((FOLDER / "announced.json").read_text("utf-8"))
@@ -37,7 +37,7 @@ def test_the_revealed_text_draws_what_was_announced() -> None:
 def test_the_committed_page_is_that_of_the_committed_table() -> None:
     table = pd.read_csv(FOLDER / "scores.csv")
     assert list(table["protocol"].unique()) == list(ANNOUNCED["splits"])
-    assert page(table, ANNOUNCED) == (FOLDER / "README.md").read_text("utf-8")
+    assert held_out_page(table, ANNOUNCED) == (FOLDER / "README.md").read_text("utf-8")
     for split in (DEV, TEST):
         assert (table[f"{split}_score"].between(table[f"{split}_score_low"], table[f"{split}_score_high"])).all()
     assert set(table["code"].map(lambda code: code == OURS)) == {True, False}

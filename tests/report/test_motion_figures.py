@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsbench.dataset.corrected_frames import MARKER
-from rsbench.report.corrected_page import write_page
-from rsbench.report.motion_figures import direction_covariance, draw_certainty, sizes
+from rsbench.report.corrected_page import direction_covariance, draw_certainty, sizes, write_page
 
 
 def _motion(rng: np.random.Generator, spread: float = 1e-3) -> dict[str, Any]:

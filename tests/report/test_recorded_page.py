@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 from documents import ROOT, rows
 
-from rsbench.report.recorded_page import by_recording, page
+from rsbench.report.points_pages import by_recording, recorded_page
 
 
 def scores() -> pd.DataFrame:
@@ -36,7 +36,7 @@ def test_medians_and_coverage_of_each_recording() -> None:
 def test_the_page_counts_choices_and_departures() -> None:
     chosen = scores().assign(departure_px=[0.5] * 10 + [2.0] * 15 + [20.0] * 15, noise_px=1.0)
     resampling = pd.read_csv(ROOT / "results/recorded/resampling.csv")
-    text = page(by_recording({"ours": scores()}), chosen, resampling)
+    text = recorded_page(by_recording({"ours": scores()}), chosen, resampling)
     assert ["hand-b", "0", "6", "0", "0", "24"] in rows(text) and ["car-a", "10", "0", "0", "0", "0"] in rows(text)
     cells = {tuple(row[:2]): row for row in rows(text)}
     assert cells["car-a", "motion model"][2].startswith("1.0") and cells["hand-b", "spline"][2].startswith("0.8")
@@ -47,7 +47,5 @@ def test_the_page_counts_choices_and_departures() -> None:
 
 def test_the_committed_page_is_that_of_the_committed_tables() -> None:
     folder = ROOT / "results/recorded"
-    names = ("recordings", "choices", "resampling")
-    assert page(*(pd.read_csv(folder / f"{name}.csv") for name in names)) == (folder / "README.md").read_text(
-        "utf-8"
-    )
+    tables = (pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices", "resampling"))
+    assert recorded_page(*tables) == (folder / "README.md").read_text("utf-8")

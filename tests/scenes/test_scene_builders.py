@@ -15,7 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from rsbench.core.errors import RsbenchError
-from rsbench.dataset.sequence_identity import scene_hash
+from rsbench.dataset.manifest import scene_hash
 from rsbench.scenes import load
 from rsbench.scenes.load import (
     LightCard,

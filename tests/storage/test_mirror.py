@@ -23,9 +23,9 @@ from rsbench.benchmark.leaderboard import running
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.card import load_dataset_card
 from rsbench.dataset.generation import generate_dataset
-from rsbench.storage import mirror
+from rsbench.storage import object_store
 from rsbench.storage.files import write_bytes
-from rsbench.storage.mirror import mirrored, name_of
+from rsbench.storage.object_store import mirrored, name_of
 from rsbench.storage.work_folder import WORK, work_folder
 
 fsspec = pytest.importorskip("fsspec", reason="needs rsbench[cloud]")
@@ -37,7 +37,7 @@ SWEEP = sweep_card(["gs-8pt"], noise_px=[0.0, 0.5], trials=3)
 def open_mirrors(monkeypatch: pytest.MonkeyPatch) -> queue.Queue[Any]:
     """Mirrors that upload only on request."""
     found: queue.Queue[Any] = queue.Queue()
-    monkeypatch.setattr(mirror._Mirror, "keep_sending", lambda self, done: found.put(self))
+    monkeypatch.setattr(object_store._Mirror, "keep_sending", lambda self, done: found.put(self))
     return found
 
 
@@ -170,7 +170,7 @@ def _stopped(number: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     kind = fsspec.filesystem("memory").__class__
     operations = [(kind, name) for name in ("put_file", "get_file", "find", "rm_file")]
     with monkeypatch.context() as patch:
-        for owner, name in [*operations, (os, "replace"), (mirror._Mirror, "_drop")]:
+        for owner, name in [*operations, (os, "replace"), (object_store._Mirror, "_drop")]:
             patch.setattr(owner, name, counted(getattr(owner, name)))
         yield
 
@@ -241,8 +241,10 @@ def test_half_files_locks_and_odd_names_stay_where_they_are(memory: Any, open_mi
         open_mirrors.get().send()
         assert memory.cat("/bucket/mine/.rsbench/lock") == b""
     assert stored(memory).keys() - {path.removeprefix("/bucket/mine/") for path in odd} == {"whole"}
-    assert not mirror._travels("../x") and not mirror._travels("a//x") and not mirror._travels("/x")
-    assert not mirror._travels("a/../x") and mirror._travels("a/..x")
+    assert (
+        not object_store._travels("../x") and not object_store._travels("a//x") and not object_store._travels("/x")
+    )
+    assert not object_store._travels("a/../x") and object_store._travels("a/..x")
 
 
 @pytest.mark.usefixtures("open_mirrors")
@@ -252,8 +254,10 @@ def test_what_others_change_is_brought_and_nothing_else(memory: Any, monkeypatch
             (folder / name).mkdir()
             (folder / name / "x").write_text("old")
     brought = list[str]()
-    real = mirror.Store.download
-    monkeypatch.setattr(mirror.Store, "download", lambda self, files: (brought.extend(files), real(self, files)))
+    real = object_store.Store.download
+    monkeypatch.setattr(
+        object_store.Store, "download", lambda self, files: (brought.extend(files), real(self, files))
+    )
     with mirrored(URL):
         assert brought == []
     memory.pipe("/bucket/mine/a/x", b"new")
@@ -275,10 +279,10 @@ def test_what_a_command_removes_while_it_is_sent_is_no_fault(
     with mirrored(URL) as folder:
         (folder / "a").write_text("a")
         (folder / "b").write_text("b")
-        real = mirror.Store.upload
+        real = object_store.Store.upload
         with monkeypatch.context() as patch:
             patch.setattr(
-                mirror.Store,
+                object_store.Store,
                 "upload",
                 lambda self, files: ((folder / "a").unlink(missing_ok=True), real(self, files)),
             )

@@ -121,7 +121,11 @@ def test_killed_at_any_time_it_goes_on_to_the_same_bytes(
     assert not list((tmp_path / "cache").rglob("*.png"))
 
 
-_EAGER = "from rsbench.storage import mirror; mirror._BEAT_S = 0.02; from rsbench.cli.main import run; run()"
+_EAGER = """from rsbench.cli.main import run
+from rsbench.storage import object_store
+object_store._BEAT_S = 0.02
+run()
+"""
 """``rsbench`` that sends what there is at once."""
 
 

@@ -17,7 +17,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.rig import VIEWS, View
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.imu import ImuSamples, gyro_samples, true_samples
+from rsbench.dataset.clock_channels import ImuSamples, gyro_samples, true_samples
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.correction import correction_flow

@@ -16,7 +16,8 @@ import pandas as pd
 from rsbench.benchmark.images.plan import EvaluationOptions, Places, Plan, make_plan
 from rsbench.benchmark.images.predict import Bench, Step, prediction_steps
 from rsbench.benchmark.images.score import AFTER, KEYS, TABLES, Row, Scorer, kept_scores
-from rsbench.benchmark.metric_plugins import (
+from rsbench.benchmark.provenance import dataset_record, provenance
+from rsbench.benchmark.scoring import (
     METRICS,
     Case,
     Column,
@@ -25,9 +26,8 @@ from rsbench.benchmark.metric_plugins import (
     Metric,
     PoseCase,
     load_metrics,
+    score,
 )
-from rsbench.benchmark.provenance import dataset_record, provenance
-from rsbench.benchmark.scoring import score
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_pairs
 from rsbench.jobs.isolation import ONE_THREAD, use_one_thread

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from rsbench.benchmark.images.store import Artefact, identity_of, records_below
-from rsbench.benchmark.metric_plugins import MetricEntry, load_metrics
 from rsbench.benchmark.provenance import numeric_version
+from rsbench.benchmark.scoring import MetricEntry, load_metrics
 from rsbench.components.cards import choices, list_cards
 from rsbench.components.plugins import Entry, Kind, is_path
 from rsbench.core.errors import RsbenchError

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.plan import NONE, HashOf, Places, Plan, Recipe, reference_of
 from rsbench.benchmark.images.store import Artefact, read_record
-from rsbench.benchmark.seeds import generator
+from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, StereoRig, View
+from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.corrected_frames import write_origin
-from rsbench.dataset.imu import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four
 from rsbench.pipeline.frame_capture import find_matches_of_rig

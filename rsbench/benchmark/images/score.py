@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from rsbench.benchmark.images.plan import NONE, Places, Plan, stored_corrections, stored_depths, stored_motions
 from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pairs
 from rsbench.benchmark.images.store import Artefact, identity_of, keep, kept, read_seconds
-from rsbench.benchmark.metric_plugins import Case, DepthCase, ImageCase, PoseCase
 from rsbench.benchmark.provenance import numeric_version, package_version
-from rsbench.benchmark.scoring import answered, score
+from rsbench.benchmark.scoring import Case, DepthCase, ImageCase, PoseCase, answered, score
 from rsbench.components.imports import hash_of_files
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, Side, View

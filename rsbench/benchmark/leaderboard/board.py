@@ -17,6 +17,7 @@ import hashlib
 import json
 import lzma
 import os
+import re
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -25,20 +26,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import identity_of
-from rsbench.benchmark.leaderboard.doubt import doubt_about, refuse_reserved
 from rsbench.benchmark.leaderboard.inputs import split_record
 from rsbench.benchmark.leaderboard.pictures import copy_files, file_bytes
 from rsbench.benchmark.leaderboard.submissions import SUBMISSION_BYTES, read_submission
 from rsbench.benchmark.leaderboard.track import ORACLE, Header, Split, Step, Submission
 from rsbench.benchmark.leaderboard.tracks import TRACKS, track_of_id
 from rsbench.benchmark.provenance import numeric_version
-from rsbench.components.cards import parse_card
+from rsbench.benchmark.statistics import share_interval
+from rsbench.benchmark.trajectory_scores import METHODS
+from rsbench.components.cards import list_cards, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.jobs.process_jobs import Workers
 from rsbench.storage.files import read_table, write_bytes, write_json, write_table
-from rsbench.storage.untrusted_files import NAME, parse_json, read_bytes, read_json
+from rsbench.storage.untrusted_files import NAME, naming, parse_json, read_bytes, read_json
 from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
@@ -243,7 +246,8 @@ def _read_record(folder: Path) -> Recorded:
     named = (record.header.protocol, record.header.split, record.header.method)
     if named != (folder.parents[2].name, folder.parents[1].name, folder.name):
         raise RsbenchError(f"{path}: header: is of {'/'.join(named)}, but the entry is in another folder")
-    record.header.check_uses(track_of_id(record.header.protocol), str(path))
+    with naming(path):
+        track_of_id(record.header.protocol).check_uses(record.header.uses)
     if hashlib.sha256(read_bytes(folder / FILES[0], SUBMISSION_BYTES)).hexdigest() != record.predictions_sha256:
         raise RsbenchError(
             f"{folder / FILES[0]}: has changed since it was scored; remove the entry, and submit it again"
@@ -572,11 +576,76 @@ def _only(data: bytes, split: Split, part: Split, where: str) -> bytes:
 
 
 def _unpacked(file: Path) -> bytes:
-    try:
+    with naming(f"{file}: is no xz file", lzma.LZMAError):
         unpacker = lzma.LZMADecompressor()
         data = unpacker.decompress(read_bytes(file), SUBMISSION_BYTES)
         if not unpacker.eof:
             raise RsbenchError(f"{file}: is cut off, or larger than {SUBMISSION_BYTES} bytes")
-    except lzma.LZMAError as error:
-        raise RsbenchError(f"{file}: is no xz file: {error}") from error
     return data
+
+
+COVERAGE = 0.999
+"""Coverage of the interval that must exclude one half: 1 of 2000 unbiased methods at the bound is put in doubt."""
+_EXACT_SHARE = 0.1
+"""Largest share of problems in which an error may be zero up to rounding."""
+_ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
+_BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
+"""Names of former entries, in addition to those of cards."""
+
+
+def outline(name: str) -> str:
+    """A name reduced to its appearance: without case and separators, and with 0 = o and 1 = i = l."""
+    return re.sub("[._-]+", "-", name.lower()).strip("-").translate(str.maketrans("01i", "oll"))
+
+
+def refuse_reserved(header: Header, where: str) -> None:
+    """Refuse a submission with the name of a method of rsbench, or one that uses the ground truth.
+
+    Raises:
+        RsbenchError: the name reads like one of rsbench's own, or ``uses`` names the truth.
+    """
+    method, kinds = header.method, ("solvers", "matchers", "correctors")
+    own = {*_ORACLES, *_BUILT_IN, *METHODS, *(name for kind in kinds for name in list_cards(kind))}
+    if outline(method) in {outline(name) for name in own}:
+        raise RsbenchError(
+            f"{where}: method = {method!r}: is the name of a method of rsbench, or looks like it; choose another, "
+            f"such as '{method}-mine'"
+        )
+    if ORACLE in header.uses:
+        raise RsbenchError(
+            f"{where}: uses = {ORACLE!r}: only oracles of rsbench know the truth (rsbench leaderboard oracles); "
+            "name the data that the method works on"
+        )
+
+
+def doubt_about(scores: pd.DataFrame, header: Header, split: Split) -> str:
+    """The reason why an entry is in doubt, in one line; empty if it is not.
+
+    Such an entry is more accurate than its data allow, and is not ranked until the board's keeper accepts it: an
+    error is zero up to rounding in a tenth of the problems, or errors are below the Cramer-Rao bound of the data
+    that the method states to use. The error of an unbiased method is below the median at the bound in at most half
+    of the problems. Each error of a track is tested separately. If no bound is known, as for rendered frames, a
+    submission of the true values with a small error is not detected; to be sure, the keeper must run the method.
+    """
+    if ORACLE in header.uses:
+        return ""
+    track = split.track
+    for column, below in track.exact.items():
+        exact = np.asarray(scores[column].to_numpy(dtype=np.float64) < below)
+        if np.count_nonzero(exact) > _EXACT_SHARE * len(exact):
+            return f"{column} is below {below:g}, exact but for rounding, in {_words(exact, 0.95)} of the problems"
+    for name, medians in track.medians_at_bound(header.uses, split).items():
+        known = np.isfinite(medians)
+        nearer = scores[name].to_numpy(dtype=np.float64)[known] < medians[known]
+        if share_interval(int(np.count_nonzero(nearer)), len(nearer), COVERAGE).low > 0.5:
+            return (
+                f"{name} is below the median at the Cramer-Rao bound of {' + '.join(header.uses)} in "
+                f"{_words(nearer, COVERAGE)} of the problems; without bias it is so in half of them at most"
+            )
+    return ""
+
+
+def _words(hits: NDArray[np.bool_], coverage: float) -> str:
+    count = int(np.count_nonzero(hits))
+    low, high = share_interval(count, len(hits), coverage)
+    return f"{count / len(hits):.2f} [{low:.2f}, {high:.2f}]"

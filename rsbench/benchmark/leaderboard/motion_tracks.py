@@ -52,12 +52,12 @@ from rsbench.benchmark.leaderboard.track import (
     score_row,
 )
 from rsbench.benchmark.scoring import answered, pose_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, Views, bound_of_one_camera, motion_bound
 from rsbench.benchmark.simulated.contract import misreading
 from rsbench.benchmark.simulated.trials import Information, enter
 from rsbench.capture.model_choice import AUTO
 from rsbench.components.motion_models import TwistMotion
+from rsbench.components.seeds import generator
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
 from rsbench.core.errors import RsbenchError
@@ -66,7 +66,7 @@ from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import View
 from rsbench.core.so3 import FloatArray
 from rsbench.core.spline_motion import SplineMotion, TrajectoryMotion
-from rsbench.dataset.matches import MATCHED, arranged, looks, seen_near
+from rsbench.dataset.point_channels import MATCHED, arranged, looks, seen_near
 from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.views import FAR
 from rsbench.jobs.process_jobs import Workers
@@ -78,7 +78,7 @@ from rsbench.pipeline.problem import COLUMNS, Problem
 from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.storage.files import read_table, write_bytes
-from rsbench.storage.untrusted_files import read_bytes
+from rsbench.storage.untrusted_files import naming, read_bytes
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import between_pixels
 
@@ -186,10 +186,8 @@ class SolverTrack(Track):
 
     def check_entry(self, entry: SolverEntry) -> None:
         """Raises RsbenchError when a solver does not fit the track."""
-        try:
+        with naming(f"solver {entry.name!r}"):
             self.check_uses(uses_of(entry, self.gives_readout))
-        except ValueError as error:
-            raise RsbenchError(f"solver {entry.name!r}: {error}") from error
 
     def runnable(self, card: str) -> Runnable:
         entry = self.entry_of(card)

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.leaderboard.splits import KINDS, DrawnPoints, Draws, RigKind, log_uniform
-from rsbench.benchmark.seeds import generator
+from rsbench.benchmark.leaderboard.splits import KINDS, DrawnPoints, Draws, RigKind, circumstances
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.components.cards import choices, shipped_folder
 from rsbench.components.motion_models import fixed_endpoint
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.spline_motion import TrajectoryMotion
@@ -124,12 +124,7 @@ def _setting(folder: Path, seed: int, number: int) -> Setting:
         depth=kind.depth,
         rotation_deg=float(np.rad2deg(np.linalg.norm(motion.w))),
         translation=float(np.linalg.norm(motion.d)),
-        baseline=log_uniform(rng, kind.baseline),
-        noise_px=log_uniform(rng, (0.05, 1.0)),
-        readout_ratio=float(rng.uniform(*_READOUT)),
-        points=int(rng.integers(40, 201)),
-        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
-        shape="plane" if rng.random() < 0.2 else "box",
+        **circumstances(rng, kind.baseline, _READOUT),
     )
 
 

@@ -19,7 +19,7 @@ from rsbench.benchmark.leaderboard.correction_tracks import OF_SENSORS, SensorTr
 from rsbench.benchmark.leaderboard.motion_tracks import MotionTrack, add_area_columns, motion_row, pose_fields
 from rsbench.benchmark.leaderboard.splits import Frames
 from rsbench.benchmark.leaderboard.track import Answer, Row, Split, Track, Truth
-from rsbench.benchmark.seeds import generator
+from rsbench.components.seeds import generator
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.pose_errors import translation_of_offset

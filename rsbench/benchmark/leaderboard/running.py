@@ -25,7 +25,7 @@ from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs, run_jobs
 from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import sha256, write_bytes
-from rsbench.storage.untrusted_files import check_name
+from rsbench.storage.untrusted_files import check_name, naming
 from rsbench.storage.work_folder import remove
 
 
@@ -38,10 +38,8 @@ def load_cards(track: Track, cards: Sequence[str]) -> dict[str, Runnable]:
     names = dict[str, str]()
     found = track.load(cards)
     for card, runnable in found.items():
-        try:
+        with naming(f"entry {card}"):
             check_name(runnable.name)
-        except ValueError as error:
-            raise RsbenchError(f"entry {card}: {error}") from error
         if (other := names.setdefault(runnable.name, card)) != card:
             raise RsbenchError(
                 f"--entry {card} and --entry {other}: both have the name {runnable.name!r}; rename one"

@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.leaderboard.pictures import TruePictures
 from rsbench.benchmark.leaderboard.track import PUBLIC_SEED, Inputs, Split, Track, Truth
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.simulation import OutlierImages, Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.dataset.imu import MEASURED, gyro_samples
+from rsbench.dataset.clock_channels import MEASURED, gyro_samples
 from rsbench.dataset.layout import picture_file
 from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manifest, read_pairs
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.problem import Problem
-from rsbench.storage.untrusted_files import check_name, read_text
+from rsbench.storage.untrusted_files import check_name, naming, read_text
 from rsbench.vision.feature_matcher import load_features
 
 Range = tuple[float, float]
@@ -99,13 +99,20 @@ def points_setting(seed: int, number: int) -> Setting:
         depth=(2.0, 10.0),
         rotation_deg=log_uniform(rng, (0.2, 8.0)),
         translation=log_uniform(rng, (0.05, 0.5)),
-        baseline=log_uniform(rng, (0.1, 0.6)),
-        noise_px=log_uniform(rng, (0.05, 1.0)),
-        readout_ratio=float(rng.uniform(0.1, 1.0)),
-        points=int(rng.integers(40, 201)),
-        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
-        shape="plane" if rng.random() < 0.2 else "box",
+        **circumstances(rng, (0.1, 0.6), (0.1, 1.0)),
     )
+
+
+def circumstances(rng: np.random.Generator, baseline: Range, readout: Range) -> dict[str, Any]:
+    """What the settings of all protocols draw last, and in this order."""
+    return {
+        "baseline": log_uniform(rng, baseline),
+        "noise_px": log_uniform(rng, (0.05, 1.0)),
+        "readout_ratio": float(rng.uniform(*readout)),
+        "points": int(rng.integers(40, 201)),
+        "outlier_ratio": float(rng.choice([0.0, 0.1, 0.3, 0.5])),
+        "shape": "plane" if rng.random() < 0.2 else "box",
+    }
 
 
 POINTS_1 = Draws(scope=("leaderboard",), problems=250, setting=points_setting, outlier_images="frame 1")
@@ -178,12 +185,7 @@ def setting_by_kind(seed: int, number: int) -> Setting:
         translation_axis=tuple(ahead.tolist()) if kind.drives else None,
         motion_model=model,
         motion_parameters=parameters.get(model, {}),
-        baseline=log_uniform(rng, kind.baseline),
-        noise_px=log_uniform(rng, (0.05, 1.0)),
-        readout_ratio=float(rng.uniform(*_READOUT)),
-        points=int(rng.integers(40, 201)),
-        outlier_ratio=float(rng.choice([0.0, 0.1, 0.3, 0.5])),
-        shape="plane" if rng.random() < 0.2 else "box",
+        **circumstances(rng, kind.baseline, _READOUT),
     )
 
 
@@ -411,10 +413,8 @@ def label_of(folder: Path) -> str:
 
 
 def _checked_name(name: str, where: Path) -> str:
-    try:
+    with naming(where):
         check_name(name)
-    except ValueError as error:
-        raise RsbenchError(f"{where}: {error}") from error
     return name
 
 

@@ -23,7 +23,7 @@ from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.deviations import Calibration, calibration, named_numbers
 from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Track
 from rsbench.benchmark.leaderboard.tracks import track_of_id
-from rsbench.benchmark.statistics import COVERAGE, format_interval, scene_means, score_interval
+from rsbench.benchmark.statistics import COVERAGE, format_interval, scene_means, score_interval, with_ends
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 
@@ -276,12 +276,12 @@ def _median(values: FloatArray) -> float:
 
 def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
     """The numbers of a table, as in its CSV file; for a secret split without the ``worst`` problems."""
-    rows = []
+    rows, unranked = list[dict[str, object]](), (None, None, None)
     for line in lines:
         header = line.scored.header
         row: dict[str, object] = {"method": header.method, "uses": line.uses, "peers": line.peers or None}
         row |= {"handed_in": line.scored.handed_in, "doubt": line.scored.doubt or None}
-        row |= _rank_columns("rank", line.rank)
+        row |= with_ends("rank", *(line.rank or unranked))
         row |= {"assumes": line.assumes or None} if line.parts else {}
         row |= _ends(line.means) | line.medians
         row |= _ends({f"{line.track.primary.key}_{name}": triple for name, triple in line.parts.items()})
@@ -289,20 +289,12 @@ def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
             row |= {f"worst_{name}": error, f"worst_{name}_problem": problem}
         if "nees" in line.scored.scores:
             row |= _ends(named_numbers(line.calibration, "log_score" in line.scored.scores))
-        row |= _rank_columns("log_rank", line.log_rank) if "log_score" in line.scored.scores else {}
+        row |= with_ends("log_rank", *(line.log_rank or unranked)) if "log_score" in line.scored.scores else {}
         rows.append(row | {"ties": " ".join(line.ties)})
     found = pd.DataFrame(rows)
     integers = [name for name in map(str, found.columns) if name == "peers" or "rank" in name]
     return found.astype(dict.fromkeys(integers, "Int64"))
 
 
-def _rank_columns(name: str, rank: Rank | None) -> dict[str, object]:
-    return dict(zip((name, f"{name}_low", f"{name}_high"), rank or (None, None, None), strict=True))
-
-
 def _ends(triples: Mapping[str, tuple[float, float, float]]) -> dict[str, object]:
-    return {
-        f"{name}{end}": number
-        for name, triple in triples.items()
-        for end, number in zip(("", "_low", "_high"), triple, strict=True)
-    }
+    return {key: number for name, triple in triples.items() for key, number in with_ends(name, *triple).items()}

@@ -18,7 +18,7 @@ from rsbench.benchmark.leaderboard.track import ORACLE, Answer, Header, Split, S
 from rsbench.components.cards import choices, parse_card
 from rsbench.core.errors import RsbenchError
 from rsbench.storage.files import write_bytes
-from rsbench.storage.untrusted_files import MB, parse_json, read_text
+from rsbench.storage.untrusted_files import MB, naming, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
 """Largest file of motions: 20 kB for each of 800 problems."""
@@ -147,7 +147,8 @@ def _header(text: str, where: str, split: Split) -> Header:
     ):
         if is_now != must_be:
             raise RsbenchError(f"{where}: {field} = {is_now!r}: the truth at hand is that of {must_be!r}")
-    header.check_uses(split.track, where)
+    with naming(where):
+        split.track.check_uses(header.uses)
     if "links" in header.uses and not {"left", "right", "images"} & set(header.uses):
         raise RsbenchError(
             f"{where}: uses = 'links' without 'left' or 'right': links join matches of these; name the matches too"

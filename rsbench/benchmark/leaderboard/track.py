@@ -168,13 +168,6 @@ class Header:
             if isinstance(value, str) and (len(value) > _TEXT_CHARACTERS or not value.isprintable()):
                 raise ValueError(f"{field.name}: must be one line of at most {_TEXT_CHARACTERS} characters")
 
-    def check_uses(self, track: Track, where: str) -> None:
-        """Raises RsbenchError when the method uses an input that its track does not give."""
-        try:
-            track.check_uses(self.uses)
-        except ValueError as error:
-            raise RsbenchError(f"{where}: {error}") from error
-
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:

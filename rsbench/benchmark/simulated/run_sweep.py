@@ -26,13 +26,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rsbench.benchmark.scoring import pose_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.sweep_card import Cell, SweepCard
 from rsbench.benchmark.simulated.trials import Arrays, Entrant, enter, run_bounds, run_trials
-from rsbench.benchmark.statistics import average_interval, share_interval, typical_interval
+from rsbench.benchmark.statistics import average_interval, share_interval, typical_interval, with_ends
 from rsbench.components.cards import parse_card
 from rsbench.components.imports import source_version
 from rsbench.components.motion_models import motion_model
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
@@ -496,7 +496,7 @@ def summary_row(
     row["metric_share"] = len(metric) / len(success)
     has_scale = len(metric) > 0 and not hidden["scale"]
     numbers = (np.median(metric), *typical_interval(metric, seed)) if has_scale else (None, None, None)
-    row |= dict(zip(("e_s_median", "e_s_median_low", "e_s_median_high"), numbers, strict=True))
+    row |= with_ends("e_s_median", *numbers)
     row["e_s_bound"] = float(_rms(limit["scale"][known["scale"]])) if not hidden["scale"] else None
     return row
 
@@ -530,8 +530,8 @@ def over_bound(values: FloatArray, sigmas: FloatArray, seed: int) -> dict[str, f
     if bound == 0.0:
         return found
     squares = np.stack([values**2, sigmas**2], axis=-1)
-    low, high = average_interval(squares, seed, lambda means: np.sqrt(means[..., 0] / means[..., 1]))
-    return found | {"over_bound": rms / bound, "over_bound_low": low, "over_bound_high": high}
+    ends = average_interval(squares, seed, lambda means: np.sqrt(means[..., 0] / means[..., 1]))
+    return found | with_ends("over_bound", rms / bound, *ends)
 
 
 def _rms(values: FloatArray) -> FloatArray:

@@ -16,11 +16,10 @@ from rsbench.components.motion_models import drawn_parameters, fixed_endpoint, m
 from rsbench.components.rig_tables import RigTables, load_rig
 from rsbench.core.arguments import check_whole
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.storage.untrusted_files import check_name
+from rsbench.storage.untrusted_files import check_name, naming
 
 Axis = Literal[
     "noise_px",
@@ -291,7 +290,5 @@ def with_options(
         RsbenchError: a value that a card could not have either.
     """
     given: dict[str, Any] = {"solvers": tuple(solvers) if solvers else None, "trials": trials, "seed": seed}
-    try:
+    with naming(f"sweep {card.name}"):
         return replace(card, **{name: value for name, value in given.items() if value is not None})
-    except ValueError as error:
-        raise RsbenchError(f"sweep {card.name}: {error}") from error

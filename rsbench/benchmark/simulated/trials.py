@@ -10,17 +10,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.simulated.bound import Bound, bound_from_root, bound_of_one_camera, joined, motion_bound
 from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
+from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences, track_pairs
-from rsbench.core.errors import RsbenchError
 from rsbench.core.so3 import FloatArray
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.pipeline.isolated_components import GuardedSolver, SolverRunner
 from rsbench.solvers.engine.base import BESIDE, MotionEstimate, Solver, SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
+from rsbench.storage.untrusted_files import naming
 
 Arrays = dict[str, NDArray[Any]]
 Information = Literal["left pairs", "left and right pairs", "linked pairs", "tracks"]
@@ -53,10 +53,8 @@ def enter(entry: SolverEntry) -> Entrant:
     """
     solver, needs = entry.solver, entry.solver.spec.needs
     probe = Correspondences(left=np.ones((50, 4)), right=np.ones((50, 4)), tracks=np.ones((50, 8)))
-    try:
+    with naming(f"solver {entry.name!r}: sample_sizes", EntryFailure):
         sizes = (solver if entry.built_in else GuardedSolver(solver)).sample_sizes(probe)
-    except EntryFailure as error:
-        raise RsbenchError(f"solver {entry.name!r}: sample_sizes: {error}") from error
     if "tracks" in needs or sizes.get("tracks", 0) > 0:
         return Entrant(entry=entry, information="tracks")
     if "stereo" in needs:
@@ -151,10 +149,8 @@ def _simulation(setting: Setting, entrants: list[Entrant], seed: int, trial: int
     tracks = any(e.information in ("linked pairs", "tracks") for e in entrants)
     motion = setting.motion(generator(seed, "simulate", "motion", trial))
     rng = generator(seed, "simulate", "scene", trial)
-    try:
+    with naming(f"trial {trial}"):
         return simulate(setting.rig(), setting.shutter(), motion, setting.options(tracks), rng)
-    except ValueError as error:
-        raise RsbenchError(f"trial {trial}: {error}") from error
 
 
 def _bounds(simulation: Simulation, kinds: set[Information]) -> dict[Information, Bound]:

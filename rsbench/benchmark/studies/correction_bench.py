@@ -16,14 +16,14 @@ from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.scoring import motion_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.imports import hash_of_files
+from rsbench.components.seeds import generator
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.imu import GyroMotion
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, View
-from rsbench.dataset.imu import gyro_samples
+from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
 from rsbench.pipeline.frame_capture import find_matches

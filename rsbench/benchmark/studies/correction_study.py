@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.store import resumed
 from rsbench.benchmark.standard_metrics import Flip, Psnr, Ssim
-from rsbench.benchmark.statistics import median_interval
+from rsbench.benchmark.statistics import median_interval, with_ends
 from rsbench.benchmark.studies.correction_bench import (
     METHODS,
     Attempt,
@@ -117,9 +117,8 @@ def _interval(name: str, values: FloatArray) -> dict[str, float]:
     """Median and its interval; NaN if no value is finite."""
     known = values[np.isfinite(values)]
     if len(known) == 0:
-        return {name: np.nan, f"{name}_low": np.nan, f"{name}_high": np.nan}
-    low, high = median_interval(known)
-    return {name: float(np.median(known)), f"{name}_low": low, f"{name}_high": high}
+        return with_ends(name, np.nan, np.nan, np.nan)
+    return with_ends(name, float(np.median(known)), *median_interval(known))
 
 
 def summarise_bands(bands: pd.DataFrame) -> pd.DataFrame:

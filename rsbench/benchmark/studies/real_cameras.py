@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from rsbench.benchmark.images.store import keep
 from rsbench.benchmark.images.store import kept as kept_rows
 from rsbench.benchmark.scoring import motion_errors
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.studies.correction_bench import Row, rows_identity
 from rsbench.capture.shutter_decision import NoMotionError
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.motion import Motion
 from rsbench.core.rig import VIEWS, View

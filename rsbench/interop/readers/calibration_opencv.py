@@ -23,6 +23,7 @@ from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
 from rsbench.interop.readers.calibration_parts import (
     Calibration,
+    Fields,
     Files,
     Table,
     brown,
@@ -33,7 +34,6 @@ from rsbench.interop.readers.calibration_parts import (
     rotation_of,
     table_of,
 )
-from rsbench.interop.readers.calibration_trees import Fields
 
 _ROLES = (
     ("rectified", r"[rp][12]", (9, 12)),

@@ -45,21 +45,23 @@ from rsbench.interop.readers.calibration_parts import (
     UNITS,
     Assumptions,
     Calibration,
+    Fields,
     Files,
     Format,
     Table,
     brown,
     by_name,
     camera_table,
+    files_in,
     keyed,
     lens_of,
     pose_of,
     quaternion_of,
+    read_tree,
     rotation_of,
     table_of,
     unfolded,
 )
-from rsbench.interop.readers.calibration_trees import Fields, files_in, read_tree
 
 _CORNER = 0.5
 

@@ -67,8 +67,16 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.dataset.recording import PoseAt, Recording
-from rsbench.interop.readers.calibration_parts import Table, brown, camera_of, quaternion_of, rotation_of, table_of
-from rsbench.interop.readers.calibration_trees import Fields, read_tree
+from rsbench.interop.readers.calibration_parts import (
+    Fields,
+    Table,
+    brown,
+    camera_of,
+    quaternion_of,
+    read_tree,
+    rotation_of,
+    table_of,
+)
 from rsbench.interop.readers.calibrations import (
     asl_camera,
     asl_pose,

@@ -18,6 +18,7 @@ from rsbench.core.shutter import Scanning
 from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table, refuse_unseen
 from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.pipeline.footage import OneCameraCard, RigCard, rig_path
+from rsbench.storage.untrusted_files import naming
 
 _READOUTS = ("readout_ratio", "shutter", "line_delay_s")
 
@@ -151,10 +152,8 @@ def known_rig(path: Path, sizes: tuple[Size, Size] | None = None, fps: float | N
         raise RsbenchError(f"{path}: has no image size: give size = (width, height)")
     left, right = sizes or (left, right)
     assert left is not None and right is not None
-    try:
+    with naming(path):
         return KnownRig(card.rig(left, right), card.readout_ratio, card.scanning, notes)
-    except ValueError as error:
-        raise RsbenchError(f"{path}: {error}") from error
 
 
 def calibration_of(path: Path, given: Assumptions) -> Calibration:

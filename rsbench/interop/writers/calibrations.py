@@ -21,6 +21,7 @@ from rsbench.interop.writers.colmap_and_tum import camera_line
 from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, write_chain, yaml_transform
 from rsbench.interop.writers.sequence_views import number, projections
 from rsbench.storage.files import write_bytes
+from rsbench.storage.untrusted_files import naming
 
 
 def write_calibration(found: Calibration, kind: str, out: Path) -> list[Path]:
@@ -50,10 +51,8 @@ def rig_of(found: Calibration) -> StereoRig | None:
     if found.right_from_left is None:
         return None
     cameras = cameras_of(found)
-    try:
+    with naming("right_from_left"):
         return StereoRig.of_cameras(cameras["left"], cameras["right"], *found.right_from_left)
-    except ValueError as error:
-        raise RsbenchError(f"right_from_left: {error}") from error
 
 
 # rig.toml

@@ -22,7 +22,7 @@ from rsbench.core.camera import LensModel, PinholeCamera
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.imu import Imu
+from rsbench.dataset.clock_channels import Imu
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.sequence_views import (
     Format,

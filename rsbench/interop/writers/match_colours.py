@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsbench.core.rig import VIEWS
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.matches import MATCHED, MatchClass
+from rsbench.dataset.point_channels import MATCHED, MatchClass
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.writers.sequence_views import View
 from rsbench.pipeline.frame_capture import find_matches_of_rig

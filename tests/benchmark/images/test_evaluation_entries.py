@@ -20,7 +20,7 @@ import os, sys, time
 from dataclasses import dataclass
 from typing import final
 import numpy as np
-from rsbench.benchmark.metric_plugins import Column, ImageMetric, PoseMetric
+from rsbench.benchmark.scoring import Column, ImageMetric, PoseMetric
 from rsbench.solvers.engine.base import MotionEstimate, Solver, SolverSpec
 from rsbench.vision.corrector import Corrector, CorrectorSpec
 from rsbench.vision.feature_matcher import FeatureMatcher

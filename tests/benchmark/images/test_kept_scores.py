@@ -16,7 +16,7 @@ from evaluations import QUICK, contents, evaluate
 from rsbench.benchmark.images import score
 from rsbench.benchmark.images.plan import Places, Plan, make_plan
 from rsbench.benchmark.images.score import Row, Scorer, kept_scores
-from rsbench.benchmark.metric_plugins import DepthCase, ImageCase
+from rsbench.benchmark.scoring import DepthCase, ImageCase
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import Sequence, read_dataset
 from rsbench.report.evaluation_page import write_pictures

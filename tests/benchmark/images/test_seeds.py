@@ -10,8 +10,8 @@ import pytest
 
 from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
 from rsbench.benchmark.images.plan import EvaluationOptions
-from rsbench.benchmark.seeds import generator
 from rsbench.benchmark.statistics import median_and_quartiles
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.sequence import read_sequence
 from rsbench.report.evaluation_page import summary_tables

@@ -18,7 +18,7 @@ from rsbench.dataset.sequence import read_dataset
 DEADLY = """
 import os, signal
 from pathlib import Path
-from rsbench.benchmark.metric_plugins import Column, PoseMetric
+from rsbench.benchmark.scoring import Column, PoseMetric
 
 
 class Deadly(PoseMetric):

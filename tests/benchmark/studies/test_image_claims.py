@@ -8,8 +8,7 @@ import pandas as pd
 import pytest
 from commands import refused
 
-from rsbench.benchmark.studies.claims import verdict
-from rsbench.benchmark.studies.image_claims import (
+from rsbench.benchmark.studies.claims import (
     IMAGE_CLAIMS,
     PUBLISHED,
     ImageClaim,
@@ -19,6 +18,7 @@ from rsbench.benchmark.studies.image_claims import (
     motion_on_images,
     sgm_is_accurate,
     stereo_corrects_better,
+    verdict,
 )
 from rsbench.core.errors import RsbenchError
 from rsbench.report.claim_pages import image_claims_page

@@ -1,20 +1,26 @@
-"""The tables and the page of points on recorded trajectories: errors, coverage, and what a method chose there."""
+"""The tables and pages of points: on recorded trajectories (errors, coverage, and what a method chose there), and
+of public and held-out splits side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtrit
 
+from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.deviations import calibration, named_numbers
+from rsbench.benchmark.leaderboard.standings import Standing, standings
 from rsbench.benchmark.leaderboard.track import ORACLE, Split
-from rsbench.benchmark.statistics import format_interval, median_interval, share_interval
+from rsbench.benchmark.leaderboard.tracks import track_of_id
+from rsbench.benchmark.statistics import COVERAGE, format_interval, median_interval, share_interval, with_ends
 from rsbench.capture.hypotheses import MODELS
-from rsbench.report.markup import table_lines
+from rsbench.core.so3 import FloatArray
+from rsbench.report.markup import frame_text, words_of
 from rsbench.storage.files import write_bytes
 
 SPLINE = "continuous"
@@ -54,30 +60,23 @@ def _numbers(scores: pd.DataFrame) -> dict[str, float]:
     found: dict[str, float] = {"stated": int(scores["nees"].notna().sum())}
     for key in ("e_R_deg", "e_T_deg"):
         values = scores[key].to_numpy(dtype=np.float64)
-        found |= _triple(key, float(np.median(values)), *median_interval(values))
+        found |= with_ends(key, float(np.median(values)), *median_interval(values))
     stated = named_numbers(calibration(scores.assign(scene=range(len(scores))), _UNKNOWNS), scored=False)
     for key in ("nees_ratio", "covers_95"):
-        found |= _triple(key, *stated[key])
+        found |= with_ends(key, *stated[key])
     return found
 
 
-def _triple(name: str, *triple: float) -> dict[str, float]:
-    return {f"{name}{end}": value for end, value in zip(("", "_low", "_high"), triple, strict=True)}
-
-
-# The page
-
-
-def write_page(folder: Path) -> Path:
+def write_recorded_page(folder: Path) -> Path:
     """README.md from recordings.csv, choices.csv and, if there, resampling.csv of a folder; returns it."""
     recordings, chosen = (pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices"))
     resampling = folder / "resampling.csv"
-    text = page(recordings, chosen, pd.read_csv(resampling) if resampling.is_file() else None)
+    text = recorded_page(recordings, chosen, pd.read_csv(resampling) if resampling.is_file() else None)
     write_bytes(folder / "README.md", text.encode())
     return folder / "README.md"
 
 
-def page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFrame | None) -> str:
+def recorded_page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFrame | None) -> str:
     """The page in Markdown.
 
     Args:
@@ -96,22 +95,18 @@ def page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFram
         "Made by `rsbench reproduce recorded`; all numbers are in [recordings.csv](recordings.csv) and\n"
         "[choices.csv](choices.csv), the boards in [tables](tables). `drone-mav` does not come with rsbench:\n"
         "cards/recordings/README.md says why, and how it is made.",
-        *([] if resampling is None else [about, _lines(_resampling(resampling))]),
+        *([] if resampling is None else [about, frame_text(_resampling(resampling))]),
         "Every method on every recording, 60 windows each: medians, the share of stated 95 % ellipsoids that\n"
         "contain the truth, and the median squared error by the stated covariance over that of a correct one.",
-        _lines(_methods(recordings)),
+        frame_text(_methods(recordings)),
         "Number of windows in which `rs-stereo-auto` chose a motion model, or a spline (`continuous`):",
-        _lines(_models(chosen)),
+        frame_text(_models(chosen)),
         "Its errors and its coverage there:",
-        _lines(_kinds(chosen)),
+        frame_text(_kinds(chosen)),
         "The same by the departure of the rows from an even turn, over the noise of a match:",
-        _lines(_departures(chosen)),
+        frame_text(_departures(chosen)),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _lines(table: pd.DataFrame) -> str:
-    return "\n".join(table_lines(list(table), table.itertuples(index=False)))
 
 
 def _resampling(table: pd.DataFrame) -> pd.DataFrame:
@@ -180,3 +175,104 @@ def _words(row: Mapping[Any, Any], name: str) -> str:
     if not np.isfinite(value):
         return "-"
     return format_interval(value, low, high) if np.isfinite([low, high]).all() else f"{value:.2g}"
+
+
+# Public and held-out splits
+
+DEV, TEST = "dev", "test"
+OURS = "rsbench"
+"""``code`` of entries whose code is rsbench's own."""
+
+
+def compared(dev: Sequence[Scored], test: Sequence[Scored]) -> pd.DataFrame:
+    """A row for each entry of a track that has answered both splits, the best on the public one first.
+
+    ``score`` is the first score of the track, ``rank`` that among these entries, ``covers_95`` the coverage of the
+    stated 95 % ellipsoids, and ``difference`` the held-out score minus the public one, with Welch's interval.
+    """
+    both = {each.header.method for each in dev} & {each.header.method for each in test}
+    lines = {
+        DEV: {line.name: line for line in standings([each for each in dev if each.header.method in both])},
+        TEST: {line.name: line for line in standings([each for each in test if each.header.method in both])},
+    }
+    rows = []
+    for name, line in lines[DEV].items():
+        header, values = line.scored.header, [_primary(lines[split][name]) for split in (DEV, TEST)]
+        row: dict[str, Any] = {"protocol": header.protocol, "method": name, "uses": line.uses, "code": header.code}
+        row |= _of_split(DEV, line) | _of_split(TEST, lines[TEST][name])
+        rows.append(row | with_ends("difference", *difference(*values)))
+    return pd.DataFrame(rows).sort_values(f"{DEV}_score", ascending=False, kind="stable", ignore_index=True)
+
+
+def difference(first: FloatArray, second: FloatArray) -> tuple[float, float, float]:
+    """Mean of the second values minus that of the first, independent ones, and the ends of Welch's interval."""
+    parts = np.array([np.var(each, ddof=1) / len(each) for each in (first, second)])
+    degrees = parts.sum() ** 2 / np.sum(parts**2 / (np.array([len(first), len(second)]) - 1))
+    half = float(stdtrit(degrees, 0.5 + 0.5 * COVERAGE) * np.sqrt(parts.sum()))
+    middle = float(np.mean(second) - np.mean(first))
+    return middle, middle - half, middle + half
+
+
+def _primary(line: Standing) -> FloatArray:
+    return line.scored.scores[line.track.primary.key].to_numpy(dtype=np.float64)
+
+
+def _of_split(split: str, line: Standing) -> dict[str, Any]:
+    nothing = (np.nan, np.nan, np.nan)
+    found = with_ends(f"{split}_score", *line.means[line.track.primary.key])
+    found |= with_ends(f"{split}_rank", *(line.rank or nothing)) | {f"{split}_peers": line.peers}
+    found |= with_ends(f"{split}_covers_95", *(line.calibration.covers[-1] if line.calibration else nothing))
+    return found | {f"{split}_{key}": line.medians[key] for key in ("e_R_deg", "e_T_deg")}
+
+
+def write_held_out_page(folder: Path, about: Mapping[str, Any]) -> Path:
+    """README.md from scores.csv of a folder and what was announced; returns it."""
+    text = held_out_page(pd.read_csv(folder / "scores.csv", keep_default_na=True), about)
+    write_bytes(folder / "README.md", text.encode())
+    return folder / "README.md"
+
+
+def held_out_page(table: pd.DataFrame, about: Mapping[str, Any]) -> str:
+    """The page in Markdown: of ``compared`` of several tracks, and of the announcement."""
+    parts = [
+        "# Public and held-out splits",
+        "Made by `rsbench reproduce held-out`; all numbers are in [scores.csv](scores.csv), the boards in\n"
+        "[tables](tables). [announced.json](announced.json) was committed before any entry was run on the\n"
+        "held-out splits, which [seed.txt](seed.txt) draws. Scores have 95 % intervals; *difference* is\n"
+        "held-out minus public; *in 95 %* is the share of stated 95 % ellipsoids that contain the truth.",
+    ]
+    for protocol, rows in table.groupby("protocol", sort=False):
+        score = track_of_id(str(protocol)).primary.title
+        named = f"{protocol}, {score}: public split against `{about['splits'][protocol]['split']}`"
+        parts += [f"## {named}", frame_text(_comparison(rows))]
+    parts += ["## Code of others, on the public splits", frame_text(others(table))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _comparison(rows: pd.DataFrame) -> pd.DataFrame:
+    titles = {
+        "public": f"{DEV}_score",
+        "held-out": f"{TEST}_score",
+        "difference": "difference",
+        "in 95 %, public": f"{DEV}_covers_95",
+        "in 95 %, held-out": f"{TEST}_covers_95",
+    }
+    return pd.DataFrame(
+        {"method": _name(row), **{title: words_of(row, key) for title, key in titles.items()}}
+        for row in rows.to_dict("records")
+    )
+
+
+def others(table: pd.DataFrame) -> pd.DataFrame:
+    """The code of others: a row for each entry, with its scores on public splits, those that use least first."""
+    found = dict[str, dict[str, str]]()
+    rows = table[table["code"] != OURS].to_dict("records")
+    for row in sorted(rows, key=lambda row: (row["uses"].count("+"), row["uses"])):
+        track = track_of_id(str(row["protocol"]))
+        line = found.setdefault(row["method"], {"method": _name(row), "code": row["code"], "uses": row["uses"]})
+        line[f"{track.id}, {track.primary.title}"] = words_of(row, f"{DEV}_score")
+    return pd.DataFrame(list(found.values())).fillna("-")
+
+
+def _name(row: Mapping[Any, Any]) -> str:
+    return str(row["method"]).replace("_", r"\_")

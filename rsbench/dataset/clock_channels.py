@@ -1,14 +1,14 @@
-"""The channel ``imu``: what a gyroscope and an accelerometer at the rig's body measure, and what is true.
+"""The channels of clocks, in nanoseconds, of which 0 is row 0 of frame 0.
 
-The noise is that of IEEE Std 952 as camera calibration states it (Kalibr): white noise and a bias that walks, each
-given by its density.
+``timing``: when each row of each frame is exposed and read. ``imu``: what a gyroscope and an accelerometer at the
+rig's body measure, and what is true; the noise is that of IEEE Std 952 as camera calibration states it (Kalibr):
+white noise and a bias that walks, each given by its density.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,17 +17,92 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.cards import parse_card
+from rsbench.components.seeds import generator
 from rsbench.core.errors import RsbenchError
 from rsbench.core.imu import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import Motion
-from rsbench.core.rig import views_of
+from rsbench.core.rig import SIDES, Side, views_of
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.timing import write_rows
 from rsbench.renderers.image import Sensor
 from rsbench.scenes.model import Start, Viewpoint
-from rsbench.storage.files import write_json
-from rsbench.storage.untrusted_files import inside, read_text
+from rsbench.storage.files import write_bytes, write_json
+from rsbench.storage.untrusted_files import inside, naming, read_text
+
+TIMING_MANIFEST = "timing.json"
+TIMING_COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"
+_NS = 1e9
+
+
+def table_file(side: str, frame: int) -> str:
+    """Below the folder of a sequence."""
+    return f"timing/{side}_{frame}.csv"
+
+
+def timing_files(frames: int) -> tuple[str, ...]:
+    """All of them, of a sequence of so many frames."""
+    return (TIMING_MANIFEST, *(table_file(*view) for view in views_of(frames)))
+
+
+def timing_manifest(
+    shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
+) -> dict[str, Any]:
+    """Content of timing.json: of each camera what makes its tables; times count from that of row 0 of frame 0."""
+    readout_ns = {side: _NS * shutter.ratio_of(side) * frame_period_s for side in SIDES}
+    cameras = {
+        side: {
+            "readout_ns": readout_ns[side],
+            "line_delay_ns": readout_ns[side] / shutter.lines(side),
+            "exposure_ns": _NS * (sensor.of(side, 0).exposure_s if sensor else 0.0),
+            "scan": shutter.scan_of(side),
+            "reference_row": shutter.first_line(side),
+            "reference_ns": [_NS * frame_period_s * float(shutter.start(frame, side)) for frame in range(frames)],
+        }
+        for side in SIDES
+    }
+    common = {"frame_period_ns": _NS * frame_period_s, "time_of_a_row": "middle of its exposure"}
+    return common | cameras
+
+
+def timing_table(
+    shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, side: Side, frame: int
+) -> NDArray[np.int64]:
+    """(H, 4) in the order of ``TIMING_COLUMNS``, whole nanoseconds; of columns where the camera reads those."""
+    rows = np.arange(shutter.lines(side))
+    middle = _NS * frame_period_s * shutter.line_times(frame, side)
+    half = 0.5 * _NS * (sensor.of(side, frame).exposure_s if sensor else 0.0)
+    return np.round(np.stack([rows, middle, middle - half, middle + half], axis=1)).astype(np.int64)
+
+
+def write_timing(
+    folder: Path, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
+) -> None:
+    """All ``timing_files`` below the folder of a sequence."""
+    write_json(folder / TIMING_MANIFEST, timing_manifest(shutter, frame_period_s, sensor, frames))
+    for side, frame in views_of(frames):
+        table = timing_table(shutter, frame_period_s, sensor, side, frame)
+        write_rows(folder / table_file(side, frame), TIMING_COLUMNS, table.tolist())
+
+
+def write_rows(path: Path, columns: str, rows: Iterable[Iterable[float]]) -> None:
+    """A CSV file with this header and numbers to their last bit."""
+    lines = [",".join(map(repr, row)) for row in rows]
+    write_bytes(path, ("\n".join([columns, *lines]) + "\n").encode())
+
+
+def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:
+    """(height, 4) in the order of ``TIMING_COLUMNS``.
+
+    Raises:
+        RsbenchError: missing, or not such a table.
+    """
+    header, *lines = read_text(path).splitlines() or [""]
+    with naming(f"{path}: not a table of whole numbers", ValueError, OverflowError):
+        table = np.array([[int(cell) for cell in line.split(",")] for line in lines], dtype=np.int64)
+    if header != TIMING_COLUMNS or table.shape != (height, 4) or np.any(table[:, 0] != np.arange(height)):
+        raise RsbenchError(f"{path}: must have the columns {TIMING_COLUMNS} and rows 0 to {height - 1}")
+    return table
+
 
 IMU_MANIFEST, MEASURED, TRUE = "imu/imu.json", "imu/measured.csv", "imu/true.csv"
 IMU_FILES = (IMU_MANIFEST, MEASURED, TRUE)
@@ -35,7 +110,6 @@ MEASURED_COLUMNS = "stamp_ns,wx,wy,wz,ax,ay,az"
 TRUE_COLUMNS = "time_ns,wx,wy,wz,ax,ay,az,bwx,bwy,bwz,bax,bay,baz"
 MARGIN_S = 0.05
 """Measured before the first row is exposed and after the last one."""
-_NS = 1e9
 _FASTEST_HZ, _LONGEST_OFFSET_S, _WORST_DRIFT = 1e4, 1.0, 1e-2
 
 
@@ -139,8 +213,7 @@ def draw_samples(
     imu: Imu, motion: Motion, times_ns: NDArray[np.int64], frame_period_s: float, gravity: FloatArray, seed: str
 ) -> ImuSamples:
     """Measure a motion; the same seed draws the same noise whatever the motion."""
-    digest = hashlib.sha256(f"{seed}/imu".encode()).digest()
-    rng = np.random.default_rng(int.from_bytes(digest[:16], "little"))
+    rng = generator(f"{seed}/imu")
     noise, walk, start = deviations(imu)
     steps = rng.standard_normal((len(times_ns), 6)) * np.where(np.arange(len(times_ns))[:, None] > 0, walk, start)
     bias = np.cumsum(steps, axis=0)
@@ -208,12 +281,10 @@ def _read_table(path: Path, columns: str) -> tuple[NDArray[np.int64], FloatArray
         RsbenchError: missing, or not such a table.
     """
     header, *lines = read_text(path).splitlines() or [""]
-    try:
+    with naming(f"{path}: not a table of numbers", ValueError, OverflowError):
         cells = [line.split(",") for line in lines]
         times = np.array([int(row[0]) for row in cells], dtype=np.int64)
         values = np.array([[float(cell) for cell in row[1:]] for row in cells])
-    except (ValueError, OverflowError) as error:
-        raise RsbenchError(f"{path}: not a table of numbers: {error}") from error
     if header != columns or values.shape != (len(lines), columns.count(",")) or not len(lines):
         raise RsbenchError(f"{path}: must have the columns {columns}")
     if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):

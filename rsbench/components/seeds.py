@@ -7,7 +7,8 @@ import hashlib
 import numpy as np
 
 
-def generator(suite_seed: int, *names: str | int) -> np.random.Generator:
-    """Generator of (suite seed, track, sequence, solver, repetition, ...); equal names give equal draws."""
-    text = "\x1f".join(str(part) for part in (suite_seed, *names))
+def generator(*names: str | int) -> np.random.Generator:
+    """Generator of (suite seed, track, sequence, solver, repetition, ...), or of a text for a purpose; equal names
+    give equal draws."""
+    text = "\x1f".join(map(str, names))
     return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
