@@ -9,6 +9,7 @@ every frame. The ratio has a uniform prior, so its posterior is proportional to 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
@@ -36,6 +37,7 @@ from rsbench.capture.trajectory_fit import (
     log_evidence,
     normal_equations,
     right_tracks,
+    squared_errors,
     variances,
     window_motions,
 )
@@ -55,6 +57,7 @@ from rsbench.capture.trajectory_tracks import (
     Tails,
     TimedTracks,
     is_of_one_camera,
+    noise_by_tile,
     observed,
     pack_windows,
     thinned,
@@ -286,13 +289,14 @@ def ratio_of_sequence(
         profile = _Profile(few, rig, scanning, times, focal_sigma)
         started = _likeliest(partial(profile.started, curve=profile.first_spline(seed)), first, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
-        for each in _likeliest(profile.refined, rough, 1):
+        for each in _likeliest(profile.refined_with_noise, rough, 1):
             found[number] = each
     if not found:
         return None
     best = max(found, key=lambda each: found[each].evidence)
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
+        profile = profile.with_noise_of(found[best])
         start = found[best].fit
         start = replace(start, trust=right_tracks(start, profile.tracks(found[best].place)))
         top, covariance = profile.most_evident(profile.refined(found[best]._replace(fit=start)))
@@ -439,6 +443,14 @@ class _Profile:
             pack_windows(windows, rig, self._shutter(ratio), self._linked, share=self._share, times=self._times)
             for ratio in (0.0, 1.0)
         ]
+        self._noise = np.ones(len(self._packed[0]))
+
+    def with_noise_of(self, found: _Found) -> _Profile:
+        """The evidence with the noise of each part of the image as a fit, perhaps to other tracks, has it."""
+        tracks, out = self.tracks(found.place), copy.copy(self)
+        noise = noise_by_tile(tracks, squared_errors(found.fit.curve, tracks))
+        out._packed, out._noise = [each.with_noise(noise) for each in self._packed], self._noise * noise
+        return out
 
     def _shutter(self, ratio: float) -> RollingShutter:
         return self._rig.shutter_of(self._scanning, ratio)
@@ -515,11 +527,15 @@ class _Profile:
         equations = _Joint(self, tails, prior, trust).equations(curve, place)
         return place, Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=equations)
 
+    def refined_with_noise(self, start: _Found) -> _Found:
+        """``refined`` with the noise that each part of the image has at the start."""
+        return self.with_noise_of(start).refined(start)
+
     def _normalised(self, found: _Found) -> float:
         """Logarithm of evidence that can be compared with that under other error distributions of these tracks."""
         tails, freedom = found.fit.tails, self.tracks(found.place).freedom
         each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
-        each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
+        each -= 0.5 * freedom * np.log(np.pi * tails.nu * (self._noise * tails.scale) ** 2)
         wrong = -freedom * np.log(MOST_NOISE_PX)  # outliers have a uniform distribution in all fits
         return found.evidence + self._share * float(np.sum(np.where(found.fit.trust > 0.0, each, wrong)))
 
