@@ -293,7 +293,7 @@ def ratio_of_sequence(
         rough = _likeliest(profile.rough, started, _REFINED)
         for each in _likeliest(profile.refined_with_noise, rough, 1):
             others = _likeliest(profile.refined_without_dashboard, [each] if alone else [], 1)
-            found[number] = max(each, *others, key=lambda one: one.evidence) if others else each
+            found[number] = max([each, *others], key=lambda one: one.evidence)
     if not found:
         return None
     best = max(found, key=lambda each: found[each].evidence)
