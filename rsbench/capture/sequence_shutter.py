@@ -9,6 +9,7 @@ every frame. The ratio has a uniform prior, so its posterior is proportional to 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
@@ -36,6 +37,7 @@ from rsbench.capture.trajectory_fit import (
     log_evidence,
     normal_equations,
     right_tracks,
+    squared_errors,
     variances,
     window_motions,
 )
@@ -55,6 +57,7 @@ from rsbench.capture.trajectory_tracks import (
     Tails,
     TimedTracks,
     is_of_one_camera,
+    noise_by_tile,
     observed,
     pack_windows,
     thinned,
@@ -93,6 +96,8 @@ _SHARE = 0.5
 """Weight of one camera's track relative to the prior; ``dispersion`` accounts for correlated errors."""
 _COARSE_FOCAL, _FARTHEST = 0.3, 0.9
 """Step of the search in the logarithm of the focal length, and its largest absolute value."""
+_LITTLE_WEIGHT = 4.0
+"""Relative noise of tracks that a fit is to use little."""
 _LEAST_SHARE = 0.2
 """Least share of inliers among the tracks."""
 _PRECISION = 1e12
@@ -286,16 +291,16 @@ def ratio_of_sequence(
         profile = _Profile(few, rig, scanning, times, focal_sigma)
         started = _likeliest(partial(profile.started, curve=profile.first_spline(seed)), first, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
-        for each in _likeliest(profile.refined, rough, 1):
-            found[number] = each
+        for each in _likeliest(profile.refined_with_noise, rough, 1):
+            others = _likeliest(profile.refined_without_dashboard, [each] if alone else [], 1)
+            found[number] = max([each, *others], key=lambda one: one.evidence)
     if not found:
         return None
     best = max(found, key=lambda each: found[each].evidence)
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
-        start = found[best].fit
-        start = replace(start, trust=right_tracks(start, profile.tracks(found[best].place)))
-        top, covariance = profile.most_evident(profile.refined(found[best]._replace(fit=start)))
+        profile = profile.with_noise_of(found[best])
+        top, covariance = profile.most_evident(profile.refined_again(found[best]))
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
@@ -439,6 +444,18 @@ class _Profile:
             pack_windows(windows, rig, self._shutter(ratio), self._linked, share=self._share, times=self._times)
             for ratio in (0.0, 1.0)
         ]
+        self._noise = np.ones(len(self._packed[0]))
+
+    def with_noise(self, noise: FloatArray) -> _Profile:
+        """The evidence with this relative noise (n,) of each track in addition."""
+        out = copy.copy(self)
+        out._packed, out._noise = [each.with_noise(noise) for each in self._packed], self._noise * noise
+        return out
+
+    def with_noise_of(self, found: _Found) -> _Profile:
+        """The evidence with the noise of each part of the image under a fit, which may be to other tracks."""
+        tracks = self.tracks(found.place)
+        return self.with_noise(noise_by_tile(tracks, squared_errors(found.fit.curve, tracks)))
 
     def _shutter(self, ratio: float) -> RollingShutter:
         return self._rig.shutter_of(self._scanning, ratio)
@@ -515,11 +532,30 @@ class _Profile:
         equations = _Joint(self, tails, prior, trust).equations(curve, place)
         return place, Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=equations)
 
+    def refined_again(self, start: _Found) -> _Found:
+        """``refined`` from a fit to other tracks, or under another noise."""
+        trust = right_tracks(start.fit, self.tracks(start.place))
+        return self.refined(start._replace(fit=replace(start.fit, trust=trust)))
+
+    def refined_with_noise(self, start: _Found) -> _Found:
+        """``refined`` with the noise that each part of the image has at the start."""
+        return self.with_noise_of(start).refined_again(start)
+
+    def refined_without_dashboard(self, start: _Found) -> _Found:
+        """``refined_with_noise`` after a fit in which the lower third of the image has little weight.
+
+        A dashboard or a handlebar there moves with the camera. A fit to it and to the scene is a local optimum.
+        """
+        tracks = self.tracks(start.place)
+        y = tracks.ends[tracks.starts[:-1], 1]
+        little = self.with_noise(np.where(y > np.quantile(y, 2.0 / 3.0), _LITTLE_WEIGHT, 1.0))
+        return self.refined_with_noise(little.refined_again(start))
+
     def _normalised(self, found: _Found) -> float:
         """Logarithm of evidence that can be compared with that under other error distributions of these tracks."""
         tails, freedom = found.fit.tails, self.tracks(found.place).freedom
         each = scipy.special.gammaln(0.5 * (tails.nu + freedom)) - scipy.special.gammaln(0.5 * tails.nu)
-        each -= 0.5 * freedom * np.log(np.pi * tails.nu * tails.scale**2)
+        each -= 0.5 * freedom * np.log(np.pi * tails.nu * (self._noise * tails.scale) ** 2)
         wrong = -freedom * np.log(MOST_NOISE_PX)  # outliers have a uniform distribution in all fits
         return found.evidence + self._share * float(np.sum(np.where(found.fit.trust > 0.0, each, wrong)))
 

@@ -81,6 +81,8 @@ _LEAST_WIDTH = 5
 """Number of control poses that one term of the prior, or one gyroscope sample, depends on."""
 ANCHORED = 1e4
 """Precision of the pose at time 0 divided by that of the most certain control pose."""
+_ROUNDING = 1e-15
+"""Precision of all poses of one camera divided by that of the most certain one."""
 _FEWEST = 2.0
 """Number of accelerations that the tracks must determine before the prior's variance is estimated."""
 _LIMITS = (1e-10, 1e2)
@@ -240,13 +242,20 @@ def _add_past(
 def anchored(equations: Equations, curve: Curve, tracks: TimedTracks, certain: float) -> FloatArray:
     """The normal matrix, a band; without marginalised windows, the pose at time 0 is fixed as the origin.
 
+    One camera does not determine the scale of its translation, and the prior hardly bounds it: rounding could make
+    the matrix indefinite, so that all poses get a precision above rounding errors.
+
     Args:
         certain: precision of that pose divided by that of the most certain control pose.
     """
     band = equations.band
     if tracks.past is not None:
         return band
-    return band + anchors(curve, band.shape[1], certain * float(np.max(band[:, 0])))
+    largest = float(np.max(band[:, 0]))
+    out = band + anchors(curve, band.shape[1], certain * largest)
+    if not np.any(tracks.ends[:, 9]):
+        out[:, 0] += _ROUNDING * largest
+    return out
 
 
 def covariance_band(found: Fit, tracks: TimedTracks, share: float = 1.0) -> FloatArray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, nearest_wit
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.core.uncertainty import tiles
 from rsbench.solvers.engine.packed import t_distribution
 
 IntArray = NDArray[np.int64]
@@ -39,6 +40,10 @@ BEHIND = 1e12
 """Squared error, px^2, of a track whose point lies behind a camera."""
 _NEAREST = 1e-3
 """Least depth of the point at an observation, relative to that at the first one."""
+_TILES, _FEWEST_IN_TILE = (4, 4), 8
+"""Columns and rows of image tiles, each with its own noise, and the average number of tracks that this needs."""
+_LEAST_SQUARE, _LEAST_SHARE = LEAST_SCALE_PX**2, 1e-2
+"""Least median of squared errors, px^2, and least median in a tile divided by that of all."""
 _POINT_STEPS = 2
 """Gauss-Newton steps for the point: an error of 1 px becomes 1e-3 px after one and 1e-9 px after two."""
 _ROUGH_RHO = 3.0
@@ -389,6 +394,24 @@ def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float
     return best, (squares <= freedom * (REACH * best.scale) ** 2).astype(np.float64)
 
 
+def noise_by_tile(tracks: TimedTracks, squares: FloatArray) -> FloatArray:
+    """(n,) noise of each track's part of the image relative to that of all tracks, from squared errors (n,), px^2.
+
+    Texture and blur differ between parts of an image. A part may also have a motion of its own, as a car's
+    dashboard: points explain much of it, so that its errors are larger than others but no outliers.
+    """
+    each, most = squares / tracks.freedom, int(np.prod(_TILES))
+    noise = np.ones(len(tracks))
+    if len(tracks) >= _FEWEST_IN_TILE * most:
+        groups, typical = (
+            tiles(tracks.ends[tracks.starts[:-1], :2], _TILES),
+            max(float(np.median(each)), _LEAST_SQUARE),
+        )
+        for tile in range(most):
+            noise[groups == tile] = np.median(each[groups == tile]) / typical
+    return np.sqrt(np.maximum(noise, _LEAST_SHARE))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Past:
     """Marginalised matches of earlier windows: a quadratic cost of the first control poses of a spline."""
@@ -441,6 +464,12 @@ class TimedTracks:
     def freedom(self) -> FloatArray:
         """(n,) degrees of freedom of each track's error."""
         return 2.0 * np.diff(self.starts) - 3.0
+
+    def with_noise(self, noise: FloatArray) -> TimedTracks:
+        """The tracks with errors in units of their noise (n,), relative to a common one, instead of pixels."""
+        ends = self.ends.copy()
+        ends[:, 3:9] *= np.repeat(noise, np.diff(self.starts))[:, None]
+        return replace(self, ends=ends)
 
     @property
     def span(self) -> tuple[FloatArray, FloatArray]:

@@ -59,6 +59,7 @@ from rsbench.capture.trajectory_tracks import (
     Tails,
     TimedTracks,
     informative,
+    noise_by_tile,
     pack_windows,
     thinned,
     thinned_chains,
@@ -440,6 +441,8 @@ def _fitted(
     tracks = packed(windows)
     trust = right_tracks(first, tracks)
     tracks = packed(windows, [trust[each] for each in tracks.members])
+    if len(windows) > 1:
+        tracks = tracks.with_noise(noise_by_tile(tracks, squared_errors(first.curve, tracks)))
     return fit(first.curve, tracks, first.prior, False, first.tails), tracks
 
 

@@ -9,7 +9,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 from shaken_rig import RIG, SHUTTER, matches, sines
 
-from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, normal_equations
+from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, normal_equations, squared_errors
 from rsbench.capture.trajectory_spline import (
     ContinuousMotion,
     Curve,
@@ -26,7 +26,7 @@ from rsbench.capture.trajectory_spline import (
     roughness,
     whitening,
 )
-from rsbench.capture.trajectory_tracks import ENOUGH, Tails, informative, pack_windows
+from rsbench.capture.trajectory_tracks import ENOUGH, Tails, informative, noise_by_tile, pack_windows
 from rsbench.components.motion_models import LinearMotion, motion_record, read_motion
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.so3 import FloatArray
@@ -154,6 +154,23 @@ def test_half_a_share_is_half_the_information() -> None:
     found = Fit(curve=curve, tails=Tails(5.0, 0.3), prior=prior, trust=trust, equations=shared)
     one, other = (covariance_band(found, each) for each in (half, whole))
     np.testing.assert_array_equal(one, other)
+
+
+def test_the_noise_of_a_tile_is_estimated_and_divides_the_errors_of_its_tracks() -> None:
+    rng, curve = (
+        np.random.default_rng(8),
+        approximated(LinearMotion([0.02, 0, 0], [0.1, 0, 0]).body_from_world, (0, 2.8), 0.5),
+    )
+    windows, _ = matches(sines(rng, 1.0, 0.15, 0.45), 3, rng, outliers=0.0)
+    tracks = pack_windows(windows, RIG, SHUTTER)
+    right = tracks.ends[tracks.starts[:-1], 0] > np.median(tracks.ends[tracks.starts[:-1], 0])
+    squares = np.where(right, 0.4, 0.1) ** 2 * rng.chisquare(tracks.freedom)
+    noise = noise_by_tile(tracks, squares)
+    # The median of 35 values of chi-squared with 5 degrees of freedom has a deviation of 13 %, its root of 7 %.
+    assert np.mean(noise[right]) / np.mean(noise[~right]) == pytest.approx(4.0, rel=0.1)
+    np.testing.assert_allclose(
+        squared_errors(curve, tracks.with_noise(noise)), squared_errors(curve, tracks) / noise**2, rtol=1e-3
+    )
 
 
 def test_pairs_of_windows_with_tracks_enough_are_left_out() -> None:
