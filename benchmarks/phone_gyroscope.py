@@ -10,6 +10,9 @@ the gyroscope's clock and that of the frames, and its bias, are those with which
 difference of the rotations over a frame period). Printed are quantiles over the pairs of corrected frames: the
 difference of the rotation over a frame period, and the largest error of a row of the second frame about its middle
 row, px at the focal length, beside the rotation itself (``uncorrected``).
+
+With ``--ratio`` the readout ratio is estimated instead, from eight runs of 12 frames, with the camera given and
+with nothing given. It is about 0.95: the frames give that without the dashboard, which is a third of the image.
 """
 
 from __future__ import annotations
@@ -24,17 +27,22 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation, Slerp
 
+from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.footage import read_frame
+from rsbench.pipeline.footage import OneCameraCard, read_frame
+from rsbench.pipeline.mono_camera import find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_sequence import correct_frames
+from rsbench.solvers.engine.robust_motion import RobustOptions
 
 Array = NDArray[np.float64]
 CAMERA = PinholeCamera(width=800, height=600, fx=573.85, fy=575.04, cx=406.01, cy=309.01)
 FIRST_FRAME, PERIOD_S = 99, 0.0333125
 ROWS = 14
 """Of 20 rows per frame, those that show the road and not the dashboard, which moves with the phone."""
+_RUN = 12
+"""Frames from which a ratio is estimated."""
 TAUS = np.linspace(0.0, 2.0, 41)
 
 
@@ -48,6 +56,28 @@ def estimated(folder: Path) -> dict[int, Rotation]:
             # A frame is corrected along the pair that ends with it.
             found[moment.number - 1] = Rotation.from_matrix(moment.found.own.motion.body_from_world(TAUS).R)
     return found
+
+
+def print_ratios(folder: Path) -> None:
+    """Print the readout ratio and focal length with their deviations, from runs of successive frames."""
+    files = sorted((folder / "reshape").glob("*.jpg"), key=lambda path: int(path.stem.split("-")[-1]))
+    for first in range(0, len(files) - _RUN + 1, _RUN):
+        frames, row = (
+            [read_frame(path) for path in files[first : first + _RUN]],
+            f"frames {first:3} to {first + _RUN:3}:",
+        )
+        for name, camera in (("camera given", CAMERA), ("nothing given", None)):
+            try:
+                found = find_shutter(frames, len(frames), OneCameraCard.of(camera, None), RobustOptions())
+            except NoMotionError as error:
+                row += f" {name}: refused ({error});"
+                continue
+            assert found.capture is not None and found.capture.likeliest is not None
+            ratio, focal = found.capture.likeliest, found.focal
+            row += f" {name}: {ratio.ratio:.3f} +- {ratio.sigma:.3f} ({found.scan})"
+            row += ";" if focal is None else f", focal length {focal.focal:.0f} +- {focal.sigma:.0f} px;"
+        sys.stdout.write(row + "\n")
+        sys.stdout.flush()
 
 
 def integrated(samples: Array) -> Slerp:
@@ -73,10 +103,15 @@ def differences(ours: list[Rotation], theirs: list[Rotation]) -> Array:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
+    parser.add_argument("--ratio", action="store_true", help="estimate the readout ratio")
+    given = parser.parse_args()
+    folder = given.folder
     for name in ("framestamp.txt", "gyro.txt", "reshape"):
         if not (folder / name).exists():
             parser.error(f"{folder}: there is no {name}; give the folder 20200109_145447 of the repository")
+    if given.ratio:
+        print_ratios(folder)
+        return
     stamps, gyro = np.loadtxt(folder / "framestamp.txt"), np.loadtxt(folder / "gyro.txt", delimiter=",")
     times = (gyro[:, 3] - stamps[FIRST_FRAME]) / PERIOD_S
     samples = np.column_stack([times, -PERIOD_S * gyro[:, [1, 0, 2]]])[(times > -6.0) & (times < 115.0)]
