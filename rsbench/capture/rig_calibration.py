@@ -90,15 +90,8 @@ class FoundRig:
 
     @property
     def significant(self) -> bool:
-        """Whether the errors as a whole contradict the calibration: a chi-squared test at 0.1 %.
-
-        Of seven errors one exceeds three deviations in every fiftieth rig by chance, and a needless correction
-        costs accuracy.
-        """
-        free = np.flatnonzero(self.sigma > 0.0)
-        inverse = np.linalg.pinv(self.covariance[np.ix_(free, free)], hermitian=True)
-        distance = float(self.errors[free] @ inverse @ self.errors[free])
-        return distance > float(chdtri(len(free), _CHANCE))
+        """Whether the errors contradict the calibration, see ``contradict``."""
+        return contradict(self.errors, self.covariance)
 
     @property
     def record(self) -> dict[str, Any]:
@@ -116,6 +109,17 @@ class FoundRig:
         text += f"; focal lengths {longer[0]:+.2f} +- {sigma[0]:.2f} % and {longer[1]:+.2f} +- {sigma[1]:.2f} %"
         late = f"; right camera later by {self.errors[_DELAY]:.4f} +- {self.sigma[_DELAY]:.4f} frame periods"
         return text + (late if self.sigma[_DELAY] > 0.0 else "")
+
+
+def contradict(errors: FloatArray, covariance: FloatArray) -> bool:
+    """Whether errors (8,) as a whole contradict a calibration: a chi-squared test at 0.1 %.
+
+    Of seven errors one exceeds three deviations in every fiftieth rig by chance, and a needless correction costs
+    accuracy. Errors with a covariance (8, 8) of 0 are not estimated.
+    """
+    free = np.flatnonzero(np.diagonal(covariance) > 0.0)
+    inverse = np.linalg.pinv(covariance[np.ix_(free, free)], hermitian=True)
+    return float(errors[free] @ inverse @ errors[free]) > float(chdtri(len(free), _CHANCE))
 
 
 def with_errors(rig: StereoRig, errors: FloatArray) -> StereoRig:
@@ -280,12 +284,11 @@ def agrees(
     rig: StereoRig,
     shutter: RollingShutter,
     prior: FloatArray,
-    deviations: float,
     robust: RobustOptions | None = None,
     seed: int = 0,
     motion_model: str = "linear",
 ) -> bool:
-    """Whether one step of ``refine_rig`` from errors of 0 stays within ``deviations`` standard deviations.
+    """Whether one step of ``refine_rig`` from errors of 0 does not ``contradict`` the calibration.
 
     This takes a fifth of the time. One step suffices for errors that move rows by a fraction of a pixel: the
     neglected terms are quadratic in them.
@@ -299,8 +302,9 @@ def agrees(
     covariance = problem.covariance(here.H)
     if covariance is None:
         return False
-    sigma = np.sqrt(np.diagonal(covariance)[problem.free])
-    return bool(np.all(np.abs(np.linalg.solve(here.H, here.g)) <= deviations * sigma))
+    errors = np.zeros(len(ERRORS))
+    errors[problem.free] = -np.linalg.solve(here.H, here.g)
+    return not contradict(errors, covariance)
 
 
 def rows_moved(errors: FloatArray, rig: StereoRig) -> float:

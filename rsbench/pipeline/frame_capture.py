@@ -288,8 +288,6 @@ def find_rig(
     return found, matches
 
 
-_CLEAR = 3.0
-"""Standard deviations above which a calibration error is estimated."""
 _WIDE = 4.0
 """Factor of the threshold for outliers while the calibration may be off by a few pixels."""
 _LIKELY_ROWS_PX = 0.3
@@ -340,11 +338,11 @@ def _rig_of_tracks(
 def _as_calibrated(
     matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> bool:
-    """Whether the matches clearly agree with the calibration; False if the readout ratio is unknown."""
+    """Whether the matches agree with the calibration, see ``agrees``; False if the readout ratio is unknown."""
     if inputs.readout_ratio is None:
         return False
     prior, model = prior_of(np.zeros(len(ERRORS))), _model_name(options)
-    return agrees([matches], rig, inputs.shutter_of(rig), prior, _CLEAR, options.robust, options.seed, model)
+    return agrees([matches], rig, inputs.shutter_of(rig), prior, options.robust, options.seed, model)
 
 
 def _model_name(options: CorrectionOptions) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
@@ -260,17 +261,19 @@ def known_depth(images: Images, depth: Mapping[View, NDArray[np.float32]]) -> Pa
 
 def timed_pairs(pairs: Pairs, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> Pairs:
     """The frames with depth that accounts for the motion between the times of both points of a disparity."""
-    first, second = (
-        pair
-        if pair.timed
-        else replace(
+
+    def timed(pair: FramePair, frame: int) -> FramePair:
+        both = {s: np.where(pair.depth[s] == 0.0, pair.guess[s], pair.depth[s]) for s in SIDES}
+        both = {s: timed_depth(both[s], rig, shutter, motion, s, frame) for s in SIDES}
+        nothing = np.float32(0.0)
+        return replace(
             pair,
-            depth={s: timed_depth(pair.depth[s], rig, shutter, motion, s, frame) for s in SIDES},
-            guess={s: timed_depth(pair.guess[s], rig, shutter, motion, s, frame) for s in SIDES},
+            depth={s: np.where(pair.depth[s] == 0.0, nothing, both[s]) for s in SIDES},
+            guess={s: np.where(pair.guess[s] == 0.0, nothing, both[s]) for s in SIDES},
             timed=True,
         )
-        for frame, pair in enumerate(pairs)
-    )
+
+    first, second = (pair if pair.timed else timed(pair, frame) for frame, pair in enumerate(pairs))
     return first, second
 
 
@@ -279,20 +282,18 @@ def complete_depth(
 ) -> Pairs:
     """The frames with depth from the motion where the other camera gives none, for the given frame indices.
 
-    If the cameras differ, it also replaces depth that the other frame contradicts, unless the other camera
-    contradicts the new one. With two equal cameras in alignment that changes a frame by -0.1 to 0.1 dB on average,
-    with one above the other it gains up to 0.8 dB.
+    If the cameras differ and read a point at different times, it also replaces depth that the other frame
+    contradicts, unless the other camera contradicts the new one. That gains up to 0.7 dB with one camera above the
+    other; if both read a point at one time, it changes a frame by -0.1 to 0.1 dB on average.
     """
+    unsure = not (rig.aligned or rig.rows_together(shutter.scanning, shutter.readout_ratio))
 
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])
         known = pairs[0].depth[side], pairs[1].depth[side]
-        found = depth_from_motion(
-            (first, second), known, rig, shutter, motion, side, frames, replace_unlike=not rig.aligned
-        )
-        if rig.aligned:
-            return found
-        for frame in frames:
+        near = math.inf if rig.aligned else _nearest(known)
+        found = depth_from_motion((first, second), known, rig, shutter, motion, side, frames, unsure, near)
+        for frame in frames if unsure else ():
             pair = eight_bit([pairs[frame].images[each] for each in (side, *(s for s in SIDES if s != side))])
             wrong = stereo_contradicts(
                 (pair[0], pair[1]), known[frame], found[frame], rig, shutter, motion, side, frame
@@ -304,6 +305,17 @@ def complete_depth(
         found = dict(zip(SIDES, pool.map(side_depths, SIDES), strict=True))
     first, second = (_completed(pair, {side: found[side][k] for side in SIDES}) for k, pair in enumerate(pairs))
     return first, second
+
+
+_NEAREST, _NEARER = 0.001, 1.25
+"""Share of the known depths that may be smaller than the nearest surface; factor of its inverse depth up to which
+unknown depth is searched."""
+
+
+def _nearest(depths: Sequence[NDArray[np.float32]]) -> float:
+    """Largest inverse depth to be searched, 1 / m, if these depths (H, W) are known."""
+    known = np.concatenate([depth[depth > 0.0] for depth in depths])
+    return _NEARER / float(np.quantile(known, _NEAREST, method="lower")) if len(known) else math.inf
 
 
 def _completed(pair: FramePair, found: dict[Side, NDArray[np.float32]]) -> FramePair:

@@ -42,6 +42,7 @@ from rsbench.vision.reprojection import (
     reproject,
     reproject_pixels,
     reprojection_of,
+    sight_of,
 )
 
 F32 = NDArray[np.float32]
@@ -76,6 +77,7 @@ def depth_from_motion(
     side: Side,
     wanted: tuple[int, ...] = (0, 1),
     replace_unlike: bool = False,
+    most_near: float = math.inf,
 ) -> tuple[F32, F32]:
     """Depth (H, W), metres, for pixels of both frames of one camera whose depth is 0; 0 where it stays unknown.
 
@@ -88,16 +90,17 @@ def depth_from_motion(
         replace_unlike: also search pixels whose known depth leads to a place of the other frame that looks
             different, and replace it if another depth leads to a place that looks much more similar. Such errors
             of stereo occur on texture along the baseline.
+        most_near: largest inverse depth, 1 / m, that is searched, if its parallax is below ``_REACH``.
     """
     found = np.zeros_like(depths[0]), np.zeros_like(depths[1])
     poses = [row_poses(rig, shutter, motion, side, frame) for frame in (0, 1)]
     axes = (shutter.axis(side), shutter.axis(side))
     maps = [reprojection_of(rig.sensor(side), poses[frame], poses[1 - frame], axes) for frame in (0, 1)]
     gain = parallax_gain(rig.sensor(side), *maps)
-    count = int(_REACH * max(depths[0].shape))
     unknown = [depth == 0.0 for depth in depths]
     if gain == 0.0 or not (replace_unlike or any(np.any(mask) for mask in unknown)):
         return found
+    count = int(min(_REACH * max(depths[0].shape), math.ceil(min(gain * most_near, 1e6)) + _FEWEST))
     greys = [grey_u8(image) for image in images]
     censuses = [census(grey) for grey in greys]
     rhos = [inverse_depth(depth) for depth in depths]
@@ -147,8 +150,13 @@ def stereo_contradicts(
     maps = here._replace(A=there.A, B=there.B, lens=there.lens, there=there.there)
     greys = [grey_u8(image) for image in images]
     both = (greys[0], greys[1], census(greys[0]), census(greys[1]))
-    costs = [_known_costs(inverse_depth(depth), both, maps) for depth in (known, found)]
-    return np.asarray((known > 0.0) & (found > 0.0) & (costs[1] > costs[0] + _WORSE))
+    compared = (known > 0.0) & (found > 0.0)
+    near = _windows(compared.astype(np.uint8))
+    costs = [
+        _known_costs(np.where(near, inverse_depth(depth), np.float32(np.nan)), both, maps)
+        for depth in (known, found)
+    ]
+    return np.asarray(compared & (costs[1] > costs[0] + _WORSE))
 
 
 def _known_costs(
@@ -192,6 +200,11 @@ def _landed(rho: F32, wanted: Mask, maps: Reprojection) -> Mask:
     """Places (H, W) of the other frame where ``wanted`` pixels are seen, and those in their windows."""
     marks = np.zeros(rho.shape, dtype=np.uint8)
     _mark(rho, wanted, maps, marks)
+    return _windows(marks)
+
+
+def _windows(marks: NDArray[np.uint8]) -> Mask:
+    """Pixels (H, W) in the windows of those that are marked."""
     return np.asarray(cv2.dilate(marks, np.ones((_WINDOW, _WINDOW), np.uint8)) > 0)
 
 
@@ -343,8 +356,8 @@ def _fill_costs(
     """
     height, width = other.shape
     last = len(maps.A) - 1
-    line = min(line_of(maps.columns, x, y), last)
-    M, b = homography(x, y, line, maps)
+    line, sight = min(line_of(maps.columns, x, y), last), sight_of(x, y, maps)
+    M, b = homography(sight, line, maps)
     u, v, u_0, v_0, u_1, v_1, ahead = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, line
     for k in range(len(cost)):
         if maps.lens is None:
@@ -354,7 +367,7 @@ def _fill_costs(
             seen_by = min(max(int(along + 0.5), 0), last) if -far < along < 2 * far else line
             if seen_by != line:
                 line = seen_by
-                M, b = homography(x, y, line, maps)
+                M, b = homography(sight, line, maps)
         else:
             # A lens takes most of the time. Between places _CHORD steps apart the curve is straight to 0.1 px.
             share = (k % _CHORD) / _CHORD

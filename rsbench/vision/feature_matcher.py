@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -117,10 +118,16 @@ def undistorted(image: NDArray[Any], camera: PinholeCamera | AlignedCamera) -> N
     """
     if camera.is_ideal:
         return image
-    source = np.nan_to_num(camera.lens_pixels(camera.ideal.pixel_grid()), nan=_FAR).astype(np.float32)
+    source = _lens_pixels(camera)
     return np.asarray(
         cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
     )
+
+
+@lru_cache(maxsize=2 * len(SIDES))
+def _lens_pixels(camera: PinholeCamera | AlignedCamera) -> NDArray[np.float32]:
+    """(H, W, 2) pixels of the image at which all pixels of the ideal camera are; not to be written to."""
+    return np.nan_to_num(camera.lens_pixels(camera.ideal.pixel_grid()), nan=_FAR).astype(np.float32)
 
 
 def of_sensors(matches: Correspondences, rig: StereoRig, border_px: float = 0.0) -> Correspondences:

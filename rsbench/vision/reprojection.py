@@ -125,14 +125,14 @@ def across_lines(columns: bool, u: float, v: float) -> float:
     return u if columns else v
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", inline="always")
 def distort(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """``rsbench.core.camera.Lens.distort`` of one ideal pixel, in pixels; NaN beyond the lens's reach."""
     x, y = bend(lens, (u - lens[2]) / lens[0], (v - lens[3]) / lens[1])
     return x * lens[0] + lens[2], y * lens[1] + lens[3]
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", inline="always")
 def bend(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
     """``rsbench.core.camera.Lens.distort`` of one point of the plane z = 1; NaN beyond the lens's reach."""
     s = x * x + y * y
@@ -239,13 +239,19 @@ def _seen_from(
 
 
 @compiled(error_model="numpy", inline="always")
-def homography(x: int, y: int, line: int, maps: Reprojection) -> tuple[Vector, Vector]:
-    """M and b of a pixel and a line of the other view: it sees the pixel's point at M + rho b, homogeneous."""
-    G, c, A, B, own = maps.G, maps.c, maps.A[line], maps.B[line], line_of(maps.columns, x, y)
+def sight_of(x: int, y: int, maps: Reprojection) -> tuple[Vector, Vector]:
+    """Ray of a pixel and centre of its camera, in the world's axes."""
+    G, c, own = maps.G, maps.c, line_of(maps.columns, x, y)
     gx, gy = look(maps.ideal, x, y)
-    ray = apply(G[own], (gx, gy, 1.0))
-    centre = apply(A, (c[own, 0], c[own, 1], c[own, 2]))
-    return apply(A, ray), (centre[0] + B[0], centre[1] + B[1], centre[2] + B[2])
+    return apply(G[own], (gx, gy, 1.0)), (c[own, 0], c[own, 1], c[own, 2])
+
+
+@compiled(error_model="numpy", inline="always")
+def homography(sight: tuple[Vector, Vector], line: int, maps: Reprojection) -> tuple[Vector, Vector]:
+    """M and b of a pixel and a line of the other view: it sees the pixel's point at M + rho b, homogeneous."""
+    A, B = maps.A[line], maps.B[line]
+    centre = apply(A, sight[1])
+    return apply(A, sight[0]), (centre[0] + B[0], centre[1] + B[1], centre[2] + B[2])
 
 
 @compiled(error_model="numpy", inline="always")

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, final
@@ -33,23 +33,23 @@ from numpy.typing import NDArray
 from rsbench.components.compiled import compiled
 from rsbench.components.motion_kernels import Vector
 from rsbench.core.arguments import check_ranges
-from rsbench.core.camera import Lens
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import grey_u8, guided_upsample, halved, keys_weights, resample
-from rsbench.vision.reprojection import distort, lens_table
 from rsbench.vision.stereo_matcher import (
     F32,
     MatcherEntry,
     StereoMatcher,
     between_pixels,
     body_depth,
+    camera_of_body,
     find_disparities,
     level_pixels,
     own_depths,
     pixel_rays,
+    seen_at,
     widened,
 )
 
@@ -208,6 +208,7 @@ def _plane_at_centre(sums: FloatArray) -> float:
 
 
 U8 = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 _MODES = {
     "sgbm": cv2.StereoSGBM_MODE_SGBM,
     "hh": cv2.StereoSGBM_MODE_HH,
@@ -285,6 +286,12 @@ class SgmMatcher(SgmOptions, StereoMatcher):
 
     def disparities(self, left: NDArray[Any], right: NDArray[Any], rig: StereoRig) -> tuple[F32, F32]:
         return stereo_disparities(left, right, rig, self)
+
+    def limited(self, left: NDArray[Any], right: NDArray[Any], rig: StereoRig, seen: Sequence[Mask]) -> SgmMatcher:
+        if self.num_disparities is not None or self.nearest_depth is not None:
+            return self
+        largest = _largest_disparity(*_greys(left, right, rig), self, seen)
+        return replace(self, num_disparities=math.ceil(min(max(largest, 1.0), rig.camera.width)))
 
 
 def stereo_disparity(
@@ -367,11 +374,19 @@ def disparity_range(left: U8, right: U8, rig: StereoRig, options: SgmOptions) ->
     return 16 * math.ceil(min(max(largest, 1.0), width) / 16)
 
 
-def _largest_disparity(left: U8, right: U8, options: SgmOptions) -> float:
+def _largest_disparity(left: U8, right: U8, options: SgmOptions, seen: Sequence[Mask] | None = None) -> float:
+    """With masks (H, W) of what the images show: of pixels that both show, also if infinitely far. Others find
+    false partners, of large disparity, as theirs are black."""
     small = (max(left.shape[1] // _COARSE, 1), max(left.shape[0] // _COARSE, 1))
     a, b = (cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (left, right))
     count = 16 * math.ceil(small[0] / 2 / 16)
     found = _consistent(*_match_both(a, b, count, options), options.consistency_px)
+    if seen is not None:
+        here, there = (cv2.resize(np.float32(each), small, interpolation=cv2.INTER_AREA) == 1.0 for each in seen)
+        partner = np.maximum(np.rint(np.arange(small[0]) - np.nan_to_num(found)).astype(np.int64), 0)
+        both = here & there & np.take_along_axis(there, partner, axis=1)
+        coarse = replace(options, speckle_window=options.speckle_window // _COARSE)
+        found = _without_speckles(np.where(both, found, np.float32(np.nan)), coarse)
     found = found[np.isfinite(found)]
     if found.size == 0:
         return 16.0
@@ -435,14 +450,22 @@ def fill_holes(disparity: F32) -> F32:
 
 def known_beside(values: F32) -> tuple[F32, F32]:
     """Nearest finite value (H, W) at or left of each pixel, and at or right of it; NaN where there is none."""
-    height, width = values.shape
-    known = np.isfinite(values)
-    columns = np.broadcast_to(np.arange(width), (height, width))
-    before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    after = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
-    left = np.where(before >= 0, np.take_along_axis(values, np.maximum(before, 0), axis=1), np.nan)
-    right = np.where(after < width, np.take_along_axis(values, np.minimum(after, width - 1), axis=1), np.nan)
+    left, right = np.empty_like(values), np.empty_like(values)
+    _fill_beside(values, left, right)
     return left, right
+
+
+@compiled(error_model="numpy")
+def _fill_beside(values: F32, left: F32, right: F32) -> None:
+    height, width = values.shape
+    for y in range(height):
+        before, after = np.float32(np.nan), np.float32(np.nan)
+        for x in range(width):
+            before = values[y, x] if abs(values[y, x]) < np.inf else before
+            left[y, x] = before
+        for x in range(width - 1, -1, -1):
+            after = values[y, x] if abs(values[y, x]) < np.inf else after
+            right[y, x] = after
 
 
 def seen_by_other(depth: NDArray[Any], other_depth: NDArray[Any], rig: StereoRig, side: Side) -> NDArray[np.bool_]:
@@ -498,7 +521,6 @@ def depth_metrics(
     }
 
 
-Mask = NDArray[np.bool_]
 _SMOOTH_LEVELS = 2.0
 """Largest standard deviation of 3 x 3 pixels of sky, grey levels."""
 _LEAST_SHARE = 0.002
@@ -576,9 +598,9 @@ _ROUNDS, _SETTLED, _STILL_PX = 4, 0.02, 0.5
 changed by more than the third value, px. Delayed cameras take two or three rounds, opposite scans all."""
 _SMALL, _LEAST_SIDE = 4, 60
 """Reduction of the size, and smallest side of a reduced image, px. The last round is at full size."""
-_STEPS, _SAME_LINE = 6, 1e-3
+_STEPS, _SAME_LINE = 6, 0.03
 """Most iterations for the line of a point, each of which multiplies the error by the motion, px, during one line;
-change of the line at which they end."""
+change of the line at which they end: places are exact to that share of the motion, px, during one line."""
 _ONE_SURFACE_PX = 1.0
 """Results are not interpolated between neighbours whose displacement differs by more than this, px."""
 _ORDINARY = 1 / 32
@@ -636,18 +658,22 @@ def moving_disparities(
     """
     eyes = {side: _eye(rig, shutter, motion, side, frame) for side in SIDES}
     level, gain = replace(rig.ideal, camera=widened(rig)), rig.camera.fx * rig.baseline
-    tilt, own = _tilt(_pair(eyes, level, "left"), level), dict[Side, U8]()
+    tilt, own, shown = _tilt(_pair(eyes, level, "left"), level), dict[Side, U8](), dict[Side, Mask]()
     level, tilt, pad = _heightened(level, tilt)
     for side in SIDES:
         places = np.full((level.camera.height, level.camera.width, 2), np.nan, np.float32)
         _fill_places(_pair(eyes, level, side, tilt), places)
-        own[side] = resample(images[side], places)
+        own[side], shown[side] = resample(images[side], places), np.isfinite(places[..., 0])
     rho = _first_guess(entry, own["left"], images["right"], level, _pair(eyes, level, "left", tilt))
     found = list[F32]()
     for side, other in (SIDES, SIDES[::-1]):
         pair = _pair(eyes, level, side, tilt)
         ends, rays = _ends(pair, rho)
-        here = _of_one(entry, own[side], resample(images[other], ends), level, side)
+        seen = resample(images[other], ends)
+        if side == "left":  # the disparities of the right image are the same ones
+            masks = shown[side], np.isfinite(ends[..., 0])
+            entry = replace(entry, component=entry.component.limited(own[side], seen, level, masks))
+        here = _of_one(entry, own[side], seen, level, side)
         disparity = np.full_like(here, np.nan)
         _fill_disparities(here, rays, pair, disparity)
         rho = _without_holes(disparity / np.float32(gain))
@@ -694,9 +720,7 @@ def _untilted(places: FloatArray, pair: _Pair, pad: int) -> FloatArray:
 def _eye(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int) -> _Eye:
     poses, camera = rig.eye_from_world(motion, shutter.line_times(frame, side), side), rig.sensor(side)
     lines = np.concatenate([poses.R.reshape(-1, 9), poses.t], axis=1)
-    table = lens_table(camera, camera.lens or Lens(model="brown-conrady"))
-    size = camera.width, camera.height
-    return _Eye(camera.ideal.K @ rig.own(side).R, table, lines, shutter.axis(side) == 0, size)
+    return _Eye(*camera_of_body(rig, side), lines, shutter.axis(side) == 0, (camera.width, camera.height))
 
 
 def _pair(
@@ -770,17 +794,6 @@ def _without_holes(rho: F32) -> F32:
 
 
 @compiled(error_model="numpy", inline="always")
-def _seen_at(eye: _Eye, x: float, y: float, z: float) -> tuple[float, float]:
-    """Pixel of a point in the body's axes in a camera; NaN if it is not visible."""
-    m = eye.turn
-    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
-    s = 1.0 / depth if depth > 0.0 else np.nan
-    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) * s
-    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) * s
-    return distort(eye.lens, u, v)
-
-
-@compiled(error_model="numpy", inline="always")
 def _level_ray(pair: _Pair, column: float, row: int) -> tuple[float, float]:
     """x / z, y / z of a pixel of the level images."""
     x = (column - pair.level[2]) / pair.level[0]
@@ -794,7 +807,7 @@ def _fill_places(pair: _Pair, places: F32) -> None:
     for row in range(places.shape[0]):
         for column in range(places.shape[1]):
             x, y = _level_ray(pair, column, row)
-            u, v = _seen_at(eye, x, y, 1.0)
+            u, v = seen_at(eye.turn, eye.lens, x, y, 1.0)
             if -0.5 <= u <= eye.size[0] - 0.5 and -0.5 <= v <= eye.size[1] - 0.5:
                 places[row, column, 0], places[row, column, 1] = u, v
 
@@ -827,10 +840,11 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
     eye, other = pair.eye, pair.other
     width, height = other.size
     for row in range(rho.shape[0]):
+        shift = 0.0
         for column in range(rho.shape[1]):
             far = rho[row, column]
             x, y = _level_ray(pair, column + pair.shift * far, row)
-            u, v = _seen_at(eye, x, y, 1.0)
+            u, v = seen_at(eye.turn, eye.lens, x, y, 1.0)
             if not abs(u + v) < np.inf:
                 continue
             below, s = _line(eye, u if eye.columns else v)
@@ -841,8 +855,9 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
             Y = a[1] * p + b[1] * q + c[1] * r
             Z = a[2] * p + b[2] * q + c[2] * r
             p, q = _level_ray(pair, column, row)
-            u, v = _seen_at(other, p, q, 1.0)
-            before = u if other.columns else v
+            u, v = seen_at(other.turn, other.lens, p, q, 1.0)
+            start = u if other.columns else v
+            before = start + shift
             for _ in range(_STEPS):
                 below, s = _line(other, before)
                 a, b = _pose(other.lines, below, s, 0), _pose(other.lines, below, s, 1)
@@ -850,11 +865,12 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
                 p = a[0] * X + a[1] * Y + a[2] * Z + far * t[0]
                 q = b[0] * X + b[1] * Y + b[2] * Z + far * t[1]
                 r = c[0] * X + c[1] * Y + c[2] * Z + far * t[2]
-                u, v = _seen_at(other, p, q, r)
+                u, v = seen_at(other.turn, other.lens, p, q, r)
                 along = u if other.columns else v
                 if abs(along - before) < _SAME_LINE:
                     break
                 before = along
+            shift = before - start if abs(before) < np.inf else 0.0  # of the next pixel about the same
             rays[row, column, 0], rays[row, column, 1] = p / r, q / r
             if -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5:
                 ends[row, column, 0], ends[row, column, 1] = u, v
@@ -864,11 +880,11 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
 def _inverse_depth(pair: _Pair, x: float, y: float, p: float, q: float) -> float:
     """``_rho`` if both cameras show these rays, else NaN."""
     eye, other = pair.eye, pair.other
-    u, v = _seen_at(other, p, q, 1.0)
+    u, v = seen_at(other.turn, other.lens, p, q, 1.0)
     if not (-0.5 <= u <= other.size[0] - 0.5 and -0.5 <= v <= other.size[1] - 0.5):
         return np.nan
     there = u if other.columns else v
-    u, v = _seen_at(eye, x, y, 1.0)
+    u, v = seen_at(eye.turn, eye.lens, x, y, 1.0)
     if not abs(u + v) < np.inf:
         return np.nan
     return _rho(pair, x, y, p, u if eye.columns else v, there)
@@ -908,7 +924,7 @@ def _fill_timed(depth: F32, own: F32, rays: FloatArray, pair: _Pair, same: tuple
                 continue
             x, y = rays[row, column, 0], rays[row, column, 1]
             p = x - pair.shift / pair.level[0] * own[row, column] / depth[row, column]
-            u, v = _seen_at(other, p, y, 1.0)
+            u, v = seen_at(other.turn, other.lens, p, y, 1.0)
             line, there = float(column if eye.columns else row), u if other.columns else v
             if not abs(there) < np.inf:
                 there = same[0] + same[1] * line  # the lens does not show it: use the time of the pixel itself

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rsbench.components import plugins
 from rsbench.components.compiled import compiled
 from rsbench.components.plugins import Entry, Kind, RunOptions
-from rsbench.core.camera import PinholeCamera
+from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.errors import RsbenchError
 from rsbench.core.geometry import check_cameras_of, check_ideal
 from rsbench.core.motion import Motion
@@ -26,10 +26,13 @@ from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.images import resample
-from rsbench.vision.reprojection import ideal_pixels_of
+from rsbench.vision.reprojection import distort, ideal_pixels_of, lens_table
 
 _WIDEST = 2.0
 """Times the size of the image: what a lens shows beyond has no depth from the other camera."""
+_LARGEST, _SPARE, _CUT = 0.25, 0.12, 0.25
+"""Largest disparity of what both cameras must show, to be matched; what is added around it, as the cameras may
+read it at different times; most that is cut off at each side: shares of the ideal image's size."""
 _ONE_SURFACE_PX = 1.0
 """Disparities of neighbours that differ by more are not interpolated."""
 
@@ -50,6 +53,16 @@ class StereoMatcher(ABC):
         rectified in a rolling-shutter pair too, for both cameras read a row at the same time. ``rig`` gives focal
         length and baseline to a matcher that limits its search.
         """
+
+    def limited(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig, seen: Sequence[NDArray[np.bool_]]
+    ) -> StereoMatcher:
+        """The matcher with a search that is limited to the disparities of this pair; by default itself.
+
+        Args:
+            seen: (H, W) of each image, whether the camera shows the pixel; all others are black.
+        """
+        return self
 
 
 class MotionMatcher(StereoMatcher):
@@ -214,9 +227,11 @@ def sensor_disparities(
     """
     if rig.rectified:
         return find_disparities(entry, left, right, rig)
-    wide, images = widened(rig), zip(SIDES, (left, right), strict=True)
-    levels = [resample(image, level_places(rig, side)) for side, image in images]
-    both = find_disparities(entry, levels[0], levels[1], replace(rig.ideal, camera=wide))
+    level, places = replace(rig.ideal, camera=widened(rig)), [level_places(rig, side) for side in SIDES]
+    levels = [resample(image, each) for image, each in zip((left, right), places, strict=True)]
+    seen = [np.isfinite(each[..., 0]) for each in places]
+    entry = replace(entry, component=entry.component.limited(levels[0], levels[1], level, seen))
+    both = find_disparities(entry, levels[0], levels[1], level)
     first, second = (
         _with_partner(between_pixels(found, level_pixels(rig, side)), rig, side)
         for side, found in zip(SIDES, both, strict=True)
@@ -225,19 +240,37 @@ def sensor_disparities(
 
 
 def widened(rig: StereoRig) -> PinholeCamera:
-    """The rig's ideal camera with an image that holds all that both cameras show."""
+    """The rig's ideal camera with an image that holds what both cameras show at any disparity up to ``_LARGEST``.
+
+    Cameras that converge show what is as near as the point where their axes meet with larger disparities. If the
+    cameras are equal, the image holds all that they show.
+    """
     return rig.camera if rig.rectified else _widened(rig)
 
 
 @lru_cache(maxsize=4)
 def _widened(rig: StereoRig) -> PinholeCamera:
+    ideal = rig.camera.ideal
     if rig.aligned:
-        return _around(rig.camera.ideal, rig.camera.ideal.project(pixel_rays(rig, "left")))
-    rims = list[FloatArray]()
+        grid = ideal.project(pixel_rays(rig, "left"))
+        return _around(ideal, np.nanmin(grid, axis=(0, 1)), np.nanmax(grid, axis=(0, 1)), 0.0)
+    lows, highs = list[FloatArray](), list[FloatArray]()
     for side in SIDES:
-        grid = rig.camera.project(pixel_rays(rig, side))
-        rims += [grid[0], grid[-1], grid[:, 0], grid[:, -1], grid[::8, ::8].reshape(-1, 2)]
-    return _around(rig.camera, np.concatenate(rims)[None])
+        rays = pixel_rays(rig, side)
+        rim = np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1], rays[::8, ::8].reshape(-1, 3)])
+        pixels = ideal.project(rim)
+        lows.append(np.nanmin(pixels, axis=0))
+        highs.append(np.nanmax(pixels, axis=0))
+    (left, right), (left_end, right_end) = lows, highs
+    size, apart = np.array([ideal.width, ideal.height]), 0.5 * (left + left_end - right - right_end)
+    largest, spare = np.array([_LARGEST * ideal.width + max(apart[0], 0.0), 0.0]), _SPARE * size
+    low = np.minimum(np.maximum(left, right), np.maximum(right, left - largest))
+    high = np.maximum(np.minimum(left_end, right_end + largest), np.minimum(right_end, left_end))
+    low, high = (
+        np.maximum(low - spare, np.minimum(left, right)),
+        np.minimum(high + spare, np.maximum(left_end, right_end)),
+    )
+    return _around(ideal, low, high, _CUT)
 
 
 @lru_cache(maxsize=2 * len(SIDES))
@@ -263,9 +296,43 @@ def level_pixels(rig: StereoRig, side: Side) -> FloatArray:
 @lru_cache(maxsize=2 * len(SIDES))
 def level_places(rig: StereoRig, side: Side) -> F32:
     """(h, w, 2) pixels of a camera at which all pixels of the level image are; NaN beside it."""
-    wide, eye = widened(rig), rig.eye(side)
-    places = eye.project(wide.unproject(wide.pixel_grid()))
-    return np.where(eye.contains(places)[..., None], places, np.nan).astype(np.float32)
+    wide = widened(rig)
+    return _places(wide.unproject(wide.pixel_grid()), rig, side)
+
+
+def camera_of_body(rig: StereoRig, side: Side) -> tuple[FloatArray, FloatArray]:
+    """(3, 3) from rays in the body's axes to homogeneous pixels of a camera without its lens, and (14,) the
+    numbers of its lens, or of one without distortion."""
+    camera = rig.sensor(side)
+    return camera.ideal.K @ rig.own(side).R, lens_table(camera, camera.lens or Lens(model="brown-conrady"))
+
+
+def _places(rays: FloatArray, rig: StereoRig, side: Side) -> F32:
+    """(h, w, 2) pixels of a camera that see rays (h, w, 3) in the body's axes; NaN beside the image."""
+    places, camera = np.full((*rays.shape[:2], 2), np.nan, np.float32), rig.sensor(side)
+    _fill_places(rays, *camera_of_body(rig, side), camera.width, camera.height, places)
+    return places
+
+
+@compiled(error_model="numpy", inline="always")
+def seen_at(m: FloatArray, lens: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
+    """Pixel of a point in the body's axes in a camera, by ``camera_of_body``; NaN if it is not visible."""
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
+    s = 1.0 / depth if depth > 0.0 else np.nan
+    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) * s
+    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) * s
+    return distort(lens, u, v)
+
+
+@compiled(error_model="numpy")
+def _fill_places(
+    rays: FloatArray, turn: FloatArray, lens: FloatArray, width: int, height: int, places: F32
+) -> None:
+    for row in range(rays.shape[0]):
+        for column in range(rays.shape[1]):
+            u, v = seen_at(turn, lens, rays[row, column, 0], rays[row, column, 1], rays[row, column, 2])
+            if -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5:
+                places[row, column, 0], places[row, column, 1] = u, v
 
 
 @lru_cache(maxsize=4)
@@ -279,12 +346,13 @@ def body_depth(depth: F32, rig: StereoRig, side: Side) -> F32:
     return depth if rig.aligned else depth / own_depths(rig, side)
 
 
-def _around(ideal: PinholeCamera, pixels: FloatArray) -> PinholeCamera:
-    """The ideal camera with an image that holds these pixels (..., 2), by whole pixels, at most ``_WIDEST``."""
+def _around(ideal: PinholeCamera, low: FloatArray, high: FloatArray, cut: float) -> PinholeCamera:
+    """The ideal camera with an image that holds pixels from ``low`` (2,) to ``high``, by whole pixels, at most
+    ``_WIDEST``; at most the share ``cut`` is cut off at each side."""
     size = np.array([ideal.width, ideal.height])
-    spare = np.floor((_WIDEST - 1.0) * 0.5 * size)
-    low = np.clip(np.ceil(-np.nanmin(pixels, axis=(0, 1))), 0.0, spare).astype(int)
-    high = np.clip(np.ceil(np.nanmax(pixels, axis=(0, 1)) - (size - 1)), 0.0, spare).astype(int)
+    least, spare = -np.floor(cut * size), np.floor((_WIDEST - 1.0) * 0.5 * size)
+    low = np.clip(np.ceil(-low), least, spare).astype(int)
+    high = np.clip(np.ceil(high - (size - 1)), least, spare).astype(int)
     width, height = (size + low + high).tolist()
     return replace(ideal, width=width, height=height, cx=ideal.cx + low[0], cy=ideal.cy + low[1])
 
@@ -318,7 +386,7 @@ def _fill_between(disparity: F32, places: FloatArray, out: F32) -> None:
 
 def _with_partner(disparity: F32, rig: StereoRig, side: Side) -> F32:
     """The disparities (H, W) of a camera's pixels whose other end the other camera shows."""
-    sign, other = (1.0, rig.eye("right")) if side == "left" else (-1.0, rig.eye("left"))
+    sign, other = (1.0, SIDES[1]) if side == "left" else (-1.0, SIDES[0])
     rays = pixel_rays(rig, side).copy()
     rays[..., 0] -= sign / rig.camera.fx * disparity
-    return np.where(other.contains(other.project(rays)), disparity, np.float32(np.nan))
+    return np.where(np.isfinite(_places(rays, rig, other)[..., 0]), disparity, np.float32(np.nan))

@@ -174,10 +174,10 @@ def test_one_step_decides_whether_a_calibration_agrees() -> None:
     prior = prior_of(np.zeros(8))
     for seed in range(3):
         tracks = Correspondences(tracks=tracks_of(np.random.default_rng(200 + seed), 0.3, 250))
-        assert agrees([tracks], TRUE, SHUTTER, prior, 3.0)
+        assert agrees([tracks], TRUE, SHUTTER, prior)
         turned = with_errors(TRUE, np.eye(8)[1] * np.deg2rad(0.15))
         assert rows_moved(np.eye(8)[1] * np.deg2rad(0.15), TRUE) < 0.3
-        assert not agrees([tracks], turned, SHUTTER, prior, 3.0)
+        assert not agrees([tracks], turned, SHUTTER, prior)
 
 
 def test_a_late_right_camera_is_found_with_its_rotation() -> None:

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from commands import refused
+from general_rigs import RIGS
 
 from rsbench.components.cards import list_cards
 from rsbench.components.motion_models import LinearMotion
@@ -16,13 +18,20 @@ from rsbench.components.plugins import Entry, RunOptions
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import VIEWS, StereoRig
+from rsbench.core.rig import SIDES, VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.vision.feature_matcher import FeatureMatcher, find_correspondences, load_features
 from rsbench.vision.features import MatchOptions, SiftMatcher
 from rsbench.vision.plane_sweep import SweepMatcher
 from rsbench.vision.stereo_depth import SgmMatcher, SgmOptions
-from rsbench.vision.stereo_matcher import MotionMatcher, StereoMatcher, find_depths, find_disparities, load_matcher
+from rsbench.vision.stereo_matcher import (
+    MotionMatcher,
+    StereoMatcher,
+    find_depths,
+    find_disparities,
+    load_matcher,
+    widened,
+)
 
 RIG = StereoRig(camera=PinholeCamera.centred(40, 30, 50.0), baseline=0.2)
 SHUTTER, MOTION = RollingShutter(height=30, readout_ratio=0.5), LinearMotion(np.zeros(3), np.ones(3))
@@ -184,3 +193,35 @@ def test_wrong_answers_are_refused_in_one_line(found: Any, answer: Any, words: t
 def test_sub_pixel_positions_at_the_border_pass() -> None:
     corner = Correspondences(left=np.array([[-0.4, -0.4, 39.4, 29.4]]))
     assert find_correspondences(entry_of(Finds(corner)), IMAGES) is corner
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_level_images_hold_what_both_cameras_show(name: str) -> None:
+    rig, rng = RIGS[name], np.random.default_rng(3)
+    level, ends = widened(rig), rig.camera.ideal
+    # Points all around, up to a disparity of a quarter of the image's width; within twice the size, the limit.
+    pixels = rng.uniform(-0.49, 1.49, (20_000, 2)) * (ends.width, ends.height)
+    disparity = rng.uniform(0.0, 0.25 * ends.width, (len(pixels), 1))
+    pixels[:, 0] = np.maximum(pixels[:, 0], disparity[:, 0] - 0.49 * ends.width)
+    other = pixels - disparity * [1.0, 0.0]
+    rays = [ends.unproject(each) for each in (pixels, other)]
+    shown = [rig.eye(side).contains(rig.eye(side).project(each)) for side, each in zip(SIDES, rays, strict=True)]
+    assert 100 < np.count_nonzero(shown[0] & shown[1]) < 0.6 * len(pixels)
+    for each in rays:
+        assert np.all(level.contains(level.project(each[shown[0] & shown[1]])))
+
+
+def test_black_borders_do_not_widen_the_search() -> None:
+    """Both images show noise at a disparity of 8 px within a band; beyond it the right one is black."""
+    rng = np.random.default_rng(0)
+    wall = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (240, 420)).astype(np.float32), None, 2.0)
+    wall = np.clip((wall - 127.5) * 4.0 + 127.5, 0.0, 255.0).astype(np.uint8)
+    left, right, seen = wall[:, :400], wall[:, 8:408].copy(), np.ones((240, 400), np.bool_)
+    seen[:, 200:] = False
+    right[~seen] = 0
+    rig = StereoRig(camera=PinholeCamera.centred(400, 240, 300.0), baseline=0.2)
+    limited = SgmMatcher().limited(left, right, rig, [np.ones_like(seen), seen])
+    assert isinstance(limited, SgmMatcher)
+    # The search at a quarter of the size finds 2 px or so, to which a tenth and a pixel are added.
+    assert limited.num_disparities is not None and 8 <= limited.num_disparities <= 16
+    assert SgmMatcher(num_disparities=40).limited(left, right, rig, [seen, seen]).num_disparities == 40
