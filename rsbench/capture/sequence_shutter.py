@@ -70,7 +70,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scan, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.core.uncertainty import shared_error_factor, tiles, variance_factor
+from rsbench.core.uncertainty import shared_error_factor, spread_about, tempered, tiles, variance_factor
 from rsbench.solvers.engine.levenberg_marquardt import descend
 
 _Start = TypeVar("_Start")
@@ -283,29 +283,34 @@ def ratio_of_sequence(
     if sum(len(each.left if alone else each.tracks) for each in windows) < _FEWEST * len(windows):
         return None
     fewer = thinned_chains if alone else thinned
-    few, found = fewer(windows, _SOME), dict[int, _Found]()
+    few, found = fewer(windows, _SOME), dict[int, list[_Found]]()
     # Far from the truth the evidence has several maxima, so start at several places.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
-    first = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
+    starts = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
         profile = _Profile(few, rig, scanning, times, focal_sigma)
-        started = _likeliest(partial(profile.started, curve=profile.first_spline(seed)), first, _ROUGH)
+        started = _likeliest(partial(profile.started, curve=profile.first_spline(seed)), starts, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
-        for each in _likeliest(profile.refined_with_noise, rough, 1):
-            others = _likeliest(profile.refined_without_dashboard, [each] if alone else [], 1)
-            found[number] = max([each, *others], key=lambda one: one.evidence)
+        refined = _likeliest(profile.refined_with_noise, rough, _REFINED)
+        refined += _likeliest(profile.refined_without_dashboard, refined[:1] if alone else [], 1)
+        if refined:
+            found[number] = sorted(refined, key=lambda each: -each.evidence)
     if not found:
         return None
-    best = max(found, key=lambda each: found[each].evidence)
+    best = max(found, key=lambda each: found[each][0].evidence)
+    first, rivals = found[best][0], found[best]  # local optima, which may be nearly as likely
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
-        profile = profile.with_noise_of(found[best])
-        top, covariance = profile.most_evident(profile.refined_again(found[best]))
+        profile = profile.with_noise_of(first)
+        top, covariance = profile.most_evident(profile.refined_again(first))
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
-    odds = sum(np.exp((each.evidence - found[best].evidence) / dispersion) for each in found.values())
-    estimate = profile.result(top, dispersion * covariance, 1.0 / float(odds))
+    odds = sum(np.exp((each[0].evidence - first.evidence) / dispersion) for each in found.values())
+    places = np.array([each.place for each in rivals])
+    likely = tempered([np.exp(each.evidence - first.evidence) for each in rivals], dispersion)
+    covariance = dispersion * covariance + spread_about(places[0], likely, places)
+    estimate = profile.result(top, covariance, 1.0 / float(odds))
     # Refuse fits to two or three wrong matches, and fits to all of them with an error scale too large for noise.
     right = estimate.used >= _LEAST_SHARE * estimate.total and estimate.noise_px <= MOST_NOISE_PX
     return estimate if right else None

@@ -25,12 +25,13 @@ def test_a_sequence_shows_the_ratio_that_its_windows_do_not() -> None:
     assert found.sigma < 0.03  # frames that allow no more would be no use
 
 
-@pytest.mark.parametrize("seed", [1, 4, 6])
+@pytest.mark.parametrize("seed", [1, 4, 6, 12])
 def test_a_dashboard_that_moves_with_the_camera_does_not_bias_the_ratio(seed: int) -> None:
     """The lower third of the image shows a dashboard, which vibrates by 0.4 px between frames.
 
-    With one noise for the whole image, the ratios were wrong by 12, 4 and 16 standard deviations; without a start
-    at which the dashboard has little weight, that of seed 4 by 3.
+    With one noise for the whole image, the ratios of 1, 4 and 6 were wrong by 12, 4 and 16 standard deviations;
+    without a start at which the dashboard has little weight, that of 4 by 3; without the distance between local
+    optima in the deviation, that of 12 by 3.
     """
     rng = np.random.default_rng(seed)
     law, shaken, windows = sines(rng, *SHAKES["strong"]), rng.normal(0.0, 0.4, (9, 2)), list[Correspondences]()
