@@ -282,8 +282,9 @@ def _identity(e: Entrant) -> dict[str, Any]:
 
 def simulator_version() -> str:
     """Hash of the sources of the simulation; the sources of solvers are in their keys."""
-    package = resources.files("rsbench.benchmark")
-    files = [package / "seeds.py", *(package / "simulated" / name for name in _SIMULATOR)]
+    package = resources.files("rsbench")
+    simulator = package / "benchmark" / "simulated"
+    files = [package / "components" / "seeds.py", *(simulator / name for name in _SIMULATOR)]
     return hashlib.sha256(b"\n".join(file.read_bytes() for file in files)).hexdigest()
 
 
