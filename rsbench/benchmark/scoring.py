@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.components import plugins
 from rsbench.components.plugins import Entry, Kind, RunOptions
 from rsbench.core.arguments import LARGEST
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import (
     WORST_ANGLE,
@@ -37,7 +37,6 @@ from rsbench.core.pose_errors import (
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import naming
 
 
 @final

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rsbench.cli.console import echo
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.rig import SIDES
 from rsbench.pipeline.footage import IMAGE_SUFFIXES, FrameSource, OneCameraCard, Part, RigCard, rig_card_of
 from rsbench.storage.files import check_out as can_be_written
-from rsbench.storage.untrusted_files import naming
 from rsbench.storage.videos import said_fps, written_as_video
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from rsbench.capture.two_frame_estimate import Capture, Window, conclude, examin
 from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.correct_input import ReadoutOptions, frame_source, is_rendered, say_notes, sequence_files
 from rsbench.components.motion_models import load_kernel
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
@@ -26,7 +26,6 @@ from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.problem import read_problems
 from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
-from rsbench.storage.untrusted_files import naming
 from rsbench.vision.feature_matcher import load_features
 
 

@@ -15,8 +15,7 @@ import typer
 from rsbench.cli.cluster_options import Scheduler, chosen_workers, results_at
 from rsbench.cli.console import echo, late_progress, print_rows, progress_bar, say
 from rsbench.cli.names import complete, named
-from rsbench.core.errors import RsbenchError
-from rsbench.storage.untrusted_files import naming
+from rsbench.core.errors import RsbenchError, naming
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager

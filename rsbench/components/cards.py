@@ -25,8 +25,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from rsbench.core.errors import RsbenchError
-from rsbench.storage.untrusted_files import CARD_BYTES, naming, read_text
+from rsbench.core.errors import RsbenchError, naming
+from rsbench.storage.untrusted_files import CARD_BYTES, read_text
 
 T = TypeVar("T")
 CardKind = Literal[

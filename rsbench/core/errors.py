@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import unicodedata
+from collections.abc import Iterator
 
 _WORD = 300
 """Characters of a word of a message, which may be a path, or a name that somebody gave."""
@@ -30,3 +32,13 @@ class RsbenchError(Exception):
     def __init__(self, message: object = "") -> None:
         shortened = re.sub(rf"\S{{{_WORD + 1},}}", lambda word: f"{word[0][:60]}...{word[0][-20:]}", str(message))
         super().__init__(shortened)
+
+
+@contextlib.contextmanager
+def naming(where: object, *kinds: type[Exception]) -> Iterator[None]:
+    """Raise errors of these kinds, ValueError without any, as RsbenchError with ``where`` in front."""
+    kinds = kinds or (ValueError,)
+    try:
+        yield
+    except kinds as error:
+        raise RsbenchError(f"{where}: {error}") from error

@@ -15,7 +15,7 @@ from rsbench.components.imports import search
 from rsbench.components.rig_tables import RIG_KEY, RigTables, with_rig
 from rsbench.components.seeds import generator
 from rsbench.core.camera import Lens, PinholeCamera
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.geometry import FixedGeometry
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, StereoRig
@@ -29,7 +29,7 @@ from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.sequence import check_sizes, sequence_manifest
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.scenes.model import Start
-from rsbench.storage.untrusted_files import check_name, naming
+from rsbench.storage.untrusted_files import check_name
 
 
 @dataclass(frozen=True, kw_only=True)

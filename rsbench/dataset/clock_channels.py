@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.components.cards import parse_card
 from rsbench.components.seeds import generator
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.imu import STANDARD_GRAVITY, inertial
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, views_of
@@ -27,7 +27,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.renderers.image import Sensor
 from rsbench.scenes.model import Start, Viewpoint
 from rsbench.storage.files import write_bytes, write_json
-from rsbench.storage.untrusted_files import inside, naming, read_text
+from rsbench.storage.untrusted_files import inside, read_text
 
 TIMING_MANIFEST = "timing.json"
 TIMING_COLUMNS = "row,time_ns,exposure_start_ns,exposure_end_ns"

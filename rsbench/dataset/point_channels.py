@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from rsbench.components.seeds import generator
 from rsbench.core.camera import inverse_2x2
 from rsbench.core.correspondences import Correspondences, repeated
+from rsbench.core.errors import naming
 from rsbench.core.geometry import Geometry
 from rsbench.core.projection import (
     ProjectionStatus,
@@ -34,7 +35,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.version import __version__
 from rsbench.dataset.views import FAR, PixelClass, Rays
 from rsbench.storage.files import save_arrays
-from rsbench.storage.untrusted_files import load_arrays, naming
+from rsbench.storage.untrusted_files import load_arrays
 
 if TYPE_CHECKING:
     from rsbench.pipeline.frame_depth import Images

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import naming
 from rsbench.core.rig import SIDES, Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import naming
 
 PoseAt = Callable[[FloatArray], Pose]
 """``cam_from_world`` (..., 3, 3), (..., 3) at times (...), frame periods; NaN where it is not known."""

@@ -15,10 +15,10 @@ from itertools import product
 from pathlib import Path
 
 from rsbench.components.cards import card_path
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.dataset.card import DatasetCard, MotionCard, SequenceCard, Variation, read_dataset_card
 from rsbench.scenes.load import read_scene_card
-from rsbench.storage.untrusted_files import naming, read_text
+from rsbench.storage.untrusted_files import read_text
 
 SHORTEST = 16
 """Characters of a secret: shorter ones could be tried."""

@@ -17,7 +17,7 @@ from rsbench.components.cards import parse_card
 from rsbench.components.motion_models import motion_record, read_motion
 from rsbench.components.rig_tables import CameraTable, RightFromLeft, Vector, camera_record, tables_of
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.geometry import MovingObject
 from rsbench.core.motion import LaterMotion, Motion
 from rsbench.core.rig import FRAMES, SIDES, RigCamera, Side, StereoRig, views_of
@@ -48,7 +48,7 @@ from rsbench.dataset.point_channels import Matching
 from rsbench.dataset.views import numbers_of
 from rsbench.renderers.image import Sensor, check_brightness
 from rsbench.storage.files import read_depth, read_grey_png, read_json, read_mask, read_png, read_poses
-from rsbench.storage.untrusted_files import check_name, check_size, inside, naming
+from rsbench.storage.untrusted_files import check_name, check_size, inside
 
 FORMAT, OF_RIG = 1, 2
 FORMATS = (FORMAT, OF_RIG)

@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import check_image_size, check_size, naming, read_bytes, read_text
+from rsbench.storage.untrusted_files import check_image_size, check_size, read_bytes, read_text
 from rsbench.storage.untrusted_files import load_arrays as load_arrays
 from rsbench.storage.untrusted_files import read_json as read_json
 from rsbench.storage.untrusted_files import sha256 as sha256

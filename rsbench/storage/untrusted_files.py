@@ -18,7 +18,6 @@ import re
 import stat
 import zipfile
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -47,16 +46,6 @@ _OPEN = re.compile(r"/dev/[^/]+|/dev/fd/\d+|/proc/[^/]+(/task/\d+)?/fd/\d+")
 PLAIN_KINDS = "biufU"
 """Kinds of arrays that are plain data: truth values, numbers and text."""
 _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
-
-
-@contextlib.contextmanager
-def naming(where: object, *kinds: type[Exception]) -> Iterator[None]:
-    """Raise errors of these kinds, ValueError without any, as RsbenchError with ``where`` in front."""
-    kinds = kinds or (ValueError,)
-    try:
-        yield
-    except kinds as error:
-        raise RsbenchError(f"{where}: {error}") from error
 
 
 def check_amount(where: object, what: str, amount: int, limit: int) -> None:

@@ -38,10 +38,10 @@ from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.statistics import share_interval
 from rsbench.benchmark.trajectory_scores import METHODS
 from rsbench.components.cards import list_cards, parse_card
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.jobs.process_jobs import Workers
 from rsbench.storage.files import read_table, write_bytes, write_json, write_table
-from rsbench.storage.untrusted_files import NAME, naming, parse_json, read_bytes, read_json
+from rsbench.storage.untrusted_files import NAME, parse_json, read_bytes, read_json
 from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1

@@ -60,7 +60,7 @@ from rsbench.components.motion_models import TwistMotion
 from rsbench.components.seeds import generator
 from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences, track_pairs
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.motion import Motion
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import View
@@ -78,7 +78,7 @@ from rsbench.pipeline.problem import COLUMNS, Problem
 from rsbench.solvers.engine.base import SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.storage.files import read_table, write_bytes
-from rsbench.storage.untrusted_files import naming, read_bytes
+from rsbench.storage.untrusted_files import read_bytes
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import between_pixels
 

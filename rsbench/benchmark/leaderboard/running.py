@@ -20,12 +20,12 @@ from rsbench.benchmark.leaderboard.pictures import PICTURES
 from rsbench.benchmark.leaderboard.submissions import method_header, submission_text
 from rsbench.benchmark.leaderboard.track import Job, Limits, Runnable, Split, Step, Target, Track
 from rsbench.benchmark.provenance import numeric_version, processor
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.jobs.isolation import ONE_THREAD, use_one_thread
 from rsbench.jobs.process_jobs import Workers, finished_jobs, run_jobs
 from rsbench.solvers.refined import warm_up
 from rsbench.storage.files import sha256, write_bytes
-from rsbench.storage.untrusted_files import check_name, naming
+from rsbench.storage.untrusted_files import check_name
 from rsbench.storage.work_folder import remove
 
 

@@ -21,7 +21,7 @@ from rsbench.benchmark.simulated.simulation import OutlierImages, Simulation, si
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
@@ -31,7 +31,7 @@ from rsbench.dataset.sequence import Sequence, read_dataset, read_dataset_manife
 from rsbench.pipeline.frame_capture import find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.problem import Problem
-from rsbench.storage.untrusted_files import check_name, naming, read_text
+from rsbench.storage.untrusted_files import check_name, read_text
 from rsbench.vision.feature_matcher import load_features
 
 Range = tuple[float, float]

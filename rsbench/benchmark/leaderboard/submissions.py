@@ -16,9 +16,9 @@ from typing import Any
 
 from rsbench.benchmark.leaderboard.track import ORACLE, Answer, Header, Split, Submission
 from rsbench.components.cards import choices, parse_card
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.storage.files import write_bytes
-from rsbench.storage.untrusted_files import MB, naming, parse_json, read_text
+from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
 """Largest file of motions: 20 kB for each of 800 problems."""

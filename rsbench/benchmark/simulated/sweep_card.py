@@ -16,10 +16,11 @@ from rsbench.components.motion_models import drawn_parameters, fixed_endpoint, m
 from rsbench.components.rig_tables import RigTables, load_rig
 from rsbench.core.arguments import check_whole
 from rsbench.core.camera import PinholeCamera
+from rsbench.core.errors import naming
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
-from rsbench.storage.untrusted_files import check_name, naming
+from rsbench.storage.untrusted_files import check_name
 
 Axis = Literal[
     "noise_px",

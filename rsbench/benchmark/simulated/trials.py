@@ -15,12 +15,12 @@ from rsbench.benchmark.simulated.simulation import Simulation, simulate
 from rsbench.benchmark.simulated.sweep_card import Setting
 from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences, track_pairs
+from rsbench.core.errors import naming
 from rsbench.core.so3 import FloatArray
 from rsbench.jobs.isolation import EntryFailure
 from rsbench.pipeline.isolated_components import GuardedSolver, SolverRunner
 from rsbench.solvers.engine.base import BESIDE, MotionEstimate, Solver, SolverEntry, load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions
-from rsbench.storage.untrusted_files import naming
 
 Arrays = dict[str, NDArray[Any]]
 Information = Literal["left pairs", "left and right pairs", "linked pairs", "tracks"]

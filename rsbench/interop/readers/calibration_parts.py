@@ -24,7 +24,7 @@ from rsbench.components.cards import parse_card
 from rsbench.components.rig_tables import CameraTable, Size
 from rsbench.core import so3
 from rsbench.core.camera import COEFFICIENTS, Lens, PinholeCamera
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.lens_fit import (
     Profile,
     continued,
@@ -36,7 +36,7 @@ from rsbench.core.lens_fit import (
 from rsbench.core.rig import Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.storage.untrusted_files import MB, naming, parse_json, read_text
+from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 _LONGEST = 8 * MB
 """Largest file, bytes; COLMAP lists a camera for each image of a collection."""

@@ -11,14 +11,13 @@ import numpy as np
 
 from rsbench.components.cards import parse_card, read_toml, with_shutter
 from rsbench.components.rig_tables import RightFromLeft, Size, with_readouts
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import Scanning
 from rsbench.interop.readers.calibration_parts import Assumptions, Calibration, Table, refuse_unseen
 from rsbench.interop.readers.calibrations import read_calibration
 from rsbench.pipeline.footage import OneCameraCard, RigCard, rig_path
-from rsbench.storage.untrusted_files import naming
 
 _READOUTS = ("readout_ratio", "shutter", "line_delay_s")
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
-from rsbench.core.errors import RsbenchError
+from rsbench.core.errors import RsbenchError, naming
 from rsbench.core.rig import Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
@@ -21,7 +21,6 @@ from rsbench.interop.writers.colmap_and_tum import camera_line
 from rsbench.interop.writers.kitti_and_kalibr import KALIBR_LENSES, kalibr_camera, write_chain, yaml_transform
 from rsbench.interop.writers.sequence_views import number, projections
 from rsbench.storage.files import write_bytes
-from rsbench.storage.untrusted_files import naming
 
 
 def write_calibration(found: Calibration, kind: str, out: Path) -> list[Path]:
