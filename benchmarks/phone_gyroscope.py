@@ -62,10 +62,8 @@ def print_ratios(folder: Path) -> None:
     """Print the readout ratio and focal length with their deviations, from runs of successive frames."""
     files = sorted((folder / "reshape").glob("*.jpg"), key=lambda path: int(path.stem.split("-")[-1]))
     for first in range(0, len(files) - _RUN + 1, _RUN):
-        frames, row = (
-            [read_frame(path) for path in files[first : first + _RUN]],
-            f"frames {first:3} to {first + _RUN:3}:",
-        )
+        frames = [read_frame(path) for path in files[first : first + _RUN]]
+        row = f"frames {first:3} to {first + _RUN:3}:"
         for name, camera in (("camera given", CAMERA), ("nothing given", None)):
             try:
                 found = find_shutter(frames, len(frames), OneCameraCard.of(camera, None), RobustOptions())

@@ -397,16 +397,14 @@ def observed(squares: FloatArray, freedom: FloatArray, tails: Tails, used: float
 def noise_by_tile(tracks: TimedTracks, squares: FloatArray) -> FloatArray:
     """(n,) noise of each track's part of the image relative to that of all tracks, from squared errors (n,), px^2.
 
-    Texture and blur differ between parts of an image. A part may also have a motion of its own, as a car's
-    dashboard: points explain much of it, so that its errors are larger than others but no outliers.
+    Texture and blur differ between parts of an image. A part may also have a motion of its own, as a dashboard:
+    one trajectory explains much of it, so that its errors are larger than others but are not outliers.
     """
     each, most = squares / tracks.freedom, int(np.prod(_TILES))
     noise = np.ones(len(tracks))
     if len(tracks) >= _FEWEST_IN_TILE * most:
-        groups, typical = (
-            tiles(tracks.ends[tracks.starts[:-1], :2], _TILES),
-            max(float(np.median(each)), _LEAST_SQUARE),
-        )
+        groups = tiles(tracks.ends[tracks.starts[:-1], :2], _TILES)
+        typical = max(float(np.median(each)), _LEAST_SQUARE)
         for tile in range(most):
             noise[groups == tile] = np.median(each[groups == tile]) / typical
     return np.sqrt(np.maximum(noise, _LEAST_SHARE))

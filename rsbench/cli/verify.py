@@ -165,9 +165,9 @@ DIGEST_EPILOG = """[bold]Examples[/bold]
 
   rsbench digest data/paper --check paper.txt
 
-A digest is of the frames, depth, poses and channels of a sequence, and of what its sequence.json says of motion,
-cameras and scene; not of dates, versions and pages. Another kind of processor may give others; where rsbench has a
-reference copy, [bold]rsbench verify --reference[/bold] says whether pictures are alike.
+A digest covers the frames, depth, poses and channels of a sequence, and the motion, cameras and scene in its
+sequence.json, but no dates, versions and pages. Another kind of processor may give other digests; where rsbench
+has a reference copy, [bold]rsbench verify --reference[/bold] says whether pictures are alike.
 
 Exit codes: 0 done, 1 a digest differs, 2 an input is wrong."""
 

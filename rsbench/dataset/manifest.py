@@ -249,7 +249,7 @@ def scene_hash(scene: Scene) -> str:
 
 
 def mesh_file_hash(mesh: MeshFile) -> str:
-    """The same of a mesh file that moves, by itself; RsbenchError where it cannot be read."""
+    """SHA-256 of the meshes of one moving mesh file; RsbenchError if the file cannot be read."""
     return hashlib.sha256(b"".join(_bytes_of(mesh.meshes()))).hexdigest()
 
 

@@ -26,8 +26,8 @@ _LINE = re.compile(rf"([0-9a-f]{{64}})  ({NAME.pattern})")
 def digests(folder: Path) -> Iterator[tuple[str, str]]:
     """Name and digest of each sequence of a dataset, in its order.
 
-    A digest is of the truth in sequence.json (motion, cameras, scene, renderer, seed), and of the path and content
-    of each file that it lists: frames, depth, poses, channels. It knows no dates, versions or folders.
+    A digest covers the truth in sequence.json (motion, cameras, scene, renderer, seed), and the path and content
+    of each file that it lists: frames, depth, poses, channels. It does not depend on dates, versions or folders.
 
     Raises:
         RsbenchError: the dataset cannot be read, or has not a file that it lists.

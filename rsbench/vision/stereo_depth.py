@@ -870,7 +870,7 @@ def _fill_ends(rho: F32, pair: _Pair, ends: F32, rays: F32) -> None:
                 if abs(along - before) < _SAME_LINE:
                     break
                 before = along
-            shift = before - start if abs(before) < np.inf else 0.0  # of the next pixel about the same
+            shift = before - start if abs(before - start) < np.inf else 0.0  # about that of the next pixel
             rays[row, column, 0], rays[row, column, 1] = p / r, q / r
             if -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5:
                 ends[row, column, 0], ends[row, column, 1] = u, v
