@@ -185,6 +185,8 @@ def _turn(window: Window) -> float:
 PRIOR = 0.35
 """Prior standard deviation of log(focal length / image width) about 0: two of them cover lenses from half a width
 to two widths, 90 to 28 degrees."""
+CENTRE_SIGMA = 0.01
+"""Prior standard deviation of the principal point of an unknown camera about the image centre, image widths."""
 _MATCHES, _SAMPLES = 400, 100
 """Number of matches of a pair that are used, as neighbours in dense flow are correlated; RANSAC iterations."""
 _MODELS = ("inertial", "accelerated")

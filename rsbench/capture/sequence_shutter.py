@@ -13,7 +13,7 @@ import copy
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -26,7 +26,8 @@ from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions
 from rsbench.capture.trajectory_fit import (
     ANCHORED,
     DAMPING,
-    Descent,
+    DIRECTIONS,
+    SHORT,
     Equations,
     Fit,
     anchored,
@@ -41,11 +42,10 @@ from rsbench.capture.trajectory_fit import (
     variances,
     window_motions,
 )
-from rsbench.capture.trajectory_gyro import Border
+from rsbench.capture.trajectory_gyro import Border, bordered_step
 from rsbench.capture.trajectory_spline import (
     Curve,
     NotDefiniteError,
-    Prior,
     band_factor,
     band_solve,
     from_pose_at,
@@ -94,10 +94,14 @@ _FEWEST, _SOME, _TRACKS = 15, 60, 150
 """Approximate tracks per window: fewest for an estimate, number for the scanning, and number for the ratio."""
 _SHARE = 0.5
 """Weight of one camera's track relative to the prior; ``dispersion`` accounts for correlated errors."""
-_COARSE_FOCAL, _FARTHEST = 0.3, 0.9
-"""Step of the search in the logarithm of the focal length, and its largest absolute value."""
+_COARSE_FOCAL = 0.3
+"""Step of the search in the logarithm of the focal length."""
+_LIMITS, _LARGEST = np.array([1.0, 0.9, 0.1, 0.1]), np.array([_COARSE, _COARSE_FOCAL, 0.02, 0.02])
+"""Largest absolute values of ratio, log focal length and principal point (image widths), and largest steps."""
 _LITTLE_WEIGHT = 4.0
 """Relative noise of tracks that a fit is to use little."""
+_STRAIGHT = (0.01 * SHORT) ** 2
+"""Variance of the acceleration of nearly uniform translations: changes of the speed by 1 % in a frame period."""
 _LEAST_SHARE = 0.2
 """Least share of inliers among the tracks."""
 _PRECISION = 1e12
@@ -113,8 +117,6 @@ _STEPS, _STEPS_BESIDE, _LARGEST_STEP = 4, 4, np.array([0.05, 0.1])
 """Most Newton steps to the largest evidence, steps of the spline at each place, and largest step of a place."""
 _REACH = np.array([[0.002, 0.01], [0.02, 0.04]])
 """Smallest and largest steps of the differences of the evidence."""
-_DIFFERENCE = 1e-3
-"""Step of ratio and log focal length for derivatives of the cost."""
 _FIXED_ROUNDS, _FREE_ROUNDS, _STEPS_A_ROUND = 15, 25, 2
 """Most rounds under the wide error distribution and under the tracks' own, and steps in each."""
 _FLAT_COST, _FLAT_VARIANCE, _FLAT_EVIDENCE, _FLAT_PLACE = 1e-3, 0.05, 0.1, np.array([0.002, 0.005])
@@ -151,6 +153,7 @@ def capture_of_sequence(
     seed: int = 0,
     focal_sigma: float = 0.0,
     times: FloatArray | None = None,
+    centre_sigma: float = 0.0,
 ) -> Capture:
     """Estimate the shutter from one trajectory through successive windows, without motion models.
 
@@ -158,14 +161,14 @@ def capture_of_sequence(
         capture: the estimate by motion models, which is returned if no trajectory explains the tracks.
         windows: matches of the frames 0 and 1, 1 and 2, ...
         scannings: candidates; None: both cameras synchronous and from one of four sides, or as in ``capture``.
-        focal_sigma, times: see ``ratio_of_sequence``.
+        focal_sigma, times, centre_sigma: see ``ratio_of_sequence``.
     """
     if scannings is None:
         best, scannings = capture.likeliest, _TOGETHER
         if best is not None and not best.scans.together and "global" not in astuple(best.scans):
             own = Scanning(scan=best.scans.left, right_scan=best.scans.right)  # pyrefly: ignore[bad-argument-type]
             scannings = (*_TOGETHER, own)
-    found = ratio_of_sequence(windows, rig, scannings, seed, focal_sigma, times)
+    found = ratio_of_sequence(windows, rig, scannings, seed, focal_sigma, times, centre_sigma)
     if found is None:
         return capture
     candidate = Candidate(
@@ -218,18 +221,22 @@ def capture_of_video(
     seed: int = 0,
     focal_sigma: float = 0.0,
     times: FloatArray | None = None,
+    centre_sigma: float = 0.0,
 ) -> Capture | None:
     """The shutter of one camera from a trajectory through successive frames; None if none explains the matches.
 
     Args:
         windows: matches (n, 4) x0, y0, x1, y1, px, of the frames 0 and 1, 1 and 2, ...; with outliers.
         scan: see ``known_alone``.
-        focal_sigma, times: see ``ratio_of_sequence``. The focal length is returned as a calibration error.
+        focal_sigma, times, centre_sigma: see ``ratio_of_sequence``. The focal length is returned as a calibration
+            error.
     """
     matches, scan = [Correspondences(left=each) for each in windows], scan or "top"
     scannings = Scanning(scan=scan), Scanning(scan=OPPOSITE[scan])
     rig = StereoRig.of_one(camera)
-    found = capture_of_sequence(_without_estimate(matches), matches, rig, scannings, seed, focal_sigma, times)
+    found = capture_of_sequence(
+        _without_estimate(matches), matches, rig, scannings, seed, focal_sigma, times, centre_sigma
+    )
     return found if found.candidates else None
 
 
@@ -269,6 +276,7 @@ def ratio_of_sequence(
     seed: int = 0,
     focal_sigma: float = 0.0,
     times: FloatArray | None = None,
+    centre_sigma: float = 0.0,
 ) -> SequenceRatio | None:
     """Estimate the ratio and choose among the scannings; None if no trajectory explains the tracks.
 
@@ -278,6 +286,8 @@ def ratio_of_sequence(
         focal_sigma: prior standard deviation of the logarithm of the focal length about the rig's; 0: it is given,
             as it must be for a camera with a lens.
         times: (n + 1,) times of the frames' first lines, frame periods; None: one period apart.
+        centre_sigma: prior standard deviation of the principal point about the rig's, image widths, each axis; 0:
+            it is given.
     """
     alone = is_of_one_camera(windows)
     if sum(len(each.left if alone else each.tracks) for each in windows) < _FEWEST * len(windows):
@@ -286,12 +296,16 @@ def ratio_of_sequence(
     few, found = fewer(windows, _SOME), dict[int, list[_Found]]()
     # Far from the truth the evidence has several maxima, so start at several places.
     away = (-_COARSE_FOCAL, _COARSE_FOCAL) if focal_sigma else (0.0,)
-    starts = [_Place(_FIRST, 0.0), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
+    starts = [_Place(_FIRST), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
-        profile = _Profile(few, rig, scanning, times, focal_sigma)
-        started = _likeliest(partial(profile.started, curve=profile.first_spline(seed)), starts, _ROUGH)
+        profile = _Profile(few, rig, scanning, times, focal_sigma, centre_sigma)
+        first = profile.first_spline(seed)
+        started = _likeliest(partial(profile.started, curve=first), starts, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
-        refined = _likeliest(profile.refined_with_noise, rough, _REFINED)
+        if alone:
+            straight = _likeliest(profile.started_straight, profile.straight(first), 1)
+            rough += _likeliest(profile.rough, straight, 1)
+        refined = _likeliest(profile.refined_with_noise, rough, len(rough))
         refined += _likeliest(profile.refined_without_dashboard, refined[:1] if alone else [], 1)
         if refined:
             found[number] = sorted(refined, key=lambda each: -each.evidence)
@@ -300,14 +314,14 @@ def ratio_of_sequence(
     best = max(found, key=lambda each: found[each][0].evidence)
     first, rivals = found[best][0], found[best]  # local optima, which may be nearly as likely
     try:
-        profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma)
+        profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma, centre_sigma)
         profile = profile.with_noise_of(first)
         top, covariance = profile.most_evident(profile.refined_again(first))
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
     odds = sum(np.exp((each[0].evidence - first.evidence) / dispersion) for each in found.values())
-    places = np.array([each.place for each in rivals])
+    places = np.array([each.place[:2] for each in rivals])
     likely = tempered([np.exp(each.evidence - first.evidence) for each in rivals], dispersion)
     covariance = dispersion * covariance + spread_about(places[0], likely, places)
     estimate = profile.result(top, covariance, 1.0 / float(odds))
@@ -317,20 +331,24 @@ def ratio_of_sequence(
 
 
 class _Place(NamedTuple):
-    """A readout ratio and a focal length at which the evidence is evaluated."""
+    """Values of the unknowns that all observations share."""
 
     ratio: float
-    log_focal: float
+    log_focal: float = 0.0
     """See ``SequenceRatio``."""
+    x: float = 0.0
+    """Principal point relative to the rig's, image widths."""
+    y: float = 0.0
 
     def inside(self, reach: FloatArray) -> _Place:
         """The nearest place whose ratio is at least ``reach[0]`` from its limits."""
         return self._replace(ratio=float(np.clip(self.ratio, _LEAST + reach[0], 1.0 - reach[0])))
 
     def moved(self, step: FloatArray) -> _Place:
-        """The place after a step (2,), within the limits."""
-        ratio, log_focal = np.clip(np.add(self, step), [_LEAST, -_FARTHEST], [1.0, _FARTHEST])
-        return _Place(float(ratio), float(log_focal))
+        """The place after a step of its first unknowns, within the limits."""
+        whole = np.zeros(len(self))
+        whole[: len(step)] = step
+        return _Place(*np.clip(np.add(self, whole), -_LIMITS, _LIMITS).tolist()).inside(np.zeros(1))
 
 
 class _Found(NamedTuple):
@@ -350,76 +368,58 @@ def _likeliest(step: Callable[[_Start], _Found], starts: Iterable[_Start], count
     return sorted(found, key=lambda each: -each.evidence)[:count]
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A spline, with the readout ratio and the focal length at which it is evaluated."""
+class _Point(NamedTuple):
+    """A spline and a place, with the normal equations there."""
 
-    problem: _Joint
     curve: Curve
     place: _Place
-    predicted: float = 0.0
-    """Decrease of the cost that was predicted for the last step."""
-
-    @cached_property
-    def equations(self) -> Equations:
-        """Normal equations of the control poses."""
-        return self.problem.equations(self.curve, self.place)
-
-    @cached_property
-    def border(self) -> Border:
-        """The parts that involve the place, by differences of cost and gradient."""
-        axes, here = self.problem.profile.axes, self.equations
-        steps = _DIFFERENCE * np.eye(2)[:axes]
-
-        def beside(step: FloatArray) -> Equations:
-            return self.problem.equations(self.curve, _Place(*np.add(self.place, step)))
-
-        ahead, behind = ([beside(sign * step) for step in steps] for sign in (1.0, -1.0))
-        pairs = list(zip(ahead, behind, strict=True))
-        mixed = np.stack([a.gradient - b.gradient for a, b in pairs], axis=1) / (2.0 * _DIFFERENCE)
-        slope = np.array([a.cost - b.cost for a, b in pairs]) / (2.0 * _DIFFERENCE)
-        corner = np.diag([a.cost + b.cost - 2.0 * here.cost for a, b in pairs])
-        if axes > 1:
-            both = beside(steps[0] + steps[1]).cost
-            corner[0, 1] = corner[1, 0] = both - ahead[0].cost - ahead[1].cost + here.cost
-        return Border(mixed, corner / _DIFFERENCE**2, slope)
+    equations: Equations
 
 
 @dataclass(frozen=True, eq=False)
 class _Joint:
-    """The cost of a spline, a ratio and a focal length, in the form that ``descend`` takes.
+    """The cost of a spline and of some unknowns of a place, in the form that ``descend`` takes.
 
     The error distribution and the prior are fixed. The spline depends strongly on ratio and focal length, and
     steps of these alone would creep along narrow curved valleys.
     """
 
     profile: _Profile
-    tails: Tails
-    prior: Prior
-    trust: FloatArray
+    found: Fit
+    """Only its error distribution, prior and inliers are used."""
+    free: Sequence[int]
+    """Indices of the unknowns of the place that are estimated."""
 
-    def equations(self, curve: Curve, place: _Place) -> Equations:
-        """The normal equations of the control poses, with the prior of the focal length in the cost."""
-        found = normal_equations(curve, self.profile.tracks(place), self.tails, self.prior, self.trust)
-        return found._replace(cost=found.cost - self.profile.log_prior(place))
+    def at(self, curve: Curve, place: _Place) -> _Point:
+        """The point with equations that include the prior of the place."""
+        tracks, known, free = self.profile.tracks(place, True), self.found, np.array(self.free, dtype=np.int64)
+        found = normal_equations(curve, tracks, known.tails, known.prior, known.trust)
+        precisions, units, border = self.profile.precisions, self.profile.units, found.border
+        assert border is not None
+        corner = border.corner * np.outer(units, units) + np.diag(precisions)
+        slope = border.slope * units + precisions * place
+        border = Border((border.mixed * units)[:, free], corner[np.ix_(free, free)], slope[free])
+        cost = found.cost + 0.5 * float(precisions @ np.square(place))
+        return _Point(curve, place, found._replace(cost=cost, border=border if len(free) else None))
 
     def stepped(self, here: _Point, damping: float) -> _Point | None:
-        equations, border, tracks = here.equations, here.border, self.profile.tracks(here.place)
-        damped = anchored(equations, here.curve, tracks, 1.0).copy()
+        equations, border = here.equations, here.equations.border
+        damped = anchored(equations, here.curve, self.profile.tracks(here.place), 1.0).copy()
         damped[:, 0] += damping * equations.band[:, 0]
+        step = np.zeros(len(here.place))
         try:
             lower = band_factor(damped)
+            if border is None:
+                follow = -band_solve(lower, equations.gradient)
+            else:
+                larger = border.corner + np.diag(damping * np.diagonal(border.corner))
+                follow, own = bordered_step(lower, equations.gradient, border._replace(corner=larger))
+                step[list(self.free)] = own
         except NotDefiniteError:
             return None
-        follows, alone = band_solve(lower, border.mixed), band_solve(lower, equations.gradient)
-        values, vectors = np.linalg.eigh(border.corner - border.mixed.T @ follows)
-        values, slope = np.maximum(np.abs(values), 1.0), border.slope - border.mixed.T @ alone
-        step = -(vectors / (values * (1.0 + damping))) @ (vectors.T @ slope)
-        step *= np.min(np.minimum(1.0, [_COARSE, _COARSE_FOCAL][: len(step)] / np.maximum(np.abs(step), 1e-9)))
-        follow = -alone - follows @ step
-        predicted = -0.5 * float(follow @ equations.gradient + step @ border.slope)
-        curve = from_pose_at(moved(here.curve, follow), 0.0)
-        there = _Point(self, curve, here.place.moved(np.append(step, 0.0)[:2]), predicted)
+        shorter = float(np.min(np.minimum(1.0, _LARGEST / np.maximum(np.abs(step), 1e-9))))
+        curve = from_pose_at(moved(here.curve, shorter * follow), 0.0)
+        there = self.at(curve, here.place.moved(shorter * step))
         return there if there.equations.cost <= equations.cost else None
 
     def settled(self, before: _Point, after: _Point) -> bool:
@@ -436,9 +436,15 @@ class _Profile:
         scanning: Scanning,
         times: FloatArray | None,
         focal_sigma: float,
+        centre_sigma: float,
     ) -> None:
-        self._windows, self._rig, self._scanning, self._focal_sigma = windows, rig, scanning, focal_sigma
+        self._windows, self._rig, self._scanning = windows, rig, scanning
+        sigmas, width = (0.0, focal_sigma, centre_sigma, centre_sigma), float(rig.camera.width)
+        self.precisions = np.array([each**-2 if each else 0.0 for each in sigmas])
+        self.units = np.array([1.0, 1.0, width, width])
         self.axes = 2 if focal_sigma else 1
+        self._marginal = (2, 3) if centre_sigma else ()
+        self._free = (*range(self.axes), *self._marginal)
         self._linked = [np.ones(len(each.left)) for each in windows] if is_of_one_camera(windows) else None
         # Errors of dense flow are correlated, those of features are not.
         flow = self._linked is not None
@@ -449,6 +455,8 @@ class _Profile:
             pack_windows(windows, rig, self._shutter(ratio), self._linked, share=self._share, times=self._times)
             for ratio in (0.0, 1.0)
         ]
+        later = self._packed[1].ends[:, [2, 7, 8]] - self._packed[0].ends[:, [2, 7, 8]]
+        self._packed[0] = replace(self._packed[0], by_ratio=later)
         self._noise = np.ones(len(self._packed[0]))
 
     def with_noise(self, noise: FloatArray) -> _Profile:
@@ -465,24 +473,36 @@ class _Profile:
     def _shutter(self, ratio: float) -> RollingShutter:
         return self._rig.shutter_of(self._scanning, ratio)
 
-    def tracks(self, place: _Place) -> TimedTracks:
-        """The tracks as read and seen with this ratio and focal length."""
+    def tracks(self, place: _Place, shared: bool = False) -> TimedTracks:
+        """The tracks as read and seen at this place; ``shared``: with what equations of the place need."""
         still, full = self._packed
         ends, longer = still.ends + place.ratio * (full.ends - still.ends), np.exp(place.log_focal)
-        ends[:, :2] /= longer
-        return replace(still, ends=ends, focal=still.focal * longer)
-
-    def log_prior(self, place: _Place) -> float:
-        """Logarithm of the prior density of the focal length, up to a constant."""
-        return -0.5 * (place.log_focal / self._focal_sigma) ** 2 if self._focal_sigma else 0.0
+        ends[:, :2] = (ends[:, :2] - self.units[2:] * [place.x, place.y] / still.focal) / longer
+        return replace(still, ends=ends, focal=still.focal * longer, by_ratio=still.by_ratio if shared else None)
 
     def first_spline(self, seed: int) -> Curve:
         """The spline through the motions of single windows at ``_FIRST`` and the given focal length."""
-        first = _Place(_FIRST, 0.0)
+        first = _Place(_FIRST)
         motions = window_motions(self._windows, self._rig, self._shutter(first.ratio), seed, self._times)
         # All ratios have the same knots, so that control poses without tracks add the same to each evidence.
         span = span_of(float(self._times[-1]), self._shutter(1.0))
         return first_curve(motions, self.tracks(first), span, _KNOTS, self._times)
+
+    def straight(self, curve: Curve) -> list[Curve]:
+        """Splines with the rotations of one, and a uniform translation in each of some directions.
+
+        Where a third of the image moves with the camera, or its lens is long, translations across the optical axis
+        explain in part what rotations do, and motions of single windows change between both.
+        """
+        taus = curve.first + curve.interval * (np.arange(len(curve.p)) - 1.0)
+        directions = SHORT * DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+        return [make_curve(curve.first, curve.interval, curve.R, taus[:, None] * each) for each in directions]
+
+    def started_straight(self, curve: Curve) -> _Found:
+        """The fit of a nearly uniform translation, from a spline, at ``_FIRST``."""
+        place, prior = _Place(_FIRST), TrajectoryOptions().prior._replace(position=_STRAIGHT)
+        tracks = self.tracks(place)
+        return self._found(place, fit(curve, tracks, prior, False, _WIDE, np.ones(len(tracks))))
 
     def started(self, start: _Place, curve: Curve) -> _Found:
         """The fit at a place under a wide error distribution, from the spline for the given focal length.
@@ -495,38 +515,42 @@ class _Profile:
         return self._found(start, fit(curve, tracks, prior, True, _WIDE, np.ones(len(tracks))))
 
     def _found(self, place: _Place, found: Fit) -> _Found:
-        return _Found(log_evidence(found, _PRECISION) + self.log_prior(place), place, found)
+        """The fit with its evidence, in which the principal point is marginalised."""
+        here = _Joint(self, found, self._marginal).at(found.curve, place)
+        found = replace(found, equations=here.equations)
+        return _Found(log_evidence(found, _PRECISION), place, found)
 
     def rough(self, start: _Found) -> _Found:
         """Fit spline and place together under the same wide error distribution."""
-        return self._found(*self._fitted(start.place, start.fit, fixed=True))
+        return self._found(*self._fitted(start.place, start.fit, self._free, fixed=True))
 
     def refined(self, start: _Found) -> _Found:
         """Fit spline and place under the error distribution of the tracks; the evidence is normalised."""
         place, found = start.place, start.fit
         for _ in range(_ROUNDS):
-            last_place, (place, found) = place, self._fitted(place, found, fixed=False)
+            last_place, (place, found) = place, self._fitted(place, found, self._free, fixed=False)
             # The knots stay fine, since coarse ones would enforce a smoothness that the prior must decide on.
             kind = choose(found, self.tracks(place), ())
-            near = np.all(np.abs(np.subtract(place, last_place)) < _NEAR_PLACE)
+            near = np.all(np.abs(np.subtract(place, last_place)[:2]) < _NEAR_PLACE)
             done, found = kind is found, kind
             if done or near:
                 break
         out = self._found(place, found)
         return out._replace(evidence=self._normalised(out))
 
-    def _fitted(self, place: _Place, found: Fit, fixed: bool) -> tuple[_Place, Fit]:
-        """Fit spline, place, variances of the prior and, unless ``fixed``, the error distribution."""
-        curve, tails, prior, trust = found.curve, found.tails, found.prior, found.trust
+    def _fitted(self, place: _Place, found: Fit, free: Sequence[int], fixed: bool) -> tuple[_Place, Fit]:
+        """Fit spline, ``free`` unknowns, variances of the prior and, unless ``fixed``, the error distribution."""
         for _ in range(_FIXED_ROUNDS if fixed else _FREE_ROUNDS):
-            start = _Point(_Joint(self, tails, prior, trust), curve, place)
-            here, last, old = descend(start.problem, start, _STEPS_A_ROUND, DAMPING), variances(prior, None), tails
-            moved_by, tracks = np.abs(np.subtract(here.place, place)), self.tracks(here.place)
-            curve, place = here.curve, here.place
-            lower = band_factor(anchored(here.equations, curve, tracks, ANCHORED))
-            used, determined, prior, _ = estimate_variances(here.equations, lower, prior, None)
+            problem = _Joint(self, found, free)
+            here = descend(problem, problem.at(found.curve, place), _STEPS_A_ROUND, DAMPING)
+            last, old, trust = variances(found.prior, None), found.tails, found.trust
+            moved_by, tracks = np.abs(np.subtract(here.place, place))[:2], self.tracks(here.place)
+            place, tails = here.place, old
+            lower = band_factor(anchored(here.equations, here.curve, tracks, ANCHORED))
+            used, determined, prior, _ = estimate_variances(here.equations, lower, found.prior, None)
             if not fixed:
-                tails, trust = observed(here.equations.squares, tracks.freedom, tails, used)
+                tails, trust = observed(here.equations.squares, tracks.freedom, old, used)
+            found = Fit(curve=here.curve, tails=tails, prior=prior, trust=trust, equations=here.equations)
             change = np.abs(np.log(variances(prior, None) / last))
             settling = (change > _FLAT_VARIANCE) & (change * determined > _FLAT_EVIDENCE)
             still = abs(np.log(tails.scale / old.scale)) < _FLAT_VARIANCE and np.all(
@@ -534,8 +558,7 @@ class _Profile:
             )
             if still and not np.any(settling):
                 break
-        equations = _Joint(self, tails, prior, trust).equations(curve, place)
-        return place, Fit(curve=curve, tails=tails, prior=prior, trust=trust, equations=equations)
+        return place, replace(found, equations=_Joint(self, found, ()).at(found.curve, place).equations)
 
     def refined_again(self, start: _Found) -> _Found:
         """``refined`` from a fit to other tracks, or under another noise."""
@@ -572,18 +595,23 @@ class _Profile:
             step: (2,) from the other place.
         """
         (_, place, other), near = found, found.place.moved(step)
-        tracks, step = self.tracks(near), np.subtract(near, place)[: self.axes]
-        curve, equations, _ = Descent(tracks, other.tails, other.prior, other.trust).descended(
-            moved(other.curve, -follows @ step), None, _STEPS_BESIDE
-        )
-        return self._found(near, replace(other, curve=curve, equations=equations))
+        taken = np.subtract(near, place)[: self.axes]
+        follow, own = np.split(-follows @ taken, [-len(self._marginal) or len(follows)])
+        place = near.moved(np.concatenate([np.zeros(2), own]))
+        problem = _Joint(self, other, self._marginal)
+        here = descend(problem, problem.at(moved(other.curve, follow), place), _STEPS_BESIDE, DAMPING)
+        return self._found(here.place, replace(other, curve=here.curve))
 
     def follows(self, found: _Found) -> FloatArray:
-        """Minus the derivative (6 controls, axes) of a fitted spline by the place."""
-        (_, place, other), tracks = found, self.tracks(found.place)
-        here = _Point(_Joint(self, other.tails, other.prior, other.trust), other.curve, place)
-        lower = band_factor(anchored(here.equations, other.curve, tracks, ANCHORED))
-        return band_solve(lower, here.border.mixed)
+        """Minus the derivative (6 controls + m, axes) of spline and principal point by ratio and focal length."""
+        (_, place, other), tracks, axes = found, self.tracks(found.place), self.axes
+        here = _Joint(self, other, self._free).at(other.curve, place).equations
+        lower, border = band_factor(anchored(here, other.curve, tracks, ANCHORED)), here.border
+        assert border is not None
+        follows = band_solve(lower, border.mixed)
+        left = border.corner - border.mixed.T @ follows
+        own = np.asarray(np.linalg.solve(left[axes:, axes:], left[axes:, :axes]), dtype=np.float64)
+        return np.concatenate([follows[:, :axes] - follows[:, axes:] @ own, own])
 
     def most_evident(self, start: _Found) -> tuple[_Found, FloatArray]:
         """The fit of largest evidence and the covariance (2, 2) of its place, by Newton's method on differences.
@@ -608,16 +636,14 @@ class _Profile:
             values, vectors = np.linalg.eigh(H / np.outer(reach[:axes], reach[:axes]))
             inverse = (vectors / np.maximum(np.abs(values), 1.0)) @ vectors.T
             out[:axes, :axes] = inverse
-            step = np.append(inverse @ ((ahead - behind) / (2.0 * reach[:axes])), 0.0)[:2]
-            step *= np.min(np.minimum(1.0, _LARGEST_STEP / np.maximum(np.abs(step), 1e-9)))
+            step = inverse @ ((ahead - behind) / (2.0 * reach[:axes]))
+            step *= np.min(np.minimum(1.0, _LARGEST_STEP[:axes] / np.maximum(np.abs(step), 1e-9)))
             there = self.beside(best, follows, step)
             if there.evidence >= here:
-                tracks, other = self.tracks(there.place), there.fit
-                again = fit(other.curve, tracks, other.prior, True, other.tails, other.trust)
-                best = self._found(there.place, again)
+                best = self._found(*self._fitted(there.place, there.fit, self._marginal, fixed=True))
             sigma = np.sqrt(np.diagonal(out))
             reach = np.clip(np.where(sigma > 0.0, sigma, reach), *_REACH)
-            if np.all(np.abs(step) <= 0.3 * sigma):
+            if np.all(np.abs(step) <= 0.3 * sigma[:axes]):
                 break
         return best, out
 
@@ -628,8 +654,7 @@ class _Profile:
         scores = np.zeros((len(tracks), self.axes))
         factor = 0.5 * self._share * fitted.trust * (fitted.tails.nu + tracks.freedom)
         for axis, step in enumerate(np.diag(np.sqrt(np.diagonal(inverse)))):
-            steps = [np.append(sign * step, 0.0)[:2] for sign in (-1.0, 1.0)]
-            ends = [self.beside(found, follows, each) for each in steps]
+            ends = [self.beside(found, follows, sign * step) for sign in (-1.0, 1.0)]
             spread = fitted.tails.nu * fitted.tails.scale**2
             costs = [factor * np.log1p(each.fit.equations.squares / spread) for each in ends]
             scores[:, axis] = (costs[1] - costs[0]) / (ends[1].place[axis] - ends[0].place[axis])

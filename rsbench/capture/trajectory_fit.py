@@ -50,9 +50,11 @@ from rsbench.capture.trajectory_tracks import (
     LEAST_SCALE_PX,
     REACH,
     Past,
+    Shared,
     Tails,
     TimedTracks,
     add_tracks,
+    blank_shared,
     inverse_depths,
     is_of_one_camera,
     observed,
@@ -90,13 +92,13 @@ _LIMITS = (1e-10, 1e2)
 DAMPING = Damping(least=0.0, first=1e-6, largest=3e8, dropped=1e-6)
 _SOME = 250
 """Approximate number of tracks per window from which the first motions are estimated."""
-_SHORT = 0.03
+SHORT = 0.03
 """Length at the start of one camera's translations, whose scale is unknown: a hand's, in metres, as the prior's
 start variance is in metres too. With a length of 1, that variance was never adapted to the large accelerations,
 and errors were 0.28 px instead of 0.05."""
 _WEAKEST = 100.0
 """Least precision of poses in the evidence: nothing else bounds the scale of one camera's uniform translation, and
-a precision of 0.1 would hardly do so at the length ``_SHORT``."""
+a precision of 0.1 would hardly do so at the length ``SHORT``."""
 _SUSPECT = 4.0
 """A window's own motion is wrong if its error is this many times that of the motion of its neighbours."""
 _TRIED, _TRIED_KNOTS, _STEPS_TRIED, _STEPS_ADDED, _TRIED_TAILS = 4, 0.5, 12, 3, Tails(3.0, 0.3)
@@ -106,7 +108,7 @@ _WALLS = 4
 """Most times at which a trajectory is tried with all later translations negated, and most such changes."""
 _ONE_SIGN = 0.95
 """Mean sign of the inverse depths below which a fit may be a local minimum, and other starts are tried."""
-_DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
+DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
 """(n, 3) axes and diagonals; their opposites are as good."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Candidates for ``Prior.memory``, frame periods."""
@@ -129,7 +131,7 @@ class Equations(NamedTuple):
     sensed: Sensed | None = None
     """The part of a gyroscope's samples."""
     border: Border | None = None
-    """The part of a gyroscope's errors."""
+    """The part of a gyroscope's errors, or of unknowns that all observations share."""
 
     @property
     def slope(self) -> FloatArray:
@@ -178,13 +180,14 @@ def normal_equations(
     n, past = len(curve.p), tracks.past
     width = width_of(tracks, curve)
     band, gradient, squares = np.zeros((6 * n, width)), np.zeros(6 * n), np.zeros(len(trust))
-    cost = _add_in_threads(curve, tracks, tails, tracks.share * trust, (squares, band, gradient), want)
+    shared = blank_shared(n, tracks.by_ratio is not None)
+    cost = _add_in_threads(curve, tracks, tails, tracks.share * trust, (squares, band, gradient, shared), want)
     rough = roughness(curve, prior.memory, prior.smooth, width, past is None, until)
     for kind, strength in enumerate((prior.rotation, prior.position)):
         cost += 0.5 * rough.squares[kind] / strength
         gradient += rough.gradients[kind] / strength
         band += rough.bands[kind] / strength
-    found = border = None
+    found, border = None, None if tracks.by_ratio is None else Border(*shared)
     if tracks.gyro is not None and drift is not None:
         found = sensed(curve, tracks.gyro, drift, width)
         gradient += found.gradient / drift.variance
@@ -201,23 +204,35 @@ def _add_in_threads(
     tracks: TimedTracks,
     tails: Tails,
     trust: FloatArray,
-    out: tuple[FloatArray, FloatArray, FloatArray],
+    out: tuple[FloatArray, FloatArray, FloatArray, Shared],
     want: bool,
 ) -> float:
     """``add_tracks``; many tracks run as two halves in threads, on all machines, so that sums are identical."""
     starts, middle, same = tracks.starts, len(trust) // 2, (tracks.focal, tails)
+    by_ratio = np.zeros((0, 3)) if tracks.by_ratio is None else tracks.by_ratio
     if len(trust) < _MANY:
-        return add_tracks(curve, tracks.ends, starts, *same, trust, *out, want)
-    squares, band, gradient = out
-    later = np.zeros_like(band), np.zeros_like(gradient)
+        return add_tracks(curve, tracks.ends, starts, *same, trust, *out, by_ratio, want)
+    squares, band, gradient, shared = out
+    later = np.zeros_like(band), np.zeros_like(gradient), Shared(*map(np.zeros_like, shared))
     with ThreadPoolExecutor(1) as pool:
-        half = (curve, tracks.ends, starts[middle:], *same, trust[middle:], squares[middle:], *later, want)
+        half = (
+            curve,
+            tracks.ends,
+            starts[middle:],
+            *same,
+            trust[middle:],
+            squares[middle:],
+            *later,
+            by_ratio,
+            want,
+        )
         other = pool.submit(add_tracks, *half)
-        half = trust[:middle], squares[:middle], band, gradient, want
+        half = trust[:middle], squares[:middle], band, gradient, shared, by_ratio, want
         cost = add_tracks(curve, tracks.ends, starts[: middle + 1], *same, *half)
-    band += later[0]
-    gradient += later[1]
-    return cost + other.result()
+    cost += other.result()
+    for whole, part in zip((band, gradient, *shared), (*later[:2], *later[2]), strict=True):
+        whole += part
+    return cost
 
 
 def _add_past(
@@ -294,8 +309,9 @@ def log_evidence(found: Fit, precision: float) -> float:
     anchor[:, 0] += _WEAKEST
     lower = band_factor(equations.band + anchor)
     after = band_log_determinant(lower)
-    if equations.sensed is not None and equations.border is not None and found.drift is not None:
+    if equations.border is not None:
         after += eliminated(lower, equations.border).log_determinant
+    if equations.sensed is not None and found.drift is not None:
         after += equations.sensed.count * float(np.log(found.drift.variance))
     return log_prior(curve, found.prior, equations.rough) - 0.5 * after - equations.cost
 
@@ -304,7 +320,8 @@ def squared_errors(curve: Curve, tracks: TimedTracks) -> FloatArray:
     """(n,) squared errors of the tracks at their best points, px^2."""
     squares, trust, nothing = *np.zeros((2, len(tracks))), np.zeros((1, width_of(tracks, curve)))
     of_tracks = tracks.ends, tracks.starts, tracks.focal, Tails(3.0, 1.0)
-    add_tracks(curve, *of_tracks, trust, squares, nothing, np.zeros(1), False)
+    unused = blank_shared(0, False), np.zeros((0, 3))
+    add_tracks(curve, *of_tracks, trust, squares, nothing, np.zeros(1), *unused, False)
     return squares
 
 
@@ -440,7 +457,7 @@ def window_motions(
 ) -> list[Motion | None]:
     """The paper's linear motion of each window, from some of its tracks; None if none is found.
 
-    The unknown length of one camera's translation is set to ``_SHORT`` per frame period.
+    The unknown length of one camera's translation is set to ``SHORT`` per frame period.
 
     Args:
         times: (n + 1,) times of the frames' first lines, frame periods; None: 0, 1, 2, ... A motion has the time
@@ -448,7 +465,7 @@ def window_motions(
     """
     lengths = np.ones(len(windows)) if times is None else np.diff(times)
     alone = is_of_one_camera(windows)
-    out, solver, unit = list[Motion | None](), RefinedSolver(one_camera=alone), _SHORT if alone else 1.0
+    out, solver, unit = list[Motion | None](), RefinedSolver(one_camera=alone), SHORT if alone else 1.0
     for window, length in zip(thinned(windows, _SOME), lengths.tolist(), strict=True):
         rng, paced = np.random.default_rng(seed), shutter
         if length != 1.0:
@@ -527,7 +544,7 @@ def first_curve_of_camera(
     def extended(first: int) -> _Place:
         """The best direction in the windows from ``first`` on, extended to all windows."""
         last, turn = min(first + _TRIED, count), evaluate(start, times[first])[0].R
-        speeds = _SHORT * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)) @ turn
+        speeds = SHORT * (DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)) @ turn
         straight = ((taus - times[first])[:, None] * speed for speed in speeds)
         tried = [make_curve(start.first, start.interval, start.R, p) for p in straight]
         places = [fitted(each, _STEPS_TRIED, first, last) for each in tried]

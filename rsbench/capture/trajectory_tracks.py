@@ -52,6 +52,9 @@ _UNCERTAIN = 0.3
 """Error, px, that an inverse depth of one such deviation contributes to the cost."""
 END = 10
 """Number of values per observation."""
+SHARED = 4
+"""Number of unknowns that all observations share: readout ratio, logarithm of the focal length, principal point
+(2), px."""
 
 
 class Tails(NamedTuple):
@@ -61,6 +64,23 @@ class Tails(NamedTuple):
     """Degrees of freedom."""
     scale: float
     """px."""
+
+
+class Shared(NamedTuple):
+    """Parts of the normal equations that involve the ``SHARED`` unknowns; without columns, they are not wanted."""
+
+    mixed: FloatArray
+    """(6 controls, m)"""
+    corner: FloatArray
+    """(m, m)"""
+    slope: FloatArray
+    """(m,) gradient."""
+
+
+def blank_shared(controls: int, wanted: bool) -> Shared:
+    """Parts of 0 for a spline with this number of control poses."""
+    count = SHARED if wanted else 0
+    return Shared(np.zeros((6 * controls, count)), np.zeros((count, count)), np.zeros(count))
 
 
 class Scratch(NamedTuple):
@@ -96,10 +116,18 @@ class Scratch(NamedTuple):
     """(m, m) upper half of the normal matrix of the control poses that the track depends on."""
     g: FloatArray
     """(m,) gradient."""
+    v: FloatArray
+    """(n, 2) velocity of the ideal pixel, px per frame period."""
+    E: FloatArray
+    """(2, SHARED) derivatives of one observation by the shared unknowns."""
+    S: Shared
+    """Equations of one track that involve these unknowns."""
+    T: FloatArray
+    """(3, SHARED) mixed part of the point and these unknowns."""
 
 
 @compiled(error_model="numpy")
-def _scratch(ends: int, size: int) -> Scratch:
+def _scratch(ends: int, size: int, shared: int) -> Scratch:
     return Scratch(
         blank_views(ends),
         np.zeros((ends, 3, 3)),
@@ -117,6 +145,10 @@ def _scratch(ends: int, size: int) -> Scratch:
         np.zeros((3, size)),
         np.zeros((size, size)),
         np.zeros(size),
+        np.zeros((ends, 2)),
+        np.zeros((2, SHARED)),
+        Shared(np.zeros((size, shared)), np.zeros((shared, shared)), np.zeros(shared)),
+        np.zeros((3, SHARED)),
     )
 
 
@@ -131,6 +163,8 @@ def add_tracks(
     squares: FloatArray,
     band: FloatArray,
     gradient: FloatArray,
+    shared: Shared,
+    by_ratio: FloatArray,
     want: bool,
 ) -> float:
     """Negative log-likelihood of tracks, and their weighted normal equations.
@@ -142,12 +176,15 @@ def add_tracks(
         trust: (n,) weights of the tracks; for a weight of 0, only ``squares`` is computed.
         squares: (n,) output, px^2: chi-squared with 2 observations - 3 degrees of freedom at a noise of 1 px.
         band: (6 controls, width) lower half of the normal matrix, by columns from the diagonal on; equations are
-            added to it and to gradient (6 controls,) if ``want``.
+            added to it, to gradient (6 controls,) and to ``shared`` if ``want``.
+        by_ratio: (e, 3) see ``TimedTracks``; not used if ``shared`` has no columns.
     """
     most = 0
     for k in range(len(starts) - 1):
         most = max(most, starts[k + 1] - starts[k])
-    scratch = _scratch(int(most), band.shape[1])  # without int(), compiled for the literal 0 as well
+    scratch = _scratch(
+        int(most), band.shape[1], len(shared.slope)
+    )  # without int(), compiled for the literal 0 as well
     total = 0.0
     for k in range(len(starts) - 1):
         track = ends[starts[k] : starts[k + 1]]
@@ -159,7 +196,7 @@ def add_tracks(
         total += 0.5 * trust[k] * (tails.nu + freedom) * math.log1p(squares[k] / spread)
         if want and squares[k] < BEHIND:
             weight = trust[k] * (tails.nu + freedom) / (spread + squares[k])
-            _add_track(track, focal, scratch, weight, band, gradient)
+            _add_track(track, focal, scratch, weight, band, gradient, shared, by_ratio[starts[k] : starts[k + 1]])
     return total
 
 
@@ -169,7 +206,7 @@ def inverse_depths(curve: Curve, ends: FloatArray, starts: NDArray[np.int64], fo
     most = 0
     for k in range(len(starts) - 1):
         most = max(most, starts[k + 1] - starts[k])
-    scratch, out = _scratch(int(most), 1), np.zeros(len(starts) - 1)
+    scratch, out = _scratch(int(most), 1, 0), np.zeros(len(starts) - 1)
     for k in range(len(out)):
         _explain(curve, ends[starts[k] : starts[k + 1]], focal, scratch)
         out[k] = scratch.point[2]
@@ -243,7 +280,8 @@ def _linearise(track: FloatArray, focal: FloatArray, point: Vector, s: Scratch, 
             body = plus(P, -rho * track[n, 9], (1.0, 0.0, 0.0))
             along = apply(v.R[n], (v.speed[n, 0], v.speed[n, 1], v.speed[n, 2]))
             rate = plus(cross((v.spin[n, 0], v.spin[n, 1], v.spin[n, 2]), body), -rho, along)
-            _fill_weight(track[n], _flow(P, rate, focal), s.W[n])
+            s.v[n, 0], s.v[n, 1] = _flow(P, rate, focal)
+            _fill_weight(track[n], (s.v[n, 0], s.v[n, 1]), s.W[n])
         W = s.W[n]
         e = (focal[0] * (track[n, 0] - P[0] / P[2]), focal[1] * (track[n, 1] - P[1] / P[2]))
         s.e[n, 0], s.e[n, 1] = W[0, 0] * e[0] + W[0, 1] * e[1], W[1, 0] * e[0] + W[1, 1] * e[1]
@@ -314,7 +352,14 @@ def _forward(L: FloatArray, g: Vector) -> Vector:
 
 @compiled(error_model="numpy")
 def _add_track(
-    track: FloatArray, focal: FloatArray, s: Scratch, weight: float, band: FloatArray, gradient: FloatArray
+    track: FloatArray,
+    focal: FloatArray,
+    s: Scratch,
+    weight: float,
+    band: FloatArray,
+    gradient: FloatArray,
+    shared: Shared,
+    by_ratio: FloatArray,
 ) -> None:
     """Add the normal equations with the point eliminated: H = Dc^T Dc - Q N^-1 Q^T with Q = Dc^T Dp."""
     low, high = s.views.index[0], s.views.index[0]
@@ -325,6 +370,7 @@ def _add_track(
     g[:size] = 0.0
     Q[:, :size] = 0.0
     H[:size, :size] = 0.0
+    _clear(s, size)
     for n in range(len(track)):
         _fill_block(track[n], n, focal, s)
         first = 6 * (s.views.index[n] - low)
@@ -336,7 +382,60 @@ def _add_track(
             row, c, d = H[first + i, first:], s.block[0], s.block[1]
             for j in range(i, 24):
                 row[j] += a * c[j] + b * d[j]
+        if len(shared.slope) > 0:
+            _add_shared(track[n], by_ratio[n], n, first, focal, s)
     _reduce(s, size, weight, 6 * low, band, gradient)
+    if len(shared.slope) > 0:
+        _reduce_shared(s, size, weight, 6 * low, shared)
+
+
+@compiled(error_model="numpy")
+def _clear(s: Scratch, size: int) -> None:
+    s.S.mixed[:size] = 0.0
+    s.S.corner[:] = 0.0
+    s.S.slope[:] = 0.0
+    s.T[:] = 0.0
+
+
+@compiled(error_model="numpy")
+def _add_shared(end: FloatArray, by_ratio: FloatArray, n: int, first: int, focal: FloatArray, s: Scratch) -> None:
+    """Add the equations of one observation that involve the shared unknowns.
+
+    The derivative by the ratio is that of the readout time at the best pixel, which is ``e`` from the measured
+    one: W depends on the ratio as well.
+    """
+    W, P, E = s.W[n], s.P[n], s.E
+    later = by_ratio[0] - by_ratio[1] * s.e[n, 0] - by_ratio[2] * s.e[n, 1]
+    x, y = focal[0] * P[0] / P[2], focal[1] * P[1] / P[2]
+    for i in range(2):
+        E[i, 0] = -(W[i, 0] * s.v[n, 0] + W[i, 1] * s.v[n, 1]) * later
+        E[i, 1] = -(W[i, 0] * x + W[i, 1] * y)
+        E[i, 2], E[i, 3] = -W[i, 0], -W[i, 1]
+    for j in range(SHARED):
+        a, b = E[0, j], E[1, j]
+        s.S.slope[j] += a * s.e[n, 0] + b * s.e[n, 1]
+        for i in range(3):
+            s.T[i, j] += a * s.D[n, 0, i] + b * s.D[n, 1, i]
+        for i in range(SHARED):
+            s.S.corner[i, j] += a * E[0, i] + b * E[1, i]
+        for i in range(24):
+            s.S.mixed[first + i, j] += a * s.block[0, i] + b * s.block[1, i]
+
+
+@compiled(error_model="numpy")
+def _reduce_shared(s: Scratch, size: int, weight: float, first: int, shared: Shared) -> None:
+    """Eliminate the point from the equations of a track and the shared unknowns; ``_reduce`` comes before."""
+    best = _forward(s.L, (s.left[0], s.left[1], s.left[2]))
+    for j in range(SHARED):
+        s.T[0, j], s.T[1, j], s.T[2, j] = _forward(s.L, (s.T[0, j], s.T[1, j], s.T[2, j]))
+    for j in range(SHARED):
+        a, b, c = s.T[0, j], s.T[1, j], s.T[2, j]
+        shared.slope[j] += weight * (s.S.slope[j] - a * best[0] - b * best[1] - c * best[2])
+        for i in range(SHARED):
+            shared.corner[i, j] += weight * (s.S.corner[i, j] - s.T[0, i] * a - s.T[1, i] * b - s.T[2, i] * c)
+        for i in range(size):
+            left = s.Q[0, i] * a + s.Q[1, i] * b + s.Q[2, i] * c
+            shared.mixed[first + i, j] += weight * (s.S.mixed[i, j] - left)
 
 
 @compiled(error_model="numpy")
@@ -454,6 +553,9 @@ class TimedTracks:
     """Weight of a track relative to the prior: less than 1 if errors of neighbouring tracks are correlated."""
     gyro: GyroSteps | None = None
     """Rotations measured by a gyroscope during the spline; None: there is none."""
+    by_ratio: FloatArray | None = None
+    """(e, 3) derivative of tau by the readout ratio, and its derivatives by the pixel (2), for equations of the
+    ``SHARED`` unknowns; None: these are given."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -466,8 +568,11 @@ class TimedTracks:
     def with_noise(self, noise: FloatArray) -> TimedTracks:
         """The tracks with errors in units of their noise (n,), relative to a common one, instead of pixels."""
         ends = self.ends.copy()
-        ends[:, 3:9] *= np.repeat(noise, np.diff(self.starts))[:, None]
-        return replace(self, ends=ends)
+        factors, by_ratio = np.repeat(noise, np.diff(self.starts))[:, None], self.by_ratio
+        ends[:, 3:9] *= factors
+        if by_ratio is not None:
+            by_ratio = np.hstack([by_ratio[:, :1], factors * by_ratio[:, 1:]])
+        return replace(self, ends=ends, by_ratio=by_ratio)
 
     @property
     def span(self) -> tuple[FloatArray, FloatArray]:

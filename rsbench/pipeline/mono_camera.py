@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rsbench.capture.calibration import RefusedFramesError
 from rsbench.capture.hypotheses import scans_of
 from rsbench.capture.self_calibration import (
+    CENTRE_SIGMA,
     PRIOR,
     FoundFocal,
     PairFocal,
@@ -135,9 +136,10 @@ def _estimate_shutter(
     """Estimate the shutter from a trajectory through successive pairs, or else from single pairs."""
     first, run, camera = _successive_matches(frames, card, seed, advance)
     focal_sigma, on_trajectory = PRIOR if card.focal_unknown else 0.0, None
+    centre_sigma = CENTRE_SIGMA if card.camera is None else 0.0
     if len(run) >= _FEWEST_PAIRS:
         times = None if starts is None else starts[first : first + len(run) + 1] - starts[first]
-        on_trajectory = capture_of_video(run, camera, card.scan, seed, focal_sigma, times)
+        on_trajectory = capture_of_video(run, camera, card.scan, seed, focal_sigma, times, centre_sigma)
     if on_trajectory is not None:
         focal = focal_of_capture(on_trajectory, camera.width) if card.focal_unknown else None
         return replace(_conclude(on_trajectory, camera, card), focal=focal)
