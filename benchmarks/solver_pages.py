@@ -76,8 +76,8 @@ measurements that [Solvers](../explanation/solvers.md#what-is-measured) explains
 - **Success**: at 0, 30 and 50 % outliers; then at 50 % in equal time and with equal numbers of samples.
 - **Degenerate**: which of the 11 motions and scenes of
   [the suite]({repository}/cards/sweeps/degenerate.toml) are not always solved, without noise and with 0.3 px,
-  as numbers of solved trials. A trial is solved if its errors are below {solved_R} deg and {solved_T} deg, or three
-  times the bound if that is more; a direction that the matches do not determine is ignored. The other trials
+  as numbers of solved trials. A trial is solved if its errors are below {solved_R} deg and {solved_T} deg, or
+  three times the bound if that is more; a direction that the matches do not determine is ignored. The other trials
   give a wrong motion or, if so stated, a failure.
 
 """
