@@ -450,7 +450,7 @@ def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
 
 @dataclass(frozen=True)
 class AnyLaw(MotionKernel):
-    """Any of the laws of motion of this package, by its number: one compiled function for all of them."""
+    """Any motion model of rsbench, by its number: one compiled function for all of them."""
 
     number: float
     acceleration: float = 0.0
