@@ -82,7 +82,7 @@ def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFr
 
 
 def worst_table(sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
-    """A row for each motion model and size: the sequence with our lowest score, and the one with our largest e_T."""
+    """A row for each motion model and size: the sequences with our lowest score and with our largest e_T."""
     wide = sequences.pivot(index="sequence", columns="method", values="psnr_covered")
     errors = motions.set_index("sequence")
     head = (
